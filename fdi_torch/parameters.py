@@ -1,0 +1,185 @@
+"""What a physical number is: its name, unit, nominal value, range, tolerance and meaning.
+
+A `ParameterSpace` is an ordered set of `Parameter`s, the bridge between names and the last
+dimension of a tensor `(*batch, P)`. All values are SI. This file is the only importer of the unit library.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import pint
+import torch
+from torch import Tensor
+
+_units = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+_units.define("duty = [] ")
+_units.define("lps = litre / second")
+_units.define("percent = 0.01 = pct")
+
+SI_UNITS = ("m", "s", "V", "m^2", "m^3", "m^3/s", "m/s", "1")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One scalar that may be estimated.
+
+    name: `component.field` or `component.effect.parameter`, unique in its space.
+    unit: SI unit of every number below. nominal: the value believed in. low, high: the box searched.
+    std: one standard deviation of the prior about nominal; infinite where nothing is known.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    low: float = -math.inf
+    high: float = math.inf
+    std: float = math.inf
+    meaning: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.low <= self.nominal <= self.high:
+            raise ValueError(
+                f"{self.name}: expected low <= nominal <= high, got {self.low} <= {self.nominal} <= {self.high} {self.unit}"
+            )
+        if not self.std > 0:
+            raise ValueError(f"{self.name}: expected a positive standard deviation, got {self.std} {self.unit}")
+
+
+class ParameterSpace:
+    """An ordered set of parameters; the names of the last dimension of `(*batch, P)`."""
+
+    def __init__(self, parameters: Iterable[Parameter] = ()) -> None:
+        self.parameters = tuple(parameters)
+        self._index = {p.name: i for i, p in enumerate(self.parameters)}
+        if len(self._index) < len(self.parameters):
+            doubled = [p.name for i, p in enumerate(self.parameters) if self._index[p.name] != i]
+            raise ValueError(f"expected each parameter once, got {doubled[0]} twice; remove one")
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self.parameters)
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self.parameters[self.index(name)]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._index
+
+    def __add__(self, other: ParameterSpace) -> ParameterSpace:
+        return ParameterSpace(self.parameters + other.parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.parameters)
+
+    def index(self, name: str) -> int:
+        if name not in self._index:
+            raise ValueError(f"expected one of {', '.join(self.names)}, got {name}")
+        return self._index[name]
+
+    def with_changes(self, name: str, **changes: float) -> ParameterSpace:
+        """The same space with fields of one parameter replaced."""
+        self.index(name)
+        return ParameterSpace(replace(p, **changes) if p.name == name else p for p in self.parameters)
+
+    def nominal(self, like: Tensor | None = None) -> Tensor:
+        return self._column("nominal", like)
+
+    def low(self, like: Tensor | None = None) -> Tensor:
+        return self._column("low", like)
+
+    def high(self, like: Tensor | None = None) -> Tensor:
+        return self._column("high", like)
+
+    def std(self, like: Tensor | None = None) -> Tensor:
+        return self._column("std", like)
+
+    def _column(self, field: str, like: Tensor | None) -> Tensor:
+        values = [getattr(p, field) for p in self.parameters]
+        return torch.tensor(values, dtype=torch.float64) if like is None else like.new_tensor(values)
+
+    def vector(self, values: Mapping[str, float]) -> Tensor:
+        """Nominal values with some replaced by name. Returns (P,)."""
+        theta = self.nominal()
+        for name, value in values.items():
+            theta[self.index(name)] = value
+        return theta
+
+    def named(self, theta: Tensor) -> dict[str, Tensor]:
+        """Splits (*batch, P) into one tensor (*batch) per name."""
+        if theta.shape[-1] != len(self):
+            raise ValueError(
+                f"expected a last dimension of {len(self)} ({', '.join(self.names)}), got {theta.shape[-1]}"
+            )
+        return dict(zip(self.names, theta.unbind(-1), strict=True))
+
+
+@lru_cache(maxsize=4096)
+def parse_quantity(text: str, unit: str) -> float:
+    """'160 cm^2' -> 0.016 for unit 'm^2'. A bare number is taken only where the unit is '1'.
+
+    Raises ValueError where the text is no quantity or has another dimension.
+    """
+    try:
+        quantity = _units.Quantity(text)
+        return float(quantity.to(_pint_unit(unit)).magnitude)
+    except Exception as error:
+        raise ValueError(f"expected a quantity in {unit} such as '1 {unit}', got '{text}'") from error
+
+
+@lru_cache(maxsize=256)
+def unit_factor(unit: str, si_unit: str) -> float:
+    """How many `si_unit` one `unit` is: unit_factor('cm', 'm') = 0.01."""
+    try:
+        return float(_units.Quantity(1.0, _pint_unit(unit)).to(_pint_unit(si_unit)).magnitude)
+    except Exception as error:
+        raise ValueError(f"expected a unit that converts to {si_unit}, got '{unit}'") from error
+
+
+def si_unit_of(unit: str) -> str:
+    """The SI unit in which this project keeps a quantity given in `unit`: 'cm3_s' -> 'm^3/s'."""
+    for candidate in SI_UNITS:
+        try:
+            unit_factor(unit, candidate)
+        except ValueError:
+            continue
+        return candidate
+    raise ValueError(
+        f"expected a unit of level, flow, time, volts or share, got '{unit}'; write for example cm, cm3_s, V, pct"
+    )
+
+
+def header_unit(header: str) -> tuple[str, str] | None:
+    """Splits a CSV header of the form name_unit: 'Q1_cm3_s' -> ('Q1', 'cm3_s'); None where no unit stands in it.
+
+    The shortest name whose rest is a unit wins, so that `qL_cmd_lps` is (`qL_cmd`, `lps`) and `vLM_cmd_pct` is (`vLM_cmd`, `pct`).
+    """
+    parts = header.split("_")
+    for split in range(1, len(parts)):
+        unit = "_".join(parts[split:])
+        try:
+            si_unit_of(unit)
+        except ValueError:
+            continue
+        return "_".join(parts[:split]), unit
+    return None
+
+
+_HEADER_UNITS = {
+    "cm3_s": "cm^3/s",
+    "m3_s": "m^3/s",
+    "l_min": "litre/minute",
+    "m3_h": "m^3/hour",
+    "pct": "percent",
+    "1": "",
+}
+
+
+def _pint_unit(unit: str) -> str:
+    return _HEADER_UNITS.get(unit, unit)

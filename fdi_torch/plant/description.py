@@ -1,0 +1,204 @@
+"""What a rig is made of: tanks, pipes, outlets, pumps and sensors, as plain data in SI.
+
+The physics that reads it is `TankNetwork`. A component's name is a location for faults and unmodelled effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+OUTSIDE = "outside"
+
+
+@dataclass(frozen=True)
+class Tank:
+    """area m^2; height m (the rim); start_level m, or None where it is the equilibrium of the first inputs.
+
+    overflow_to: the tank that catches what runs over the rim, or outside.
+    leak_reference: the pipe or outlet whose capacity a leak's size is a share of.
+    """
+
+    name: str
+    area: float
+    height: float
+    start_level: float | None = None
+    overflow_to: str = OUTSIDE
+    leak_reference: str | None = None
+
+
+@dataclass(frozen=True)
+class Pipe:
+    """An orifice from one tank into another tank or the outside.
+
+    area m^2; elevation m above both floors. free_fall: it pours into `target` from above, so that only the
+    source's level drives it (always so into the outside). valve: the input channel with its measured opening (0..1).
+    """
+
+    name: str
+    source: str
+    target: str
+    area: float
+    discharge_coefficient: float
+    elevation: float = 0.0
+    free_fall: bool = False
+    valve: str | None = None
+
+    @property
+    def is_outlet(self) -> bool:
+        return self.target == OUTSIDE or self.free_fall
+
+
+@dataclass(frozen=True)
+class Pump:
+    """Delivers gain x command into `target`, between 0 and max_flow (m^3/s).
+
+    command: the input channel. gain: m^3/s per SI unit of the command (1 where the command is a flow).
+    """
+
+    name: str
+    target: str
+    max_flow: float
+    gain: float = 1.0
+    command: str | None = None
+    gain_unit: str = "1"
+
+    @property
+    def channel(self) -> str:
+        return self.command or self.name
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """reading = gain x level + offset. unit: SI unit of the reading ('m' for a level sensor, 'V' for volts)."""
+
+    name: str
+    tank: str
+    unit: str = "m"
+    gain: float = 1.0
+    offset: float = 0.0
+    channel: str | None = None
+    low: float | None = None
+    high: float | None = None
+
+    @property
+    def column(self) -> str:
+        return self.channel or self.name
+
+
+@dataclass(frozen=True)
+class PlacedEffect:
+    """An effect that the plant is believed to have, with its parameters (SI); what `--adopt` adds."""
+
+    effect: str
+    location: str
+    parameters: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PlantDescription:
+    """A rig. tolerances: one standard deviation of a constant ('P13.discharge_coefficient'), as a share of it."""
+
+    name: str
+    tanks: tuple[Tank, ...]
+    pipes: tuple[Pipe, ...] = ()
+    pumps: tuple[Pump, ...] = ()
+    sensors: tuple[Sensor, ...] = ()
+    effects: tuple[PlacedEffect, ...] = ()
+    tolerances: dict[str, float] = field(default_factory=dict)
+    gravity: float = 9.81
+
+    def __post_init__(self) -> None:
+        _check_names(self)
+        _check_references(self)
+        _check_numbers(self)
+
+    def components(self) -> Iterator[Tank | Pipe | Pump | Sensor]:
+        yield from self.tanks
+        yield from self.pipes
+        yield from self.pumps
+        yield from self.sensors
+
+    def component(self, name: str) -> Tank | Pipe | Pump | Sensor:
+        for component in self.components():
+            if component.name == name:
+                return component
+        raise ValueError(f"plant {self.name}: expected one of {', '.join(self.locations())}, got {name}")
+
+    def tank_pairs(self) -> tuple[tuple[str, str], ...]:
+        """All unordered pairs of tanks; the location of an unknown path between two is 'T1-T2'."""
+        names = [t.name for t in self.tanks]
+        return tuple((a, b) for i, a in enumerate(names) for b in names[i + 1 :])
+
+    def locations(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.components()) + tuple(f"{a}-{b}" for a, b in self.tank_pairs())
+
+    def channels(self) -> tuple[str, ...]:
+        """The input channels that a recording must have: pump commands, then valve openings, each once."""
+        wanted = [p.channel for p in self.pumps] + [p.valve for p in self.pipes if p.valve]
+        return tuple(dict.fromkeys(wanted))
+
+
+def _check_names(plant: PlantDescription) -> None:
+    if not plant.tanks:
+        raise ValueError(f"plant {plant.name}: expected at least one tank, got none; add one under tanks")
+    seen: set[str] = {OUTSIDE}
+    for component in plant.components():
+        if component.name in seen:
+            raise ValueError(f"plant {plant.name}: expected each name once, got '{component.name}' twice; rename one")
+        seen.add(component.name)
+
+
+def _check_references(plant: PlantDescription) -> None:
+    tanks = [t.name for t in plant.tanks]
+
+    def expect_tank(place: str, name: str, also: tuple[str, ...] = ()) -> None:
+        if name not in (*tanks, *also):
+            known = ", ".join((*tanks, *also))
+            raise ValueError(f"plant {plant.name}: {place}: expected one of the tanks {known}, got '{name}'")
+
+    for pipe in plant.pipes:
+        expect_tank(f"pipes.{pipe.name}.source", pipe.source)
+        expect_tank(f"pipes.{pipe.name}.target", pipe.target, (OUTSIDE,))
+        if pipe.source == pipe.target:
+            raise ValueError(
+                f"plant {plant.name}: pipes.{pipe.name}: expected two different ends, got {pipe.source} twice"
+            )
+    for pump in plant.pumps:
+        expect_tank(f"pumps.{pump.name}.target", pump.target)
+    for sensor in plant.sensors:
+        expect_tank(f"sensors.{sensor.name}.tank", sensor.tank)
+    for tank in plant.tanks:
+        expect_tank(f"tanks.{tank.name}.overflow_to", tank.overflow_to, (OUTSIDE,))
+        pipes = [p.name for p in plant.pipes]
+        if tank.leak_reference is not None and tank.leak_reference not in pipes:
+            known = ", ".join(pipes) or "none there are"
+            raise ValueError(
+                f"plant {plant.name}: tanks.{tank.name}.leak_reference: expected one of the pipes {known}, "
+                f"got '{tank.leak_reference}'"
+            )
+
+
+def _check_numbers(plant: PlantDescription) -> None:
+    positive = [
+        (f"tanks.{t.name}.{f}", getattr(t, f), u) for t in plant.tanks for f, u in (("area", "m^2"), ("height", "m"))
+    ]
+    positive += [(f"pipes.{p.name}.area", p.area, "m^2") for p in plant.pipes]
+    positive += [(f"pipes.{p.name}.discharge_coefficient", p.discharge_coefficient, "") for p in plant.pipes]
+    positive += [(f"pumps.{p.name}.max_flow", p.max_flow, "m^3/s") for p in plant.pumps]
+    positive += [("gravity", plant.gravity, "m/s^2")]
+    for field_name, value, unit in positive:
+        if not value > 0:
+            raise ValueError(
+                f"plant {plant.name}: {field_name}: expected a positive number, got {value} {unit}".rstrip()
+            )
+    for sensor in plant.sensors:
+        if sensor.gain == 0:
+            raise ValueError(f"plant {plant.name}: sensors.{sensor.name}.gain: expected a number other than 0, got 0")
+
+
+def describe(component: Any) -> str:
+    """'tank T1', 'pipe P13' ...: a component in words."""
+    kind = "outlet" if isinstance(component, Pipe) and component.is_outlet else type(component).__name__.lower()
+    return f"{kind} {component.name}"
