@@ -10,12 +10,13 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import pint
 import torch
 from torch import Tensor
 
-_units = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+_units: pint.UnitRegistry[float] = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
 _units.define("duty = [] ")
 _units.define("lps = litre / second")
 _units.define("percent = 0.01 = pct")
@@ -43,7 +44,8 @@ class Parameter:
     def __post_init__(self) -> None:
         if not self.low <= self.nominal <= self.high:
             raise ValueError(
-                f"{self.name}: expected low <= nominal <= high, got {self.low} <= {self.nominal} <= {self.high} {self.unit}"
+                f"{self.name}: expected low <= nominal <= high, "
+                f"got {self.low} <= {self.nominal} <= {self.high} {self.unit}"
             )
         if not self.std > 0:
             raise ValueError(f"{self.name}: expected a positive standard deviation, got {self.std} {self.unit}")
@@ -83,7 +85,7 @@ class ParameterSpace:
             raise ValueError(f"expected one of {', '.join(self.names)}, got {name}")
         return self._index[name]
 
-    def with_changes(self, name: str, **changes: float) -> ParameterSpace:
+    def with_changes(self, name: str, **changes: Any) -> ParameterSpace:
         """The same space with fields of one parameter replaced."""
         self.index(name)
         return ParameterSpace(replace(p, **changes) if p.name == name else p for p in self.parameters)
@@ -127,7 +129,7 @@ def parse_quantity(text: str, unit: str) -> float:
     Raises ValueError where the text is no quantity or has another dimension.
     """
     try:
-        quantity = _units.Quantity(text)
+        quantity: Any = _units.Quantity(text)
         return float(quantity.to(_pint_unit(unit)).magnitude)
     except Exception as error:
         raise ValueError(f"expected a quantity in {unit} such as '1 {unit}', got '{text}'") from error
@@ -158,7 +160,7 @@ def si_unit_of(unit: str) -> str:
 def header_unit(header: str) -> tuple[str, str] | None:
     """Splits a CSV header of the form name_unit: 'Q1_cm3_s' -> ('Q1', 'cm3_s'); None where no unit stands in it.
 
-    The shortest name whose rest is a unit wins, so that `qL_cmd_lps` is (`qL_cmd`, `lps`) and `vLM_cmd_pct` is (`vLM_cmd`, `pct`).
+    The shortest name whose rest is a unit wins: `qL_cmd_lps` is (`qL_cmd`, `lps`), `Q1_cm3_s` is (`Q1`, `cm3_s`).
     """
     parts = header.split("_")
     for split in range(1, len(parts)):

@@ -1,4 +1,4 @@
-"""Recording: time, inputs, outputs and where they came from; the one thing rooms hand each other. All numbers are SI."""
+"""Recording: time, inputs, outputs and where they came from; the one thing rooms hand each other. All is SI."""
 
 from __future__ import annotations
 
