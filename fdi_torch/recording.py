@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -58,19 +60,55 @@ class Recording:
 
     def stretch(self, first: int, last: int) -> Recording:
         """Samples first..last-1, with the same clock."""
-        return Recording(
-            self.time[first:last],
-            self.inputs[first:last],
-            self.outputs[first:last],
-            self.input_names,
-            self.output_names,
-            self.input_units,
-            self.output_units,
-            self.mask[first:last],
-            self.hold,
-            self.source,
-            self.sha256,
+        part = slice(first, last)
+        return replace(
+            self,
+            time=self.time[part],
+            inputs=self.inputs[part],
+            outputs=self.outputs[part],
+            mask=self.mask[part],
         )
+
+    def window(self, start: float = -math.inf, stop: float = math.inf) -> Recording:
+        """Samples with start <= time <= stop (s), on the same clock. Raises ValueError where fewer than two are."""
+        first = int((self.time < start).sum())
+        last = int((self.time <= stop).sum())
+        if last - first < 2:
+            raise ValueError(
+                f"{self.source}: expected at least two samples between start {start:g} s and stop {stop:g} s, got "
+                f"{max(last - first, 0)} (the recording runs from {self.time[0]:g} s to {self.time[-1]:g} s)"
+            )
+        return self.stretch(first, last)
+
+    def masked(self, intervals: Iterable[tuple[float, float]]) -> Recording:
+        """Readings within start <= time <= stop (s) no longer count; the inputs stay."""
+        keep = torch.ones_like(self.time, dtype=torch.bool)
+        for start, stop in intervals:
+            if not start < stop:
+                raise ValueError(f"{self.source}: expected masks with start < stop, got [{start:g}, {stop:g}] s")
+            keep &= (self.time < start) | (self.time > stop)
+        return replace(self, mask=self.mask & keep[:, None])
+
+    def every(self, step: int) -> Recording:
+        """Every step-th sample. A held input becomes its mean until the next kept sample, so that no volume is lost.
+
+        An input of which any part is unknown becomes unknown (NaN).
+        """
+        if step < 1:
+            raise ValueError(f"{self.source}: expected every to be a whole number from 1, got {step}")
+        inputs = self._held_means(step) if self.hold == "zero_order" else self.inputs[::step]
+        return replace(
+            self, time=self.time[::step], inputs=inputs, outputs=self.outputs[::step], mask=self.mask[::step]
+        )
+
+    def _held_means(self, step: int) -> Tensor:
+        """Mean input (T/step, M) over each block of step samples, weighted by how long each is held."""
+        steps = torch.diff(self.time)
+        held = torch.cat((steps, steps[-1:]))[:, None]
+        block = torch.arange(len(self.time), device=self.time.device) // step
+        first = self.inputs[::step]
+        volume = torch.zeros_like(first).index_add_(0, block, (self.inputs - first[block]) * held)
+        return first + volume / torch.zeros_like(first[:, :1]).index_add_(0, block, held)
 
     def known_stretches(self) -> list[Recording]:
         """The longest stretches whose inputs are all known."""
