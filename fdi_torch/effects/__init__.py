@@ -1,0 +1,54 @@
+"""The plugs: faults and unmodelled effects alike, one file each. A new one is one file and one line in the tuple."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+from fdi_torch.effects.leak import Leak
+from fdi_torch.effects.net_outlet import NetOutlet
+from fdi_torch.effects.openness import Openness
+from fdi_torch.effects.plugging import Plugging
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Placement, fits
+from fdi_torch.plant.network import TankNetwork
+
+EFFECTS: tuple[Effect, ...] = (
+    Leak(),
+    Plugging(),
+    NetOutlet(),
+    Openness(),
+)
+
+
+def effect(name: str) -> Effect:
+    """The effect of that name. Raises ValueError naming the nearest known one."""
+    by_name = {e.name: e for e in EFFECTS}
+    if name not in by_name:
+        near = get_close_matches(name, by_name, n=1, cutoff=0.0)[0]
+        raise ValueError(f"expected an effect of the library, got '{name}'; the nearest is '{near}'")
+    return by_name[name]
+
+
+def place(name: str, location: str) -> Placement:
+    """('leak', 'T1') -> the effect at that place, absent until its size leaves nominal."""
+    return Placement(effect(name), location)
+
+
+def all_placements(plant: PlantDescription, effects: Iterable[Effect] = EFFECTS) -> tuple[Placement, ...]:
+    """Every effect at every place where it can sit."""
+    return tuple(Placement(e, place) for e in effects for place in plant.locations() if fits(e, plant, place))
+
+
+def build_network(plant: PlantDescription, placements: Iterable[Placement] = ()) -> TankNetwork:
+    """The plant with the effects that it is believed to have, and further ones to be estimated."""
+    own = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    known = {p.prefix for p in own}
+    return TankNetwork(plant, [*own, *(p for p in placements if p.prefix not in known)])
+
+
+def placements_for(names: Iterable[str]) -> tuple[Placement, ...]:
+    """The effects that parameter names such as 'T1.leak.size' speak of, each once; names of constants speak of none."""
+    split = (name.split(".") for name in names)
+    pairs = dict.fromkeys((parts[1], parts[0]) for parts in split if len(parts) == 3)
+    return tuple(place(effect_name, location) for effect_name, location in pairs)

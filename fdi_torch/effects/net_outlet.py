@@ -1,0 +1,28 @@
+"""Plugging of an outlet and a leak of its tank, taken together."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Local, Stage, Values
+
+
+class NetOutlet(Effect):
+    """The outflow is theta times the outlet's law; nominal 1 (theta_2 of the 2020 paper, eq. 31, as an outflow).
+
+    Plugging b and a floor leak rho k of the same tank act through the same sqrt(2 g h), so that only
+    theta = 1 - b + rho k can be found: below 1 plugging prevails, above 1 the leak.
+    """
+
+    name = "net_outlet"
+    stage = Stage.FLOW
+    places = ("outlet",)
+    mistaken_for = ("plugging", "leak at the floor of the same tank")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (Parameter("size", "1", 1.0, -1.0, 2.0, meaning="net outflow as a share of the outlet's law"),)
+
+    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+        return flow * p["size"]

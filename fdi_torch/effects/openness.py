@@ -1,0 +1,27 @@
+"""How open a pipe or outlet is: the paper's own coordinates for plugging."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Local, Stage, Values
+
+
+class Openness(Effect):
+    """The flow is theta times its law; nominal 1. At a pipe theta_4 = 1 - b_1 and theta_5 = 1 - b_3 (2020 paper, eq. 31).
+
+    It is plugging counted from the other end; use one of the two at a place.
+    """
+
+    name = "openness"
+    stage = Stage.FLOW
+    places = ("pipe",)
+    mistaken_for = ("plugging",)
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (Parameter("size", "1", 1.0, 0.0, 1.0, meaning="share of the nominal flow that passes (1 - b)"),)
+
+    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+        return flow * p["size"]

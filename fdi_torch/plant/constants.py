@@ -1,0 +1,73 @@
+"""The numbers of a plant that can be estimated: one Parameter for each constant of each component."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription
+
+
+def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
+    """Every constant of the plant; std from its tolerances, box of a tenth to ten times where it must be positive."""
+    tolerances = dict(plant.tolerances)
+    for tank in plant.tanks:
+        yield _positive(tank.name, "area", "m^2", tank.area, tolerances)
+        yield _positive(tank.name, "height", "m", tank.height, tolerances)
+        start = 0.5 * tank.height if tank.start_level is None else tank.start_level
+        low, high = min(0.0, start), max(tank.height, start)
+        yield Parameter(f"{tank.name}.start_level", "m", start, low, high, meaning="level at t = 0")
+        capacity = nominal_capacity(plant, leak_pipe(plant, tank.name))
+        yield Parameter(f"{tank.name}.leak_capacity", "m^2.5/s", capacity, meaning="flow of a leak of size 1 at 1 m")
+    for pipe in plant.pipes:
+        yield _positive(pipe.name, "area", "m^2", pipe.area, tolerances)
+        yield _positive(pipe.name, "discharge_coefficient", "1", pipe.discharge_coefficient, tolerances)
+        yield Parameter(f"{pipe.name}.elevation", "m", pipe.elevation, meaning="height of the pipe above the floor")
+    for pump in plant.pumps:
+        yield _positive(pump.name, "gain", pump.gain_unit, pump.gain, tolerances)
+        yield _positive(pump.name, "max_flow", "m^3/s", pump.max_flow, tolerances)
+    for sensor in plant.sensors:
+        gain_unit = "1" if sensor.unit == "m" else f"{sensor.unit}/m"
+        name, scale = f"{sensor.name}.gain", abs(sensor.gain)
+        std = tolerances.pop(name, math.inf) * scale
+        yield Parameter(
+            name, gain_unit, sensor.gain, sensor.gain - 9 * scale, sensor.gain + 9 * scale, std, "gain of the sensor"
+        )
+        offset = f"{sensor.name}.offset"
+        yield Parameter(
+            offset, sensor.unit, sensor.offset, std=tolerances.pop(offset, math.inf), meaning="offset of the sensor"
+        )
+    yield Parameter("gravity", "m/s^2", plant.gravity, 0.0)
+    if tolerances:
+        raise ValueError(
+            f"plant {plant.name}: tolerances: expected constants of the plant, got {', '.join(tolerances)}"
+        )
+
+
+def _positive(component: str, field: str, unit: str, value: float, tolerances: dict[str, float]) -> Parameter:
+    name = f"{component}.{field}"
+    std = tolerances.pop(name, math.inf) * value
+    return Parameter(name, unit, value, 0.1 * value, 10.0 * value, std, f"{field.replace('_', ' ')} of {component}")
+
+
+def leak_pipe(plant: PlantDescription, tank: str) -> Pipe:
+    """The pipe or outlet whose capacity a leak of the tank is a share of: the named one, or else the first attached."""
+    reference = plant.component(tank).leak_reference  # type: ignore[union-attr]
+    attached = [p for p in plant.pipes if p.name == reference or (reference is None and tank in (p.source, p.target))]
+    if attached:
+        return attached[0]
+    # A tank without pipes: a hole of a thousandth of its floor is as good a unit as any.
+    area = next(t.area for t in plant.tanks if t.name == tank)
+    return plant.pipes[0] if plant.pipes else Pipe(f"{tank}.hole", tank, OUTSIDE, 1e-3 * area, 0.6)
+
+
+def nominal_capacity(plant: PlantDescription, pipe: Pipe) -> float:
+    """C_d a sqrt(2 g) as the plant file has it, m^2.5/s."""
+    return pipe.discharge_coefficient * pipe.area * math.sqrt(2.0 * plant.gravity)
+
+
+def inverse_areas(plant: PlantDescription, pipe: Pipe) -> float:
+    """1/A of the tanks at both ends, 1/m^2: how fast a flow through the pipe changes the head across it."""
+    areas = {tank.name: tank.area for tank in plant.tanks}
+    return sum(1.0 / areas[end] for end in (pipe.source, pipe.target) if end in areas)

@@ -1,0 +1,302 @@
+"""TankNetwork: any network of tanks, pipes, valves, pumps and sensors as one differentiable module.
+
+The physics is written once, over single components, so that it traces into flat pointwise code; every engine
+runs these same lines. All numbers are SI; a tensor's leading dimensions are batches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+
+from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.plant.constants import constant_parameters, inverse_areas, leak_pipe, nominal_capacity
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription
+from fdi_torch.plant.effect import Effect, Local, Memory, Placement, Stage, Values, fits
+from fdi_torch.plant.orifice import orifice_capacity, regular_width, signed_root, weir_flow
+from fdi_torch.plant.signals import Clock
+
+PlaceValues = Mapping[str, Mapping[str, Tensor]]
+Bound = tuple[Effect, Values]
+
+
+class TankNetwork(nn.Module):
+    """The right-hand side and the sensors of a plant.
+
+    description: the rig. placements: faults and unmodelled effects beside the plant's own ones; they are absent
+    until a parameter leaves its nominal value. `constants` names every number that can be estimated.
+    """
+
+    nominal: Tensor
+
+    def __init__(self, description: PlantDescription, placements: Iterable[Placement] = ()) -> None:
+        super().__init__()
+        self.description = description
+        self.placements = tuple(placements)
+        for placement in self.placements:
+            _expect_fit(description, placement)
+        effect_parameters = [p for placement in self.placements for p in placed_parameters(placement, description)]
+        self.constants = ParameterSpace([*constant_parameters(description), *effect_parameters])
+        self.register_buffer("nominal", self.constants.nominal())
+        self._tank_index = {tank.name: i for i, tank in enumerate(description.tanks)}
+        self._channel_index = {name: i for i, name in enumerate(description.channels())}
+        self._by_place: dict[tuple[str, Stage], list[Placement]] = {}
+        for placement in self.placements:
+            self._by_place.setdefault((placement.location, placement.effect.stage), []).append(placement)
+
+    def bind(self, space: ParameterSpace, theta: Tensor) -> PlaceValues:
+        """All constants by place and field: columns of theta (*batch, P) where `space` names them, else nominal."""
+        values: dict[str, dict[str, Tensor]] = {}
+        for name, nominal in zip(self.constants.names, self.nominal.unbind(), strict=True):
+            place, _, field = name.rpartition(".")
+            values.setdefault(place, {})[field] = nominal
+        for name, value in space.named(theta).items():
+            self.constants.index(name)
+            place, _, field = name.rpartition(".")
+            values[place][field] = value
+        return values
+
+    def forward(self, levels: Tensor, commands: Tensor, clock: Clock, values: PlaceValues) -> Tensor:
+        """dh/dt (*batch, tanks) in m/s; levels (*batch, tanks) in m, commands (*batch, actuators) as they act."""
+        rates = self.rates(levels.unbind(-1), commands.unbind(-1), clock, values)
+        return torch.stack(torch.broadcast_tensors(*rates), dim=-1)
+
+    def rates(
+        self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
+    ) -> list[Tensor]:
+        """The physical stages, in the order water takes; one tensor (*batch) a tank."""
+        pumps = self.pump_flows(levels, commands, clock, values)
+        pipes = self.pipe_flows(levels, commands, clock, values)
+        net = self.net_inflows(levels, pumps, pipes, clock, values)
+        return self.level_rates(levels, net, clock, values)
+
+    def commands(
+        self, channels: Sequence[Tensor], memory: Memory, clock: Clock, values: PlaceValues
+    ) -> tuple[list[Tensor], Memory]:
+        """COMMAND: the channel of each actuator, averaged over a step -> what it makes of it, and the memories."""
+        actual: list[Tensor] = []
+        remembered: list[Tensor] = []
+        rest = list(memory)
+        for (place, _), value in zip(self.actuators(), channels, strict=True):
+            for effect, p in self._effects(place, Stage.COMMAND, values):
+                value, kept = effect.command(value, tuple(rest[: effect.memory]), clock, p)
+                del rest[: effect.memory]
+                remembered.extend(kept)
+            actual.append(value)
+        return actual, tuple(remembered)
+
+    def remember_commands(self, channels: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Memory:
+        """The actuators' memories after the channels have long been what they are."""
+        remembered: list[Tensor] = []
+        for (place, _), value in zip(self.actuators(), channels, strict=True):
+            for effect, p in self._effects(place, Stage.COMMAND, values):
+                memory = effect.remember(value, p)
+                value, _ = effect.command(value, memory, clock, p)
+                remembered.extend(memory)
+        return tuple(remembered)
+
+    def command_delays(self, values: PlaceValues) -> dict[int, Tensor]:
+        """By how many seconds an actuator (index into `actuators`) is late; only those that can be."""
+        return self._delays([place for place, _ in self.actuators()], Stage.COMMAND, values)
+
+    def pump_flows(
+        self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
+    ) -> list[Tensor]:
+        """FLOW of each pump: gain x command within [0, max_flow], m^3/s."""
+        flows = []
+        for i, pump in enumerate(self.description.pumps):
+            own = values[pump.name]
+            flow = torch.minimum(torch.clamp(own["gain"] * commands[i], min=0.0), own["max_flow"])
+            level = levels[self._tank_index[pump.target]]
+            local = Local(clock, level, level, level, own["gain"], commands[i], torch.sqrt, own)
+            for effect, p in self._effects(pump.name, Stage.FLOW, values):
+                flow = effect.flow(flow, local, p)
+            flows.append(flow)
+        return flows
+
+    def pipe_flows(
+        self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
+    ) -> list[Tensor]:
+        """FLOW of each pipe and outlet by Torricelli's law, m^3/s, positive from source to target."""
+        flows = []
+        openings = iter(commands[len(self.description.pumps) :])
+        for pipe in self.description.pipes:
+            local = self._pipe_local(pipe, levels, clock, values)
+            if pipe.valve:
+                local = replace(local, command=torch.clamp(next(openings), 0.0, 1.0))
+            effects = self._effects(pipe.name, Stage.FLOW, values)
+            for effect, p in effects:
+                local = replace(local, head=effect.head(local.head, local, p))
+            head = torch.clamp(local.head, min=0.0) if pipe.is_outlet else local.head
+            flow = local.capacity * local.command * local.root(head)
+            for effect, p in effects:
+                flow = effect.flow(flow, local, p)
+            flows.append(flow)
+        return flows
+
+    def net_inflows(
+        self,
+        levels: Sequence[Tensor],
+        pumps: Sequence[Tensor],
+        pipes: Sequence[Tensor],
+        clock: Clock,
+        values: PlaceValues,
+    ) -> list[Tensor]:
+        """BALANCE of each tank: pumps in, pipes through, faults, and what runs over the rim, m^3/s."""
+        net = [torch.zeros_like(level) for level in levels]
+        for pump, flow in zip(self.description.pumps, pumps, strict=True):
+            self._move(net, OUTSIDE, pump.target, flow)
+        for pipe, flow in zip(self.description.pipes, pipes, strict=True):
+            self._move(net, pipe.source, pipe.target, flow)
+        for placement in self.placements:
+            if placement.effect.stage is Stage.BALANCE:
+                self._move_by_effect(net, placement, levels, clock, values)
+        for tank, level in zip(self.description.tanks, levels, strict=True):
+            own = values[tank.name]
+            spill = weir_flow(level - own["height"], own["area"], values[""]["gravity"], clock.resolution)
+            self._move(net, tank.name, tank.overflow_to, spill)
+        return net
+
+    def level_rates(
+        self, levels: Sequence[Tensor], net: Sequence[Tensor], clock: Clock, values: PlaceValues
+    ) -> list[Tensor]:
+        """STORAGE: dh/dt = net inflow / area(h); an empty tank cannot lose more, m/s."""
+        rates = []
+        for i, tank in enumerate(self.description.tanks):
+            local = self._tank_local(tank.name, levels, clock, values)
+            area = local.constants["area"]
+            for effect, p in self._effects(tank.name, Stage.STORAGE, values):
+                area = effect.area(area, local, p)
+            kept = torch.where(levels[i] <= 0.0, torch.clamp(net[i], min=0.0), net[i])
+            rates.append(kept / area)
+        return rates
+
+    def read(
+        self, levels: Sequence[Tensor], memory: Memory, clock: Clock, values: PlaceValues
+    ) -> tuple[list[Tensor], Memory]:
+        """READING: the level at each sensor, late where it is late -> readings in sensor units, and the memories."""
+        readings: list[Tensor] = []
+        remembered: list[Tensor] = []
+        rest = list(memory)
+        for sensor, level in zip(self.description.sensors, levels, strict=True):
+            own = values[sensor.name]
+            value = own["gain"] * level + own["offset"]
+            for effect, p in self._effects(sensor.name, Stage.READING, values):
+                value, kept = effect.reading(value, tuple(rest[: effect.memory]), clock, p)
+                del rest[: effect.memory]
+                remembered.extend(kept)
+            if sensor.low is not None or sensor.high is not None:
+                value = torch.clamp(value, sensor.low, sensor.high)
+            readings.append(value)
+        return readings, tuple(remembered)
+
+    def remember_readings(self, levels: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Memory:
+        """The sensors' memories after the levels have long been what they are."""
+        remembered: list[Tensor] = []
+        for sensor, level in zip(self.description.sensors, levels, strict=True):
+            own = values[sensor.name]
+            value = own["gain"] * level + own["offset"]
+            for effect, p in self._effects(sensor.name, Stage.READING, values):
+                memory = effect.remember(value, p)
+                value, _ = effect.reading(value, memory, clock, p)
+                remembered.extend(memory)
+        return tuple(remembered)
+
+    def reading_delays(self, values: PlaceValues) -> dict[int, Tensor]:
+        """By how many seconds a sensor (index) is late; only those that can be."""
+        return self._delays([s.name for s in self.description.sensors], Stage.READING, values)
+
+    def actuators(self) -> list[tuple[str, int]]:
+        """Each pump, then each pipe with a valve: its name and its input channel."""
+        pumps = [(p.name, self._channel_index[p.channel]) for p in self.description.pumps]
+        return pumps + [(p.name, self._channel_index[p.valve]) for p in self.description.pipes if p.valve]
+
+    def sensor_tanks(self) -> list[int]:
+        return [self._tank_index[s.tank] for s in self.description.sensors]
+
+    def start_levels(self, values: PlaceValues) -> list[Tensor]:
+        return [values[tank.name]["start_level"] for tank in self.description.tanks]
+
+    def command_memory(self) -> int:
+        return self._memory(Stage.COMMAND)
+
+    def reading_memory(self) -> int:
+        return self._memory(Stage.READING)
+
+    def _memory(self, stage: Stage) -> int:
+        return sum(p.effect.memory for p in self.placements if p.effect.stage is stage)
+
+    def _delays(self, places: Sequence[str], stage: Stage, values: PlaceValues) -> dict[int, Tensor]:
+        delays: dict[int, Tensor] = {}
+        for i, place in enumerate(places):
+            for effect, p in self._effects(place, stage, values):
+                if effect.delays:
+                    delays[i] = delays[i] + effect.delay(p) if i in delays else effect.delay(p)
+        return delays
+
+    def _effects(self, location: str, stage: Stage, values: PlaceValues) -> list[Bound]:
+        return [(p.effect, values[p.prefix]) for p in self._by_place.get((location, stage), ())]
+
+    def _move(self, net: list[Tensor], source: str, target: str, flow: Tensor) -> None:
+        for end, sign in ((source, -1.0), (target, 1.0)):
+            if end != OUTSIDE:
+                i = self._tank_index[end]
+                net[i] = net[i] + sign * flow
+
+    def _move_by_effect(
+        self, net: list[Tensor], placement: Placement, levels: Sequence[Tensor], clock: Clock, values: PlaceValues
+    ) -> None:
+        ends = placement.location.split("-") if placement.location not in self._tank_index else [placement.location]
+        local = self._tank_local(ends[0], levels, clock, values, ends[-1])
+        flow = placement.effect.inflow(local, values[placement.prefix])
+        self._move(net, *((ends[0], ends[1]) if len(ends) == 2 else (OUTSIDE, ends[0])), flow)
+
+    def _pipe_local(self, pipe: Pipe, levels: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Local:
+        own = values[pipe.name]
+        level = levels[self._tank_index[pipe.source]]
+        head = far = level - own["elevation"]
+        if pipe.is_outlet:
+            far = torch.zeros_like(level) if pipe.target == OUTSIDE else levels[self._tank_index[pipe.target]]
+        else:
+            far = levels[self._tank_index[pipe.target]]
+            wet_far = torch.clamp(far - own["elevation"], min=0.0)
+            head = torch.clamp(head, min=0.0) - wet_far if pipe.elevation else level - far
+        capacity = orifice_capacity(own["discharge_coefficient"], own["area"], values[""]["gravity"])
+        return Local(clock, level, far, head, capacity, torch.ones_like(level), self._root(pipe, clock), own)
+
+    def _tank_local(
+        self, name: str, levels: Sequence[Tensor], clock: Clock, values: PlaceValues, far: str | None = None
+    ) -> Local:
+        level = levels[self._tank_index[name]]
+        far_level = levels[self._tank_index[far or name]]
+        own = values[name]
+        root = self._root(leak_pipe(self.description, name), clock)
+        return Local(clock, level, far_level, level, own["leak_capacity"], level, root, own)
+
+    def _root(self, pipe: Pipe, clock: Clock) -> partial[Tensor]:
+        rate = nominal_capacity(self.description, pipe) * inverse_areas(self.description, pipe)
+        return partial(signed_root, width=regular_width(rate, clock.resolution))
+
+
+def placed_parameters(placement: Placement, plant: PlantDescription) -> list[Parameter]:
+    """The effect's parameters under their full names, believed to be what the placement says."""
+    believed = dict(placement.values or {})
+    parameters = []
+    for p in placement.effect.parameters(placement.location, plant):
+        nominal = believed.pop(p.name, p.nominal)
+        low, high = min(p.low, nominal), max(p.high, nominal)
+        parameters.append(replace(p, name=f"{placement.prefix}.{p.name}", nominal=nominal, low=low, high=high))
+    if believed:
+        known = ", ".join(p.name for p in placement.effect.parameters(placement.location, plant))
+        raise ValueError(f"{placement.prefix}: expected parameters of {known}, got {', '.join(believed)}")
+    return parameters
+
+
+def _expect_fit(plant: PlantDescription, placement: Placement) -> None:
+    if not fits(placement.effect, plant, placement.location):
+        wanted = " or ".join(placement.effect.places)
+        raise ValueError(f"{placement.prefix}: expected a place of kind {wanted}, got {placement.location}")

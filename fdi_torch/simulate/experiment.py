@@ -1,0 +1,105 @@
+"""Experiment: what is imposed on a plant, laid out in integration steps, and when it is read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from fdi_torch.plant.signals import CumulativeSignal
+from fdi_torch.recording import Hold, Recording
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Inputs and sample times on a grid of steps.
+
+    nodes (K+1,) s: the ends of the integration steps, which hit every switch of a held input they can.
+    inputs (K, channels): each channel's exact mean over each step. signal: the same for any delayed interval.
+    sample_times (S,) s; sample k lies at share `sample_share` (0..1] of step `sample_step` (the first one at 0 of step 0).
+    resolution: the longest step, s.
+    """
+
+    nodes: Tensor
+    inputs: Tensor
+    signal: CumulativeSignal
+    sample_times: Tensor
+    sample_step: Tensor
+    sample_share: Tensor
+    resolution: Tensor
+
+    @property
+    def steps(self) -> Tensor:
+        return torch.diff(self.nodes)
+
+
+def lay_out(recording: Recording, channels: tuple[str, ...], step: float) -> Experiment:
+    """The experiment that a recording was, in steps no longer than `step` (s).
+
+    channels: the plant's input channels, by name. Raises ValueError where the recording lacks one or does not know it.
+    """
+    if not step > 0:
+        raise ValueError(f"expected a positive integration step, got {step} s")
+    if len(recording) < 2:
+        raise ValueError(f"{recording.source}: expected at least two samples, got {len(recording)}")
+    inputs = _select(recording, channels)
+    time = recording.time - recording.time[0]
+    nodes = grid_nodes(time, inputs, recording.hold, step)
+    signal = CumulativeSignal(time, inputs, recording.hold)
+    starts, steps = nodes[:-1], torch.diff(nodes)
+    means = [signal.average(starts, steps, c) for c in range(len(channels))]
+    index = torch.clamp(torch.searchsorted(nodes, time) - 1, min=0)
+    share = (time - nodes[index]) / steps[index]
+    return Experiment(
+        nodes=nodes,
+        inputs=torch.stack(means, dim=1) if means else time.new_zeros(len(starts), 0),
+        signal=signal,
+        sample_times=time,
+        sample_step=index,
+        sample_share=share,
+        resolution=steps.max(),
+    )
+
+
+def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float) -> Tensor:
+    """Step ends from the first to the last sample: at switches, and at samples where these are not denser than `step`.
+
+    Switches that come faster than half a step are averaged over instead.
+    """
+    wanted = torch.ones_like(time, dtype=torch.bool)
+    if hold == "zero_order":
+        changed = torch.diff(inputs, dim=0).abs().sum(dim=1) > 0
+        wanted[1:] = changed
+        if int(changed.sum()) * step > 2.0 * float(time[-1]):
+            wanted[1:] = False
+    dense = float(time[-1]) / (len(time) - 1) < 0.999 * step
+    anchors = time[wanted] if dense and hold == "zero_order" else time
+    if dense and hold == "linear":
+        anchors = time[:1]
+    ends = torch.cat([time[:1], anchors, time[-1:]]).unique()
+    gaps = torch.diff(ends)
+    counts = torch.ceil(gaps / step - 1e-9).clamp(min=1).to(torch.int64)
+    which = torch.repeat_interleave(torch.arange(len(gaps)), counts)
+    first = torch.cumsum(counts, 0) - counts
+    within = (torch.arange(int(counts.sum())) - first[which]).to(time.dtype)
+    return torch.cat([ends[which] + gaps[which] * within / counts[which], ends[-1:]])
+
+
+def _select(recording: Recording, channels: tuple[str, ...]) -> Tensor:
+    columns = []
+    for channel in channels:
+        if channel not in recording.input_names:
+            known = ", ".join(recording.input_names) or "none"
+            raise ValueError(f"{recording.source}: expected an input '{channel}', got {known}; map the column to it")
+        columns.append(recording.inputs[:, recording.input_names.index(channel)])
+    if not columns:
+        return recording.time.new_zeros(len(recording), 0)
+    inputs = torch.stack(columns, dim=1)
+    if not bool(torch.isfinite(inputs).all()):
+        row = int((~torch.isfinite(inputs)).any(dim=1).nonzero()[0])
+        raise ValueError(
+            f"{recording.source}: expected known inputs, got an unknown one at {float(recording.time[row]):g} s; "
+            "mask that stretch or cut the recording there"
+        )
+    return inputs
