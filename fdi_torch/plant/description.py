@@ -68,6 +68,11 @@ class Pump:
     def channel(self) -> str:
         return self.command or self.name
 
+    @property
+    def command_unit(self) -> str:
+        """SI unit of the command: a flow, volts, or a share (duty)."""
+        return {"1": "m^3/s", "m^3/s/V": "V", "m^3/s": "1"}[self.gain_unit]
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -98,7 +103,9 @@ class PlacedEffect:
 
 @dataclass(frozen=True)
 class PlantDescription:
-    """A rig. tolerances: one standard deviation of a constant ('P13.discharge_coefficient'), as a share of it."""
+    """A rig. tolerances: one standard deviation of a constant ('P13.discharge_coefficient'), as a share of it;
+    of an offset, in the reading's unit.
+    """
 
     name: str
     tanks: tuple[Tank, ...]
@@ -138,6 +145,11 @@ class PlantDescription:
         """The input channels that a recording must have: pump commands, then valve openings, each once."""
         wanted = [p.channel for p in self.pumps] + [p.valve for p in self.pipes if p.valve]
         return tuple(dict.fromkeys(wanted))
+
+    def channel_units(self) -> dict[str, str]:
+        """SI unit of each input channel: of the pump's command, or 1 for a valve's opening."""
+        units = {p.valve: "1" for p in self.pipes if p.valve} | {p.channel: p.command_unit for p in self.pumps}
+        return {channel: units[channel] for channel in self.channels()}
 
 
 def _check_names(plant: PlantDescription) -> None:

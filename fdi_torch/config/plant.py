@@ -1,0 +1,185 @@
+"""Plant files: YAML with units -> PlantDescription in SI."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, ValidationError
+
+from fdi_torch.config.files import find_plant, read_yaml
+from fdi_torch.config.problems import ConfigError, explain, unknown
+from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Share, Strict, quantity
+from fdi_torch.parameters import base_quantity
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+
+PUMP_GAIN_UNITS = ("1", "m^3/s/V", "m^3/s")
+SENSOR_UNITS = {"1": "m", "V/m": "V", "1/m": "1"}
+
+
+def _start_level(value: Any) -> float | None:
+    return None if value in (None, "equilibrium") else quantity(value, "m")
+
+
+class TankConfig(Strict):
+    area: Area = Field(description="cross-section, m^2")
+    height: Length = Field(description="from the floor to the rim, m")
+    start_level: Annotated[float | None, BeforeValidator(_start_level)] = Field(
+        None, description="level at t = 0, m, or equilibrium (of the first inputs)"
+    )
+    overflow_to: str = Field(OUTSIDE, description="the tank that catches what runs over the rim")
+    leak_reference: str | None = Field(None, description="the pipe whose capacity a leak's size is a share of")
+
+
+class PipeConfig(Strict):
+    source: str = Field(description="the tank it starts from")
+    target: str = Field(OUTSIDE, description="the tank it leads to, or outside")
+    area: Area = Field(description="of the orifice, m^2")
+    discharge_coefficient: Share = Field(description="of the orifice, without unit")
+    elevation: Length = Field(0.0, description="of the orifice above both floors, m")
+    free_fall: bool = Field(False, description="whether it pours into its target from above")
+    valve: str | None = Field(None, description="the input channel with its measured opening, 0 to 1")
+
+
+class PumpConfig(Strict):
+    target: str = Field(description="the tank it fills")
+    max_flow: Flow = Field(description="what it can deliver at most, m^3/s")
+    gain: Amount = Field(1.0, description="flow for a command of 1: no unit, or cm^3/s/V, or cm^3/s for a duty")
+    command: str | None = Field(None, description="its input channel, where that is not its name")
+
+
+class SensorConfig(Strict):
+    tank: str = Field(description="the tank whose level it reads")
+    gain: Amount = Field(1.0, description="reading for a level of 1: no unit, or V/cm, or 1/cm")
+    offset: Amount | None = Field(None, description="reading at level 0, in the reading's unit")
+    channel: str | None = Field(None, description="its output channel, where that is not its name")
+    low: Amount | None = Field(None, description="it never reads less, in the reading's unit")
+    high: Amount | None = Field(None, description="it never reads more, in the reading's unit")
+
+
+class EffectConfig(Strict):
+    effect: str = Field(description="which effect, such as pump_lag")
+    location: str = Field(description="the component that has it")
+    parameters: dict[str, Amount] = Field(default_factory=dict, description="with units, such as time_constant: 8 s")
+
+
+class PlantConfig(Strict):
+    name: str = ""
+    gravity: Acceleration = Field(9.81, description="m/s^2")
+    tanks: dict[str, TankConfig]
+    pipes: dict[str, PipeConfig] = Field(default_factory=dict)
+    pumps: dict[str, PumpConfig] = Field(default_factory=dict)
+    sensors: dict[str, SensorConfig] = Field(default_factory=dict)
+    tolerances: dict[str, Amount] = Field(
+        default_factory=dict,
+        description="one standard deviation of a constant as a share of it (of an offset: in its unit); * is any name",
+    )
+    effects: list[EffectConfig] = Field(default_factory=list, description="what the plant is known to have")
+
+
+def load_plant(name: str | Path, base: Path | None = None) -> PlantDescription:
+    """The plant in a file, or one that is shipped, by its name ('three_tank'). Raises ConfigError."""
+    path = find_plant(str(name), base or Path.cwd())
+    data = read_yaml(path)
+    return build_plant({"name": path.stem, **data}, str(path))
+
+
+def build_plant(data: dict[str, Any], source: str) -> PlantDescription:
+    """The plant in a mapping. Raises ConfigError, naming `source` and the field."""
+    try:
+        config = PlantConfig.model_validate(data)
+    except ValidationError as error:
+        raise explain(error, source) from None
+    try:
+        return _description(config)
+    except ValueError as error:
+        raise ConfigError([f"{source}: {error}"]) from error
+
+
+def _description(config: PlantConfig) -> PlantDescription:
+    sensors = tuple(_sensor(name, sensor) for name, sensor in config.sensors.items())
+    return PlantDescription(
+        name=config.name,
+        tanks=tuple(Tank(name, **dict(tank)) for name, tank in config.tanks.items()),
+        pipes=tuple(Pipe(name, **dict(pipe)) for name, pipe in config.pipes.items()),
+        pumps=tuple(_pump(name, pump) for name, pump in config.pumps.items()),
+        sensors=sensors,
+        effects=tuple(_effect(i, effect) for i, effect in enumerate(config.effects)),
+        tolerances=_tolerances(config, sensors),
+        gravity=config.gravity,
+    )
+
+
+def _pump(name: str, pump: PumpConfig) -> Pump:
+    gain, unit = _amount_in_one_of(f"pumps.{name}.gain", pump.gain, PUMP_GAIN_UNITS)
+    return Pump(name, pump.target, pump.max_flow, gain, pump.command, unit)
+
+
+def _sensor(name: str, sensor: SensorConfig) -> Sensor:
+    gain, gain_unit = _amount_in_one_of(f"sensors.{name}.gain", sensor.gain, tuple(SENSOR_UNITS))
+    unit = SENSOR_UNITS[gain_unit]
+
+    def reading(field: Literal["offset", "low", "high"]) -> float | None:
+        value = getattr(sensor, field)
+        return None if value is None else _amount(f"sensors.{name}.{field}", value, unit)
+
+    offset = reading("offset") or 0.0
+    return Sensor(name, sensor.tank, unit, gain, offset, sensor.channel, reading("low"), reading("high"))
+
+
+def _effect(index: int, effect: EffectConfig) -> PlacedEffect:
+    place = f"effects.{index}.parameters"
+    values = {name: _base(f"{place}.{name}", value) for name, value in effect.parameters.items()}
+    return PlacedEffect(effect.effect, effect.location, values)
+
+
+def _tolerances(config: PlantConfig, sensors: Sequence[Sensor]) -> dict[str, float]:
+    """Patterns such as *.discharge_coefficient spelled out for every constant that they match; later ones win."""
+    units = {f"{sensor.name}.offset": sensor.unit for sensor in sensors}
+    known = _constants(config)
+    tolerances: dict[str, float] = {}
+    for pattern, value in config.tolerances.items():
+        place = f"tolerances.{pattern}"
+        matched = [name for name in known if fnmatchcase(name, pattern)]
+        if not matched:
+            raise ValueError(f"{place}: {unknown('a constant', pattern, known)}")
+        for name in matched:
+            tolerances[name] = _amount(place, value, units.get(name, "1"))
+            if not tolerances[name] > 0:
+                raise ValueError(f"{place}: expected a positive tolerance such as 3 %, got {value}")
+    return tolerances
+
+
+def _constants(config: PlantConfig) -> list[str]:
+    fields: Sequence[tuple[dict[str, Any], tuple[str, ...]]] = (
+        (config.tanks, ("area", "height")),
+        (config.pipes, ("area", "discharge_coefficient")),
+        (config.pumps, ("gain", "max_flow")),
+        (config.sensors, ("gain", "offset")),
+    )
+    return [f"{name}.{field}" for components, names in fields for name in components for field in names]
+
+
+def _amount_in_one_of(place: str, value: Amount, units: tuple[str, ...]) -> tuple[float, str]:
+    for unit in units:
+        try:
+            return quantity(value, unit), unit
+        except ValueError:
+            continue
+    raise ValueError(f"{place}: expected a quantity in {' or '.join(units)}, got '{value}'")
+
+
+def _amount(place: str, value: Amount, unit: str) -> float:
+    try:
+        return quantity(value, unit)
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
+
+
+def _base(place: str, value: Amount) -> float:
+    try:
+        return base_quantity(value) if isinstance(value, str) else float(value)
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error

@@ -1,0 +1,96 @@
+"""Plant files written: PlantDescription in SI -> YAML with units, so that it reads back as the same description."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fdi_torch.config.files import write_yaml
+from fdi_torch.config.plant import SENSOR_UNITS
+from fdi_torch.parameters import parse_quantity
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
+
+
+def dump_plant(plant: PlantDescription) -> str:
+    """A plant file that reads back as the same description."""
+    return write_yaml(plant_mapping(plant))
+
+
+def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
+    """The description as the mapping that `build_plant` reads."""
+    data: dict[str, Any] = {"name": plant.name, "gravity": _text(plant.gravity, "m/s^2", "cm/s^2")}
+    data["tanks"] = {t.name: _tank_mapping(t) for t in plant.tanks}
+    data["pipes"] = {p.name: _pipe_mapping(p) for p in plant.pipes}
+    data["pumps"] = {p.name: _pump_mapping(p) for p in plant.pumps}
+    data["sensors"] = {s.name: _sensor_mapping(s) for s in plant.sensors}
+    units = {f"{s.name}.offset": s.unit for s in plant.sensors}
+    data["tolerances"] = {
+        name: _text(v, units.get(name, "1"), units.get(name, "1")) for name, v in plant.tolerances.items()
+    }
+    data["effects"] = [
+        {"effect": e.effect, "location": e.location, "parameters": dict(e.parameters)} for e in plant.effects
+    ]
+    return {key: value for key, value in data.items() if value}
+
+
+def _tank_mapping(tank: Tank) -> dict[str, Any]:
+    start = None if tank.start_level is None else _text(tank.start_level, "m", "cm")
+    outside = None if tank.overflow_to == OUTSIDE else tank.overflow_to
+    return _given(
+        area=_text(tank.area, "m^2", "cm^2"),
+        height=_text(tank.height, "m", "cm"),
+        start_level=start,
+        overflow_to=outside,
+        leak_reference=tank.leak_reference,
+    )
+
+
+def _pipe_mapping(pipe: Pipe) -> dict[str, Any]:
+    return _given(
+        source=pipe.source,
+        target=pipe.target,
+        area=_text(pipe.area, "m^2", "cm^2"),
+        discharge_coefficient=pipe.discharge_coefficient,
+        elevation=_text(pipe.elevation, "m", "cm") if pipe.elevation else None,
+        free_fall=pipe.free_fall or None,
+        valve=pipe.valve,
+    )
+
+
+def _pump_mapping(pump: Pump) -> dict[str, Any]:
+    shown = {"1": "1", "m^3/s/V": "cm^3/s/V", "m^3/s": "cm^3/s"}[pump.gain_unit]
+    plain = pump.gain_unit == "1" and pump.gain == 1.0
+    return _given(
+        target=pump.target,
+        max_flow=_text(pump.max_flow, "m^3/s", "cm^3/s"),
+        gain=None if plain else _text(pump.gain, pump.gain_unit, shown),
+        command=pump.command,
+    )
+
+
+def _sensor_mapping(sensor: Sensor) -> dict[str, Any]:
+    gain_unit = next(gain for gain, unit in SENSOR_UNITS.items() if unit == sensor.unit)
+    shown = {"m": "cm"}.get(sensor.unit, sensor.unit)
+
+    def reading(value: float | None) -> str | float | None:
+        return None if value is None else _text(value, sensor.unit, shown)
+
+    return _given(
+        tank=sensor.tank,
+        gain=None if sensor.gain == 1.0 and sensor.unit == "m" else _text(sensor.gain, gain_unit, gain_unit),
+        offset=reading(sensor.offset) if sensor.offset else None,
+        channel=sensor.channel,
+        low=reading(sensor.low),
+        high=reading(sensor.high),
+    )
+
+
+def _given(**fields: Any) -> dict[str, Any]:
+    return {key: value for key, value in fields.items() if value is not None}
+
+
+def _text(value: float, unit: str, shown: str) -> str | float:
+    """'160 cm^2' where that reads back as the same number, else the number in SI to the last bit."""
+    if unit == "1":
+        return value
+    short = f"{value / parse_quantity(f'1 {shown}', unit):.9g} {shown}"
+    return short if parse_quantity(short, unit) == value else f"{value!r} {unit}"

@@ -1,0 +1,60 @@
+"""The base of all configuration models: unknown keys are refused, quantities carry their units."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from fdi_torch.config.problems import unknown
+from fdi_torch.parameters import parse_quantity
+
+
+class Strict(BaseModel):
+    """A mapping with known keys only. Field descriptions say what each is, with its unit."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys_only(cls, data: Any) -> Any:
+        known = [field.alias or name for name, field in cls.model_fields.items()]
+        for key in data if isinstance(data, dict) else ():
+            if key not in known:
+                raise ValueError(unknown("a known key", str(key), known))
+        return data
+
+
+def quantity(value: Any, unit: str) -> float:
+    """'160 cm^2' -> 0.016 for unit 'm^2'. A number without unit is taken only where the unit is '1'.
+
+    Raises ValueError where it is no finite quantity of that kind.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise ValueError(f"expected a quantity in {unit}, got {value!r}")
+    if isinstance(value, str):
+        number = parse_quantity(value, unit)
+    elif unit == "1":
+        number = float(value)
+    else:
+        raise ValueError(
+            f"expected a quantity in {unit}, got the bare number {value}; write its unit, as in '{value} {unit}'"
+        )
+    if not abs(number) < float("inf"):
+        raise ValueError(f"expected a finite quantity in {unit}, got {value}")
+    return number
+
+
+def _of(unit: str) -> tuple[BeforeValidator, Any]:
+    return BeforeValidator(lambda value: quantity(value, unit)), Field(json_schema_extra={"unit": unit})
+
+
+Share = Annotated[float, *_of("1")]
+Length = Annotated[float, *_of("m")]
+Area = Annotated[float, *_of("m^2")]
+Flow = Annotated[float, *_of("m^3/s")]
+Seconds = Annotated[float, *_of("s")]
+Acceleration = Annotated[float, *_of("m/s^2")]
+
+Amount = float | str
+"""A quantity whose unit depends on what it belongs to; turned into SI where that is known."""
