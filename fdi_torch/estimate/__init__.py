@@ -1,0 +1,1 @@
+"""Estimation: global search, refinement, and how sure one may be of the result."""

@@ -1,0 +1,71 @@
+"""How a differential evolution is to search; every number of the method that is a choice."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from fdi_torch.estimate.bounds import RULES
+
+STRATEGIES = ("rand/1/bin", "l-shade")
+
+
+@dataclass(frozen=True)
+class EvolutionSettings:
+    """How to search. The first block is for both strategies, then each has its own.
+
+    population: members N; None for 10 P (rand/1/bin) or 18 P (l-shade). evaluations: budget of each problem.
+    parameter_tolerance: share of the box; cost_tolerance: share of the scale of the costs (see `State.scale`).
+    patience: generations without progress until a problem counts as stalled. target: a cost that is good enough.
+    factor, rate: F and CR. memory, best_share, archive_share, smallest: H, p, r_arc and N_min.
+    """
+
+    strategy: str = "l-shade"
+    population: int | None = None
+    evaluations: int = 20_000
+    bounds: str = "midpoint"
+    parameter_tolerance: float = 1e-6
+    cost_tolerance: float = 1e-9
+    patience: int = 200
+    target: float = -math.inf
+    # rand/1/bin
+    factor: float = 0.5
+    rate: float = 0.9
+    # l-shade
+    memory: int = 6
+    best_share: float = 0.11
+    archive_share: float = 2.6
+    smallest: int = 4
+
+    def __post_init__(self) -> None:
+        _expect(self.strategy in STRATEGIES, f"strategy to be one of {', '.join(STRATEGIES)}", self.strategy)
+        _expect(self.bounds in RULES, f"bounds to be one of {', '.join(RULES)}", self.bounds)
+        _expect(self.population is None or self.population >= 4, "a population of at least 4", self.population)
+        _expect(self.smallest >= 4, "smallest (population) of at least 4", self.smallest)
+        _expect(self.evaluations >= 4, "a budget of at least 4 evaluations", self.evaluations)
+        _expect(self.patience >= 1, "a patience of at least 1 generation", self.patience)
+        _expect(self.memory >= 1, "a memory of at least 1 cell", self.memory)
+        _expect(0.0 <= self.factor <= 2.0, "factor (F) in [0, 2]", self.factor)
+        _expect(0.0 <= self.rate <= 1.0, "rate (CR) in [0, 1]", self.rate)
+        _expect(0.0 < self.best_share <= 1.0, "best_share (p) in (0, 1]", self.best_share)
+        _expect(self.archive_share >= 0.0, "archive_share of at least 0", self.archive_share)
+        _expect(self.parameter_tolerance >= 0.0, "parameter_tolerance of at least 0", self.parameter_tolerance)
+        _expect(self.cost_tolerance >= 0.0, "cost_tolerance of at least 0", self.cost_tolerance)
+
+    def first_population(self, parameters: int) -> int:
+        return self.population or (18 if self.strategy == "l-shade" else 10) * max(parameters, 1)
+
+    def population_after(self, first: int, evaluations: int) -> int:
+        """Members of the next generation: constant, or falling linearly to `smallest` over the budget (L-SHADE, 10)."""
+        if self.strategy != "l-shade" or first <= self.smallest:
+            return first
+        share = min(1.0, evaluations / self.evaluations)
+        return round(first + (self.smallest - first) * share)
+
+    def archive_size(self, population: int) -> int:
+        return round(self.archive_share * population) if self.strategy == "l-shade" else 0
+
+
+def _expect(condition: bool, wanted: str, got: object) -> None:
+    if not condition:
+        raise ValueError(f"expected {wanted}, got {got}; change the search settings")

@@ -1,0 +1,276 @@
+"""One generation of differential evolution as init, ask and tell: state in, state out.
+
+Strategies: "rand/1/bin" is equations (20)-(23) of the paper this project implements (Storn & Price 1997); "l-shade" is
+Tanabe & Fukunaga (2014): current-to-pbest/1/bin with success-history memory, archive and linear population reduction.
+Leading dimensions are problems that share nothing: a problem's numbers are bit for bit those it has alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.bounds import into_box
+from fdi_torch.estimate.draws import stream, uniform
+from fdi_torch.estimate.evolution_settings import EvolutionSettings
+from fdi_torch.estimate.shade import draw_factor, draw_rate, update_archive, update_memory
+
+_VARIATION, _REPAIR, _ARCHIVE = range(3)  # the streams of one generation
+
+
+@dataclass(frozen=True)
+class State:
+    """Where the search stands. Members are sorted, best first; an infinite cost is a member without a valid cost.
+
+    scale: the largest distance seen between the median and the best cost of a generation: the yardstick for costs,
+    which an offset of the cost does not touch. anchor: best cost at the last progress, waited: generations since.
+    """
+
+    population: Tensor  # (*problems, N, P)
+    cost: Tensor  # (*problems, N)
+    low: Tensor  # (*problems, P)
+    high: Tensor  # (*problems, P)
+    seed: Tensor  # (*problems) int64
+    memory_f: Tensor  # (*problems, H)
+    memory_cr: Tensor  # (*problems, H)
+    memory_cell: Tensor  # (*problems) int64
+    archive: Tensor  # (*problems, A, P)
+    archived: Tensor  # (*problems) int64
+    scale: Tensor  # (*problems)
+    anchor: Tensor  # (*problems)
+    waited: Tensor  # (*problems) int64
+    first_population: int
+    generation: int = 0
+    evaluations: int = 0
+
+    def select(self, keep: Tensor) -> State:
+        """The problems that the mask (*problems) keeps, as one flat leading dimension."""
+        kept: dict[str, Any] = {name: value[keep] for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **kept)
+
+    def to_dict(self) -> dict[str, Tensor]:
+        """Plain tensors, from which `from_dict` makes the same state bit for bit."""
+        return {name: torch.as_tensor(value) for name, value in vars(self).items()}
+
+    @classmethod
+    def from_dict(cls, tensors: dict[str, Tensor]) -> State:
+        values: dict[str, Any] = {f.name: tensors[f.name] for f in fields(cls)}
+        counts = {name: int(values[name]) for name in ("first_population", "generation", "evaluations")}
+        return cls(**(values | counts))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Candidates to be evaluated and the F and CR that made them."""
+
+    candidates: Tensor  # (*problems, N, P)
+    factor: Tensor  # (*problems, N)
+    rate: Tensor  # (*problems, N)
+
+
+def init(
+    low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor, first_guess: Tensor | None = None
+) -> State:
+    """A uniform population in the box, low + rand(0, 1) (high - low), not yet evaluated. (20)
+
+    low, high (*problems, P); seed (*problems) int64; first_guess (*problems, K, P), K <= N: replaces the first members.
+    """
+    problems, parameters = low.shape[:-1], low.shape[-1]
+    _check_box(low, high, seed)
+    size = settings.first_population(parameters)
+    if size > settings.evaluations:
+        raise ValueError(
+            f"expected a budget of at least the population of {size}, got {settings.evaluations} evaluations; raise it"
+        )
+    draws = uniform(stream(seed, 0, _VARIATION), size * parameters).to(low.dtype).unflatten(-1, (size, parameters))
+    low_, high_ = low[..., None, :], high[..., None, :]
+    population = (low_ + draws * (high_ - low_)).clamp(low_, high_)
+    if first_guess is not None:
+        population = _seeded(population, first_guess.to(low).clamp(low_, high_))
+    cells = settings.memory if settings.strategy == "l-shade" else 0
+    return State(
+        population=population,
+        cost=low.new_full((*problems, size), math.inf),
+        low=low,
+        high=high,
+        seed=seed,
+        memory_f=low.new_full((*problems, cells), 0.5),
+        memory_cr=low.new_full((*problems, cells), 0.5),
+        memory_cell=torch.zeros_like(seed),
+        archive=low.new_zeros((*problems, settings.archive_size(size), parameters)),
+        archived=torch.zeros_like(seed),
+        scale=low.new_zeros(problems),
+        anchor=low.new_full(problems, math.inf),
+        waited=torch.zeros_like(seed),
+        first_population=size,
+    )
+
+
+def _check_box(low: Tensor, high: Tensor, seed: Tensor) -> None:
+    if low.shape != high.shape or low.shape[:-1] != seed.shape:
+        raise ValueError(
+            f"expected low and high (*problems, P) and seeds (*problems), got {tuple(low.shape)}, {tuple(high.shape)} "
+            f"and {tuple(seed.shape)}; broadcast them first"
+        )
+    if not bool((torch.isfinite(low) & torch.isfinite(high) & (low <= high)).all()):
+        raise ValueError(
+            "expected a finite box low <= high for every parameter, got one that is infinite or empty; give it a range"
+        )
+
+
+def _seeded(population: Tensor, guess: Tensor) -> Tensor:
+    if guess.shape[-2] > population.shape[-2]:
+        raise ValueError(
+            f"expected at most {population.shape[-2]} first guesses (the population), got {guess.shape[-2]}; give fewer"
+        )
+    return torch.cat((guess, population[..., guess.shape[-2] :, :]), -2)
+
+
+def ask(state: State, settings: EvolutionSettings) -> Trial:
+    """The next candidates (*problems, N, P): the first population itself, then mutants crossed with their parents."""
+    if state.generation == 0:
+        nothing = torch.zeros_like(state.cost)
+        return Trial(state.population, nothing, nothing)
+    size, parameters = state.population.shape[-2:]
+    rows = 4 if settings.strategy == "rand/1/bin" else 7
+    u = uniform(stream(state.seed, state.generation, _VARIATION), size * (rows + parameters))
+    per_member, per_component = u.split((size * rows, size * parameters), -1)
+    q, *others = per_member.unflatten(-1, (rows, size)).unbind(-2)
+    mutant, factor, rate = (_rand_1 if settings.strategy == "rand/1/bin" else _to_p_best_1)(state, settings, others)
+    mutant = _repaired(mutant, state, settings)
+    crossed = per_component.unflatten(-1, (size, parameters)) <= rate[..., None]
+    crossed |= torch.arange(parameters, device=u.device) == (q * parameters).long()[..., None]
+    return Trial(torch.where(crossed, mutant, state.population), factor, rate)
+
+
+def _rand_1(state: State, settings: EvolutionSettings, u: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """theta_j + F (theta_k - theta_l), with i, j, k, l mutually different. (21)"""
+    size = state.population.shape[-2]
+    i = torch.arange(size, device=u[0].device)
+    j = draw_other(u[0], size, i)
+    k = draw_other(u[1], size, i, j)
+    m = draw_other(u[2], size, i, j, k)
+    factor = torch.full_like(state.cost, settings.factor)
+    step = pick(state.population, k).sub_(pick(state.population, m)).mul_(settings.factor)
+    return step.add_(pick(state.population, j)), factor, torch.full_like(state.cost, settings.rate)
+
+
+def _to_p_best_1(state: State, settings: EvolutionSettings, u: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """x_i + F (x_pbest - x_i) + F (x_r1 - x_r2), x_r2 from population and archive. (L-SHADE, 3)"""
+    population, size = state.population, state.population.shape[-2]
+    u_cell, u_factor, u_rate, u_best, u_1, u_2 = u
+    cell = (u_cell * settings.memory).long()
+    factor = draw_factor(state.memory_f.gather(-1, cell), u_factor.to(state.cost.dtype))
+    rate = draw_rate(state.memory_cr.gather(-1, cell), u_rate.to(state.cost.dtype))
+    best = (u_best * max(2, round(settings.best_share * size))).long()
+    i = torch.arange(size, device=u_1.device)
+    r_1 = draw_other(u_1, size, i)
+    r_2 = draw_other(u_2, size + state.archived[..., None], i, r_1)
+    step = pick(population, best).sub_(population).add_(pick(population, r_1)).sub_(_pick_of_two(state, r_2))
+    return step.mul_(factor[..., None]).add_(population), factor, rate
+
+
+def _pick_of_two(state: State, index: Tensor) -> Tensor:
+    """Rows of the population followed by the archive; not joined first, the copy would cost more than all else."""
+    size, room = state.population.shape[-2], state.archive.shape[-2]
+    member = pick(state.population, index.clamp(max=size - 1))
+    if not room:
+        return member
+    return torch.where((index < size)[..., None], member, pick(state.archive, (index - size).clamp(min=0)))
+
+
+def draw_other(u: Tensor, size: int | Tensor, *taken: Tensor) -> Tensor:
+    """Integers uniform on 0..size-1 without those in `taken`, which differ from one another; all (*problems, N)."""
+    index = (u * (size - len(taken))).long()
+    for value in _ascending(list(taken)):
+        index = index + (index >= value)
+    return index
+
+
+def _ascending(values: list[Tensor]) -> list[Tensor]:
+    """Elementwise sorted; bubble sort, for there are at most three."""
+    for end in range(len(values) - 1, 0, -1):
+        for a in range(end):
+            values[a], values[a + 1] = torch.minimum(values[a], values[a + 1]), torch.maximum(values[a], values[a + 1])
+    return values
+
+
+def pick(rows: Tensor, index: Tensor) -> Tensor:
+    """rows (*problems, M, P) at index (*problems, K) -> (*problems, K, P), a new tensor."""
+    problem = torch.arange(index[..., 0].numel(), device=index.device).reshape(*index.shape[:-1], 1)
+    flat = (index + problem * rows.shape[-2]).reshape(-1)
+    return rows.reshape(-1, rows.shape[-1]).index_select(0, flat).reshape(*index.shape, rows.shape[-1])
+
+
+def _repaired(mutant: Tensor, state: State, settings: EvolutionSettings) -> Tensor:
+    size, parameters = mutant.shape[-2:]
+
+    def draw() -> Tensor:
+        key = stream(state.seed, state.generation, _REPAIR)
+        return uniform(key, size * parameters).unflatten(-1, (size, parameters))
+
+    low, high = state.low[..., None, :], state.high[..., None, :]
+    return into_box(mutant, state.population, low, high, settings.bounds, draw)
+
+
+def tell(state: State, trial: Trial, cost: Tensor, settings: EvolutionSettings) -> State:
+    """Selection, learning, sorting. cost (*problems, N); a cost that is not finite never wins. (23)"""
+    if cost.shape != state.cost.shape:
+        raise ValueError(f"expected costs {tuple(state.cost.shape)}, got {tuple(cost.shape)}; one for each candidate")
+    cost = torch.where(torch.isfinite(cost), cost, math.inf).to(state.cost.dtype)
+    better = cost < state.cost
+    # L-SHADE lets an equal candidate replace its parent too, so that the population can cross plateaus.
+    wins = better if settings.strategy == "rand/1/bin" else (cost <= state.cost) & torch.isfinite(cost)
+    learned = state
+    if settings.strategy == "l-shade" and state.generation > 0:
+        learned = _learned(state, trial, state.cost - cost, better)
+    chosen = replace(
+        learned,
+        population=torch.where(wins[..., None], trial.candidates, state.population),
+        cost=torch.where(wins, cost, state.cost),
+        generation=state.generation + 1,
+        evaluations=state.evaluations + state.cost.shape[-1],
+    )
+    return _progressed(_sorted(chosen, settings), settings)
+
+
+def _learned(state: State, trial: Trial, gain: Tensor, success: Tensor) -> State:
+    memory_f, memory_cr, cell = update_memory(
+        state.memory_f, state.memory_cr, state.memory_cell, trial.factor, trial.rate, gain, success
+    )
+    archive, archived = state.archive, state.archived
+    if archive.shape[-2]:
+        u = uniform(stream(state.seed, state.generation, _ARCHIVE), success.shape[-1])
+        archive, archived = update_archive(archive, archived, state.population, success, u)
+    return replace(state, memory_f=memory_f, memory_cr=memory_cr, memory_cell=cell, archive=archive, archived=archived)
+
+
+def _sorted(state: State, settings: EvolutionSettings) -> State:
+    """Best first, without the worst when the population shrinks."""
+    size = min(state.cost.shape[-1], settings.population_after(state.first_population, state.evaluations))
+    cost, order = torch.sort(state.cost, stable=True)
+    room = min(state.archive.shape[-2], settings.archive_size(size))
+    return replace(
+        state,
+        population=pick(state.population, order[..., :size]),
+        cost=cost[..., :size].contiguous(),
+        archive=state.archive[..., :room, :].contiguous(),
+        archived=state.archived.clamp(max=room),
+    )
+
+
+def _progressed(state: State, settings: EvolutionSettings) -> State:
+    best, median = state.cost[..., 0], state.cost[..., state.cost.shape[-1] // 2]
+    spread = torch.where(torch.isfinite(median), median - best, 0.0)
+    scale = torch.maximum(state.scale, spread)
+    moved = best < state.anchor - settings.cost_tolerance * scale
+    return replace(
+        state,
+        scale=scale,
+        anchor=torch.where(moved, best, state.anchor),
+        waited=torch.where(moved, 0, state.waited + 1),
+    )
