@@ -1,0 +1,184 @@
+"""Makes cases: draws them, runs the hidden rigs in one batch, reads their sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fdi_torch.gap.challenge.conditions import (
+    HELD_OUT,
+    RECORDED,
+    Conditions,
+    asked_of_pumps,
+    draw_conditions,
+    kept_below_the_rim,
+    levels_at_rest,
+)
+from fdi_torch.gap.challenge.kinds import FAINT, KINDS, Chosen, case_generator, choose
+from fdi_torch.gap.challenge.known import KNOWN
+from fdi_torch.gap.challenge.laws_sensor import READOUT_LAWS, SENSOR_LAWS
+from fdi_torch.gap.challenge.moment import Array, Deviation
+from fdi_torch.gap.challenge.plants import Rig
+from fdi_torch.gap.challenge.simulator import STEP, HiddenRigs, grouped, simulate
+from fdi_torch.gap.challenge.surroundings import Surroundings
+
+PARTS = (("recording", RECORDED), ("holdout", HELD_OUT))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Which case: `index` counts within its kind, `number` within the challenge."""
+
+    number: int
+    kind: str
+    index: int
+
+    @property
+    def name(self) -> str:
+        return f"case{self.number + 1:04d}"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case as it was made; its truth goes under seal.
+
+    commands, readings: of recording and hold-out, (T, C) in the header's unit and (T, S) m.
+    """
+
+    plan: Plan
+    commands: tuple[Array, Array]
+    readings: tuple[Array, Array]
+    truth: dict[str, Any]
+
+
+def plans(cases: int, seed: int, kinds: Sequence[str]) -> list[Plan]:
+    """Kinds in turn, in an order shuffled anew each round, so that a case's number does not give its kind away."""
+    strange = [k for k in kinds if k not in KINDS]
+    if strange or not kinds:
+        raise ValueError(
+            f"expected kinds among {', '.join(KINDS)}, got {', '.join(strange) or 'none'}; name some of these"
+        )
+    out = []
+    for number in range(cases):
+        turn, at = divmod(number, len(kinds))
+        order = case_generator(seed, "order", turn).permutation(len(kinds))
+        out.append(Plan(number, kinds[int(order[at])], turn))
+    return out
+
+
+def make(
+    todo: Sequence[Plan], rig: Rig, seed: int, library: Collection[str] = (), leave_out: Sequence[str] = ()
+) -> list[Case]:
+    """The cases of these plans, all rigs in one batch. A case is the same in whatever company it is made."""
+    rest = levels_at_rest(rig)
+    chosen = [choose(KINDS[p.kind], rig, seed, p.index, library, leave_out) for p in todo]
+    drawn = [_conditions(p, c, rig, seed, rest) for p, c in zip(todo, chosen, strict=True)]
+    conditions, sound = kept_below_the_rim(rig, drawn)
+    deviations = [_deviations(plan, chosen[i], conditions[i], rig, sound[:, :, i], seed) for i, plan in enumerate(todo)]
+    levels = _run(rig, conditions, deviations)
+    return [
+        _read(plan, chosen[i], conditions[i], deviations[i], rig, levels[:, :, 4 * i : 4 * i + 4], seed)
+        for i, plan in enumerate(todo)
+    ]
+
+
+def _conditions(plan: Plan, chosen: Chosen, rig: Rig, seed: int, rest: Array) -> Conditions:
+    kind = KINDS[plan.kind]
+    inputs = "wide" if chosen.unknown and chosen.unknown.reversing else kind.inputs
+    return draw_conditions(rig, case_generator(seed, plan.kind, plan.index, 3), inputs, kind.coloured, rest)
+
+
+def _deviations(
+    plan: Plan, chosen: Chosen, conditions: Conditions, rig: Rig, sound: Array, seed: int
+) -> tuple[Deviation, ...]:
+    kind, asked = KINDS[plan.kind], asked_of_pumps(rig.plant, conditions.commands[0])
+    rng = case_generator(seed, plan.kind, plan.index, 4)
+
+    def surroundings(strength: float) -> Surroundings:
+        return Surroundings(rig.plant, sound, asked, conditions.conductance, strength, rng)
+
+    if chosen.unknown:
+        return (chosen.unknown.draw(surroundings(kind.strength), chosen.place),)
+    strengths = [kind.strength if i < kind.causes else FAINT for i in range(len(chosen.causes))]
+    pairs = zip(chosen.causes, strengths, strict=True)
+    return tuple(KNOWN[effect](surroundings(strength), place) for (effect, place), strength in pairs)
+
+
+def _run(rig: Rig, conditions: Sequence[Conditions], deviations: Sequence[tuple[Deviation, ...]]) -> Array:
+    """Levels (T, N, 4 cases) m: recording and hold-out of the rig as it is, then of the same rig with nothing wrong."""
+    asked = np.empty((RECORDED, len(rig.plant.pumps), 4 * len(conditions)))
+    starts, conductance, lanes = [], [], []
+    for i, c in enumerate(conditions):
+        for j, commands in enumerate((*c.commands, *c.commands)):
+            flow = asked_of_pumps(rig.plant, commands)
+            asked[:, :, 4 * i + j] = flow[np.minimum(np.arange(RECORDED), len(flow) - 1)]
+        starts += [c.starts[0], c.starts[1]] * 2
+        conductance += [c.conductance] * 4
+        lanes += [deviations[i]] * 2 + [()] * 2
+    rigs = HiddenRigs(rig.plant, np.stack(conductance, axis=-1), lanes)
+    return simulate(rigs, asked, np.stack(starts, axis=-1), STEP)
+
+
+def _read(
+    plan: Plan,
+    chosen: Chosen,
+    conditions: Conditions,
+    deviations: tuple[Deviation, ...],
+    rig: Rig,
+    levels: Array,
+    seed: int,
+) -> Case:
+    rng = case_generator(seed, plan.kind, plan.index, 5)
+    readings, noise_rms, gap_rms = [], {}, {}
+    for lane, (part, samples) in enumerate(PARTS):
+        clean = _sensed(rig, levels[:samples, :, lane], deviations)
+        sound = _sensed(rig, levels[:samples, :, lane + 2], ())
+        noisy = clean + noise(rng, clean.shape, conditions.noise, conditions.colour)
+        shown = _applied(READOUT_LAWS, rig, noisy, deviations)
+        readings.append(shown)
+        noise_rms[part] = np.sqrt(np.mean((shown - clean) ** 2, axis=0)).tolist()
+        gap_rms[part] = float(np.sqrt(np.mean((clean - sound) ** 2)))
+    truth = _truth(plan, chosen, deviations) | {
+        "noise_rms_m": noise_rms,
+        "gap_rms_m": gap_rms,
+        "colour": conditions.colour,
+        "over_rim": bool((levels[:, :, :2].max(axis=(0, 2)) > [t.height for t in rig.plant.tanks]).any()),
+    }
+    return Case(plan, conditions.commands, (readings[0], readings[1]), truth)
+
+
+def _truth(plan: Plan, chosen: Chosen, deviations: tuple[Deviation, ...]) -> dict[str, Any]:
+    kind = KINDS[plan.kind]
+    full = deviations[: max(kind.causes, 1)]
+    really = {"really": chosen.unknown.law} if chosen.unknown else {}
+    return {
+        "case": plan.name,
+        "kind": plan.kind,
+        "causes": [{"effect": d.effect, "location": d.location} | really for d in full],
+        "leave_out": list(chosen.leave_out),
+        "deviations": [d.as_dict() for d in deviations],
+    }
+
+
+def _sensed(rig: Rig, levels: Array, deviations: Sequence[Deviation]) -> Array:
+    tanks = [t.name for t in rig.plant.tanks]
+    return _applied(SENSOR_LAWS, rig, levels[:, [tanks.index(s.tank) for s in rig.plant.sensors]], deviations)
+
+
+def _applied(laws: Any, rig: Rig, signal: Array, deviations: Sequence[Deviation]) -> Array:
+    """Each of these laws that is at work, at its sensor. signal (T, S)."""
+    time, out = np.arange(len(signal), dtype=np.float64), signal.copy()
+    for group in grouped(laws, [s.name for s in rig.plant.sensors], [tuple(deviations)]):
+        out[:, group.rows] = group.law(out[:, group.rows], time, group.numbers)
+    return out
+
+
+def noise(rng: np.random.Generator, shape: tuple[int, ...], std: float, colour: float) -> Array:
+    """Gaussian noise (T, S) of this standard deviation: e_i = a e_{i-1} + sqrt(1 - a^2) w_i."""
+    e = std * rng.normal(size=shape)
+    for i in range(1, shape[0] if colour else 0):
+        e[i] = colour * e[i - 1] + np.sqrt(1 - colour * colour) * e[i]
+    return e

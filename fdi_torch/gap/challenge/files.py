@@ -1,0 +1,145 @@
+"""A challenge on disk: recordings as CSV, sealed causes, and the manifest that holds the hashes of both.
+
+spec.json          what was asked for: seed, kinds, rig
+cases/caseNNNN_recording.csv.gz, cases/caseNNNN_holdout.csv.gz
+manifest.jsonl     a line a case: SHA-256 of both recordings and of the sealed key
+key.jsonl          a line a case: the truth; opened after the diagnosis
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from fdi_torch.gap.challenge.cases import PARTS, Case
+from fdi_torch.gap.challenge.conditions import command_unit
+from fdi_torch.gap.challenge.moment import Array
+from fdi_torch.gap.challenge.plants import Rig
+from fdi_torch.parameters import header_unit, si_unit_of, unit_factor
+from fdi_torch.recording import Recording
+
+_DECIMALS_OF_LEVEL = 3
+
+
+def as_csv(rig: Rig, commands: Array, readings: Array) -> str:
+    """commands (T, C) in the header's unit, readings (T, S) as levels in m; samples a second apart."""
+    header, columns, decimals = ["t_s"], [np.arange(len(commands), dtype=np.float64)], [0]
+    for i, channel in enumerate(rig.plant.channels()):
+        unit = command_unit(next(p for p in rig.plant.pumps if p.channel == channel))
+        header.append(f"{channel}_{unit}")
+        columns.append(commands[:, i])
+        decimals.append({"cm3_s": 1, "V": 3, "1": 4}[unit])
+    for i, sensor in enumerate(rig.plant.sensors):
+        in_metres = sensor.unit == "m"
+        header.append(f"{sensor.column}_{'cm' if in_metres else sensor.unit}")
+        columns.append((sensor.gain * readings[:, i] + sensor.offset) * (100 if in_metres else 1))
+        decimals.append(_DECIMALS_OF_LEVEL)
+    rows = zip(*([f"{v:.{d}f}" for v in column] for column, d in zip(columns, decimals, strict=True)), strict=True)
+    return "\n".join([",".join(header), *(",".join(row) for row in rows)]) + "\n"
+
+
+def from_csv(text: str, rig: Rig, source: str) -> Recording:
+    """Back from `as_csv`, in SI."""
+    lines = text.splitlines()
+    named = [header_unit(h) for h in lines[0].split(",")]
+    table = torch.tensor(np.loadtxt(lines[1:], delimiter=",", ndmin=2))
+    units = [unit for _, unit in (n for n in named if n)]
+    table = table * torch.tensor([unit_factor(u, si_unit_of(u)) for u in units])
+    inputs = len(rig.plant.channels())
+    names = [name for name, _ in (n for n in named if n)]
+    si = [si_unit_of(u) for u in units]
+    return Recording(
+        time=table[:, 0],
+        inputs=table[:, 1 : 1 + inputs],
+        outputs=table[:, 1 + inputs :],
+        input_names=tuple(names[1 : 1 + inputs]),
+        output_names=tuple(names[1 + inputs :]),
+        input_units=tuple(si[1 : 1 + inputs]),
+        output_units=tuple(si[1 + inputs :]),
+        source=source,
+        sha256=digest(text),
+    )
+
+
+def digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def sealed_line(truth: Mapping[str, Any]) -> str:
+    """The truth as the one line that is hashed: sorted, without blanks."""
+    return json.dumps(truth, sort_keys=True, separators=(",", ":"))
+
+
+def write_cases(out: Path, rig: Rig, made: Iterable[Case], secrets: Iterable[str]) -> None:
+    """Recordings first, then their line in the key and in the manifest: what the manifest names is complete.
+
+    secrets: a random word a case, kept in the key, without which its hash would give the cause away by trial.
+    """
+    (out / "cases").mkdir(parents=True, exist_ok=True)
+    for case, secret in zip(made, secrets, strict=True):
+        line: dict[str, Any] = {"case": case.plan.name, "leave_out": case.truth["leave_out"]}
+        for (part, _), commands, readings in zip(PARTS, case.commands, case.readings, strict=True):
+            text = as_csv(rig, commands, readings)
+            path = out / "cases" / f"{case.plan.name}_{part}.csv.gz"
+            path.write_bytes(gzip.compress(text.encode(), compresslevel=5, mtime=0))
+            line[part] = digest(text)
+        key = sealed_line(case.truth | {"nonce": secret})
+        append(out / "key.jsonl", key)
+        append(out / "manifest.jsonl", json.dumps(line | {"key": digest(key)}))
+
+
+def append(path: Path, line: str) -> None:
+    with path.open("a") as file:
+        file.write(line + "\n")
+
+
+def lines_of(path: Path) -> list[dict[str, Any]]:
+    """All whole lines of a JSON-lines file; a last line cut short by an interruption is dropped from the file too."""
+    if not path.exists():
+        return []
+    text = path.read_text()
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        path.write_text(whole)
+    return [json.loads(line) for line in whole.splitlines()]
+
+
+def read_recording(out: Path, case: str, part: str, rig: Rig) -> Recording:
+    """One recording of a case, checked against the manifest. Its source names the case and nothing else."""
+    text = gzip.decompress((out / "cases" / f"{case}_{part}.csv.gz").read_bytes()).decode()
+    expected = manifest(out)[case][part]
+    if digest(text) != expected:
+        raise ValueError(
+            f"{case}: expected a {part} of SHA-256 {expected[:12]}..., got {digest(text)[:12]}...; "
+            "it was changed after it was sealed: make the challenge anew"
+        )
+    return from_csv(text, rig, f"{case}/{part}")
+
+
+def manifest(out: Path) -> dict[str, dict[str, Any]]:
+    return {line["case"]: line for line in lines_of(out / "manifest.jsonl")}
+
+
+def open_key(out: Path) -> dict[str, dict[str, Any]]:
+    """The truths by case, each checked against the manifest.
+
+    Raises ValueError where a key was changed or is missing.
+    """
+    keys = {line["case"]: line for line in lines_of(out / "key.jsonl")}
+    for case, line in manifest(out).items():
+        if case not in keys:
+            raise ValueError(f"{case}: expected a sealed key, got none; make the challenge anew")
+        found = digest(sealed_line(keys[case]))
+        if found != line["key"]:
+            raise ValueError(
+                f"{case}: expected a key of SHA-256 {line['key'][:12]}..., got {found[:12]}...; "
+                "it was changed after it was sealed: make the challenge anew"
+            )
+    return keys

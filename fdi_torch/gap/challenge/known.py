@@ -1,0 +1,180 @@
+"""How each effect of the diagnosis' vocabulary is drawn at a hidden rig: law, numbers and usual strength.
+
+Sizes are shares of what the sound rig does under this recording's inputs; a draw is f(s, place) -> Deviation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from fdi_torch.gap.challenge.moment import Deviation
+from fdi_torch.gap.challenge.surroundings import Surroundings
+
+Draw = Callable[[Surroundings, str], Deviation]
+
+
+def pump_gain(s: Surroundings, at: str) -> Deviation:
+    return Deviation("pump_gain", at, "scaled", {"gain": 1 + s.either(0.08, 0.20)})
+
+
+def pump_dead_zone(s: Surroundings, at: str) -> Deviation:
+    zone = s.size(0.06, 0.13) * s.pump(at)[1]
+    return Deviation("pump_dead_zone", at, "soft_threshold", {"zone": zone, "knee": 0.15 * zone})
+
+
+def pump_saturation(s: Surroundings, at: str) -> Deviation:
+    low, high = s.pump(at)
+    limit = high - s.size(0.28, 0.5) * (high - low)
+    return Deviation("pump_saturation", at, s.one_of("hard_limit", "rounded_limit"), {"limit": limit})
+
+
+def pump_lag(s: Surroundings, at: str) -> Deviation:
+    return Deviation("pump_lag", at, s.one_of("slow", "slow_in_two_poles"), {"tau": s.size(7, 25)})
+
+
+def pump_delay(s: Surroundings, at: str) -> Deviation:
+    return Deviation("pump_delay", at, s.one_of("late", "late_and_smeared"), {"delay": s.size(5, 15)})
+
+
+def pump_back_pressure(s: Surroundings, at: str) -> Deviation:
+    loss, high = s.size(0.1, 0.22), s.tank(s.tank_of(at), 0.98)
+    law = s.one_of("shut_off_head", "drooping")
+    head = high / (1 - (1 - loss) ** 2) if law == "shut_off_head" else high / loss**0.5
+    return Deviation("pump_back_pressure", at, law, {"head": head})
+
+
+def laminar_flow(s: Surroundings, at: str) -> Deviation:
+    law = s.one_of("viscous_and_inertial", "reynolds_blend")
+    low, high = (0.05, 0.3) if law == "viscous_and_inertial" else (0.3, 0.9)
+    return Deviation("laminar_flow", at, law, {"head": s.size(low, high) * s.head(at, 0.5)})
+
+
+def flow_exponent(s: Surroundings, at: str) -> Deviation:
+    numbers = {"power": 0.5 + s.either(0.06, 0.15), "reference": s.uniform(0.6, 1.6) * s.head(at, 0.5)}
+    return Deviation("flow_exponent", at, "other_power", numbers)
+
+
+def outlet_drop(s: Surroundings, at: str) -> Deviation:
+    share = s.either(0.08, 0.18)
+    drop = share * s.head(at, 0.5) if share > 0 else share * s.head(at, 0.05)
+    return Deviation("outlet_drop", at, "down_pipe", {"drop": drop})
+
+
+def coefficient_drift(s: Surroundings, at: str) -> Deviation:
+    law = s.one_of("drifting_evenly", "drifting_to_rest", "drifting_as_sine")
+    return Deviation("coefficient_drift", at, law, {"change": s.either(0.1, 0.25), "span": s.seconds})
+
+
+def plugging(s: Surroundings, at: str) -> Deviation:
+    """From the start on where strong, else from some time on: a small one from the start is within tolerance."""
+    sudden = s.strength < 0.5 or s.rng.random() < 0.5
+    onset = s.uniform(0.12, 0.5) * s.seconds if sudden else -1e9
+    return Deviation("plugging", at, "narrowed", {"loss": s.either(0.14, 0.28), "onset": onset, "ramp": 15.0})
+
+
+def cross_flow(s: Surroundings, at: str) -> Deviation:
+    first, second = at.split("-")
+    numbers = {"conductance": s.size(0.08, 0.25) * s.conductance_at(first), "viscous": 1e-3}
+    return Deviation("cross_flow", at, "slot", numbers, other=second)
+
+
+def leak(s: Surroundings, at: str) -> Deviation:
+    conductance = s.size(0.08, 0.25) * s.conductance_at(at)
+    if s.rng.random() < 0.5:
+        return Deviation("leak", at, "floor_hole", {"conductance": conductance})
+    height = s.uniform(0.1, 0.6) * s.tank(at, 0.5)
+    numbers = {"conductance": 1.4 * conductance, "height": height, "bore": 0.03 * s.span(at)}
+    return Deviation("leak", at, "hole", numbers)
+
+
+def unmetered_flow(s: Surroundings, at: str) -> Deviation:
+    begin = s.uniform(0.08, 0.35) * s.seconds
+    end = begin + s.uniform(0.2, 0.5) * s.seconds
+    draw = s.either(0.07, 0.16) * float(np.max(s.asked))
+    return Deviation("unmetered_flow", at, "tapped", {"draw": draw, "begin": begin, "end": end, "ramp": 5.0})
+
+
+def area_taper(s: Surroundings, at: str) -> Deviation:
+    slope = ((1 + s.either(0.15, 0.4)) ** 0.5 - 1) / s.tank(at, 0.98)
+    return Deviation("area_taper", at, "cone", {"slope": slope})
+
+
+def internal_body(s: Surroundings, at: str) -> Deviation:
+    numbers = {"low": s.tank(at, s.uniform(0.05, 0.35)), "high": s.tank(at, s.uniform(0.65, 0.95))}
+    law = s.one_of("block", "barrel")
+    numbers |= {"share": s.size(0.15, 0.45)} | ({"chamfer": s.uniform(0.05, 0.2)} if law == "block" else {})
+    return Deviation("internal_body", at, law, numbers)
+
+
+def overflow(s: Surroundings, at: str) -> Deviation:
+    law = s.one_of("rectangular_weir", "notched_weir")
+    deep = 0.05 if law == "rectangular_weir" else 0.12
+    crest = s.tank(at, 0.98) - s.size(0.25, 0.5) * s.span(at)
+    numbers = {"crest": crest, "depth": deep * s.span(at), "flow": float(np.max(s.asked))}
+    others = [t.name for t in s.plant.tanks if t.name != at]
+    into = others[int(s.rng.integers(len(others)))] if others and s.rng.random() < 0.25 else None
+    return Deviation("overflow", at, law, numbers, other=into)
+
+
+def sensor_bias(s: Surroundings, at: str) -> Deviation:
+    return Deviation("sensor_bias", at, "offset", {"offset": s.either(0.04, 0.1) * s.span(s.tank_of(at))})
+
+
+def sensor_gain(s: Surroundings, at: str) -> Deviation:
+    return Deviation("sensor_gain", at, "stretched", {"gain": 1 + s.either(0.05, 0.12)})
+
+
+def sensor_lag(s: Surroundings, at: str) -> Deviation:
+    return Deviation("sensor_lag", at, s.one_of("damped", "damped_twice"), {"tau": s.size(10, 35)})
+
+
+def sensor_drift(s: Surroundings, at: str) -> Deviation:
+    rate = s.either(0.06, 0.15) * s.span(s.tank_of(at)) / s.seconds
+    return Deviation("sensor_drift", at, "creeping", {"rate": rate})
+
+
+def sensor_quantization(s: Surroundings, at: str) -> Deviation:
+    return Deviation("sensor_quantization", at, "rounded", {"step": s.size(0.03, 0.08) * s.span(s.tank_of(at))})
+
+
+def sensor_delay(s: Surroundings, at: str) -> Deviation:
+    return Deviation("sensor_delay", at, "late_reading", {"delay": s.size(6, 18)})
+
+
+def sensor_saturation(s: Surroundings, at: str) -> Deviation:
+    tank = s.tank_of(at)
+    ceiling = s.tank(tank, 0.98) - s.size(0.25, 0.5) * s.span(tank)
+    return Deviation("sensor_saturation", at, "clipped", {"ceiling": ceiling})
+
+
+KNOWN: dict[str, Draw] = {
+    draw.__name__: draw
+    for draw in (
+        pump_gain,
+        pump_dead_zone,
+        pump_saturation,
+        pump_lag,
+        pump_delay,
+        pump_back_pressure,
+        laminar_flow,
+        flow_exponent,
+        outlet_drop,
+        coefficient_drift,
+        plugging,
+        cross_flow,
+        leak,
+        unmetered_flow,
+        area_taper,
+        internal_body,
+        overflow,
+        sensor_bias,
+        sensor_gain,
+        sensor_lag,
+        sensor_drift,
+        sensor_quantization,
+        sensor_delay,
+        sensor_saturation,
+    )
+}

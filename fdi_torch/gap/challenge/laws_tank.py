@@ -1,0 +1,107 @@
+"""What goes wrong at the hidden rigs' tanks.
+
+A tank law is f(level, other, now, p, state) -> (q, state): q (n,) m^3/s leaves the tank, into the other tank where
+one is named. A storage law gives the cross-section at levels (m, n) as a share of the nominal one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fdi_torch.gap.challenge.moment import Array, Moment, Numbers
+
+Outflow = tuple[Array, Any]
+
+
+def hole(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """A round hole: partly covered over its own bore, then Torricelli."""
+    x = np.maximum(level - p["height"], 0.0)
+    return p["conductance"] * np.sqrt(x) * np.minimum(x / p["bore"], 1.0), None
+
+
+def floor_hole(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    return p["conductance"] * np.sqrt(np.maximum(level, 0.0)), None
+
+
+def slot(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """A narrow gap between two tanks: head = a q + b q^2, so that it is smooth at equal levels."""
+    head = level - other
+    x = np.abs(head)
+    return p["conductance"] * head / (0.5 * np.sqrt(p["viscous"]) + np.sqrt(x + 0.25 * p["viscous"])), None
+
+
+def tapped(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """A tap opened at `begin` and closed at `end`, each within `ramp` seconds (negative: a tap running in)."""
+    opened = np.minimum(np.maximum((now.time - p["begin"]) / p["ramp"], 0.0), 1.0)
+    closed = np.minimum(np.maximum((now.time - p["end"]) / p["ramp"], 0.0), 1.0)
+    dry = (p["draw"] > 0) & (level <= 0)
+    return np.where(dry, 0.0, p["draw"] * (opened - closed)), None
+
+
+def rectangular_weir(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """q = q_ref (x/x_ref)^(3/2) (Poleni)."""
+    x = np.maximum(level - p["crest"], 0.0) / p["depth"]
+    return p["flow"] * x * np.sqrt(x), None
+
+
+def notched_weir(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """q = q_ref (x/x_ref)^(5/2) (Thomson)."""
+    x = np.maximum(level - p["crest"], 0.0) / p["depth"]
+    return p["flow"] * x * x * np.sqrt(x), None
+
+
+def siphon(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """Starts when its bend is covered, runs until its mouth sucks air."""
+    running = np.zeros(level.shape, dtype=bool) if state is None else state
+    running = np.where(running, level > p["mouth"], level > p["bend"])
+    return np.where(running, p["conductance"] * np.sqrt(np.maximum(level, 0.0)), 0.0), running
+
+
+def cycling_user(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """Somebody who draws water on and off, all the time."""
+    on = np.mod(now.time / p["period"], 1.0) > 0.55
+    return np.where(on & (level > 0), p["draw"], 0.0), None
+
+
+def float_valve(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """A cistern valve that tops the tank up from outside, opening and closing at two levels."""
+    filling = (level < p["high"]) if state is None else state
+    filling = np.where(filling, level < p["high"], level < p["low"])
+    return np.where(filling, -p["flow"], 0.0), filling
+
+
+def cone(level: Array, p: Numbers) -> Array:
+    """Width grows evenly, so the cross-section with the square: (1 + b h)^2."""
+    return (1 + p["slope"] * level) ** 2
+
+
+def block(level: Array, p: Numbers) -> Array:
+    """A body with chamfered edges between two levels."""
+    x = (level - p["low"]) / (p["high"] - p["low"])
+    inside = np.minimum(np.maximum(np.minimum(x, 1 - x) / p["chamfer"], 0.0), 1.0)
+    return 1 - p["share"] * inside
+
+
+def barrel(level: Array, p: Numbers) -> Array:
+    """A body bulging in the middle: share (1 - (2x - 1)^6)."""
+    x = (level - p["low"]) / (p["high"] - p["low"])
+    return 1 - p["share"] * np.maximum(1 - (2 * x - 1) ** 6, 0.0)
+
+
+TANK_LAWS = {
+    law.__name__: law
+    for law in (
+        hole,
+        floor_hole,
+        slot,
+        tapped,
+        rectangular_weir,
+        notched_weir,
+        siphon,
+        cycling_user,
+        float_valve,
+    )
+}
+STORAGE_LAWS = {"cone": cone, "block": block, "barrel": barrel}

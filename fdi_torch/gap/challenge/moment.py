@@ -1,0 +1,47 @@
+"""What a law of the hidden rigs sees of the instant it acts in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+Numbers = Mapping[str, Array]
+
+
+@dataclass
+class Moment:
+    """time s on the recording's clock; dt s; level (n,) m of the pump's tank.
+
+    asked(delay): the flow asked for so many seconds ago, (n,) s -> (n,) m^3/s.
+    """
+
+    time: float
+    dt: float
+    level: Array
+    asked: Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """One thing that is off at a hidden rig.
+
+    effect: its name in the diagnosis' vocabulary ('unknown' where it has none). location: the component.
+    law: the equation, by name. numbers: SI. other: the second tank, where water goes from one into another.
+    """
+
+    effect: str
+    location: str
+    law: str
+    numbers: dict[str, float]
+    other: str | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"effect": self.effect, "location": self.location, "law": self.law, "numbers": self.numbers} | (
+            {"other": self.other} if self.other else {}
+        )

@@ -1,0 +1,157 @@
+"""The withheld check: make and seal, diagnose without the key, open, score."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from secrets import token_hex
+from typing import Any
+
+from fdi_torch.gap.challenge.baselines import Diagnosis, always_null, random_pair
+from fdi_torch.gap.challenge.cases import make, plans
+from fdi_torch.gap.challenge.files import (
+    append,
+    lines_of,
+    manifest,
+    open_key,
+    read_recording,
+    write_cases,
+)
+from fdi_torch.gap.challenge.kinds import STANDARD
+from fdi_torch.gap.challenge.plants import Rig, three_tank
+from fdi_torch.gap.challenge.score import Row, by_effect, judge, summary
+
+Each = Callable[[Callable[[str], dict[str, Any]], Iterable[str]], Iterable[dict[str, Any]]]
+CHUNK = 200
+
+
+def challenge(
+    cases: int,
+    seed: int,
+    out: Path | str,
+    diagnose: Diagnosis,
+    *,
+    rig: Rig | None = None,
+    kinds: Sequence[str] = STANDARD,
+    library: Collection[str] = (),
+    leave_out: Sequence[str] = (),
+    rivals: Mapping[str, Diagnosis] | None = None,
+    each: Each = map,
+    tell: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """Scores `diagnose` and its rivals on `cases` recordings, kinds in turn; resumes where it was interrupted.
+
+    diagnose(recording, holdout[, leave_out=(effect,)]) -> answer in the format `fdi_torch.gap/1`.
+    library: effects that `diagnose` can name; those are not drawn as unknown.
+    leave_out: effects to deny it, one a case.
+    rivals: further diagnoses scored beside the two without skill. each: map over cases, for example an executor's.
+    Returns {diagnosis: {stratum: scores}}; the same is in out/scores.json, a row a case in out/rows_NAME.jsonl.
+    """
+    rig, out = rig or three_tank(), Path(out)
+    kinds = ("left_out",) if leave_out else tuple(kinds)
+    seal(cases, seed, out, rig, kinds, library, leave_out, tell)
+    diagnoses = {"always_null": always_null, "random": random_pair(rig.plant, seed), **(rivals or {}), "fdi": diagnose}
+    for name, each_diagnosis in diagnoses.items():
+        answer_all(name, each_diagnosis, cases, out, rig, each, tell)
+    return score_all(tuple(diagnoses), cases, out, rig)
+
+
+def seal(
+    cases: int,
+    seed: int,
+    out: Path,
+    rig: Rig,
+    kinds: Sequence[str],
+    library: Collection[str] = (),
+    leave_out: Sequence[str] = (),
+    tell: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Makes what is missing of the first `cases` cases and seals it.
+
+    Raises ValueError where `out` holds another challenge.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    spec = {
+        "seed": seed,
+        "rig": rig.plant.name,
+        "kinds": list(kinds),
+        "library": sorted(library),
+        "leave_out": list(leave_out),
+    }
+    known = out / "spec.json"
+    if known.exists() and json.loads(known.read_text()) != spec:
+        raise ValueError(f"{out}: expected the challenge {spec}, got {known.read_text().strip()}; take another folder")
+    known.write_text(json.dumps(spec) + "\n")
+    done = manifest(out)
+    todo = [plan for plan in plans(cases, seed, kinds) if plan.name not in done]
+    for at in range(0, len(todo), CHUNK):
+        chunk, start = todo[at : at + CHUNK], time.perf_counter()
+        write_cases(out, rig, make(chunk, rig, seed, library, leave_out), [token_hex(16) for _ in chunk])
+        tell(f"sealed {len(done) + at + len(chunk)} of {cases} cases, {time.perf_counter() - start:.0f} s")
+
+
+def answer_all(
+    name: str,
+    diagnose: Diagnosis,
+    cases: int,
+    out: Path,
+    rig: Rig,
+    each: Each,
+    tell: Callable[[str], None],
+) -> None:
+    """Diagnoses what has no answer yet, a JSON line a case. The key stays shut."""
+    path = out / f"answers_{name}.jsonl"
+    done = {line["case"] for line in lines_of(path)}
+    todo = [case for case in list(manifest(out))[:cases] if case not in done]
+    denied = {case: tuple(line["leave_out"]) for case, line in manifest(out).items() if line["leave_out"]}
+    for n, line in enumerate(each(partial(answer, diagnose, out, rig, denied), todo)):
+        append(path, json.dumps(line))
+        tell(f"{name} {len(done) + n + 1}/{cases} {line['case']} {line['answer'].get('verdict')} {line['sec']:.1f} s")
+
+
+def answer(
+    diagnose: Diagnosis, out: Path, rig: Rig, denied: Mapping[str, tuple[str, ...]], case: str
+) -> dict[str, Any]:
+    """One case; an exception of the diagnosis is an answer too, and a wrong one."""
+    recording, holdout = (read_recording(out, case, part, rig) for part in ("recording", "holdout"))
+    options = {"leave_out": denied[case]} if case in denied else {}
+    start = time.perf_counter()
+    try:
+        found = diagnose(recording, holdout, **options)
+    except Exception as error:  # a crash is scored, not raised: one case must not end the challenge
+        found = {"verdict": "crash", "error": f"{type(error).__name__}: {error}"}
+    return {"case": case, "sec": round(time.perf_counter() - start, 3), "answer": without_nan(found)}
+
+
+def without_nan(value: Any) -> Any:
+    """NaN and infinities as null: JSON has none."""
+    if isinstance(value, Mapping):
+        return {k: without_nan(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def score_all(names: Sequence[str], cases: int, out: Path, rig: Rig) -> dict[str, Any]:
+    """Opens the key, judges all answers."""
+    truths, scores = open_key(out), {}
+    for name in names:
+        wanted = set(list(manifest(out))[:cases])
+        rows = [
+            _row(line, truths[line["case"]], rig)
+            for line in lines_of(out / f"answers_{name}.jsonl")
+            if line["case"] in wanted
+        ]
+        (out / f"rows_{name}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+        scores[name] = summary(rows) | {"by_effect": by_effect(rows)}
+    (out / "scores.json").write_text(json.dumps(without_nan(scores), indent=1) + "\n")
+    return scores
+
+
+def _row(line: Mapping[str, Any], truth: Mapping[str, Any], rig: Rig) -> Row:
+    judged = judge(truth, line["answer"], rig.plant)
+    return {"case": line["case"], "sec": line["sec"], "gap_rms_m": truth["gap_rms_m"]["recording"]} | judged

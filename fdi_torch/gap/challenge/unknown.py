@@ -1,0 +1,129 @@
+"""Effects no diagnosis has a name for: how each is drawn, where it sits, what a library might have called it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdi_torch.gap.challenge.moment import Deviation
+from fdi_torch.gap.challenge.places import OUTLET, PIPE, PUMP, SENSOR, TANK
+from fdi_torch.gap.challenge.surroundings import Surroundings
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """law: its equation. at: kinds of places. aliases: it is unknown only to libraries without these names.
+
+    reversing: needs inputs that turn the flow round.
+    """
+
+    law: str
+    at: tuple[str, ...]
+    numbers: Callable[[Surroundings, str], dict[str, float]]
+    aliases: tuple[str, ...]
+    reversing: bool = False
+
+    def draw(self, s: Surroundings, place: str) -> Deviation:
+        return Deviation("unknown", place, self.law, self.numbers(s, place))
+
+
+def _pulsating(s: Surroundings, at: str) -> dict[str, float]:
+    return {"depth": s.size(0.15, 0.3), "period": s.uniform(40, 160)}
+
+
+def _backlash(s: Surroundings, at: str) -> dict[str, float]:
+    low, high = s.pump(at)
+    return {"slack": s.size(0.08, 0.16) * (high - low)}
+
+
+def _sticking(s: Surroundings, at: str) -> dict[str, float]:
+    low, high = s.pump(at)
+    return {"stiction": s.size(0.25, 0.4) * (high - low)}
+
+
+def _tiring(s: Surroundings, at: str) -> dict[str, float]:
+    return {"loss": s.size(0.3, 0.5), "tau": s.uniform(250, 700), "rated": s.pump(at)[1]}
+
+
+def _stalling(s: Surroundings, at: str) -> dict[str, float]:
+    return {"rest": 1 - s.size(0.4, 0.7), "period": s.uniform(0.2, 0.35) * s.seconds}
+
+
+def _silting(s: Surroundings, at: str) -> dict[str, float]:
+    q = s.conductance_of(at) * s.head(at, 0.5) ** 0.5
+    return {"slow": q, "loss": s.size(0.25, 0.4), "settle": s.uniform(200, 400), "wash": s.uniform(60, 150)}
+
+
+def _two_regimes(s: Surroundings, at: str) -> dict[str, float]:
+    return {"low": s.head(at, 0.35), "high": s.head(at, 0.7), "loss": s.size(0.15, 0.28)}
+
+
+def _fluttering(s: Surroundings, at: str) -> dict[str, float]:
+    return {"loss": s.size(0.25, 0.4), "period": s.uniform(150, 450)}
+
+
+def _check_valve(s: Surroundings, at: str) -> dict[str, float]:
+    return {"one_way": 1.0}
+
+
+def _siphon(s: Surroundings, at: str) -> dict[str, float]:
+    conductance = s.size(0.15, 0.3) * s.conductance_at(at)
+    return {"bend": s.tank(at, 0.75), "mouth": s.tank(at, 0.3), "conductance": conductance}
+
+
+def _cycling_user(s: Surroundings, at: str) -> dict[str, float]:
+    return {"draw": s.size(0.12, 0.22) * float(np.max(s.asked)), "period": s.uniform(180, 500)}
+
+
+def _float_valve(s: Surroundings, at: str) -> dict[str, float]:
+    flow = s.size(0.12, 0.22) * float(np.max(s.asked))
+    return {"low": s.tank(at, 0.3), "high": s.tank(at, 0.7), "flow": flow}
+
+
+def _bowed(s: Surroundings, at: str) -> dict[str, float]:
+    tank = s.tank_of(at)
+    return {"low": s.tank(tank, 0.02), "high": s.tank(tank, 0.98), "bow": s.either(0.06, 0.12) * s.span(tank)}
+
+
+def _sticking_float(s: Surroundings, at: str) -> dict[str, float]:
+    return {"slack": s.size(0.04, 0.08) * s.span(s.tank_of(at))}
+
+
+def _humming(s: Surroundings, at: str) -> dict[str, float]:
+    return {"height": s.size(0.03, 0.06) * s.span(s.tank_of(at)), "period": s.uniform(50, 250)}
+
+
+def _freezing(s: Surroundings, at: str) -> dict[str, float]:
+    return {"period": s.uniform(150, 400)}
+
+
+UNKNOWN = (
+    Unknown("pulsating", (PUMP,), _pulsating, ("pump_pulsation", "pulsing_pump", "pump_ripple")),
+    Unknown("backlash", (PUMP,), _backlash, ("pump_backlash", "pump_hysteresis")),
+    Unknown("sticking", (PUMP,), _sticking, ("pump_stiction",)),
+    Unknown("tiring", (PUMP,), _tiring, ("pump_derating", "pump_heating")),
+    Unknown("stalling", (PUMP,), _stalling, ("pump_stall", "pump_dropout")),
+    Unknown("silting", (PIPE, OUTLET), _silting, ("silting", "intermittent_clogging")),
+    Unknown("two_regimes", (PIPE, OUTLET), _two_regimes, ("flow_hysteresis", "flow_regimes")),
+    Unknown("fluttering", (PIPE, OUTLET), _fluttering, ("coefficient_ripple",)),
+    Unknown("check_valve", (PIPE,), _check_valve, ("check_valve",), reversing=True),
+    Unknown("siphon", (TANK,), _siphon, ("siphon",)),
+    Unknown("cycling_user", (TANK,), _cycling_user, ("periodic_draw",)),
+    Unknown("float_valve", (TANK,), _float_valve, ("float_valve",)),
+    Unknown("bowed", (SENSOR,), _bowed, ("sensor_curvature", "sensor_nonlinearity")),
+    Unknown("sticking_float", (SENSOR,), _sticking_float, ("sensor_hysteresis", "sensor_backlash")),
+    Unknown("humming", (SENSOR,), _humming, ("sensor_ripple", "sensor_hum")),
+    Unknown("freezing", (SENSOR,), _freezing, ("sensor_freeze", "sensor_stuck")),
+)
+
+
+def unknown_to(library: Collection[str]) -> tuple[Unknown, ...]:
+    """Those that a library of these effects cannot name."""
+    left = tuple(u for u in UNKNOWN if not set(u.aliases) & set(library))
+    if not left:
+        raise ValueError(
+            "expected a library that lacks some effect, got one that names all; leave 'unknown' out of kinds"
+        )
+    return left
