@@ -12,18 +12,18 @@ import gzip
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from fdi_torch.gap.challenge.cases import PARTS, Case
 from fdi_torch.gap.challenge.conditions import command_unit
 from fdi_torch.gap.challenge.moment import Array
 from fdi_torch.gap.challenge.plants import Rig
-from fdi_torch.parameters import header_unit, si_unit_of, unit_factor
 from fdi_torch.recording import Recording
+from fdi_torch.recording_csv import file_sha256, read_csv
 
 _DECIMALS_OF_LEVEL = 3
 
@@ -43,29 +43,6 @@ def as_csv(rig: Rig, commands: Array, readings: Array) -> str:
         decimals.append(_DECIMALS_OF_LEVEL)
     rows = zip(*([f"{v:.{d}f}" for v in column] for column, d in zip(columns, decimals, strict=True)), strict=True)
     return "\n".join([",".join(header), *(",".join(row) for row in rows)]) + "\n"
-
-
-def from_csv(text: str, rig: Rig, source: str) -> Recording:
-    """Back from `as_csv`, in SI."""
-    lines = text.splitlines()
-    named = [header_unit(h) for h in lines[0].split(",")]
-    table = torch.tensor(np.loadtxt(lines[1:], delimiter=",", ndmin=2))
-    units = [unit for _, unit in (n for n in named if n)]
-    table = table * torch.tensor([unit_factor(u, si_unit_of(u)) for u in units])
-    inputs = len(rig.plant.channels())
-    names = [name for name, _ in (n for n in named if n)]
-    si = [si_unit_of(u) for u in units]
-    return Recording(
-        time=table[:, 0],
-        inputs=table[:, 1 : 1 + inputs],
-        outputs=table[:, 1 + inputs :],
-        input_names=tuple(names[1 : 1 + inputs]),
-        output_names=tuple(names[1 + inputs :]),
-        input_units=tuple(si[1 : 1 + inputs]),
-        output_units=tuple(si[1 + inputs :]),
-        source=source,
-        sha256=digest(text),
-    )
 
 
 def digest(text: str) -> str:
@@ -89,7 +66,7 @@ def write_cases(out: Path, rig: Rig, made: Iterable[Case], secrets: Iterable[str
             text = as_csv(rig, commands, readings)
             path = out / "cases" / f"{case.plan.name}_{part}.csv.gz"
             path.write_bytes(gzip.compress(text.encode(), compresslevel=5, mtime=0))
-            line[part] = digest(text)
+            line[part] = file_sha256(path)
         key = sealed_line(case.truth | {"nonce": secret})
         append(out / "key.jsonl", key)
         append(out / "manifest.jsonl", json.dumps(line | {"key": digest(key)}))
@@ -113,14 +90,15 @@ def lines_of(path: Path) -> list[dict[str, Any]]:
 
 def read_recording(out: Path, case: str, part: str, rig: Rig) -> Recording:
     """One recording of a case, checked against the manifest. Its source names the case and nothing else."""
-    text = gzip.decompress((out / "cases" / f"{case}_{part}.csv.gz").read_bytes()).decode()
+    path = out / "cases" / f"{case}_{part}.csv.gz"
+    found = read_csv(path, rig.plant.channels(), [s.column for s in rig.plant.sensors])
     expected = manifest(out)[case][part]
-    if digest(text) != expected:
+    if found.sha256 != expected:
         raise ValueError(
-            f"{case}: expected a {part} of SHA-256 {expected[:12]}..., got {digest(text)[:12]}...; "
+            f"{case}: expected a {part} of SHA-256 {expected[:12]}..., got {found.sha256[:12]}...; "
             "it was changed after it was sealed: make the challenge anew"
         )
-    return from_csv(text, rig, f"{case}/{part}")
+    return replace(found, source=f"{case}/{part}")
 
 
 def manifest(out: Path) -> dict[str, dict[str, Any]]:

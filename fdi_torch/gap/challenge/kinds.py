@@ -116,7 +116,8 @@ def _left_out(
 ) -> Chosen:
     """An effect the diagnosis is denied, where nothing left is the same thing under another name."""
     alike = {canonical(c, plant) for c in effect_places(plant) if canonical(c, plant) != c}
-    free = {e: [p for p in places(plant, EFFECTS[e]) if canonical((e, p), plant) not in alike] for e in leave_out}
+    found = {e: places(plant, EFFECTS.get(e, ())) for e in leave_out}
+    free = {e: [p for p in at if canonical((e, p), plant) not in alike] for e, at in found.items()}
     possible = [e for e in leave_out if free[e]]
     if not possible:
         raise ValueError("expected an effect to leave out that has a place in this plant, got none; name one")

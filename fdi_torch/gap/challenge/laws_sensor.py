@@ -48,7 +48,7 @@ def _chain(x: Array, time: Array, taus: tuple[Array, ...]) -> Array:
     for i in range(1, len(time)):
         shares = [(time[i] - time[i - 1]) / _SUBSTEPS / tau for tau in taus]
         for j in range(1, _SUBSTEPS + 1):
-            drive = x[i - 1] + (x[i] - x[i - 1]) * ((j - 0.5) / _SUBSTEPS)
+            drive = x[i - 1] + (x[i] - x[i - 1]) * (j / _SUBSTEPS)
             for k, a in enumerate(shares):
                 states[k] = (states[k] + a * drive) / (1 + a)
                 drive = states[k]

@@ -1,0 +1,243 @@
+"""The hidden rigs against closed forms, conservation of volume, and themselves in other company."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from fdi_torch.gap.challenge.cases import make, noise, plans
+from fdi_torch.gap.challenge.conditions import random_steps, two_steps
+from fdi_torch.gap.challenge.kinds import KINDS, STANDARD, choose
+from fdi_torch.gap.challenge.known import KNOWN
+from fdi_torch.gap.challenge.laws_sensor import SENSOR_LAWS
+from fdi_torch.gap.challenge.moment import Array, Deviation
+from fdi_torch.gap.challenge.places import EFFECTS, canonical, effect_places
+from fdi_torch.gap.challenge.plants import Rig, cascaded_tanks, quadruple_tank, three_tank
+from fdi_torch.gap.challenge.simulator import HiddenRigs, simulate
+from fdi_torch.gap.challenge.unknown import UNKNOWN, unknown_to
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
+
+AREA = 0.016
+
+
+def rig_of(pipes: Sequence[Pipe], pumps: Sequence[Pump] = ()) -> PlantDescription:
+    tanks = (Tank("A", AREA, 1.0), Tank("B", AREA, 1.0))
+    return PlantDescription("two", tanks, tuple(pipes), tuple(pumps), (Sensor("a", "A"),))
+
+
+def run(
+    plant: PlantDescription,
+    conductance: float,
+    start: Sequence[float],
+    seconds: int,
+    *off: Deviation,
+    asked: float = 0.0,
+) -> Array:
+    """Levels (T, N) of one lane."""
+    rigs = HiddenRigs(plant, np.full((len(plant.pipes), 1), conductance), [off])
+    flow = np.full((seconds + 1, len(plant.pumps), 1), asked)
+    return simulate(rigs, flow, np.array(start)[:, None])[:, :, 0]
+
+
+OUTLET = (Pipe("O", "A", OUTSIDE, 6e-5, 0.6),)
+LINK = (Pipe("P", "A", "B", 6e-5, 0.6),)
+PUMP = (Pump("Q", "A", 9e-5),)
+
+
+def test_a_tank_drains_as_torricelli_says() -> None:
+    k, seconds = 1.6e-4, 60
+    level = run(rig_of(OUTLET), k, [0.5, 0.0], seconds)[:, 0]
+    time = np.arange(seconds + 1)
+    expected = (math.sqrt(0.5) - k * time / (2 * AREA)) ** 2
+    np.testing.assert_allclose(level, expected, atol=1e-6)
+
+
+def test_halving_the_step_quarters_the_error() -> None:
+    k = 1.6e-4
+    exact = (math.sqrt(0.5) - k * 60 / (2 * AREA)) ** 2
+    rigs = HiddenRigs(rig_of(OUTLET), np.full((1, 1), k), [()])
+    asked, start = np.zeros((61, 0, 1)), np.array([[0.5], [0.0]])
+    coarse, fine = (abs(simulate(rigs, asked, start, step)[-1, 0, 0] - exact) for step in (1.0, 0.5))
+    # The first, Euler, step weighs in both alike with the square of the step.
+    assert coarse / fine == pytest.approx(4, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "off",
+    [
+        (),
+        (Deviation("laminar_flow", "P", "viscous_and_inertial", {"head": 0.02}),),
+        (Deviation("cross_flow", "A-B", "slot", {"conductance": 2e-5, "viscous": 1e-3}, other="B"),),
+        (Deviation("overflow", "A", "notched_weir", {"crest": 0.3, "depth": 0.02, "flow": 7e-5}, other="B"),),
+    ],
+)
+def test_water_that_only_changes_tanks_stays_in_them(off: tuple[Deviation, ...]) -> None:
+    levels = run(rig_of(LINK), 1.6e-4, [0.5, 0.1], 300, *off)
+    np.testing.assert_allclose(levels.sum(axis=1), 0.6, atol=1e-12)
+    assert levels[-1, 0] < 0.45
+
+
+def test_what_a_conical_tank_is_given_is_in_it() -> None:
+    slope, flow, seconds = 0.5, 5e-5, 100
+    cone = Deviation("area_taper", "A", "cone", {"slope": slope})
+    levels = run(rig_of((), PUMP), 0.0, [0.2, 0.0], seconds, cone, asked=flow)[:, 0]
+    volume = AREA * ((1 + slope * levels) ** 3 - 1) / (3 * slope)
+    np.testing.assert_allclose(volume - volume[0], flow * np.arange(seconds + 1), atol=1e-9)
+
+
+def test_a_body_displaces_its_volume() -> None:
+    body = Deviation("internal_body", "A", "block", {"low": 0.3, "high": 0.4, "share": 0.5, "chamfer": 0.2})
+    sound = run(rig_of((), PUMP), 0.0, [0.2, 0.0], 100, asked=5e-5)[-1, 0]
+    filled = run(rig_of((), PUMP), 0.0, [0.2, 0.0], 100, body, asked=5e-5)[-1, 0]
+    # Its mean share of the cross-section: 0.5 x (1 - chamfer), over 0.1 m of level.
+    assert filled - sound == pytest.approx(0.5 * 0.8 * 0.1, abs=1e-5)
+
+
+def filled_by(law: str, numbers: dict[str, float], seconds: int, asked: Array) -> Array:
+    """Volumes (T,) m^3 that a closed tank received from a pump that is off."""
+    rigs = HiddenRigs(rig_of((), PUMP), np.zeros((0, 1)), [(Deviation("x", "Q", law, numbers),)])
+    levels = simulate(rigs, asked[:, None, None], np.zeros((2, 1)))[:, 0, 0]
+    return levels * AREA
+
+
+def test_a_late_pump_delivers_the_same_later() -> None:
+    asked = np.where(np.arange(61) >= 20, 5e-5, 0.0)
+    volume = filled_by("late", {"delay": 7.5}, 60, asked)
+    np.testing.assert_allclose(volume, 5e-5 * np.maximum(np.arange(61) - 27.5, 0), atol=1e-18 + 5e-5 * 0.021)
+
+
+def test_a_slow_pump_has_its_time_constant() -> None:
+    tau, asked = 8.0, np.where(np.arange(61) >= 20, 5e-5, 0.0)
+    volume = filled_by("slow", {"tau": tau}, 60, asked)
+    t = np.maximum(np.arange(61) - 20.0, 0)
+    np.testing.assert_allclose(volume, 5e-5 * (t - tau * (1 - np.exp(-t / tau))), atol=1e-9)
+
+
+def test_backlash_holds_a_flow_until_the_slack_is_used_up() -> None:
+    asked = np.array([5.0] * 10 + [4.5] * 10 + [2.0] * 11) * 1e-5
+    delivered = np.diff(filled_by("backlash", {"slack": 1e-5}, 30, asked))
+    np.testing.assert_allclose(delivered, np.array([4.0] * 20 + [3.0] * 10) * 1e-5, atol=1e-12)
+
+
+def test_a_damped_sensor_follows_a_ramp_late_by_its_time_constant() -> None:
+    time = np.arange(400.0)
+    for law in ("damped", "damped_twice"):
+        shown = SENSOR_LAWS[law](0.001 * time[:, None], time, {"tau": np.array([12.0])})[:, 0]
+        assert (0.001 * time - shown)[-1] == pytest.approx(0.012, rel=1e-6)
+
+
+def test_a_late_sensor_shows_the_level_of_before() -> None:
+    time = np.arange(50.0)
+    shown = SENSOR_LAWS["late_reading"](0.01 * time[:, None], time, {"delay": np.array([4.25])})[:, 0]
+    np.testing.assert_allclose(shown, 0.01 * np.maximum(time - 4.25, 0), atol=1e-15)
+
+
+def test_noise_has_the_colour_and_size_asked_for() -> None:
+    e = noise(np.random.default_rng(1), (20000, 1), 0.3, 0.8)[:, 0]
+    assert e.std() == pytest.approx(0.3, rel=0.05)
+    assert np.corrcoef(e[1:], e[:-1])[0, 1] == pytest.approx(0.8, abs=0.02)
+
+
+def test_a_step_that_does_not_divide_a_second_is_refused() -> None:
+    rigs = HiddenRigs(rig_of(OUTLET), np.full((1, 1), 1e-4), [()])
+    with pytest.raises(ValueError, match="a step that divides one second"):
+        simulate(rigs, np.zeros((3, 0, 1)), np.zeros((2, 1)), 0.03)
+
+
+def test_a_law_twice_in_a_rig_is_refused() -> None:
+    holes = [Deviation("leak", t, "floor_hole", {"conductance": 1e-5}) for t in ("A", "B")]
+    with pytest.raises(ValueError, match="each law once"):
+        HiddenRigs(rig_of(OUTLET), np.full((1, 1), 1e-4), [holes])
+
+
+def test_a_tank_has_no_past_commands() -> None:
+    rigs = HiddenRigs(rig_of(OUTLET), np.full((1, 1), 1e-4), [()])
+    rigs.tank_groups = HiddenRigs(
+        rig_of((), PUMP), np.zeros((0, 1)), [(Deviation("x", "Q", "late", {"delay": 1.0}),)]
+    ).pump_groups
+    rigs.tank_groups[0].law = lambda level, other, now, p, state: (now.asked(p["delay"]), None)
+    with pytest.raises(ValueError, match="use a pump law"):
+        simulate(rigs, np.zeros((3, 0, 1)), np.zeros((2, 1)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"input_low": 0.9}, "0 <= input_low < input_high <= 1"),
+        ({"plant": rig_of(OUTLET)}, "expected pumps and sensors"),
+        ({"plant": rig_of((Pipe("V", "A", "B", 6e-5, 0.6, valve="v"),), PUMP)}, "pipes without valves"),
+    ],
+)
+def test_a_rig_that_cannot_be_exercised_is_refused(changes: dict[str, object], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        Rig(**({"plant": rig_of(OUTLET, PUMP)} | changes))  # type: ignore[arg-type]
+
+
+def test_a_rig_that_always_overflows_is_refused() -> None:
+    small = PlantDescription("small", (Tank("A", AREA, 1.0),), (), (Pump("Q", "A", 0.1),), (Sensor("a", "A"),))
+    with pytest.raises(ValueError, match="lower input_high"):
+        make(plans(1, 1, ("null",)), Rig(small), 1)
+
+
+def test_strange_kinds_are_refused() -> None:
+    with pytest.raises(ValueError, match="got fancy"):
+        plans(3, 1, ("single", "fancy"))
+
+
+def test_leaving_out_nothing_that_exists_is_refused() -> None:
+    with pytest.raises(ValueError, match="has a place in this plant"):
+        choose(KINDS["left_out"], quadruple_tank(), 1, 0, (), ("cross_flow_of_oil",))
+
+
+def test_a_library_that_names_all_leaves_nothing_unknown() -> None:
+    assert "check_valve" not in [u.law for u in unknown_to(("check_valve",))]
+    with pytest.raises(ValueError, match="lacks some effect"):
+        unknown_to([alias for u in UNKNOWN for alias in u.aliases])
+
+
+def test_the_vocabulary_is_the_protocols() -> None:
+    assert set(KNOWN) == set(EFFECTS)
+    assert len(effect_places(three_tank().plant)) == 62
+    assert canonical(("plugging", "OUT2"), three_tank().plant) == ("leak", "T2")
+    assert canonical(("plugging", "P13"), three_tank().plant) == ("plugging", "P13")
+
+
+@pytest.mark.parametrize("rig", [three_tank(), quadruple_tank(), cascaded_tanks()], ids=lambda r: r.plant.name)
+def test_inputs_stay_within_the_pumps(rig: Rig) -> None:
+    rng = np.random.default_rng(5)
+    for commands in (random_steps(rig, rng, 3601), random_steps(rig, rng, 3601, wide=True), two_steps(rig, rng)):
+        assert (commands >= 0).all()
+        for i, channel in enumerate(rig.plant.channels()):
+            pump = next(p for p in rig.plant.pumps if p.channel == channel)
+            unit = 1e-6 if pump.gain_unit == "1" else 1.0
+            assert (commands[:, i] * unit * pump.gain <= pump.max_flow * 1.001).all()
+
+
+def test_a_round_of_kinds_holds_each_once() -> None:
+    order = [p.kind for p in plans(4 * len(STANDARD), 7, STANDARD)]
+    rounds = [order[i : i + len(STANDARD)] for i in range(0, len(order), len(STANDARD))]
+    assert all(sorted(r) == sorted(STANDARD) for r in rounds)
+    assert len({tuple(r) for r in rounds}) > 1
+
+
+@pytest.mark.slow
+def test_a_case_is_the_same_in_any_company() -> None:
+    rig, all_plans = three_tank(), plans(9, 3, STANDARD)
+    together, alone = make(all_plans, rig, 3), make(all_plans[4:5], rig, 3)
+    for a, b in zip(together[4].readings, alone[0].readings, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert together[4].truth == alone[0].truth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", [three_tank(), quadruple_tank(), cascaded_tanks()], ids=lambda r: r.plant.name)
+def test_full_effects_show_and_stay_in_the_tanks(rig: Rig) -> None:
+    """Without noise, a full effect moves some reading by more than the quietest noise; the null moves none."""
+    for case in make(plans(40, 11, ("single", "null")), rig, 11):
+        gap, truth = case.truth["gap_rms_m"]["recording"], case.truth
+        quantised = truth["causes"] and truth["causes"][0]["effect"] == "sensor_quantization"
+        assert np.isfinite(case.readings[0]).all()
+        assert gap == 0 if truth["kind"] == "null" or quantised else gap > 0.05 * rig.noise_unit
