@@ -1,0 +1,40 @@
+"""A log written again: same records, same order, full chunks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from mcap.opcode import Opcode
+
+from fdi_torch.logbook.reader import Run, read_run
+from fdi_torch.logbook.scan import Frame
+from fdi_torch.logbook.sink import Sink
+
+Extra = Mapping[str, Mapping[str, str]]
+
+
+def copy_log(source: Path, target: Path, salvage: bool = False, extra: Callable[[Run], Extra] | None = None) -> Run:
+    """Write every record of `source` that can be read to the new file `target`, then the metadata of `extra`."""
+    run = read_run(source, salvage=salvage)
+    sink = Sink(target, run.library, run.profile)
+    try:
+        copy_records(run, sink)
+        for name, values in (extra(run) if extra else {}).items():
+            sink.metadata(name, values)
+    except BaseException:
+        sink.abandon()
+        raise
+    sink.finish()
+    return run
+
+
+def copy_records(run: Run, sink: Sink) -> None:
+    """Metadata, attachments and messages in the order of the file."""
+    for part in run.walk():
+        if not isinstance(part, Frame):
+            sink.message(part.channel, part.log_time, part.publish_time, part.sequence, part.data)
+        elif part.opcode == Opcode.METADATA:
+            sink.metadata(*run.metadata_at(part))
+        elif part.opcode == Opcode.ATTACHMENT:
+            sink.attachment(*run.attachment_at(part))

@@ -1,0 +1,96 @@
+"""A log read while it is being written: messages as its chunks reach the disk."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterator
+from itertools import islice
+from pathlib import Path
+
+from mcap.opcode import Opcode
+
+from fdi_torch.logbook import scan
+from fdi_torch.logbook.errors import LogError
+from fdi_torch.logbook.reader import Directory, Message, map_file, open_part, read_run
+
+
+def follow(
+    path: str | Path,
+    topics: Collection[str] | None = None,
+    idle_seconds: float = 30.0,
+    poll_seconds: float = 0.1,
+    on_damage: Callable[[scan.Damage], None] = lambda damage: None,
+) -> Iterator[Message]:
+    """Messages of a growing log, from its start, as they come; ends when the log is finished.
+
+    path: NAME.mcap, there or not yet (`NAME.mcap.partial` grows meanwhile), or any file that grows. Damaged parts are
+    handed to `on_damage` and passed over. Raises LogError where nothing came for `idle_seconds`.
+    """
+    tail = _Tail(Path(path), on_damage)
+    quiet_since = time.monotonic()
+    while True:
+        finished = tail.finished()
+        count = 0
+        for message in tail.new_messages(finished):
+            count += 1
+            if topics is None or message.topic in topics:
+                yield message
+        if finished:
+            return
+        if count:
+            quiet_since = time.monotonic()
+        elif time.monotonic() - quiet_since > idle_seconds:
+            raise LogError(f"{path}: nothing came for {idle_seconds:g} s and the log has no end; is its writer alive?")
+        else:
+            time.sleep(poll_seconds)
+
+
+class _Tail:
+    """How far a growing file has been read."""
+
+    def __init__(self, path: Path, on_damage: Callable[[scan.Damage], None]) -> None:
+        self.final = path.with_suffix("") if path.suffix == ".partial" else path
+        self.partial = self.final.with_name(self.final.name + ".partial")
+        self.place: int | None = None
+        self.seen = 0
+        self.on_damage = on_damage
+        self.directory = Directory()
+
+    def finished(self) -> bool:
+        """Is the file there under its final name, with its end?"""
+        if self.partial.exists() or not self.final.exists() or not self.final.stat().st_size:
+            return False
+        return scan.ends_whole(map_file(self.final))
+
+    def new_messages(self, finished: bool) -> Iterator[Message]:
+        if finished and self.partial != self.final:
+            run = read_run(self.final, salvage=True)
+            yield from islice(run.messages(), self.seen, None)
+            for damage in run.damages:
+                self.on_damage(damage)
+            return
+        source = self.partial if self.partial.exists() else self.final
+        if source.exists() and source.stat().st_size:
+            yield from self._grown(source)
+
+    def _grown(self, source: Path) -> Iterator[Message]:
+        """Messages of the records that have become whole since the last look."""
+        data = map_file(source)
+        for part in scan.frames(data, self.place):
+            if isinstance(part, scan.Damage):
+                if part.end == len(data):
+                    return  # still being written
+                self.on_damage(part)
+            elif part.opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                yield from self._opened(data, part)
+            self.place = part.end
+
+    def _opened(self, data: scan.Buffer, part: scan.Frame) -> Iterator[Message]:
+        try:
+            found = open_part(data, part, self.directory)
+        except scan.ChunkError as error:
+            self.on_damage(scan.Damage(part.start, part.end, str(error)))
+            return
+        for message in found:
+            self.seen += 1
+            yield message

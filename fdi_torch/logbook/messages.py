@@ -1,0 +1,182 @@
+"""Messages of any topic: encoded, numbered, each on a channel that describes its fields.
+
+A topic's channel is registered with its first message. A later message with further fields gets a further channel of
+the same topic, so that every message is described by a schema.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import orjson
+
+from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, plain
+from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, json_schema, topic_definition
+from fdi_torch.logbook.sink import Channel
+
+Named = Mapping[str, Any]
+_RESERVED = ("t", NON_FINITE, WALL, "masked")
+_BLOCK = 4096
+
+
+class Messages:
+    """Encodes messages and hands them to `put`."""
+
+    def __init__(self) -> None:
+        self._latest = 0.0
+        self._described: dict[str, tuple[frozenset[str], Channel]] = {}
+        self._sequence: dict[str, int] = {}
+
+    def put(self, channel: Channel, t: float, sequence: int, payload: bytes) -> None:
+        raise NotImplementedError
+
+    def wall(self) -> dict[str, int]:
+        raise NotImplementedError
+
+    def write(
+        self,
+        topic: str,
+        fields: Named,
+        t: float | None = None,
+        *,
+        units: Mapping[str, str] | None = None,
+        about: Mapping[str, str] | None = None,
+        wall: bool = False,
+    ) -> None:
+        """One message. units: of named numbers; about: further metadata of the channel, heard at its first message."""
+        t = self._latest if t is None else float(t)
+        message = plain({"t": t, **fields})
+        if "t" not in message:
+            raise ValueError(f"{topic}: expected a finite time, got {t}; give the plant's time in s")
+        if wall:
+            message[WALL] = self.wall()
+        self._latest = t
+        channel = self._channel(topic, fields, message, {**units_of(units), **(about or {})})
+        self.put(channel, t, self._next(topic), orjson.dumps(message))
+
+    def samples(
+        self,
+        topic: str,
+        time: Any,
+        values: Any,
+        names: Sequence[str],
+        units: Sequence[str],
+        about: Mapping[str, str] | None = None,
+    ) -> None:
+        """A whole signal, values (T, N) over time (T,), one message a sample."""
+        self.recording_blocks([(topic, as_array(values), names, units, None, about)], as_array(time))
+
+    def recording(
+        self,
+        time: Any,
+        inputs: Any,
+        outputs: Any,
+        input_names: Sequence[str],
+        output_names: Sequence[str],
+        input_units: Sequence[str],
+        output_units: Sequence[str],
+        *,
+        mask: Any = None,
+        hold: str = "zero_order",
+        group: str = "",
+    ) -> None:
+        """A recording: `/plant/input` and `/plant/output` (`/plant/GROUP/...` where several are in one log).
+
+        time (T,) in s, inputs (T, M), outputs (T, N), mask (T, N) True where a reading counts. NaN is kept.
+        """
+        root = f"/plant/{group}" if group else "/plant"
+        mask = None if mask is None else as_array(mask).astype(bool)
+        self.recording_blocks(
+            [
+                (f"{root}/input", as_array(inputs), input_names, input_units, None, {"hold": hold}),
+                (f"{root}/output", as_array(outputs), output_names, output_units, mask, None),
+            ],
+            as_array(time),
+        )
+
+    def recording_blocks(self, signals: Sequence[tuple[Any, ...]], time: np.ndarray) -> None:
+        """Several signals over one clock, sample by sample, in blocks that keep memory small."""
+        for topic, values, names, *_ in signals:
+            _check_signal(topic, values, names, len(time))
+        if not np.isfinite(time).all():
+            raise ValueError(f"{signals[0][0]}: expected finite times, got NaN or infinity; drop those samples")
+        for first in range(0, len(time), _BLOCK):
+            clock = time[first : first + _BLOCK].astype(np.float64).tolist()
+            encoded = [self._encode_block(signal, clock, first) for signal in signals]
+            for t, messages in zip(clock, zip(*encoded, strict=True), strict=True):
+                for (topic, *_), payload in zip(signals, messages, strict=True):
+                    self.put(self._described[topic][1], t, self._next(topic), payload)
+        self._latest = float(time[-1]) if len(time) else self._latest
+
+    def sample(self, topic: str, t: float, values: Named, units: Mapping[str, str] | None = None) -> None:
+        """One sample of a signal that arrives bit by bit, such as "/plant/output" or "/plant/truth"."""
+        self.write(topic, values, t, units=units)
+
+    def _channel(self, topic: str, fields: Named, message: Named, metadata: Mapping[str, str]) -> Channel:
+        """The topic's channel; a new one where the message has fields that it does not describe."""
+        names, channel = self._described.get(topic, (frozenset(), None))
+        if channel is not None and names.issuperset(fields):
+            return channel
+        definition = topic_definition(topic)
+        previous = dict(channel.metadata) if channel else {}
+        new = {name: _kind(message.get(name)) for name in fields if name not in definition.fields}
+        if new and not definition.named and not topic.endswith("/population"):
+            raise ValueError(f"{topic}: expected only {', '.join(definition.fields)}, got {', '.join(new)}")
+        named: dict[str, Kind] = dict.fromkeys(sorted(names - definition.fields.keys() - new.keys()), "number")
+        named.update(new)
+        units = {f"unit.{name}": unit for name, (_, unit, _) in definition.fields.items() if unit}
+        pairs = {"schema_version": FORMAT_VERSION, "unit.t": "s", **units, **previous, **metadata}
+        channel = Channel(
+            topic, "json", definition.schema, "jsonschema", json_schema(definition, named), tuple(pairs.items())
+        )
+        self._described[topic] = (names | frozenset(fields) | frozenset(definition.fields), channel)
+        return channel
+
+    def _next(self, topic: str) -> int:
+        number = self._sequence.get(topic, 0)
+        self._sequence[topic] = number + 1
+        return number
+
+    def _encode_block(self, signal: tuple[Any, ...], clock: list[float], first: int) -> list[bytes]:
+        topic, values, names, units, mask, about = signal
+        block = values[first : first + len(clock)].astype(np.float64)
+        keys = ("t", *names)
+        metadata = {**units_of(dict(zip(names, units, strict=True))), **(about or {})}
+        self._channel(topic, dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0), metadata)
+        rows = zip(clock, *block.T.tolist(), strict=True)
+        uncounted = np.zeros(0) if mask is None else ~mask[first : first + len(clock)] & np.isfinite(block)
+        if np.isfinite(block).all() and not uncounted.any():
+            return [orjson.dumps(dict(zip(keys, row, strict=True))) for row in rows]
+        return [orjson.dumps(_row(keys, row, uncounted[i : i + 1])) for i, row in enumerate(rows)]
+
+
+def units_of(units: Mapping[str, str] | None) -> dict[str, str]:
+    """Units as channel metadata: {"h1": "m"} -> {"unit.h1": "m"}."""
+    return {f"unit.{name}": unit for name, unit in (units or {}).items()}
+
+
+def _row(keys: Sequence[str], row: Sequence[float], uncounted: np.ndarray) -> dict[str, Any]:
+    masked = (
+        [name for name, hidden in zip(keys[1:], uncounted.ravel(), strict=True) if hidden] if uncounted.size else []
+    )
+    return plain({**dict(zip(keys, row, strict=True)), "masked": masked or None})
+
+
+def _check_signal(topic: str, values: np.ndarray, names: Sequence[str], samples: int) -> None:
+    if values.shape != (samples, len(names)):
+        raise ValueError(f"{topic}: expected values of shape {(samples, len(names))}, got {values.shape}")
+    for name in names:
+        if name in _RESERVED:
+            raise ValueError(f"{topic}: expected a name other than {', '.join(_RESERVED)}, got {name}; rename it")
+
+
+def _kind(value: Any) -> Kind:
+    """JSON kind of a plain value; a number that was left out as non-finite is a number."""
+    if isinstance(value, list):
+        first = value[0] if value else 0.0
+        return "texts" if isinstance(first, str) else "integers" if type(first) is int else "numbers"
+    if isinstance(value, bool):
+        return "boolean"
+    return "text" if isinstance(value, str) else "integer" if isinstance(value, int) else "number"

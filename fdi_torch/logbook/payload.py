@@ -1,0 +1,128 @@
+"""One message as JSON and back, without losing a bit.
+
+JSON has no NaN and no infinity. A non-finite scalar is left out of its message, a non-finite element of an array
+stands there as 0; both are listed in the string array `non_finite` as `name=nan`, `name=inf`, `name[3]=-inf`, from
+which `decode` restores them. Finite float64 survive exactly; float32 is widened first. An integer beyond 2^53, which
+many readers round, is refused. Arrays with a shape travel as base64 of little-endian bytes (`pack`, `unpack`).
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import orjson
+
+NON_FINITE = "non_finite"
+WALL = "wall"
+_EXACT = 2**53
+_ENTRY = re.compile(r"(?P<name>.+?)(\[(?P<index>\d+)\])?=(?P<value>nan|inf|-inf)")
+_DTYPES = ("<f8", "<i8", "|u1", "|b1")
+
+
+def encode(fields: Mapping[str, Any]) -> bytes:
+    """JSON of plain numbers, strings, arrays and tensors; None is left out."""
+    return orjson.dumps(plain(fields))
+
+
+def plain(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """The same fields as JSON values, non-finite numbers moved into the field `non_finite`."""
+    message: dict[str, Any] = {}
+    lost: list[str] = []
+    for name, value in fields.items():
+        value = _plain_value(name, value)
+        if isinstance(value, float) and not math.isfinite(value):
+            lost.append(f"{name}={value}")
+        elif value is not None:
+            message[name] = _finite_list(name, value, lost) if isinstance(value, list) else value
+    if lost:
+        message[NON_FINITE] = lost
+    return message
+
+
+def decode(data: bytes) -> dict[str, Any]:
+    """Fields of a JSON message, non-finite numbers put back. Raises ValueError where it is no JSON object."""
+    message = orjson.loads(data)
+    if not isinstance(message, dict):
+        raise ValueError(f"expected a JSON object as message, got {type(message).__name__}")
+    if b'"non_finite"' in data:
+        _restore(message)
+    return message
+
+
+def pack(name: str, array: Any) -> dict[str, Any]:
+    """An array of any shape as three flat fields: `name` (base64), `name_shape`, `name_dtype`."""
+    values = as_array(array)
+    kind = {"f": "<f8", "i": "<i8", "u": "|u1" if values.dtype.itemsize == 1 else "<i8", "b": "|b1"}.get(
+        values.dtype.kind
+    )
+    if kind is None:
+        raise ValueError(f"{name}: expected an array of numbers, got {values.dtype}; convert it")
+    text = base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
+    return {name: text, f"{name}_shape": list(values.shape), f"{name}_dtype": kind}
+
+
+def unpack(message: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Every array that `pack` put into a message, by name."""
+    names = [key[: -len("_shape")] for key in message if key.endswith("_shape")]
+    return {name: _unpack_one(name, message) for name in names if f"{name}_dtype" in message}
+
+
+def as_array(value: Any) -> np.ndarray:
+    """A numpy array of a number, list, array or tensor on any device."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu()
+    return np.asarray(value)
+
+
+def _unpack_one(name: str, message: Mapping[str, Any]) -> np.ndarray:
+    dtype = message[f"{name}_dtype"]
+    if dtype not in _DTYPES:
+        raise ValueError(f"{name}: expected one of the types {', '.join(_DTYPES)}, got {dtype}")
+    values = np.frombuffer(base64.b64decode(message[name], validate=True), dtype=dtype)
+    return values.reshape(message[f"{name}_shape"])
+
+
+def _plain_value(name: str, value: Any) -> Any:
+    if value is None or isinstance(value, str | bool | float):
+        return float(value) if isinstance(value, np.floating) else value
+    if isinstance(value, int | np.integer):
+        return _exact_integer(name, int(value))
+    if isinstance(value, Mapping):
+        return plain(value)
+    if isinstance(value, Sequence) and all(isinstance(item, str) for item in value):
+        return list(value)
+    array = as_array(value)
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"{name}: expected numbers or text, got {type(value).__name__}; convert it")
+    if array.dtype.kind == "f":
+        array = array.astype(np.float64)
+    return array.item() if array.ndim == 0 else array.ravel().tolist()
+
+
+def _exact_integer(name: str, value: int) -> int:
+    if abs(value) > _EXACT:
+        raise ValueError(f"{name}: expected an integer of at most 2^53, got {value}; write it as text")
+    return value
+
+
+def _finite_list(name: str, values: list[Any], lost: list[str]) -> list[Any]:
+    broken = [i for i, value in enumerate(values) if isinstance(value, float) and not math.isfinite(value)]
+    for i in broken:
+        lost.append(f"{name}[{i}]={values[i]}")
+        values[i] = 0.0
+    return values
+
+
+def _restore(message: dict[str, Any]) -> None:
+    entries = message.pop(NON_FINITE, ())
+    for entry in entries if isinstance(entries, list) else ():
+        match = _ENTRY.fullmatch(str(entry))
+        if match and match["index"] is None:
+            message[match["name"]] = float(match["value"])
+        elif match and int(match["index"]) < len(message.get(match["name"], ())):
+            message[match["name"]][int(match["index"])] = float(match["value"])

@@ -1,0 +1,51 @@
+"""Where a run comes from: versions, code, and the data's fingerprints."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import subprocess
+import sys
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+
+PACKAGES = ("fdi_torch", "torch", "torchdiffeq", "numpy", "scipy", "mcap", "orjson", "zstandard", "pydantic")
+
+
+def environment(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
+    """Versions of Python, the system and the packages that shape a result; the number of threads."""
+    versions = {"python": platform.python_version(), "system": platform.system(), "machine": platform.machine()}
+    for package in packages:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "absent"
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        versions["threads"] = str(torch.get_num_threads())
+    return versions
+
+
+def git_state(folder: Path | None = None) -> dict[str, str]:
+    """Commit of the code and whether it was changed since; empty texts outside a repository."""
+    folder = folder or Path(__file__).parent
+    commit = _git(folder, "rev-parse", "HEAD")
+    changed = _git(folder, "status", "--porcelain", "--untracked-files=no") if commit else ""
+    return {"commit": commit, "changed": "yes" if changed else "no" if commit else ""}
+
+
+def sha256_of(path: str | Path) -> str:
+    """SHA-256 of a file, read in pieces."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=5, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""

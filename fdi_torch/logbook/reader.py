@@ -1,0 +1,244 @@
+"""Reading a log: what is said about the run, its messages, its arrays. The file is untrusted input.
+
+A file without end (`.partial`, torn by a crash) opens too; `advice` then says what to do. Damage in the middle raises
+LogError when the reading gets there, unless `salvage` is asked for.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mcap.opcode import Opcode
+from mcap.records import Attachment as AttachmentRecord
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Header, Metadata, Schema
+
+from fdi_torch.logbook import scan
+from fdi_torch.logbook.errors import LogError, log_error
+from fdi_torch.logbook.payload import decode
+from fdi_torch.logbook.sink import EPOCH_NS, Channel
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message; times in ns, `t` in s of plant time."""
+
+    channel: Channel
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+    @property
+    def topic(self) -> str:
+        return self.channel.topic
+
+    @property
+    def payload(self) -> dict[str, Any]:
+        """Its fields. Raises LogError where it is not a JSON object."""
+        if self.channel.encoding != "json":
+            raise LogError(f"{self.topic}: messages in {self.channel.encoding}, only json can be read")
+        try:
+            return decode(self.data)
+        except ValueError as error:
+            raise LogError(f"{self.topic}: a message is not a JSON object ({error})") from error
+
+    @property
+    def t(self) -> float:
+        """Plant time in s; of a foreign message, its log time since 2000."""
+        return (self.log_time - EPOCH_NS) * 1e-9
+
+
+@dataclass(frozen=True)
+class Attachment:
+    name: str
+    media_type: str
+    size: int
+    frame: scan.Frame = field(repr=False)
+
+
+class Run:
+    """An opened log. metadata: record name -> texts. attachments by name. damages: what cannot be read."""
+
+    def __init__(self, path: str | Path, salvage: bool = False, max_chunk_bytes: int = scan.MAX_CHUNK_BYTES) -> None:
+        self.path = Path(path)
+        self.salvage = salvage
+        self.max_chunk_bytes = max_chunk_bytes
+        self.profile = self.library = ""
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: dict[str, Attachment] = {}
+        self.damages: list[scan.Damage] = []
+        self.data = map_file(self.path)
+        self.parts = list(scan.frames(self.data))
+        self.complete = scan.ends_whole(self.data) and not any(isinstance(part, scan.Damage) for part in self.parts)
+        if self.data[:8] != scan.MAGIC and not any(isinstance(part, scan.Frame) for part in self.parts):
+            raise LogError(f"{self.path}: expected an MCAP file, got something else; check the path")
+        self._read_head()
+
+    @property
+    def ours(self) -> bool:
+        """Was it written by this project?"""
+        return self.profile == "fdi_torch" or "fdi_torch.run" in self.metadata
+
+    @property
+    def advice(self) -> str:
+        """What to tell the user about the file's state; empty where it is whole."""
+        if self.complete:
+            return ""
+        return f"{self.path}: the file is not whole; `fdi recover {self.path}` saves what can be read"
+
+    @property
+    def config_text(self) -> str:
+        """The configuration exactly as it was given; empty where none was."""
+        return self.attachment("config.yaml").decode() if "config.yaml" in self.attachments else ""
+
+    def attachment(self, name: str) -> bytes:
+        """The bytes of an attachment."""
+        if name not in self.attachments:
+            known = ", ".join(self.attachments) or "(none)"
+            raise LogError(f"{self.path}: expected one of the attachments {known}, got {name}")
+        return self.attachment_at(self.attachments[name].frame)[2]
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
+        """Messages in the order they were written, of some topics or of all."""
+        for item in self.walk():
+            if isinstance(item, Message) and (topics is None or item.topic in topics):
+                yield item
+
+    def walk(self) -> Iterator[Message | scan.Frame]:
+        """Messages, and the frames of metadata and attachments, in the order of the file."""
+        self.damages = [part for part in self.parts if isinstance(part, scan.Damage)]
+        directory = Directory(self._summary_records())
+        for place, part in enumerate(self.parts):
+            if isinstance(part, scan.Damage):
+                if place < len(self.parts) - 1 and not self.salvage:
+                    raise self._damaged(part)
+            elif part.opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                yield from self._part_messages(part, directory)
+            elif part.opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+                yield part
+
+    def metadata_at(self, part: scan.Frame) -> tuple[str, dict[str, str]]:
+        record = Metadata.read(scan.stream_of(scan.body_of(self.data, part)))
+        return record.name, record.metadata
+
+    def attachment_at(self, part: scan.Frame) -> tuple[str, str, bytes]:
+        """Name, media type and bytes."""
+        record = AttachmentRecord.read(scan.stream_of(scan.body_of(self.data, part)))
+        return record.name, record.media_type, bytes(record.data)
+
+    def _part_messages(self, part: scan.Frame, directory: Directory) -> list[Message]:
+        try:
+            return open_part(self.data, part, directory, self.max_chunk_bytes, require_crc=self.ours)
+        except scan.ChunkError as error:
+            damage = scan.Damage(part.start, part.end, str(error))
+            self.damages.append(damage)
+            if not self.salvage:
+                raise self._damaged(damage) from error
+            return []
+
+    def _summary_records(self) -> Iterator[Schema | ChannelRecord]:
+        """Schemas and channels repeated in the summary, where its CRC agrees: the first chunk may be lost."""
+        start = _summary_start(self.data)
+        for part in self.parts if start else ():
+            if isinstance(part, scan.Frame) and part.start >= start and part.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                kind = Schema if part.opcode == Opcode.SCHEMA else ChannelRecord
+                yield kind.read(scan.stream_of(scan.body_of(self.data, part)))
+
+    def _read_head(self) -> None:
+        """Header, metadata and the list of attachments."""
+        for part in self.parts:
+            if isinstance(part, scan.Damage):
+                self.damages.append(part)
+            elif part.opcode == Opcode.METADATA:
+                name, values = self.metadata_at(part)
+                self.metadata[name] = values
+            elif part.opcode == Opcode.ATTACHMENT:
+                name, media_type, content = self.attachment_at(part)
+                self.attachments[name] = Attachment(name, media_type, len(content), part)
+            elif part.opcode == Opcode.HEADER:
+                header = Header.read(scan.stream_of(scan.body_of(self.data, part)))
+                self.profile, self.library = header.profile, header.library
+
+    def _damaged(self, damage: scan.Damage) -> LogError:
+        return LogError(
+            f"{self.path}: bytes {damage.start} to {damage.end} are damaged ({damage.reason}); "
+            f"`fdi recover {self.path}` saves the rest"
+        )
+
+
+def read_run(path: str | Path, salvage: bool = False, max_chunk_bytes: int = scan.MAX_CHUNK_BYTES) -> Run:
+    """Open a log of ours or of others. Raises LogError where it is no MCAP file."""
+    return Run(path, salvage, max_chunk_bytes)
+
+
+class Directory:
+    """Channels by their number, learnt from the records that announce them."""
+
+    def __init__(self, fallback: Iterable[Schema | ChannelRecord] = ()) -> None:
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        for record in fallback:
+            self.learn(record)
+
+    def learn(self, record: Schema | ChannelRecord) -> None:
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+            return
+        schema = self._schemas.get(record.schema_id) or Schema(0, b"", "", "")
+        named = (schema.name, schema.encoding, bytes(schema.data))
+        pairs = tuple(record.metadata.items())
+        self._channels[record.id] = Channel(record.topic, record.message_encoding, *named, pairs)
+
+    def message(self, raw: scan.RawMessage) -> Message:
+        channel = self._channels.get(raw.channel_id)
+        if channel is None:
+            raise scan.ChunkError(f"message on channel {raw.channel_id}, which nothing describes")
+        return Message(channel, raw.sequence, raw.log_time, raw.publish_time, raw.data)
+
+
+def open_part(
+    data: scan.Buffer,
+    part: scan.Frame,
+    directory: Directory,
+    max_chunk_bytes: int = scan.MAX_CHUNK_BYTES,
+    require_crc: bool = False,
+) -> list[Message]:
+    """All messages of a chunk (or of a record outside chunks), or ChunkError: a chunk is believed as a whole."""
+    if part.opcode == Opcode.CHUNK:
+        body = scan.chunk_body(data, part, max_chunk_bytes, require_crc)
+    else:
+        body = bytes(data[part.start : part.end])
+    found = []
+    for record in scan.chunk_records(body):
+        if isinstance(record, scan.RawMessage):
+            found.append(directory.message(record))
+        else:
+            directory.learn(record)
+    return found
+
+
+def map_file(path: Path) -> Any:
+    try:
+        with open(path, "rb") as file:
+            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except ValueError:
+        raise LogError(f"{path}: the file is empty; the run was killed before it wrote anything") from None
+    except OSError as error:
+        raise log_error(path, error) from error
+    return data
+
+
+def _summary_start(data: Any) -> int:
+    """Where the summary begins, if the file has one and its CRC agrees; else 0."""
+    if not scan.ends_whole(data):
+        return 0
+    start, _, crc = struct.unpack_from("<QQI", data, len(data) - 28)
+    whole = 0 < start < len(data) - 37 and zlib.crc32(data[start : len(data) - 12]) == crc
+    return int(start) if whole else 0

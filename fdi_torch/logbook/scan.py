@@ -1,0 +1,259 @@
+"""Records of an MCAP file, taken from bytes that may be torn, damaged or hostile.
+
+A record is opcode (1 byte), length (8 bytes, little-endian) and body (https://mcap.dev/spec). `frames` walks the top
+level: where a record is not sound, it skips to the next one that is and reports the gap. `chunk_messages` opens a
+chunk, never beyond a cap of bytes, and only where its CRC agrees. Nothing here raises on bad bytes but `ChunkError`.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+MAGIC = b"\x89MCAP0\r\n"
+MAX_CHUNK_BYTES = 64 * 2**20
+_HEAD = struct.Struct("<BQ")
+_CHUNK = struct.Struct("<QQQI")
+_MESSAGE = struct.Struct("<HIQQ")
+# Records where reading may go on after damage, because lengths inside them must agree: chunk, chunk index, attachment,
+# statistics, metadata, data end. The three high bytes of any sensible length are zero.
+_ANCHORS = re.compile(rb"[\x06\x08\x09\x0b\x0c\x0f](?=.{5}\x00\x00\x00)", re.DOTALL)
+
+Buffer = Any  # bytes or mmap
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A sound record: bytes start..end of the file, opcode and length included."""
+
+    opcode: int
+    start: int
+    end: int
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Bytes start..end of the file cannot be read."""
+
+    start: int
+    end: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    channel_id: int
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+class ChunkError(ValueError):
+    """A chunk that cannot be opened, and why."""
+
+
+def frames(data: Buffer, start: int | None = None) -> Iterator[Frame | Damage]:
+    """Sound records in order, and the gaps between them; a gap at the end is a torn record."""
+    size = len(data)
+    place = (8 if data[:8] == MAGIC else 0) if start is None else start
+    while place < size and data[place : place + 8] != MAGIC[: size - place]:
+        end = _sound(data, place)
+        if end is not None:
+            yield Frame(data[place], place, end)
+        else:
+            end = _after_damage(data, place)
+            yield Damage(place, end, "torn at the end" if end == size else "unreadable record")
+        place = end
+
+
+def ends_whole(data: Buffer) -> bool:
+    """Does the file end as a finished one does: footer and magic?"""
+    return len(data) > 45 and data[-8:] == MAGIC and data[-37:-28] == _HEAD.pack(Opcode.FOOTER, 20)
+
+
+def chunk_body(data: Buffer, frame: Frame, cap: int = MAX_CHUNK_BYTES, require_crc: bool = False) -> bytes:
+    """The records inside a chunk. Raises ChunkError: over the cap, not decompressible, CRC differs."""
+    _, _, size, crc = _CHUNK.unpack_from(data, frame.start + 9)
+    name_end = frame.start + 41 + _u32(data, frame.start + 37)
+    compression = bytes(data[frame.start + 41 : name_end])
+    if size > cap:
+        raise ChunkError(f"chunk of {size} bytes, more than the {cap} allowed")
+    body = _decompress(compression, data[name_end + 8 : frame.end], size)
+    if len(body) != size:
+        raise ChunkError("chunk of another size than it states")
+    if (crc or require_crc) and zlib.crc32(body) != crc:
+        raise ChunkError("chunk whose CRC differs")
+    return body
+
+
+def chunk_records(body: bytes) -> Iterator[Schema | Channel | RawMessage]:
+    """Schemas, channels and messages inside a chunk. Raises ChunkError where they do not parse."""
+    place = 0
+    try:
+        while place < len(body):
+            opcode, length = _HEAD.unpack_from(body, place)
+            place += 9
+            if place + length > len(body):
+                raise ChunkError("record that leaves its chunk")
+            if opcode == Opcode.MESSAGE:
+                head = _MESSAGE.unpack_from(body, place)
+                yield RawMessage(head[0], head[1], head[2], head[3], body[place + 22 : place + length])
+            elif opcode == Opcode.SCHEMA:
+                yield Schema.read(stream_of(body[place : place + length]))
+            elif opcode == Opcode.CHANNEL:
+                yield Channel.read(stream_of(body[place : place + length]))
+            place += length
+    except (struct.error, UnicodeDecodeError, McapError) as error:
+        raise ChunkError(f"chunk with a record that does not parse ({error})") from error
+
+
+def stream_of(data: bytes) -> ReadDataStream:
+    return ReadDataStream(io.BytesIO(data))
+
+
+def body_of(data: Buffer, frame: Frame) -> bytes:
+    return bytes(data[frame.start + 9 : frame.end])
+
+
+def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
+    """At most size + 1 bytes, whatever the data claim about themselves."""
+    try:
+        if compression == b"zstd":
+            return zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(io.BytesIO(data)).read(size + 1)
+        if compression == b"lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+    except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
+        raise ChunkError(f"chunk that does not decompress ({error})") from error
+    if compression:
+        raise ChunkError(f"chunk in the unknown compression {compression!r}")
+    return data
+
+
+def _after_damage(data: Buffer, place: int) -> int:
+    """Where to go on: after the damaged record where its length still leads to a sound one, else at the next anchor."""
+    end = _framed(data, place)
+    if end is not None and end < len(data) and (_sound(data, end) is not None or data[end:] == MAGIC):
+        return end
+    sound = (match.start() for match in _ANCHORS.finditer(data, place + 1) if _sound(data, match.start()) is not None)
+    return next(sound, len(data))
+
+
+def _framed(data: Buffer, place: int) -> int | None:
+    """End of a record by its length alone; None where it leaves the file or has no opcode."""
+    if len(data) - place < 9:
+        return None
+    opcode, length = _HEAD.unpack_from(data, place)
+    return place + 9 + length if opcode and length <= len(data) - place - 9 else None
+
+
+def _sound(data: Buffer, place: int) -> int | None:
+    """End of a record whose inner lengths (and, for attachments, CRC) agree; None where they do not."""
+    end = _framed(data, place)
+    if end is None:
+        return None
+    check = _CHECKS.get(data[place])
+    try:
+        return end if check is None or check(data, place + 9, end) else None
+    except (struct.error, IndexError, UnicodeDecodeError):
+        return None
+
+
+def _u32(data: Buffer, place: int) -> int:
+    return int(struct.unpack_from("<I", data, place)[0])
+
+
+def _u64(data: Buffer, place: int) -> int:
+    return int(struct.unpack_from("<Q", data, place)[0])
+
+
+def _text_end(data: Buffer, place: int, end: int) -> int:
+    """End of a length-prefixed text."""
+    stop = place + 4 + _u32(data, place)
+    if stop > end:
+        raise IndexError
+    bytes(data[place + 4 : stop]).decode()
+    return stop
+
+
+def _map_ends_at(data: Buffer, place: int, end: int) -> bool:
+    """A map of texts that fills place..end."""
+    if place + 4 + _u32(data, place) != end:
+        return False
+    place += 4
+    while place < end:
+        place = _text_end(data, place, end)
+    return place == end
+
+
+def _chunk_ok(data: Buffer, place: int, end: int) -> bool:
+    name_end = place + 32 + _u32(data, place + 28)
+    return name_end - place - 32 <= 16 and name_end + 8 + _u64(data, name_end) == end
+
+
+def _attachment_ok(data: Buffer, place: int, end: int) -> bool:
+    after = _text_end(data, _text_end(data, place + 16, end), end)
+    if after + 8 + _u64(data, after) + 4 != end:
+        return False
+    crc = _u32(data, end - 4)
+    return crc == 0 or zlib.crc32(data[place : end - 4]) == crc
+
+
+def _metadata_ok(data: Buffer, place: int, end: int) -> bool:
+    return _map_ends_at(data, _text_end(data, place, end), end)
+
+
+def _header_ok(data: Buffer, place: int, end: int) -> bool:
+    return _text_end(data, _text_end(data, place, end), end) == end
+
+
+def _schema_ok(data: Buffer, place: int, end: int) -> bool:
+    after = _text_end(data, _text_end(data, place + 2, end), end)
+    return after + 4 + _u32(data, after) == end
+
+
+def _channel_ok(data: Buffer, place: int, end: int) -> bool:
+    return _map_ends_at(data, _text_end(data, _text_end(data, place + 4, end), end), end)
+
+
+def _message_index_ok(data: Buffer, place: int, end: int) -> bool:
+    size = _u32(data, place + 2)
+    return size % 16 == 0 and place + 6 + size == end
+
+
+def _chunk_index_ok(data: Buffer, place: int, end: int) -> bool:
+    after = place + 36 + _u32(data, place + 32) + 8
+    return _text_end(data, after, end) + 16 == end
+
+
+def _statistics_ok(data: Buffer, place: int, end: int) -> bool:
+    return place + 46 + _u32(data, place + 42) == end
+
+
+_CHECKS = {
+    Opcode.HEADER: _header_ok,
+    Opcode.FOOTER: lambda data, place, end: end - place == 20,
+    Opcode.SCHEMA: _schema_ok,
+    Opcode.CHANNEL: _channel_ok,
+    Opcode.MESSAGE: lambda data, place, end: end - place >= 22,
+    Opcode.CHUNK: _chunk_ok,
+    Opcode.MESSAGE_INDEX: _message_index_ok,
+    Opcode.CHUNK_INDEX: _chunk_index_ok,
+    Opcode.ATTACHMENT: _attachment_ok,
+    Opcode.STATISTICS: _statistics_ok,
+    Opcode.METADATA: _metadata_ok,
+    Opcode.SUMMARY_OFFSET: lambda data, place, end: end - place == 17,
+    Opcode.DATA_END: lambda data, place, end: end - place == 4,
+}

@@ -1,0 +1,219 @@
+"""Messages as arrays: any topic's fields over time, and the recording inside a log, ours or foreign."""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import orjson
+
+from fdi_torch.logbook.errors import LogError
+from fdi_torch.logbook.reader import Message, Run
+from fdi_torch.logbook.schemas import topic_definition
+from fdi_torch.logbook.sink import EPOCH_NS, Channel
+
+MAX_ARRAY_BYTES = 2**30
+_STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
+_BLOCK = 65536
+
+Source = tuple[str, str]  # topic, field
+
+
+@dataclass(frozen=True)
+class Signals:
+    """A recording as plain arrays. time (T,) in s, inputs (T, M), outputs (T, N), mask (T, N) True where one counts.
+
+    Units are "" where the log does not state them.
+    """
+
+    time: np.ndarray
+    inputs: np.ndarray
+    outputs: np.ndarray
+    mask: np.ndarray
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    hold: str = "zero_order"
+
+
+def series(run: Run, topic: str, fields: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    """Numbers of a topic over its messages, (K,) each, NaN where a message lacks one; always with `t` in s.
+
+    fields: names, or paths into foreign messages such as "pose.x" and "data[2]"; all top-level numbers where None.
+    """
+    wanted = list(fields) if fields is not None else _numeric_fields(run, topic)
+    rows = ((_time(message, payload), *_numbers(payload, wanted)) for message, payload in _of(run, topic))
+    table = _table(rows, len(wanted) + 1)
+    return {"t": table[:, 0], **{name: table[:, i + 1] for i, name in enumerate(wanted) if name != "t"}}
+
+
+def own_signals(run: Run, group: str = "") -> Signals:
+    """The recording in one of our logs. Raises LogError where it holds none."""
+    root = f"/plant/{group}" if group else "/plant"
+    source, channel = _first_channel(run, f"{root}/input"), _first_channel(run, f"{root}/output")
+    if channel is None:
+        raise LogError(f"{run.path}: expected messages on {root}/output, got none; map topics and fields to signals")
+    time, outputs, mask = _own_table(run, channel)
+    names, units = _names(channel), _units(channel)
+    if source is None:
+        return Signals(time, np.zeros((len(time), 0)), outputs, mask, (), names, (), units)
+    clock, values, _ = _own_table(run, source)
+    hold = dict(source.metadata).get("hold", "zero_order")
+    inputs = held(clock, values, time)
+    return Signals(time, inputs, outputs, mask, _names(source), names, _units(source), units, hold)
+
+
+def mapped_signals(
+    run: Run, inputs: Mapping[str, Source], outputs: Mapping[str, Source], time_field: str | None = None
+) -> Signals:
+    """A recording from any log: signal -> (topic, field). The first output's topic is the clock.
+
+    Time is the log time in s since the clock's first message, or the number in `time_field`. Signals on other
+    topics are held from their last message; before their first one they are NaN.
+    """
+    if not outputs:
+        raise ValueError("expected at least one output, got none; map a signal to a topic and a field")
+    sources = {**inputs, **outputs}
+    clock_topic = next(iter(outputs.values()))[0]
+    origin = next((message.log_time for message in run.messages([clock_topic])), EPOCH_NS)
+    tables = {t: _mapped_table(run, t, sources, time_field, origin) for t in {t for t, _ in sources.values()}}
+    clock = tables[clock_topic][0]
+    columns = {name: held(tables[topic][0], tables[topic][1][name], clock) for name, (topic, _) in sources.items()}
+    u, y = (_columns([columns[name] for name in part], len(clock)) for part in (inputs, outputs))
+    return Signals(
+        clock, u, y, np.isfinite(y), tuple(inputs), tuple(outputs), ("",) * len(inputs), ("",) * len(outputs)
+    )
+
+
+def held(clock: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Each signal's last value at or before `time`; NaN before its first."""
+    if np.array_equal(clock, time):
+        return values
+    last = np.searchsorted(clock, time, side="right") - 1
+    taken = values[np.maximum(last, 0)] if len(clock) else np.full((len(time), *values.shape[1:]), np.nan)
+    taken[last < 0] = np.nan
+    return taken
+
+
+def arrays(run: Run, name: str = "results.npz", max_bytes: int = MAX_ARRAY_BYTES) -> dict[str, np.ndarray]:
+    """Arrays of an attached .npz, of a limited size, nothing pickled."""
+    content = run.attachment(name)
+    try:
+        size = sum(item.file_size for item in zipfile.ZipFile(io.BytesIO(content)).infolist())
+        if size > max_bytes:
+            raise LogError(f"{run.path}: {name} unpacks to {size} bytes, more than the {max_bytes} allowed")
+        with np.load(io.BytesIO(content), allow_pickle=False) as loaded:
+            return {key: loaded[key] for key in loaded.files}
+    except (zipfile.BadZipFile, ValueError, EOFError) as error:
+        raise LogError(f"{run.path}: {name} is no .npz of plain arrays ({error})") from error
+
+
+def field_path(text: str) -> list[str | int]:
+    """ "pose.x[2]" -> ["pose", "x", 2]."""
+    return [int(index) if index else name for name, index in _STEP.findall(text)]
+
+
+def _of(run: Run, topic: str) -> Iterable[tuple[Message, dict[str, Any]]]:
+    return ((message, message.payload) for message in run.messages([topic]))
+
+
+def _time(message: Message, payload: Mapping[str, Any]) -> float:
+    t = payload.get("t")
+    return float(t) if isinstance(t, int | float) else message.t
+
+
+def _number(payload: Any, field: str) -> float:
+    """A field by its name or, where there is none of that name, its path; NaN where it is no number."""
+    value = payload
+    for step in [field] if field in payload else field_path(field):
+        try:
+            value = value[step]
+        except (KeyError, IndexError, TypeError):
+            return float("nan")
+    return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def _numbers(payload: Any, fields: Iterable[str]) -> list[float]:
+    return [_number(payload, field) for field in fields]
+
+
+def _numeric_fields(run: Run, topic: str) -> list[str]:
+    """Top-level numbers of any message of the topic, in order of appearance."""
+    names: dict[str, None] = {}
+    for _, payload in _of(run, topic):
+        names.update(dict.fromkeys(k for k, v in payload.items() if isinstance(v, int | float)))
+    return [name for name in names if name != "t"]
+
+
+def _table(rows: Iterable[Sequence[float]], width: int) -> np.ndarray:
+    """Rows as an array, in blocks, so that the numbers do not lie about as objects."""
+    blocks, block = [np.zeros((0, width))], []
+    for row in rows:
+        block.append(row)
+        if len(block) == _BLOCK:
+            blocks.append(np.array(block, dtype=np.float64))
+            block = []
+    return np.concatenate([*blocks, np.array(block, dtype=np.float64).reshape(-1, width)])
+
+
+def _first_channel(run: Run, topic: str) -> Channel | None:
+    return next((message.channel for message in run.messages([topic])), None)
+
+
+def _names(channel: Channel) -> tuple[str, ...]:
+    """Signals of a plant channel, in the order they were logged: the numbers its schema names."""
+    known = {"t", "non_finite", "wall", *topic_definition(channel.topic).fields}
+    try:
+        properties = orjson.loads(channel.schema_data)["properties"]
+        return tuple(name for name in properties if name not in known)
+    except (ValueError, KeyError, TypeError) as error:
+        raise LogError(f"{channel.topic}: expected a schema with properties, got {error}") from error
+
+
+def _units(channel: Channel) -> tuple[str, ...]:
+    metadata = dict(channel.metadata)
+    return tuple(metadata.get(f"unit.{name}", "") for name in _names(channel))
+
+
+def _own_table(run: Run, channel: Channel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (T,), values (T, N) and mask (T, N) of a plant topic."""
+    names = _names(channel)
+    uncounted: list[tuple[int, int]] = []
+
+    def rows() -> Iterable[Sequence[float]]:
+        for row, (message, payload) in enumerate(_of(run, channel.topic)):
+            uncounted.extend((row, names.index(name)) for name in payload.get("masked", ()) if name in names)
+            yield (_time(message, payload), *(float(payload.get(name, float("nan"))) for name in names))
+
+    table = _table(rows(), len(names) + 1)
+    mask = np.isfinite(table[:, 1:])
+    if uncounted:
+        mask[tuple(np.array(uncounted).T)] = False
+    return table[:, 0], table[:, 1:], mask
+
+
+def _mapped_table(
+    run: Run, topic: str, sources: Mapping[str, Source], time_field: str | None, origin: int
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Times in s since `origin` (ns), or as `time_field` says, and one column a signal."""
+    wanted = {name: path for name, (where, path) in sources.items() if where == topic}
+
+    def rows() -> Iterable[Sequence[float]]:
+        for message, payload in _of(run, topic):
+            t = _number(payload, time_field) if time_field else (message.log_time - origin) * 1e-9
+            yield (t, *_numbers(payload, wanted.values()))
+
+    table = _table(rows(), len(wanted) + 1)
+    if not len(table):
+        raise LogError(f"{run.path}: expected messages on {topic}, got none; `fdi inspect {run.path}` lists the topics")
+    return table[:, 0], {name: table[:, i + 1] for i, name in enumerate(wanted)}
+
+
+def _columns(columns: Sequence[np.ndarray], samples: int) -> np.ndarray:
+    return np.stack(columns, axis=1) if columns else np.zeros((samples, 0))

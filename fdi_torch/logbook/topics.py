@@ -1,0 +1,194 @@
+"""One method for each topic of a log. They take plain numbers, arrays and tensors of any library.
+
+`t` is plant time in s. An event without a plant time of its own (a generation, an iteration, a trial) counts one
+second a step, so that viewers draw it over its number; other events default to the latest time logged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import orjson
+
+from fdi_torch.logbook.messages import Messages, Named
+from fdi_torch.logbook.payload import as_array, pack
+from fdi_torch.logbook.sink import log_time_of
+
+_LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
+
+
+class Topics(Messages):
+    """The topics by name."""
+
+    def residual(
+        self,
+        t: float,
+        residuals: Named,
+        statistics: Named | None = None,
+        thresholds: Named | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> None:
+        """y - y_hat per sensor, with test statistics and thresholds where there are any."""
+        tested = {f"{name}_statistic": value for name, value in (statistics or {}).items()}
+        limits = {f"{name}_threshold": value for name, value in (thresholds or {}).items()}
+        self.write("/observer/residual", {**residuals, **tested, **limits}, t, units=units)
+
+    def alarm(self, t: float, event: str, channel: str, message: str = "", wall: bool = False, **numbers: Any) -> None:
+        """An event of the detection; numbers: value, threshold, onset (s) and others by name."""
+        fields = {"event": event, "channel": channel, "message": message, **numbers}
+        self.write("/observer/alarm", fields, t, wall=wall)
+
+    def generation(
+        self,
+        generation: int,
+        best_cost: float,
+        best: Named,
+        *,
+        mean_cost: float | None = None,
+        spread: float | None = None,
+        evaluations: int | None = None,
+        problem: int = 0,
+        t: float | None = None,
+        units: Mapping[str, str] | None = None,
+        **numbers: Any,
+    ) -> None:
+        """A generation of the search; best: parameter -> value of the best member."""
+        fields = {
+            "problem": problem,
+            "generation": generation,
+            "best_cost": best_cost,
+            "mean_cost": mean_cost,
+            "spread": spread,
+            "evaluations": evaluations,
+            **numbers,
+            **best,
+        }
+        self.write("/estimator/de/generation", fields, generation if t is None else t, units=units)
+
+    def population(
+        self, generation: int, arrays: Mapping[str, Any], *, problem: int = 0, t: float | None = None
+    ) -> None:
+        """The state of the search, from which it can go on: any arrays of numbers, such as population and cost."""
+        packed = {key: value for name, array in arrays.items() for key, value in pack(name, array).items()}
+        fields = {"problem": problem, "generation": generation, **packed}
+        self.write("/estimator/de/population", fields, generation if t is None else t)
+
+    def iteration(
+        self,
+        iteration: int,
+        cost: float,
+        parameters: Named,
+        *,
+        step: float | None = None,
+        gradient: float | None = None,
+        damping: float | None = None,
+        accepted: bool | None = None,
+        problem: int = 0,
+        t: float | None = None,
+        units: Mapping[str, str] | None = None,
+        **numbers: Any,
+    ) -> None:
+        """An iteration of the refinement; parameters: name -> value."""
+        fields = {
+            "problem": problem,
+            "iteration": iteration,
+            "cost": cost,
+            "step": step,
+            "gradient": gradient,
+            "damping": damping,
+            "accepted": accepted,
+            **numbers,
+            **parameters,
+        }
+        self.write("/estimator/refine/iteration", fields, iteration if t is None else t, units=units)
+
+    def estimate(
+        self,
+        names: Sequence[str],
+        values: Any,
+        std: Any,
+        covariance: Any,
+        status: str,
+        *,
+        units: Sequence[str] = (),
+        reason: str = "",
+        at_bound: Sequence[str] = (),
+        unidentifiable: Sequence[str] = (),
+        problem: int = 0,
+        t: float | None = None,
+        **numbers: Any,
+    ) -> None:
+        """The final estimate: values (P,), std (P,), covariance (P, P); numbers: goodness of fit and others by name."""
+        fields = {
+            "problem": problem,
+            "names": names,
+            "units": units,
+            "values": values,
+            "std": std,
+            "covariance": covariance,
+            "covariance_shape": list(as_array(covariance).shape),
+            "status": status,
+            "reason": reason,
+            "at_bound": at_bound,
+            "unidentifiable": unidentifiable,
+            **numbers,
+        }
+        self.write("/estimate/final", fields, t)
+
+    def fault(
+        self, fault: str, location: str, present: bool, *, t: float | None = None, message: str = "", **numbers: Any
+    ) -> None:
+        """A finding of the diagnosis; numbers: confidence, size, size_std, unit (text), flow, hole_diameter, others."""
+        fields = {"fault": fault, "location": location, "present": present, "message": message, **numbers}
+        self.write("/diagnosis/fault", fields, t)
+
+    def gap_where(self, location: str, share: float, p_value: float | None = None, **numbers: Any) -> None:
+        """How much of the gap one component alone can close."""
+        self.write("/gap/where", {"location": location, "share": share, "p_value": p_value, **numbers})
+
+    def gap_verdict(self, answer: Named) -> None:
+        """The diagnosis of a gap in the format `fdi_torch.gap/1`; what is numeric in its closure plots by name."""
+        closure = {k: v for k, v in answer.get("closure", {}).items() if isinstance(v, int | float)}
+        where, posterior = answer.get("where", []), answer.get("posterior", [])
+        fields = {
+            "verdict": answer["verdict"],
+            "p_value": answer.get("alarm", {}).get("p_value"),
+            "locations": [place["location"] for place in where],
+            "shares": [float(place["share"]) for place in where],
+            "causes": [_cause(cause) for cause in answer.get("causes", [])],
+            "ambiguity_set": [_explanation(causes) for causes in answer.get("ambiguity_set", [])],
+            "explanations": [_explanation(item["causes"]) for item in posterior],
+            "probabilities": [float(item["probability"]) for item in posterior],
+            "answer": orjson.dumps(dict(answer), option=orjson.OPT_SERIALIZE_NUMPY).decode(),
+            **closure,
+        }
+        self.write("/gap/verdict", fields)
+
+    def trial(
+        self, trial: int, numbers: Named, *, group: str = "", seed: int | str = "", status: str = "", **texts: str
+    ) -> None:
+        """One trial of a study."""
+        fields = {"trial": trial, "group": group, "seed": str(seed), "status": status, **texts, **numbers}
+        self.write("/study/trial", fields, trial)
+
+    def summary(self, group: str, trials: int, numbers: Named, **texts: str) -> None:
+        """A setting of a study, summed up."""
+        self.write("/study/summary", {"group": group, "trials": trials, **texts, **numbers})
+
+    def say(self, message: str, level: str = "info", name: str = "fdi", t: float | None = None) -> None:
+        """One sentence on `/log`. level: debug, info, warning, error or fatal."""
+        if level not in _LEVELS:
+            raise ValueError(f"expected a level among {', '.join(_LEVELS)}, got {level}")
+        t = self._latest if t is None else float(t)
+        sec, nsec = divmod(log_time_of(t), 10**9)
+        fields = {"timestamp": {"sec": sec, "nsec": nsec}, "level": _LEVELS[level], "message": message, "name": name}
+        self.write("/log", {**fields, "file": "", "line": 0}, t)
+
+
+def _cause(cause: Named) -> str:
+    return f"{cause['effect']}@{cause['location']}"
+
+
+def _explanation(causes: Sequence[Named]) -> str:
+    return " + ".join(_cause(cause) for cause in causes) or "no gap"

@@ -1,0 +1,283 @@
+"""RunLog: the log of one run or study, written so that a crash loses at most its last second.
+
+The run is written to `NAME.mcap.partial` and becomes `NAME.mcap` at its end. What waits in memory goes to disk after
+half a second at the latest, by a small thread, also while the run computes and says nothing. Chunks that the clock cut
+are joined again at the end, so that equal configuration, data and seed give byte-identical files but for the wall-clock
+fields: `started` and `run_id` of `fdi_torch.run`, `ended` and `wall_seconds` of `fdi_torch.status`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import orjson
+
+from fdi_torch.logbook.copying import copy_log
+from fdi_torch.logbook.errors import LogError, log_error
+from fdi_torch.logbook.payload import as_array, plain
+from fdi_torch.logbook.provenance import environment, git_state
+from fdi_torch.logbook.schemas import FORMAT_VERSION
+from fdi_torch.logbook.sink import Channel, Sink, log_time_of
+from fdi_torch.logbook.terminate import Terminated
+from fdi_torch.logbook.topics import Topics
+
+WALL_CLOCK = {"fdi_torch.run": ("started", "run_id"), "fdi_torch.status": ("ended", "wall_seconds")}
+
+
+class RunLog(Topics):
+    """Context manager that logs a run. Messages are written by the methods of `Topics`.
+
+    path: NAME.mcap, which must not exist. kind: the command, such as "train". config_text: the configuration exactly
+    as given; config: the same, resolved, as plain nested values. seeds: name -> seed. data: one mapping an input file,
+    with its "path" and "sha256". env, git: found out where not given. clock: wall time in ns.
+    Raises LogError where the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        kind: str,
+        *,
+        config_text: str = "",
+        config: Mapping[str, Any] | None = None,
+        seeds: Mapping[str, int] | None = None,
+        data: Sequence[Mapping[str, Any]] = (),
+        parent_run_id: str | None = None,
+        env: Mapping[str, str] | None = None,
+        git: Mapping[str, str] | None = None,
+        clock: Callable[[], int] = time.time_ns,
+        flush_seconds: float = 0.5,
+    ) -> None:
+        super().__init__()
+        self.path = Path(path)
+        self.partial_path = self.path.with_name(self.path.name + ".partial")
+        self.status, self.reason = "completed", ""
+        self._clock, self._flush_seconds = clock, flush_seconds
+        self._start_records = {
+            "config": {"sha256": _sha256(config_text), **flatten(config or {})},
+            "env": dict(environment() if env is None else env),
+            "git": dict(git_state() if git is None else git),
+            "seeds": {name: str(seed) for name, seed in (seeds or {}).items()},
+            "data": flatten({str(number): dict(source) for number, source in enumerate(data)}),
+        }
+        self._config_text = config_text
+        self._run = {"format": FORMAT_VERSION, "kind": kind, "parent_run_id": parent_run_id or ""}
+        self._results: dict[str, str] = {}
+        self._arrays: dict[str, np.ndarray] = {}
+        self._sink: Sink | None = None
+        self._lock = threading.RLock()
+        self._stop = threading.Event()
+        self._waiting_since: float | None = None
+        self._size = 0
+        self._cut_by_clock = False
+
+    @property
+    def run_id(self) -> str:
+        """Names this run: a hash of its inputs and its start."""
+        return self._run["run_id"]
+
+    def __enter__(self) -> RunLog:
+        _make_room(self.path)
+        self._started = self._clock()
+        self._run["started"] = _wall_text(self._started)
+        self._run["run_id"] = _sha256(repr((self._run, self._start_records)))[:16]
+        self._sink = Sink(self.partial_path, f"fdi_torch {_version()}")
+        try:
+            self._write_start(self._sink)
+        except LogError:
+            self._sink.abandon()
+            raise
+        self._thread = threading.Thread(target=self._flush_by_clock, daemon=True, name="log flush")
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+        if error is not None:
+            self.status, self.reason = _ending(error)
+        try:
+            self._write_end(self._open_sink())
+        except LogError:
+            if error is None:
+                raise
+            return
+        self._publish()
+
+    def set_status(self, status: str, reason: str = "") -> None:
+        """How the run ended, such as "not_converged"; "completed" where nothing is said."""
+        self.status, self.reason = status, reason
+
+    def result(self, values: Mapping[str, Any]) -> None:
+        """Named results for the record `fdi_torch.result`, written at the end."""
+        self._results.update(flatten(values))
+
+    def result_arrays(self, **arrays: Any) -> None:
+        """Arrays for the attachment `results.npz`, written at the end."""
+        self._arrays.update({name: as_array(array) for name, array in arrays.items()})
+
+    def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
+        """A file inside the log."""
+        with self._lock:
+            self._open_sink().attachment(name, media_type, data)
+            self._note_progress()
+
+    def flush(self) -> None:
+        """Everything logged so far goes to disk."""
+        with self._lock:
+            self._open_sink().flush()
+            self._cut_by_clock = True
+            self._note_progress()
+
+    def put(self, channel: Channel, t: float, sequence: int, payload: bytes) -> None:
+        """One encoded message; the methods of `Topics` end here."""
+        log_time = log_time_of(t)
+        with self._lock:
+            self._open_sink().message(channel, log_time, log_time, sequence, payload)
+            self._note_progress(waiting=True)
+
+    def wall(self) -> dict[str, int]:
+        """Wall time for a message's field `wall`."""
+        sec, nsec = divmod(self._clock(), 10**9)
+        return {"sec": sec, "nsec": nsec}
+
+    def _open_sink(self) -> Sink:
+        if self._sink is None:
+            raise ValueError(f"{self.path}: expected an open log, got one outside its `with` block; write inside it")
+        return self._sink
+
+    def _note_progress(self, waiting: bool = False) -> None:
+        """Remember since when messages wait in memory; nothing waits right after a write to disk."""
+        size = self._open_sink().size
+        if size != self._size:
+            self._size, self._waiting_since = size, None
+        elif waiting and self._waiting_since is None:
+            self._waiting_since = time.monotonic()
+
+    def _flush_by_clock(self) -> None:
+        while not self._stop.wait(self._flush_seconds / 2):
+            with self._lock:
+                since = self._waiting_since
+                if since is not None and time.monotonic() - since >= self._flush_seconds / 2:
+                    try:
+                        self.flush()
+                    except LogError:
+                        return  # the sink is dead; the next write says so
+
+    def _write_start(self, sink: Sink) -> None:
+        sink.metadata("fdi_torch.run", self._run)
+        for name, values in self._start_records.items():
+            sink.metadata(f"fdi_torch.{name}", values)
+        if self._config_text:
+            sink.attachment("config.yaml", "application/yaml", self._config_text.encode())
+
+    def _write_end(self, sink: Sink) -> None:
+        if self._arrays:
+            sink.attachment("results.npz", "application/x-npz", _npz(self._arrays))
+        if self._results:
+            sink.metadata("fdi_torch.result", self._results)
+        ended = self._clock()
+        seconds = f"{(ended - self._started) * 1e-9:.3f}"
+        status = {"status": self.status, "reason": self.reason, "ended": _wall_text(ended), "wall_seconds": seconds}
+        try:
+            sink.metadata("fdi_torch.status", status)
+        except LogError:
+            sink.abandon()
+            raise
+        sink.finish()
+
+    def _publish(self) -> None:
+        """Give the finished file its name, with its chunks joined if the clock cut them."""
+        source = self.partial_path
+        try:
+            if self._cut_by_clock:
+                source = _joined(source)
+            os.replace(source, self.path)
+            if source != self.partial_path:
+                self.partial_path.unlink()
+        except OSError as error:
+            raise log_error(self.path, error) from error
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Nested values as dotted names and texts: {"a": {"b": [1, 2]}} -> {"a.b": "[1,2]"}."""
+    flat: dict[str, str] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat.update(flatten(value, f"{prefix}{name}."))
+        else:
+            flat[f"{prefix}{name}"] = value if isinstance(value, str) else _text(value)
+    return flat
+
+
+def _text(value: Any) -> str:
+    try:
+        return orjson.dumps(value).decode()
+    except TypeError:
+        return orjson.dumps(plain({"value": value}).get("value", str(value))).decode()
+
+
+def _make_room(path: Path) -> None:
+    if path.suffix != ".mcap":
+        raise ValueError(f"{path}: expected a log name that ends in .mcap; rename it")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        taken = path.exists()
+    except OSError as error:
+        raise log_error(path, error) from error
+    if taken:
+        raise LogError(f"{path}: exists already; choose another name, or delete it")
+
+
+def _joined(partial: Path) -> Path:
+    """A copy with full chunks; the partial file itself where there is no room for a copy."""
+    target = partial.with_name(partial.name + ".joined")
+    try:
+        copy_log(partial, target)
+    except LogError:
+        target.unlink(missing_ok=True)
+        return partial
+    return target
+
+
+def _ending(error: BaseException) -> tuple[str, str]:
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", "Ctrl-C"
+    if isinstance(error, Terminated):
+        return "interrupted", "SIGTERM"
+    return "failed", f"{type(error).__name__}: {error}"
+
+
+def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    return buffer.getvalue()
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _wall_text(nanoseconds: int) -> str:
+    moment = datetime.fromtimestamp(nanoseconds // 10**9, UTC)
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{nanoseconds % 10**9:09d}Z"
+
+
+def _version() -> str:
+    try:
+        return metadata.version("fdi_torch")
+    except metadata.PackageNotFoundError:
+        return "0"

@@ -1,0 +1,349 @@
+"""Writing a log: what is in it, what happens when the run or the disk fails."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from example_logs import FIXED, FROZEN, VERDICT, write_everything, write_finished
+from mcap.reader import make_reader
+
+from fdi_torch.logbook import LogError, RunLog, content_hash, read_run
+from fdi_torch.logbook.provenance import environment, git_state, sha256_of
+from fdi_torch.logbook.schemas import TOPICS
+from fdi_torch.logbook.terminate import Terminated
+
+
+def test_the_reference_reader_finds_everything(finished: Path) -> None:
+    with open(finished, "rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        found = list(reader.iter_messages())
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        assert len(found) == summary.statistics.message_count == sum(1 for _ in read_run(finished).messages())
+        assert {channel.topic for _, channel, _ in found} == set(TOPICS)
+        assert all(message.log_time == message.publish_time for _, _, message in found)
+        assert [item.name for item in reader.iter_attachments()] == ["config.yaml", "results.npz"]
+
+
+def test_records_say_where_the_run_comes_from(finished: Path) -> None:
+    run = read_run(finished)
+    assert list(run.metadata) == [
+        *(f"fdi_torch.{name}" for name in ("run", "config", "env", "git", "seeds", "data", "result", "status"))
+    ]
+    about = run.metadata["fdi_torch.run"]
+    assert about["kind"] == "train" and about["started"] == "2026-09-21T14:13:20.123456789Z" and about["format"] == "1"
+    assert run.metadata["fdi_torch.config"]["search.bounds"] == "[0.0,1.0]"
+    assert run.metadata["fdi_torch.seeds"] == {"noise": "7"}
+    assert run.metadata["fdi_torch.data"] == {"0.path": "rig.csv", "0.sha256": "ab" * 32}
+    assert run.metadata["fdi_torch.result"] == {"estimate.T1.leak.size": "0.1"}
+    assert run.metadata["fdi_torch.status"]["status"] == "completed"
+    assert run.config_text == "plant: three_tank\n"
+    assert run.complete and run.ours and run.advice == ""
+
+
+def test_units_stand_in_the_channel(finished: Path) -> None:
+    channels = {message.topic: dict(message.channel.metadata) for message in read_run(finished).messages()}
+    assert channels["/plant/input"]["unit.Q1"] == "m^3/s" and channels["/plant/input"]["hold"] == "linear"
+    assert channels["/plant/output"]["unit.h3"] == "m" and channels["/plant/output"]["unit.t"] == "s"
+    assert channels["/diagnosis/fault"]["unit.flow"] == "m^3/s"
+    assert channels["/study/trial"]["schema_version"] == "1"
+
+
+def test_equal_runs_are_equal_byte_for_byte(tmp_path: Path) -> None:
+    first, second = write_finished(tmp_path / "a.mcap"), write_finished(tmp_path / "b.mcap")
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_chunks_cut_by_the_clock_leave_no_trace(tmp_path: Path) -> None:
+    fast = write_finished(tmp_path / "a.mcap")
+    with RunLog(tmp_path / "b.mcap", "train", **FIXED, flush_seconds=0.02) as log:
+        original = log.put
+
+        def slow_put(*arguments: object) -> None:
+            if log._sequence.get("/estimator/de/generation", 0) in (1, 3):
+                time.sleep(0.06)
+            original(*arguments)  # type: ignore[arg-type]
+
+        log.put = slow_put  # type: ignore[method-assign]
+        write_everything(log)
+        log.result({"estimate": {"T1.leak.size": 0.1}})
+        log.result_arrays(covariance=np.eye(2))
+        assert log._cut_by_clock
+    assert fast.read_bytes() == (tmp_path / "b.mcap").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "b.mcap"]
+
+
+def test_wall_time_stands_only_where_it_is_asked_for(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "a.mcap", "monitor", **FIXED) as log:
+        log.alarm(1.0, "raised", "h1", wall=True)
+        log.alarm(1.0, "raised", "h1")
+    with_wall, without = read_run(tmp_path / "a.mcap").messages()
+    assert with_wall.payload["wall"] == {"sec": FROZEN // 10**9, "nsec": FROZEN % 10**9}
+    assert "wall" not in without.payload
+    assert content_hash([with_wall]) == content_hash([without])
+
+
+def test_the_whole_verdict_is_kept(finished: Path) -> None:
+    import orjson
+
+    (message,) = read_run(finished).messages(["/gap/verdict"])
+    payload = message.payload
+    assert orjson.loads(payload["answer"]) == VERDICT
+    assert payload["causes"] == ["pump_lag@Q1"] and payload["closed"] == 0.998
+
+
+def test_further_fields_get_a_described_channel(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
+        log.residual(0.0, {"h1": 1.0})
+        log.residual(1.0, {"h1": 1.0}, {"h1": 2.0})
+        log.residual(2.0, {"h1": 1.0})
+    channels = [message.channel for message in read_run(tmp_path / "a.mcap").messages()]
+    assert b"h1_statistic" not in channels[0].schema_data
+    assert b"h1_statistic" in channels[1].schema_data
+    assert channels[1] == channels[2]
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "reason"),
+    [
+        (KeyboardInterrupt(), "interrupted", "Ctrl-C"),
+        (Terminated(), "interrupted", "SIGTERM"),
+        (RuntimeError("no water"), "failed", "RuntimeError: no water"),
+    ],
+)
+def test_what_was_logged_before_a_failure_stays(tmp_path: Path, error: BaseException, status: str, reason: str) -> None:
+    with pytest.raises(type(error)), RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
+        log.generation(0, 1.0, {"x": 0.5})
+        raise error
+    run = read_run(tmp_path / "a.mcap")
+    assert run.complete and [m.payload["best_cost"] for m in run.messages()] == [1.0]
+    assert run.metadata["fdi_torch.status"] | {"ended": ""} == {
+        "status": status,
+        "reason": reason,
+        "ended": "",
+        "wall_seconds": "0.000",
+    }
+
+
+def test_a_status_can_be_set(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
+        log.set_status("not_converged", "600 generations were not enough")
+    assert read_run(tmp_path / "a.mcap").metadata["fdi_torch.status"]["status"] == "not_converged"
+
+
+def test_misuse_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"expected a log name that ends in \.mcap"):
+        RunLog(tmp_path / "a.log", "train", **FIXED).__enter__()
+    closed = RunLog(tmp_path / "a.mcap", "train", **FIXED)
+    with pytest.raises(ValueError, match="outside its `with` block"):
+        closed.say("hello")
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
+        with pytest.raises(ValueError, match="expected a finite time, got nan"):
+            log.write("/study/trial", {"trial": 1}, float("nan"))
+        with pytest.raises(ValueError, match="expected a level among debug"):
+            log.say("x", level="loud")
+        with pytest.raises(ValueError, match=r"expected values of shape \(3, 1\), got \(2, 1\)"):
+            log.samples("/plant/output", np.arange(3.0), np.zeros((2, 1)), ["h1"], ["m"])
+        with pytest.raises(ValueError, match="expected a name other than t"):
+            log.samples("/plant/output", np.arange(2.0), np.zeros((2, 1)), ["t"], ["m"])
+        with pytest.raises(ValueError, match="expected finite times"):
+            log.samples("/plant/output", np.array([0.0, np.nan]), np.zeros((2, 1)), ["h1"], ["m"])
+        with pytest.raises(ValueError, match="/log: expected only timestamp"):
+            log.write("/log", {"shout": 1.0})
+
+
+def test_an_existing_log_is_not_overwritten(finished: Path) -> None:
+    before = finished.read_bytes()
+    with pytest.raises(LogError, match=r"run\.mcap: exists already"):
+        RunLog(finished, "train", **FIXED).__enter__()
+    assert finished.read_bytes() == before
+
+
+def test_two_writers_on_one_path(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
+        with pytest.raises(LogError, match="another run is writing this file"):
+            RunLog(tmp_path / "a.mcap", "train", **FIXED).__enter__()
+        log.say("still fine")
+    assert len(list(read_run(tmp_path / "a.mcap").messages())) == 1
+
+
+def test_what_a_killed_run_left_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap.partial").write_bytes(b"precious")
+    with pytest.raises(LogError, match="left by a run that did not end; save it with `fdi recover"):
+        RunLog(tmp_path / "a.mcap", "train", **FIXED).__enter__()
+    assert (tmp_path / "a.mcap.partial").read_bytes() == b"precious"
+
+
+def test_a_folder_that_is_a_file(tmp_path: Path) -> None:
+    (tmp_path / "logs").write_text("")
+    with pytest.raises(LogError, match="a part of the path is a file"):
+        RunLog(tmp_path / "logs" / "a.mcap", "train", **FIXED).__enter__()
+
+
+def run_script(text: str, folder: Path, **options: object) -> subprocess.CompletedProcess[str]:
+    root = Path(__file__).parents[2]
+    paths = os.pathsep.join([str(root), str(Path(__file__).parent)])
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(text), str(folder)],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        **options,  # type: ignore[call-overload]
+    )
+
+
+def test_a_read_only_folder(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    done = run_script(
+        """
+        import os, sys
+        from fdi_torch.logbook import LogError, RunLog
+        os.chmod(sys.argv[1], 0o555)
+        if os.geteuid() == 0:
+            os.setgid(65534)
+            os.setuid(65534)
+        try:
+            RunLog(sys.argv[1] + "/a.mcap", "train").__enter__()
+        except LogError as error:
+            print(error)
+        """,
+        tmp_path,
+    )
+    assert "may not be written or read" in done.stdout or "No such file" in done.stderr, done.stderr
+
+
+def test_a_full_disk_ends_the_log_not_the_process(tmp_path: Path) -> None:
+    """A limit on file size stands in for a full disk: both are an OSError at some write."""
+    done = run_script(
+        """
+        import resource, sys
+        from fdi_torch.logbook import LogError, RunLog
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+        log = RunLog(sys.argv[1] + "/a.mcap", "train", env={}, git={})
+        try:
+            with log:
+                written = 0
+                try:
+                    for i in range(100_000):
+                        log.trial(i, {"x": i ** 0.5})
+                        written = i
+                except LogError as error:
+                    print(error)
+                try:
+                    log.say("one more")
+                except LogError as error:
+                    print(error)
+        except LogError as error:
+            print(error)
+        print(written)
+        """,
+        tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    first, refused, at_end, written = done.stdout.splitlines()
+    assert first.endswith("the limit on file size is reached; raise it (ulimit -f)")
+    assert refused.endswith("nothing more is logged") and at_end.endswith("nothing more is logged")
+    run = read_run(tmp_path / "a.mcap.partial")
+    trials = [message.payload["trial"] for message in run.messages()]
+    assert trials == list(range(len(trials))) and 1000 < len(trials) <= int(written)
+    assert "fdi recover" in run.advice
+
+
+WRITER = """
+import sys, time
+from fdi_torch.logbook import RunLog, exit_on_sigterm
+exit_on_sigterm()
+with RunLog(sys.argv[1] + "/a.mcap", "train") as log:
+    number = 0
+    while True:
+        log.trial(number, {"x": number ** 0.5})
+        print(number, time.time(), flush=True)
+        number += 1
+        time.sleep(0.7 if number == 5 else 0.002)
+"""
+
+
+def start_writer(folder: Path) -> subprocess.Popen[str]:
+    root = Path(__file__).parents[2]
+    return subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(folder)],
+        env={**os.environ, "PYTHONPATH": str(root)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_sigterm_finishes_the_log(tmp_path: Path) -> None:
+    writer = start_writer(tmp_path)
+    assert writer.stdout is not None
+    for _ in range(3):
+        writer.stdout.readline()
+    writer.send_signal(signal.SIGTERM)
+    writer.communicate(timeout=20)
+    assert writer.returncode == 143
+    run = read_run(tmp_path / "a.mcap")
+    assert run.complete and run.metadata["fdi_torch.status"]["reason"] == "SIGTERM"
+
+
+def killed_after(folder: Path, seconds: float) -> tuple[float, dict[int, float]]:
+    """Kill a writer; returns when, and when each trial was logged."""
+    writer = start_writer(folder)
+    assert writer.stdout is not None
+    first = writer.stdout.readline()
+    time.sleep(seconds)
+    killed = time.time()
+    writer.kill()
+    lines = [first, *writer.communicate(timeout=20)[0].splitlines(keepends=True)]
+    times = {int(line.split()[0]): float(line.split()[1]) for line in lines if line.endswith("\n")}
+    return killed, times
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.65, 1.5])
+def test_a_kill_loses_at_most_the_last_second(tmp_path: Path, seconds: float) -> None:
+    """The second kill falls into a silence after a few messages, which only a clock can save."""
+    check_kill(tmp_path, seconds)
+
+
+@pytest.mark.slow
+def test_fifty_kills_lose_at_most_the_last_second_each(tmp_path: Path) -> None:
+    for number, seconds in enumerate(np.random.default_rng(0).uniform(0, 3, 50)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        check_kill(folder, float(seconds))
+
+
+def check_kill(folder: Path, seconds: float) -> None:
+    killed, times = killed_after(folder, seconds)
+    run = read_run(folder / "a.mcap.partial")
+    assert not run.complete and run.metadata["fdi_torch.run"]["kind"] == "train"
+    kept = {message.payload["trial"] for message in run.messages()}
+    lost = [number for number in times if number not in kept]
+    assert all(times[number] > killed - 1.0 for number in lost)
+
+
+def test_where_the_code_and_data_come_from(tmp_path: Path) -> None:
+    versions = environment(("numpy", "no-such-package"))
+    assert versions["numpy"] == np.__version__ and versions["no-such-package"] == "absent"
+    assert git_state(tmp_path) == {"commit": "", "changed": ""}
+    (tmp_path / "x").write_bytes(b"abc")
+    assert sha256_of(tmp_path / "x") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+@pytest.mark.slow
+def test_a_million_samples_in_little_memory_and_few_bytes(tmp_path: Path) -> None:
+    samples = 1_000_000
+    rng = np.random.default_rng(0)
+    time_s, inputs, outputs = np.arange(samples) * 0.1, rng.random((samples, 2)), rng.standard_normal((samples, 3))
+    with RunLog(tmp_path / "a.mcap", "simulate", **FIXED) as log:
+        log.recording(time_s, inputs, outputs, ["a", "b"], ["x", "y", "z"], ["1"] * 2, ["m"] * 3)
+    assert (tmp_path / "a.mcap").stat().st_size / (2 * samples) < 80
