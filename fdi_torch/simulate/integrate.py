@@ -40,7 +40,7 @@ class ReferenceEngine:
     def readings(self, theta: Tensor) -> Tensor:
         """theta (*batch, P) -> readings (*batch, S, sensors) in SI."""
         batch = theta.shape[:-1]
-        lanes = theta.reshape(-1, theta.shape[-1])
+        lanes = theta.reshape(theta.shape[:-1].numel(), theta.shape[-1])
         if self.method == "rk4":
             result = self._run(lanes)
         else:
@@ -49,7 +49,7 @@ class ReferenceEngine:
 
     def levels(self, theta: Tensor) -> Tensor:
         """theta (*batch, P) -> tank levels at the samples (*batch, S, tanks), m."""
-        lanes = theta.reshape(-1, theta.shape[-1])
+        lanes = theta.reshape(theta.shape[:-1].numel(), theta.shape[-1])
         levels = self._sample(*self._integrate(self.network.bind(self.space, lanes), len(lanes)))
         return levels.movedim(1, 0).reshape(*theta.shape[:-1], *levels.shape[::2])
 

@@ -1,0 +1,70 @@
+"""Plants and recordings that tests share."""
+
+from __future__ import annotations
+
+import torch
+
+from fdi_torch.effects import build_network, placements_for
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.recording import Recording
+
+PAPER_PARAMETERS = ("T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size")
+REST = (0.589912, 0.393275, 0.491593)  # m; the fault-free steady state at 50 cm3/s into both tanks
+
+
+def three_tank(start: tuple[float, float, float] = REST, tank_height: float = 1.0) -> PlantDescription:
+    references = ("P13", "OUT2", "P32")
+    names = ("T1", "T2", "T3")
+    return PlantDescription(
+        "three_tank",
+        tuple(Tank(n, 160e-4, tank_height, h, leak_reference=r) for n, h, r in zip(names, start, references, strict=True)),
+        (
+            Pipe("P13", "T1", "T3", 0.6e-4, 0.6),
+            Pipe("P32", "T3", "T2", 0.6e-4, 0.6),
+            Pipe("OUT2", "T2", "outside", 0.6e-4, 0.6),
+        ),
+        (Pump("Q1", "T1", 90e-6), Pump("Q2", "T2", 90e-6)),
+        (Sensor("h1", "T1"), Sensor("h2", "T2"), Sensor("h3", "T3")),
+    )
+
+
+def paper_network(plant: PlantDescription | None = None) -> tuple[TankNetwork, ParameterSpace]:
+    """The three tanks with the paper's five fault parameters."""
+    network = build_network(plant or three_tank(), placements_for(PAPER_PARAMETERS))
+    return network, ParameterSpace(network.constants[name] for name in PAPER_PARAMETERS)
+
+
+def blank_recording(
+    plant: PlantDescription, inputs: torch.Tensor, time: torch.Tensor, hold: str = "zero_order"
+) -> Recording:
+    """Inputs (T, channels) without readings."""
+    sensors = tuple(s.column for s in plant.sensors)
+    return Recording(
+        time,
+        inputs,
+        torch.full((len(time), len(sensors)), float("nan"), dtype=torch.float64),
+        plant.channels(),
+        sensors,
+        ("m^3/s",) * inputs.shape[1],
+        tuple(s.unit for s in plant.sensors),
+        hold=hold,  # type: ignore[arg-type]
+    )
+
+
+def constant_inputs(plant: PlantDescription, duration: float, sample: float = 1.0, flow: float = 50e-6) -> Recording:
+    time = torch.arange(round(duration / sample) + 1, dtype=torch.float64) * sample
+    return blank_recording(plant, torch.full((len(time), len(plant.channels())), flow, dtype=torch.float64), time)
+
+
+def random_steps(plant: PlantDescription, duration: float, seed: int = 0, sample: float = 1.0) -> Recording:
+    """Held inputs that switch at random samples between 10 and 90 cm3/s."""
+    generator = torch.Generator().manual_seed(seed)
+    time = torch.arange(round(duration / sample) + 1, dtype=torch.float64) * sample
+    columns = []
+    for _ in plant.channels():
+        switch = torch.rand(len(time), generator=generator) < sample / 60.0
+        values = 10e-6 + 80e-6 * torch.rand(len(time), generator=generator, dtype=torch.float64)
+        columns.append(values[torch.cumsum(switch, 0)])
+    return blank_recording(plant, torch.stack(columns, dim=1), time)

@@ -1,0 +1,238 @@
+"""The plant against closed forms, SciPy, conservation and the paper's own form."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from rigs import REST, blank_recording, constant_inputs, paper_network, random_steps, three_tank
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from fdi_torch.effects import build_network
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.lpv import lpv_form
+from fdi_torch.plant.signals import Clock, CumulativeSignal
+from fdi_torch.simulate.equilibrium import equilibrium
+from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.integrate import ReferenceEngine
+
+
+def clock(resolution: float = 1e-6) -> Clock:
+    zero, one = torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
+    return Clock(zero, one, one * resolution)
+
+
+def nothing() -> tuple[ParameterSpace, torch.Tensor]:
+    return ParameterSpace(), torch.zeros(1, 0, dtype=torch.float64)
+
+
+def torricelli_rates(levels: list[float], theta: tuple[float, ...], flow: float = 50e-6) -> list[float]:
+    """The paper's (31) with the readings of its errata, written out for SciPy."""
+    h1, h2, h3 = levels
+    k = 0.6 * 0.6e-4 * math.sqrt(2 * 9.81)
+
+    def root(x: float) -> float:
+        return math.copysign(math.sqrt(abs(x)), x)
+
+    q13, q32 = theta[3] * k * root(h1 - h3), theta[4] * k * root(h3 - h2)
+    return [
+        (flow - q13 - theta[0] * k * root(h1)) / 160e-4,
+        (flow + q32 - theta[1] * k * root(h2)) / 160e-4,
+        (q13 - q32 - theta[2] * k * root(h3)) / 160e-4,
+    ]
+
+
+def test_an_emptying_tank_follows_torricelli() -> None:
+    plant = PlantDescription("one", (Tank("T", 0.02, 1.0, 0.8),), (Pipe("O", "T", OUTSIDE, 1e-4, 0.6),), (), (Sensor("h", "T"),))
+    rate = 0.6 * 1e-4 * math.sqrt(2 * 9.81) / 0.02
+    empty_after = 2.0 * math.sqrt(0.8) / rate
+    time = torch.linspace(0.0, 0.9 * empty_after, 50, dtype=torch.float64)
+    recording = blank_recording(plant, torch.zeros(50, 0, dtype=torch.float64), time)
+    space, theta = nothing()
+    engine = ReferenceEngine(build_network(plant), space, lay_out(recording, (), 0.05))
+    closed = (math.sqrt(0.8) - 0.5 * rate * time) ** 2
+    assert (engine.levels(theta)[0, :, 0] - closed).abs().max() < 1e-9
+
+
+def test_an_emptied_tank_stays_empty() -> None:
+    plant = PlantDescription("one", (Tank("T", 0.02, 1.0, 0.1),), (Pipe("O", "T", OUTSIDE, 1e-4, 0.6),), (), (Sensor("h", "T"),))
+    time = torch.linspace(0.0, 2000.0, 200, dtype=torch.float64)
+    recording = blank_recording(plant, torch.zeros(200, 0, dtype=torch.float64), time)
+    space, theta = nothing()
+    levels = ReferenceEngine(build_network(plant), space, lay_out(recording, (), 1.0)).levels(theta)[0, :, 0]
+    assert levels.min() > -1e-6
+    assert levels[-1].abs() < 1e-6
+
+
+def test_small_steps_about_rest_follow_the_matrix_exponential() -> None:
+    network, space = paper_network()
+    inputs = torch.full((2,), 50e-6, dtype=torch.float64)
+    rest = equilibrium(network, inputs)
+    values = network.bind(space, space.nominal())
+    slope = torch.autograd.functional.jacobian(lambda h: network(h, inputs, clock(), values), rest)
+    push = torch.tensor([1e-5, -2e-5, 1.5e-5], dtype=torch.float64)
+    plant = three_tank(tuple((rest + push).tolist()))
+    engine = ReferenceEngine(*paper_network(plant), lay_out(constant_inputs(plant, 100.0, 10.0), ("Q1", "Q2"), 0.1))
+    levels = engine.levels(space.nominal().unsqueeze(0))[0]
+    for k in range(11):
+        expected = rest + torch.from_numpy(expm(10.0 * k * slope.numpy())) @ push
+        assert (levels[k] - expected).abs().max() < 1e-9
+
+
+def test_rest_is_where_the_paper_reading_has_it() -> None:
+    network, _ = paper_network()
+    rest = equilibrium(network, torch.full((2,), 50e-6, dtype=torch.float64))
+    assert (rest - torch.tensor(REST, dtype=torch.float64)).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("theta", [(0.3, 0.3, 0.5, 0.6, 1.0), (0.1, 0.6, 0.0, 1.0, 1.0)])
+def test_agrees_with_scipy(theta: tuple[float, ...]) -> None:
+    plant = three_tank()
+    network, space = paper_network(plant)
+    experiment = replace(
+        lay_out(constant_inputs(plant, 1000.0, 20.0), plant.channels(), 20.0),
+        resolution=torch.tensor(1e-6, dtype=torch.float64),
+    )
+    engine = ReferenceEngine(network, space, experiment, method="dopri5", rtol=1e-12, atol=1e-14)
+    levels = engine.levels(torch.tensor([theta], dtype=torch.float64))[0]
+    truth = solve_ivp(
+        lambda t, h: torricelli_rates(h, theta), (0, 1000), REST, "LSODA", experiment.sample_times.numpy(), rtol=1e-12, atol=1e-14
+    )
+    assert (levels - torch.from_numpy(truth.y.T)).abs().max() < 1e-10
+
+
+def test_fourth_order_of_convergence() -> None:
+    plant = three_tank((0.8, 0.2, 0.5))
+    network, space = paper_network(plant)
+    recording = constant_inputs(plant, 100.0, 100.0)
+    sharp = torch.tensor(1e-6, dtype=torch.float64)
+
+    def final(step: float) -> torch.Tensor:
+        experiment = replace(lay_out(recording, plant.channels(), step), resolution=sharp)
+        return ReferenceEngine(network, space, experiment).levels(space.nominal().unsqueeze(0))[0, -1]
+
+    truth = final(0.1)
+    coarse, fine = (final(step) - truth for step in (10.0, 5.0))
+    slope = torch.log2(coarse.norm() / fine.norm())
+    assert 3.7 < float(slope) < 4.4
+
+
+def test_volume_is_conserved() -> None:
+    plant = three_tank((0.9, 0.95, 0.5))
+    network, space = paper_network(plant)
+    theta = torch.tensor([[0.2, 0.7, 0.3, 0.5, 0.9]], dtype=torch.float64)
+    values = network.bind(space, theta[0])
+    levels = torch.tensor([0.9, 1.02, 0.5], dtype=torch.float64)
+    commands = torch.tensor([40e-6, 90e-6], dtype=torch.float64)
+    pumps = network.pump_flows(levels.unbind(), commands.unbind(), clock(), values)
+    pipes = network.pipe_flows(levels.unbind(), commands.unbind(), clock(), values)
+    net = torch.stack(network.net_inflows(levels.unbind(), pumps, pipes, clock(), values))
+    k = 0.6 * 0.6e-4 * math.sqrt(2 * 9.81)
+    leaks = 0.2 * k * math.sqrt(0.9) + 0.3 * k * math.sqrt(0.5)
+    crest = 2.0 * math.sqrt(math.pi * 160e-4)
+    spill = (2.0 / 3.0) * 0.6 * math.sqrt(2 * 9.81) * crest * 0.02**1.5
+    assert float(net.sum()) == pytest.approx(130e-6 - leaks - spill - 0.7 * k * math.sqrt(1.02), rel=1e-6)
+
+
+def test_gradients_pass_gradcheck_off_and_on_equal_levels() -> None:
+    network, space = paper_network()
+    commands = torch.tensor([40e-6, 60e-6], dtype=torch.float64)
+    theta = torch.tensor([0.2, 0.7, 0.3, 0.5, 0.9], dtype=torch.float64, requires_grad=True)
+
+    def scaled(levels: torch.Tensor, parameters: torch.Tensor) -> torch.Tensor:
+        return 1e3 * network(levels, commands, clock(1.0), network.bind(space, parameters))
+
+    apart = torch.tensor([0.6, 0.3, 0.5], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(scaled, (apart, theta), eps=1e-7)
+    for special in ([0.0, 0.0, 0.0], [0.4, 0.4, 0.4], [0.3, 0.5, 0.6], [1.0, 1.0, 1.0]):
+        levels = torch.tensor(special, dtype=torch.float64, requires_grad=True)
+        gradients = torch.autograd.grad(scaled(levels, theta).sum(), (levels, theta))
+        assert all(bool(torch.isfinite(g).all()) for g in gradients)
+
+
+def test_lpv_form_is_the_papers() -> None:
+    network, space = paper_network()
+    levels = torch.tensor([0.5, 0.2, 0.35], dtype=torch.float64)
+    commands = torch.tensor([40e-6, 60e-6], dtype=torch.float64)
+    f, b = lpv_form(network, space, levels, commands, clock())
+    k = 0.6 * 0.6e-4 * math.sqrt(2 * 9.81) / 160e-4
+    q13, q32 = k * math.sqrt(0.15), k * math.sqrt(0.15)
+    printed = torch.tensor(
+        [
+            [-k * math.sqrt(0.5), 0, 0, -q13, 0],
+            [0, -k * math.sqrt(0.2), 0, 0, q32],
+            [0, 0, -k * math.sqrt(0.35), q13, -q32],
+        ],
+        dtype=torch.float64,
+    )
+    assert torch.allclose(f, printed, rtol=1e-9, atol=1e-15)
+    assert torch.allclose(b, torch.tensor([[62.5, 0], [0, 62.5], [0, 0]], dtype=torch.float64))
+    theta = torch.tensor([0.2, 0.7, 0.3, 0.5, 0.9], dtype=torch.float64)
+    right = network(levels, commands, clock(), network.bind(space, theta))
+    assert torch.allclose(f @ theta + b @ commands, right, rtol=1e-9, atol=0)
+
+
+def test_averages_of_a_held_signal_are_exact() -> None:
+    time = torch.tensor([0.0, 1.0, 3.0, 4.0], dtype=torch.float64)
+    values = torch.tensor([[2.0], [5.0], [1.0], [7.0]], dtype=torch.float64)
+    signal = CumulativeSignal(time, values, "zero_order")
+    mean = signal.average(torch.tensor(0.5, dtype=torch.float64), torch.tensor(3.0, dtype=torch.float64), 0)
+    assert float(mean) == pytest.approx((0.5 * 2 + 2 * 5 + 0.5 * 1) / 3)
+    late = signal.average(torch.tensor(0.5, dtype=torch.float64), torch.tensor(3.0, dtype=torch.float64), 0, 1.0)
+    assert float(late) == pytest.approx((1.5 * 2 + 1.5 * 5) / 3)
+
+
+def test_switches_between_steps_are_hit() -> None:
+    plant = three_tank()
+    recording = random_steps(plant, 300.0, seed=3, sample=7.3)
+    experiment = lay_out(recording, plant.channels(), 2.0)
+    changed = (torch.diff(recording.inputs, dim=0).abs().sum(1) > 0).nonzero().flatten() + 1
+    for instant in recording.time[changed]:
+        assert float((experiment.nodes - instant).abs().min()) < 1e-9
+
+
+def test_samples_denser_than_steps_are_interpolated() -> None:
+    plant = three_tank((0.8, 0.2, 0.5))
+    network, space = paper_network(plant)
+    theta = space.nominal().unsqueeze(0)
+    recording = constant_inputs(plant, 50.0, 0.1)
+    sharp = torch.tensor(1e-6, dtype=torch.float64)
+    coarse, fine = (replace(lay_out(recording, plant.channels(), step), resolution=sharp) for step in (2.0, 0.1))
+    assert len(coarse.nodes) == 26
+    levels = [ReferenceEngine(network, space, experiment).levels(theta) for experiment in (coarse, fine)]
+    assert (levels[0] - levels[1]).abs().max() < 2e-8
+
+
+def test_overflow_goes_where_the_plant_says() -> None:
+    plant = PlantDescription(
+        "two",
+        (Tank("U", 0.02, 0.3, 0.3, overflow_to="L"), Tank("L", 0.02, 1.0, 0.0)),
+        (),
+        (Pump("Q", "U", 1e-4),),
+        (Sensor("h", "L"),),
+    )
+    time = torch.linspace(0.0, 100.0, 11, dtype=torch.float64)
+    recording = blank_recording(plant, torch.full((11, 1), 5e-5, dtype=torch.float64), time)
+    space, theta = nothing()
+    levels = ReferenceEngine(build_network(plant), space, lay_out(recording, plant.channels(), 0.1)).levels(theta)[0]
+    assert float(levels.sum(1)[-1]) == pytest.approx(0.3 + 5e-5 * 100 / 0.02, rel=1e-9)
+    assert 0.3 < float(levels[-1, 0]) < 0.31
+
+
+def test_no_steady_state_is_said() -> None:
+    plant = PlantDescription("closed", (Tank("T", 0.02, 1e9, None),), (), (Pump("Q", "T", 1e-4),), (Sensor("h", "T"),))
+    with pytest.raises(ValueError, match="tank T still moving; give its start_level"):
+        equilibrium(build_network(plant), torch.tensor([5e-5], dtype=torch.float64))
+
+
+def test_unknown_inputs_must_be_masked() -> None:
+    plant = three_tank()
+    recording = constant_inputs(plant, 10.0)
+    recording.inputs[4, 1] = float("nan")
+    with pytest.raises(ValueError, match="unknown one at 4 s; mask that stretch"):
+        lay_out(recording, plant.channels(), 1.0)
+    assert [len(r) for r in recording.known_stretches()] == [4, 6]
