@@ -19,7 +19,9 @@ def three_tank(start: tuple[float, float, float] = REST, tank_height: float = 1.
     names = ("T1", "T2", "T3")
     return PlantDescription(
         "three_tank",
-        tuple(Tank(n, 160e-4, tank_height, h, leak_reference=r) for n, h, r in zip(names, start, references, strict=True)),
+        tuple(
+            Tank(n, 160e-4, tank_height, h, leak_reference=r) for n, h, r in zip(names, start, references, strict=True)
+        ),
         (
             Pipe("P13", "T1", "T3", 0.6e-4, 0.6),
             Pipe("P32", "T3", "T2", 0.6e-4, 0.6),

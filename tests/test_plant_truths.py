@@ -47,7 +47,9 @@ def torricelli_rates(levels: list[float], theta: tuple[float, ...], flow: float 
 
 
 def test_an_emptying_tank_follows_torricelli() -> None:
-    plant = PlantDescription("one", (Tank("T", 0.02, 1.0, 0.8),), (Pipe("O", "T", OUTSIDE, 1e-4, 0.6),), (), (Sensor("h", "T"),))
+    plant = PlantDescription(
+        "one", (Tank("T", 0.02, 1.0, 0.8),), (Pipe("O", "T", OUTSIDE, 1e-4, 0.6),), (), (Sensor("h", "T"),)
+    )
     rate = 0.6 * 1e-4 * math.sqrt(2 * 9.81) / 0.02
     empty_after = 2.0 * math.sqrt(0.8) / rate
     time = torch.linspace(0.0, 0.9 * empty_after, 50, dtype=torch.float64)
@@ -59,7 +61,9 @@ def test_an_emptying_tank_follows_torricelli() -> None:
 
 
 def test_an_emptied_tank_stays_empty() -> None:
-    plant = PlantDescription("one", (Tank("T", 0.02, 1.0, 0.1),), (Pipe("O", "T", OUTSIDE, 1e-4, 0.6),), (), (Sensor("h", "T"),))
+    plant = PlantDescription(
+        "one", (Tank("T", 0.02, 1.0, 0.1),), (Pipe("O", "T", OUTSIDE, 1e-4, 0.6),), (), (Sensor("h", "T"),)
+    )
     time = torch.linspace(0.0, 2000.0, 200, dtype=torch.float64)
     recording = blank_recording(plant, torch.zeros(200, 0, dtype=torch.float64), time)
     space, theta = nothing()
@@ -100,7 +104,13 @@ def test_agrees_with_scipy(theta: tuple[float, ...]) -> None:
     engine = ReferenceEngine(network, space, experiment, method="dopri5", rtol=1e-12, atol=1e-14)
     levels = engine.levels(torch.tensor([theta], dtype=torch.float64))[0]
     truth = solve_ivp(
-        lambda t, h: torricelli_rates(h, theta), (0, 1000), REST, "LSODA", experiment.sample_times.numpy(), rtol=1e-12, atol=1e-14
+        lambda t, h: torricelli_rates(h, theta),
+        (0, 1000),
+        REST,
+        "LSODA",
+        experiment.sample_times.numpy(),
+        rtol=1e-12,
+        atol=1e-14,
     )
     assert (levels - torch.from_numpy(truth.y.T)).abs().max() < 1e-10
 
