@@ -165,6 +165,13 @@ def si_unit_of(unit: str) -> str:
     )
 
 
+def display_unit(si_unit: str) -> tuple[str, float]:
+    """The unit in which people read such a quantity, and how many of it one SI unit is: 'm' -> ('cm', 100.0)."""
+    shown = {"m": "cm", "m^2": "cm^2", "m^3": "cm^3", "m^3/s": "cm^3/s", "m^3/s/V": "cm^3/s/V", "V/m": "V/cm"}
+    unit = shown.get(si_unit, si_unit)
+    return ("" if unit == "1" else unit), 1.0 if unit == si_unit else 1.0 / unit_factor(unit, si_unit)
+
+
 def header_unit(header: str) -> tuple[str, str] | None:
     """Splits a CSV header of the form name_unit: 'Q1_cm3_s' -> ('Q1', 'cm3_s'); None where no unit stands in it.
 

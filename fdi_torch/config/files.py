@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from fdi_torch.config.problems import ConfigError, nearest
+from fdi_torch.config.problems import ConfigError, nearest, unknown
 
+MOST_EXTENSIONS = 8
 SHIPPED = Path(__file__).resolve().parents[1] / "configs"
 DEFAULT_RUN = SHIPPED / "default.yaml"
 
@@ -30,13 +32,30 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return data
 
 
+def read_extended(path: Path, depth: int = 0) -> dict[str, Any]:
+    """A YAML file laid over the one that its key `extends` names (a path beside it), mappings merged key by key."""
+    data = read_yaml(path)
+    if "extends" not in data:
+        return data
+    if depth >= MOST_EXTENSIONS:
+        raise ConfigError([f"{path}: extends: expected at most {MOST_EXTENSIONS} files in a row, got more; a circle?"])
+    below = path.parent / str(data.pop("extends"))
+    return _merged(read_extended(below, depth + 1), data)
+
+
+def _merged(below: Any, above: Any) -> Any:
+    if not (isinstance(below, dict) and isinstance(above, dict)):
+        return above
+    return below | {key: _merged(below.get(key), value) for key, value in above.items()}
+
+
 def write_yaml(data: dict[str, Any]) -> str:
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=1000, default_flow_style=None)
 
 
 def with_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
     """A copy of the mapping in which each 'a.b.0.c=value' (YAML) is set. Keys are checked with the whole, later."""
-    changed = yaml.safe_load(yaml.safe_dump(data))
+    changed = deepcopy(data)
     for override in overrides:
         path, equals, text = override.partition("=")
         if not equals or not path:
@@ -46,26 +65,24 @@ def with_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, 
         except yaml.YAMLError as error:
             raise ConfigError([f"--set {override}: expected a YAML value after '=', got {text}"]) from error
         _set(changed, path.split("."), value, override)
-    return dict(changed)
+    return changed
 
 
 def _set(node: Any, keys: Sequence[str], value: Any, override: str) -> None:
+    """Sets the value at the end of a path of keys and indices, making mappings where there are none yet."""
     for i, key in enumerate(keys):
-        place = ".".join(keys[:i]) or "the top level"
+        index: Any = key
         if isinstance(node, list):
             if not key.isdigit() or int(key) >= len(node):
+                place = ".".join(keys[:i])
                 raise ConfigError([f"--set {override}: {place}: expected an index below {len(node)}, got '{key}'"])
-            index: Any = int(key)
-        elif isinstance(node, dict):
-            index = key
-        else:
-            raise ConfigError([f"--set {override}: {place}: expected keys and values, got {node!r}"])
+            index = int(key)
         if i == len(keys) - 1:
             node[index] = value
-        else:
-            if isinstance(node, dict) and node.get(index) is None:
-                node[index] = {}
-            node = node[index]
+            return
+        if isinstance(node, dict) and not isinstance(node.get(index), dict | list):
+            node[index] = {}
+        node = node[index]
 
 
 def find_file(name: str, base: Path, also: Sequence[Path] = ()) -> Path:
@@ -90,8 +107,12 @@ def find_data(name: str, base: Path) -> Path:
 
 def find_plant(name: str, base: Path) -> Path:
     """A plant file, or a plant that is shipped, by its name ('three_tank')."""
-    shipped = SHIPPED / "plants" / f"{name}.yaml"
-    return shipped if shipped.is_file() else find_file(name, base, [SHIPPED.parent, SHIPPED])
+    plants = {path.stem: path for path in sorted((SHIPPED / "plants").glob("*.yaml"))}
+    if name in plants:
+        return plants[name]
+    if Path(name).suffix in (".yaml", ".yml"):
+        return find_file(name, base)
+    raise ConfigError([f"plant: {unknown('a plant file (.yaml) or a shipped plant', name, plants)}"])
 
 
 def _similar(name: str, folders: Sequence[Path]) -> str:

@@ -1,0 +1,75 @@
+"""`fdi COMMAND`: finds the command, runs it, and turns what goes wrong into one sentence and an exit code.
+
+Exit codes: 0 done, 2 misuse (said in one sentence on standard error), 3 ran but did not converge, 130 interrupted.
+A command is a module here with HELP, `add_arguments(parser)` and `run(arguments, screen) -> exit code`; it is imported
+only when asked for, so that help is instant.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import importlib
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+from typing import NoReturn
+
+DONE, MISUSE, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 130
+
+COMMANDS = {
+    "check": "examine a plant and a recording before any fit",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words or words[0] in ("-h", "--help"):
+        sys.stdout.write(_overview())
+        return DONE if words else MISUSE
+    if words[0] not in COMMANDS:
+        near = difflib.get_close_matches(words[0], COMMANDS, n=1)
+        hint = f"; the nearest is '{near[0]}'" if near else ""
+        sys.stderr.write(f"fdi: expected a command ({', '.join(COMMANDS)}), got '{words[0]}'{hint}\n")
+        return MISUSE
+    return _run(words[0], words[1:])
+
+
+def command_line() -> NoReturn:
+    """The entry point `fdi`."""
+    sys.exit(main())
+
+
+def _overview() -> str:
+    lines = [f"  {name:<16}{what}" for name, what in COMMANDS.items()]
+    return "\n".join(["usage: fdi COMMAND [options]", "", *lines, "", "fdi COMMAND --help tells more.", ""])
+
+
+def _run(name: str, words: list[str]) -> int:
+    command = importlib.import_module(f"fdi_torch.cli.{name}")
+    arguments = _parser(name, command).parse_args(words)
+    from fdi_torch.cli.screen import Screen
+
+    screen = Screen(json=arguments.json, quiet=arguments.quiet)
+    try:
+        return int(command.run(arguments, screen))
+    except KeyboardInterrupt:
+        screen.complain(f"fdi {name}: interrupted; what was computed until now is kept")
+        return INTERRUPTED
+    except (ValueError, OSError) as error:
+        if arguments.traceback:
+            raise
+        for line in str(error).splitlines():
+            screen.complain(f"fdi {name}: {line}")
+        return MISUSE
+
+
+def _parser(name: str, command: ModuleType) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=f"fdi {name}", description=command.__doc__, allow_abbrev=False)
+    command.add_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON and nothing else on standard output")
+    parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
+    parser.add_argument(
+        "--traceback", action="store_true", help="where a sentence would be printed, show the code's path"
+    )
+    return parser

@@ -1,0 +1,72 @@
+"""Examine a plant and its recordings before any fit: clock, gaps, clipped, frozen or rounded channels, units, masks."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from fdi_torch.cli.options import add_config
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.plant import load_plant
+from fdi_torch.config.recordings import RecordingConfig, load_recordings, read_recording
+from fdi_torch.config.run import load_run
+from fdi_torch.parameters import display_unit
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording_check import ChannelSummary, RecordingCheck, check_recording
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", nargs="?", help="CSV or MCAP file whose columns are named as the plant's channels")
+    parser.add_argument("--plant", metavar="NAME|FILE", help="a shipped plant such as three_tank, or a plant file")
+    add_config(parser)
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    plant, recordings, base = _wanted(arguments)
+    checks = []
+    _show_plant(plant, screen)
+    for config in recordings:
+        recording = read_recording(config, plant, base)
+        checks.append(check_recording(recording, plant))
+        _show(checks[-1], screen)
+        stretches = load_recordings([config], plant, base)
+        if len(stretches) > 1 or len(stretches[0].recording) < len(recording):
+            spans = ", ".join(f"{p.recording.time[0]:g} to {p.recording.time[-1]:g} s" for p in stretches)
+            screen.say(f"usable with all inputs known: {spans}")
+    screen.result({"format": "fdi_torch.check/1", "plant": plant, "recordings": checks})
+    return 0
+
+
+def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[RecordingConfig], Path]:
+    if arguments.config is not None:
+        wanted = load_run(arguments.config, arguments.set)
+        if not wanted.config.recordings:
+            raise ValueError("expected recordings in the run file, got a simulation; fdi simulate writes its recording")
+        return wanted.plant, wanted.config.recordings, wanted.base
+    if arguments.plant is None or arguments.recording is None:
+        raise ValueError("expected a recording and --plant, or --config; fdi check --help tells more")
+    return load_plant(arguments.plant), [RecordingConfig(file=arguments.recording)], Path.cwd()
+
+
+def _show_plant(plant: PlantDescription, screen: Screen) -> None:
+    counts = ((plant.tanks, "tanks"), (plant.pipes, "pipes"), (plant.pumps, "pumps"), (plant.sensors, "sensors"))
+    parts = ", ".join(f"{len(components)} {what}" for components, what in counts)
+    screen.say(f"plant {plant.name}: {parts}, {len(plant.tolerances)} constants with a tolerance")
+
+
+def _show(check: RecordingCheck, screen: Screen) -> None:
+    screen.say()
+    screen.say(f"{check.source}: {check.samples} samples, {check.duration:g} s, one every {check.interval:.6g} s")
+    header = ("channel", "", "unit", "lowest", "highest", "mean", "smallest step", "missing", "masked")
+    screen.table("", header, [_row(channel) for channel in check.channels], left=3)
+    for finding in check.findings:
+        screen.say(f"- {finding.channel}: {finding.text}")
+    if not check.findings:
+        screen.say("nothing odd was found")
+
+
+def _row(channel: ChannelSummary) -> list[str]:
+    unit, scale = display_unit(channel.unit)
+    numbers = (channel.low, channel.high, channel.mean, channel.resolution)
+    shown = [f"{scale * number:.5g}" for number in numbers]
+    return [channel.name, channel.role, unit or "share", *shown, str(channel.missing), str(channel.masked)]

@@ -1,0 +1,94 @@
+"""What a command shows: results on standard output, progress and complaints on standard error."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+import orjson
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+SECONDS_BETWEEN_LINES = 2.0
+PLAIN_WIDTH = 160
+"""Characters in a line where nobody has set a width, as in a pipe."""
+
+
+class Advance(Protocol):
+    """Tells how far a stage is (0 to 1), and one line about it."""
+
+    def __call__(self, share: float, text: str = "") -> None: ...
+
+
+class Screen:
+    """json: results as JSON only. quiet: no progress. On a terminal progress is a bar, otherwise plain lines."""
+
+    def __init__(self, json: bool = False, quiet: bool = False) -> None:
+        self.json = json
+        self.quiet = quiet
+        self._out = Console(width=None if sys.stdout.isatty() else PLAIN_WIDTH, highlight=False, soft_wrap=True)
+        self._err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+    def say(self, text: str = "") -> None:
+        """A line of the result; not beside JSON."""
+        if not self.json:
+            self._out.print(text, markup=False)
+
+    def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> None:
+        """Rows of words and numbers, the first `left` columns flush left; not beside JSON."""
+        if self.json:
+            return
+        table = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
+        for i, name in enumerate(header):
+            table.add_column(name, justify="left" if i < left else "right", no_wrap=True)
+        for row in rows:
+            table.add_row(*row)
+        self._out.print(table, soft_wrap=False)
+
+    def result(self, data: Any) -> None:
+        """The result as JSON (dataclasses too; what is not finite becomes null), where JSON was asked for."""
+        if self.json:
+            options = orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_DATACLASS | orjson.OPT_SERIALIZE_NUMPY
+            sys.stdout.write(orjson.dumps(data, option=options).decode() + "\n")
+            sys.stdout.flush()
+
+    def note(self, text: str) -> None:
+        """A line of progress."""
+        if not self.quiet:
+            self._err.print(text, markup=False)
+
+    def complain(self, text: str) -> None:
+        """What went wrong, also where all else is quiet."""
+        self._err.print(text, markup=False)
+
+    @contextmanager
+    def progress(self, title: str) -> Iterator[Advance]:
+        """A bar on a terminal; elsewhere a line at once and then every few seconds."""
+        if self.quiet:
+            yield lambda share, text="": None
+        elif self._err.is_terminal:
+            with self._bar() as bar:
+                task = bar.add_task(title, total=1.0, text="")
+                yield lambda share, text="": bar.update(task, completed=share, text=text)
+        else:
+            yield self._lines(title)
+
+    def _bar(self) -> Progress:
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
+        return Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=self._err, transient=True)
+
+    def _lines(self, title: str) -> Advance:
+        self.note(f"{title} ...")
+        last = time.monotonic()
+
+        def advance(share: float, text: str = "") -> None:
+            nonlocal last
+            if share >= 1.0 or time.monotonic() - last >= SECONDS_BETWEEN_LINES:
+                last = time.monotonic()
+                self.note(f"{title} {share:4.0%} {text}".rstrip())
+
+        return advance

@@ -1,0 +1,157 @@
+"""What is to be estimated, and how: parameters by name, constants to calibrate, objectives, search and refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import fields
+from fnmatch import fnmatchcase
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from fdi_torch.config.problems import ConfigError, unknown
+from fdi_torch.config.strict import Amount, Share, Strict, quantity
+from fdi_torch.effects import EFFECTS, effect, placements_for
+from fdi_torch.estimate.evolution_settings import EvolutionSettings
+from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+
+Objective = Literal["correlation", "likelihood"]
+
+
+class ParameterConfig(Strict):
+    name: str = Field(description="COMPONENT.CONSTANT, COMPONENT.EFFECT (its size) or COMPONENT.EFFECT.PARAMETER")
+    nominal: Amount | None = Field(None, description="what is believed")
+    low: Amount | None = Field(None, description="lower end of the box")
+    high: Amount | None = Field(None, description="upper end of the box")
+    std: Amount | None = Field(None, description="one standard deviation of the belief")
+
+
+def _parameter(value: Any) -> Any:
+    return {"name": value} if isinstance(value, str) else value
+
+
+def _auto_or_names(value: Any) -> Any:
+    if value == "auto" or (isinstance(value, list) and all(isinstance(name, str) for name in value)):
+        return value
+    raise ValueError(f"expected auto or a list of names, got {value!r}")
+
+
+def _auto_or_seconds(value: Any) -> Any:
+    return value if value == "auto" else quantity(value, "s")
+
+
+def _known_settings(value: Any) -> Any:
+    known = [field.name for field in fields(EvolutionSettings)]
+    for key in value if isinstance(value, dict) else ():
+        if key not in known:
+            raise ValueError(unknown("a known key", str(key), known))
+    return value
+
+
+class ObjectiveConfig(Strict):
+    search: Objective = Field("correlation", description="what the search maximises")
+    refine: Objective = Field("likelihood", description="what the refinement maximises")
+
+
+class RefineConfig(Strict):
+    method: Literal["lm", "lbfgs", "adam", "none"] = Field("lm", description="Levenberg-Marquardt, L-BFGS or Adam")
+    iterations: int = Field(50, ge=1, description="at most")
+
+
+class StepConfig(Strict):
+    search: Annotated[Any, BeforeValidator(_auto_or_seconds)] = Field("auto", description="integration step, s")
+    refine: Annotated[Any, BeforeValidator(_auto_or_seconds)] = Field("auto", description="integration step, s")
+
+
+class EstimationConfig(Strict):
+    parameters: list[Annotated[ParameterConfig, BeforeValidator(_parameter)]] = Field(
+        default_factory=list, description="names, or mappings with name, low, high, nominal, std"
+    )
+    calibrate: Annotated[Any, BeforeValidator(_auto_or_names)] = Field(
+        "auto", description="constants estimated beside them, their tolerance as prior; auto: all, where data are real"
+    )
+    objective: ObjectiveConfig = Field(default_factory=ObjectiveConfig)
+    search: Annotated[EvolutionSettings, BeforeValidator(_known_settings)] = Field(
+        default_factory=EvolutionSettings, description="differential evolution"
+    )
+    refine: RefineConfig = Field(default_factory=RefineConfig)
+    step: StepConfig = Field(default_factory=StepConfig)
+    confidence: Share = Field(0.95, gt=0, lt=1, description="of intervals and of the diagnosis")
+
+
+def full_name(name: str, plant: PlantDescription) -> str:
+    """'T1.leak' -> 'T1.leak.size': an effect's name stands for its size."""
+    location, _, rest = name.partition(".")
+    if rest in {e.name for e in EFFECTS}:
+        return f"{name}.{effect(rest).parameters(location, plant)[0].name}"
+    return name
+
+
+def placements_of(names: Iterable[str], plant: PlantDescription) -> tuple[Placement, ...]:
+    """The effects that these names speak of, each once."""
+    return placements_for(full_name(name, plant) for name in names)
+
+
+def estimated_space(
+    config: EstimationConfig, constants: ParameterSpace, plant: PlantDescription, real_data: bool
+) -> ParameterSpace:
+    """The parameters and the constants to calibrate, as `constants` (of the network) has them, changed as asked.
+
+    Raises ConfigError for names that are unknown or doubled, wrong units, and boxes that do not hold the nominal value.
+    """
+    chosen = [_chosen(p, i, constants, plant) for i, p in enumerate(config.parameters)]
+    taken = {p.name for p in chosen}
+    calibrated = [constants[name] for name in _calibrated(config, constants, plant, real_data) if name not in taken]
+    try:
+        return ParameterSpace([*chosen, *calibrated])
+    except ValueError as error:
+        raise ConfigError([f"estimate.parameters: {error}"]) from error
+
+
+def _chosen(config: ParameterConfig, index: int, constants: ParameterSpace, plant: PlantDescription) -> Parameter:
+    place = f"estimate.parameters.{index}"
+    name = full_name(config.name, plant)
+    if name not in constants:
+        raise ConfigError([f"{place}: {_unknown_parameter(name, constants)}"])
+    unit = constants[name].unit
+    try:
+        given = {field: getattr(config, field) for field in ("nominal", "low", "high", "std")}
+        changes = {field: quantity(value, unit) for field, value in given.items() if value is not None}
+        return constants.with_changes(name, **changes)[name]
+    except ValueError as error:
+        raise ConfigError([f"{place} ({config.name}): {error}"]) from error
+
+
+def _calibrated(
+    config: EstimationConfig, constants: ParameterSpace, plant: PlantDescription, real_data: bool
+) -> list[str]:
+    if config.calibrate == "auto":
+        return list(plant.tolerances) if real_data else []
+    names: list[str] = []
+    for pattern in config.calibrate:
+        matched = [name for name in constants.names if fnmatchcase(name, pattern)]
+        if not matched:
+            raise ConfigError([f"estimate.calibrate: {_unknown_parameter(pattern, constants)}"])
+        names += [name for name in matched if name not in names]
+    return names
+
+
+def _unknown_parameter(name: str, constants: ParameterSpace) -> str:
+    sentence = unknown("a parameter of the plant or its faults", name, constants.names)
+    return sentence.replace(f" ({', '.join(constants.names)})", "")
+
+
+def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant: PlantDescription) -> dict[str, float]:
+    """{'T1.leak': 0.3} -> {'T1.leak.size': 0.3} in SI. Raises ConfigError for unknown names and wrong units."""
+    si: dict[str, float] = {}
+    for given, value in values.items():
+        name = full_name(given, plant)
+        if name not in constants:
+            raise ConfigError([f"simulate.faults: {_unknown_parameter(name, constants)}"])
+        try:
+            si[name] = quantity(value, constants[name].unit)
+        except ValueError as error:
+            raise ConfigError([f"simulate.faults.{given}: {error}"]) from error
+    return si

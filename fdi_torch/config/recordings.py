@@ -1,0 +1,155 @@
+"""Which recordings are meant, and reading them as the plant's inputs and outputs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from fdi_torch.config.files import find_data
+from fdi_torch.config.problems import ConfigError, unknown
+from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.recording_csv import ChannelSource, read_csv
+
+GIVE_A_CONSTANT = "give the unknown one a constant, as in columns: {Q1: {constant: 0 cm^3/s}}"
+
+StartLevel = Literal["free", "equilibrium"] | float
+"""How a tank's level at the start is known: to be estimated, at rest under the first inputs, or so many metres."""
+
+
+def _start_level(value: Any) -> StartLevel:
+    if value in ("free", "equilibrium"):
+        return value
+    try:
+        return quantity(value, "m")
+    except ValueError as error:
+        raise ValueError(f"expected free, equilibrium or a level such as '50 cm', got {value!r}") from error
+
+
+def _start_levels(value: Any) -> Any:
+    """free, equilibrium, or a mapping of tanks to these or to levels."""
+    if isinstance(value, dict):
+        return {str(tank): _start_level(level) for tank, level in value.items()}
+    return _start_level(value)
+
+
+StartLevels = Annotated[Any, BeforeValidator(_start_levels)]
+
+
+class ColumnConfig(Strict):
+    column: str | None = Field(None, description="header of the column, or topic/field of an MCAP file")
+    unit: str | None = Field(None, description="unit of its numbers, where the header does not end in it")
+    constant: Amount | None = Field(None, description="the value of an input that was not recorded")
+    recorded: bool = Field(True, description="false for an output that the file does not have")
+
+
+class RecordingConfig(Strict):
+    file: str = Field(description="CSV (plain or .gz) or MCAP file; looked for here and below FDI_TORCH_DATA")
+    start: Seconds | None = Field(None, description="first time used, s")
+    stop: Seconds | None = Field(None, description="last time used, s")
+    mask: list[tuple[Seconds, Seconds]] = Field(
+        default_factory=list, description="intervals whose readings do not count, s"
+    )
+    every: int = Field(1, ge=1, description="use every n-th sample only")
+    hold: Literal["zero_order", "linear"] = Field("zero_order", description="how inputs run between samples")
+    columns: dict[str, ColumnConfig] = Field(
+        default_factory=dict, description="for channels (time is t) whose header is not name_unit"
+    )
+    start_levels: StartLevels = Field("free", description="free, equilibrium, or a mapping such as {T1: 50 cm}")
+
+
+@dataclass(frozen=True)
+class LoadedRecording:
+    """A stretch of a recording whose inputs are all known, and what is known of each tank's level at its start."""
+
+    recording: Recording
+    start_levels: dict[str, StartLevel]
+
+
+def load_recordings(
+    configs: Sequence[RecordingConfig], plant: PlantDescription, base: Path | None = None
+) -> list[LoadedRecording]:
+    """Every recording, cut where an input is unknown; the levels at the start of a later stretch are free."""
+    loaded: list[LoadedRecording] = []
+    for config in configs:
+        whole = read_recording(config, plant, base)
+        stretches = [part for part in whole.known_stretches() if len(part) > 1]
+        if not stretches:
+            raise ConfigError(
+                [f"{whole.source}: expected a stretch with all inputs known, got none; {GIVE_A_CONSTANT}"]
+            )
+        for part in stretches:
+            from_the_start = float(part.time[0]) == float(whole.time[0])
+            loaded.append(
+                LoadedRecording(part, _levels(config.start_levels if from_the_start else "free", plant, config))
+            )
+    return loaded
+
+
+def read_recording(config: RecordingConfig, plant: PlantDescription, base: Path | None = None) -> Recording:
+    """The plant's inputs and outputs from one file: selected, masked and thinned, unknown inputs still in it (NaN)."""
+    path = find_data(config.file, base or Path.cwd())
+    channels, columns = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
+    try:
+        mapping = _mapping(config, plant)
+        recording = _reader(path)(path, channels, columns, mapping, config.hold)
+        _expect_units(recording, plant)
+        start = -math.inf if config.start is None else config.start
+        window = recording.window(start, math.inf if config.stop is None else config.stop)
+        return window.masked(config.mask).every(config.every)
+    except ValueError as error:
+        raise ConfigError([str(error)]) from error
+
+
+def _reader(path: Path) -> Any:
+    """By the file's ending: an MCAP log, or else CSV."""
+    return read_csv
+
+
+def _mapping(config: RecordingConfig, plant: PlantDescription) -> dict[str, ChannelSource]:
+    units = _units(plant)
+    mapping = {}
+    for name, column in config.columns.items():
+        place = f"{config.file}: columns.{name}"
+        if name != "t" and name not in units:
+            raise ValueError(f"{place}: {unknown('a channel of the plant or t', name, [*units, 't'])}")
+        try:
+            constant = None if column.constant is None else quantity(column.constant, units.get(name, "s"))
+        except ValueError as error:
+            raise ValueError(f"{place}.constant: {error}") from error
+        if not column.recorded:
+            constant = float("nan")
+        unit = column.unit if constant is None else units.get(name, "s")
+        mapping[name] = ChannelSource(column.column, unit, constant)
+    return mapping
+
+
+def _units(plant: PlantDescription) -> dict[str, str]:
+    return plant.channel_units() | {sensor.column: sensor.unit for sensor in plant.sensors}
+
+
+def _expect_units(recording: Recording, plant: PlantDescription) -> None:
+    expected = _units(plant)
+    names = (*recording.input_names, *recording.output_names)
+    for name, unit in zip(names, (*recording.input_units, *recording.output_units), strict=True):
+        if unit != expected[name]:
+            raise ValueError(
+                f"{recording.source}: {name}: expected a unit of the kind {expected[name]} (plant {plant.name}), "
+                f"got one of the kind {unit}; correct the header, columns, or the gain in the plant file"
+            )
+
+
+def _levels(wanted: Any, plant: PlantDescription, config: RecordingConfig) -> dict[str, StartLevel]:
+    tanks = [tank.name for tank in plant.tanks]
+    if not isinstance(wanted, dict):
+        return dict.fromkeys(tanks, wanted)
+    for name in wanted:
+        if name not in tanks:
+            raise ConfigError([f"{config.file}: start_levels.{name}: {unknown('a tank', name, tanks)}"])
+    return {tank: wanted.get(tank, "free") for tank in tanks}

@@ -1,0 +1,86 @@
+"""Run files: which plant, which recordings (or a simulation), what to estimate and how, and where the results go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from fdi_torch.config.estimation import EstimationConfig
+from fdi_torch.config.files import DEFAULT_RUN, find_file, read_extended, with_overrides, write_yaml
+from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.problems import ConfigError, explain
+from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.simulation import SimulationConfig
+from fdi_torch.config.strict import Strict
+from fdi_torch.plant.description import PlantDescription
+
+
+class OutputConfig(Strict):
+    folder: str = Field("logs", description="for the log and the pictures")
+    name: str = Field("", description="of the run; by default the file's name")
+
+
+class RunConfig(Strict):
+    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+    recordings: list[RecordingConfig] = Field(default_factory=list, description="real data")
+    simulate: SimulationConfig | None = Field(None, description="or a run to be simulated")
+    estimate: EstimationConfig = Field(default_factory=EstimationConfig)
+    output: OutputConfig = Field(default_factory=OutputConfig)
+    seed: int = Field(0, ge=0, description="of everything drawn at random")
+    device: str = Field("cpu", description="cpu or cuda")
+    engine: Literal["auto", "reference", "compiled"] = Field("auto", description="what integrates")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> RunConfig:
+        if bool(self.recordings) == (self.simulate is not None):
+            got = "both" if self.recordings else "neither"
+            raise ValueError(f"expected either recordings or simulate, got {got}; keep one")
+        return self
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run file understood. base: where its paths start. text: YAML that gives the same run, plant included."""
+
+    config: RunConfig
+    plant: PlantDescription
+    base: Path
+    source: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        return self.config.output.name or Path(self.source).stem
+
+
+def load_run(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Run:
+    """A run file, or the built-in default, with some values changed ('estimate.search.population=40').
+
+    Raises ConfigError with one sentence for each thing that is wrong.
+    """
+    file = DEFAULT_RUN if path is None else find_file(str(path), Path.cwd())
+    return build_run(with_overrides(read_extended(file), overrides), file.parent, str(file))
+
+
+def build_run(data: Mapping[str, Any], base: Path, source: str) -> Run:
+    """A run from a mapping as in a run file. `base` is where its paths start."""
+    try:
+        config = RunConfig.model_validate(dict(data))
+    except ValidationError as error:
+        raise explain(error, source) from None
+    plant = _plant(config.plant, base, source)
+    text = write_yaml({**data, "plant": plant_mapping(plant)})
+    return Run(config, plant, base, source, text)
+
+
+def _plant(wanted: Any, base: Path, source: str) -> PlantDescription:
+    if isinstance(wanted, str):
+        return load_plant(wanted, base)
+    if isinstance(wanted, dict):
+        return build_plant({"name": "plant", **wanted}, f"{source}: plant")
+    raise ConfigError([f"{source}: plant: expected a shipped plant, a plant file or a plant, got {wanted!r}"])

@@ -1,0 +1,153 @@
+"""Recordings to be made: inputs, faults and noise of a simulated run."""
+
+from __future__ import annotations
+
+from pathlib import PurePath
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import BeforeValidator, Field
+from torch import Tensor
+
+from fdi_torch.config.problems import ConfigError, unknown
+from fdi_torch.config.recordings import StartLevels
+from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+
+
+class InputConfig(Strict):
+    value: Amount | None = Field(None, description="held throughout, in the unit of the plant's channel")
+    steps: list[tuple[Seconds, Amount]] = Field(
+        default_factory=list, description="[[0 s, 50 cm^3/s], [200 s, 60 cm^3/s], ...]: from each time on"
+    )
+
+
+def _input(value: Any) -> Any:
+    return {"value": value} if isinstance(value, int | float | str) else value
+
+
+def flat_names(value: Any, prefix: str = "") -> Any:
+    """{T1: {leak: 0.3}} -> {T1.leak: 0.3}, as --set simulate.faults.T1.leak=0.3 makes it."""
+    if not isinstance(value, dict):
+        return value
+    flat: dict[str, Any] = {}
+    for key, inner in value.items():
+        name = f"{prefix}{key}"
+        flat.update(flat_names(inner, f"{name}.") if isinstance(inner, dict) else {name: inner})
+    return flat
+
+
+class NoiseConfig(Strict):
+    snr_db: float | None = Field(None, description="signal-to-noise ratio of each output, dB")
+    definition: Literal["variance", "power"] = Field(
+        "variance", description="noise against the signal's variance, or against its mean square"
+    )
+    std: dict[str, Amount] = Field(default_factory=dict, description="instead, of named outputs: {h1: 1 mm}")
+
+
+class SimulationConfig(Strict):
+    inputs: dict[str, Annotated[InputConfig, BeforeValidator(_input)]] = Field(
+        default_factory=dict, description="channel: value or steps"
+    )
+    hold: Literal["zero_order", "linear"] = Field("zero_order", description="how inputs run between samples")
+    duration: Seconds = Field(1000.0, gt=0, description="length of the recording, s")
+    sample_time: Seconds = Field(1.0, gt=0, description="sampling interval, s")
+    start_levels: StartLevels = Field(
+        "equilibrium", description="equilibrium (of the fault-free plant), or {T1: 50 cm}"
+    )
+    faults: Annotated[dict[str, Amount], BeforeValidator(flat_names)] = Field(
+        default_factory=dict, description="values of any parameters, such as T1.leak: 0.3"
+    )
+    noise: NoiseConfig = Field(default_factory=NoiseConfig, description="added to every output")
+    seed: int | None = Field(None, description="of the noise, where it is not the run's seed")
+
+
+def planned_recording(config: SimulationConfig, plant: PlantDescription) -> Recording:
+    """The clock and the inputs of the run to be simulated; its readings are still unknown (NaN, not counted).
+
+    Raises ConfigError for inputs that the plant lacks or misses, and for steps that are not at samples.
+    """
+    time = _clock(config)
+    units = plant.channel_units()
+    for name in config.inputs:
+        if name not in units:
+            raise ConfigError([f"simulate.inputs.{name}: {unknown('a channel of the plant', name, units)}"])
+    missing = [name for name in units if name not in config.inputs]
+    if missing:
+        raise ConfigError([f"simulate.inputs: expected every channel of the plant, got none for {', '.join(missing)}"])
+    columns = [_series(name, config.inputs[name], unit, time, config) for name, unit in units.items()]
+    sensors = plant.sensors
+    return Recording(
+        time=time,
+        inputs=torch.stack(columns, dim=1) if columns else time.new_zeros(len(time), 0),
+        outputs=time.new_full((len(time), len(sensors)), float("nan")),
+        input_names=tuple(units),
+        output_names=tuple(sensor.column for sensor in sensors),
+        input_units=tuple(units.values()),
+        output_units=tuple(sensor.unit for sensor in sensors),
+        hold=config.hold,
+        source=str(PurePath("simulated")),
+    )
+
+
+def noise_std(config: NoiseConfig, plant: PlantDescription, clean: Tensor) -> Tensor:
+    """Standard deviation (N,) of the noise for noise-free outputs (T, N), in their SI units.
+
+    From the signal-to-noise ratio: sqrt(P 10^(-SNR/10)), P the variance or the mean square of each output.
+    """
+    names = [sensor.column for sensor in plant.sensors]
+    std = clean.new_zeros(len(names))
+    if config.snr_db is not None:
+        power = clean.var(dim=0, correction=0) if config.definition == "variance" else clean.square().mean(dim=0)
+        if bool((power <= 0).any()):
+            still = names[int((power <= 0).nonzero()[0])]
+            raise ConfigError([f"simulate.noise.snr_db: expected outputs that vary, got a constant {still}; give std"])
+        std = (power * 10.0 ** (-config.snr_db / 10.0)).sqrt()
+    for name, value in config.std.items():
+        if name not in names:
+            raise ConfigError([f"simulate.noise.std.{name}: {unknown('an output of the plant', name, names)}"])
+        std[names.index(name)] = _amount(f"simulate.noise.std.{name}", value, plant.sensors[names.index(name)].unit)
+    return std
+
+
+def _clock(config: SimulationConfig) -> Tensor:
+    intervals = round(config.duration / config.sample_time)
+    if intervals < 1 or abs(intervals * config.sample_time - config.duration) > 1e-9 * config.duration:
+        wanted = f"a multiple of sample_time ({config.sample_time:g} s)"
+        raise ConfigError([f"simulate.duration: expected {wanted}, got {config.duration:g} s"])
+    return torch.arange(intervals + 1, dtype=torch.float64) * config.sample_time
+
+
+def _series(name: str, config: InputConfig, unit: str, time: Tensor, run: SimulationConfig) -> Tensor:
+    place = f"simulate.inputs.{name}"
+    if (config.value is None) == (not config.steps):
+        raise ConfigError([f"{place}: expected either value or steps, got {'neither' if not config.steps else 'both'}"])
+    if config.value is not None:
+        return torch.full_like(time, _amount(place, config.value, unit))
+    times = torch.tensor([t for t, _ in config.steps], dtype=torch.float64)
+    values = torch.tensor([_amount(f"{place}.steps", v, unit) for _, v in config.steps], dtype=torch.float64)
+    if float(times[0]) != 0.0 or not bool((torch.diff(times) > 0).all()):
+        raise ConfigError([f"{place}.steps: expected times that start at 0 s and increase, got {times.tolist()}"])
+    if run.hold == "linear":
+        return _interpolated(time, times, values)
+    if bool(((times / run.sample_time - (times / run.sample_time).round()).abs() > 1e-9).any()):
+        raise ConfigError([f"{place}.steps: expected times at samples (every {run.sample_time:g} s), got others"])
+    return values[torch.searchsorted(times, time + 1e-9 * run.sample_time, right=True) - 1]
+
+
+def _interpolated(time: Tensor, times: Tensor, values: Tensor) -> Tensor:
+    """Straight lines between the given points, level after the last."""
+    if len(times) == 1:
+        return values.expand_as(time).clone()
+    right = torch.searchsorted(times, time, right=True).clamp(1, len(times) - 1)
+    left = right - 1
+    share = ((time - times[left]) / (times[right] - times[left])).clamp(max=1.0)
+    return values[left] + share * (values[right] - values[left])
+
+
+def _amount(place: str, value: Amount, unit: str) -> float:
+    try:
+        return quantity(value, unit)
+    except ValueError as error:
+        raise ConfigError([f"{place}: {error}"]) from error

@@ -1,0 +1,268 @@
+"""What a recording is like before anything is fitted to it: its clock, and what is odd about each channel.
+
+Nothing here judges a fit. A finding is a sentence with the numbers behind it, in SI, and a unit for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import display_unit
+from fdi_torch.plant.description import PlantDescription, Pump, Sensor
+from fdi_torch.recording import Recording
+
+GAP_STEPS = 3.0
+"""A gap is a step longer than this many usual ones."""
+JITTER_SHARE = 0.05
+FROZEN_SAMPLES = 20
+CLIPPED_SAMPLES = 5
+CLIPPED_PILE = 5.0
+"""Clipped: the extreme value occurs this many times as often as its neighbour."""
+COARSE_SHARE = 0.5
+"""Rounded coarsely: more than this share of the readings equal the one before."""
+RIM_MARGIN = 0.02
+SMALL_SHARE = 0.01
+"""Wrong unit: all values below this share of the limit, or above ten times the limit."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """kind: clock, gap, constant, clipped, frozen, quantised, range, unit, missing or unknown. values: SI, by name."""
+
+    kind: str
+    channel: str
+    text: str
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ChannelSummary:
+    """One channel in its SI unit. resolution: the smallest step between two different values (0 where constant)."""
+
+    name: str
+    role: str
+    unit: str
+    low: float
+    high: float
+    mean: float
+    resolution: float
+    missing: int
+    masked: int
+
+
+@dataclass(frozen=True)
+class RecordingCheck:
+    """samples, duration (s), interval: the usual sampling interval (s), and what was found."""
+
+    source: str
+    samples: int
+    duration: float
+    interval: float
+    channels: tuple[ChannelSummary, ...]
+    findings: tuple[Finding, ...]
+
+
+def check_recording(recording: Recording, plant: PlantDescription) -> RecordingCheck:
+    """Clock, missing and unknown stretches, and each channel by itself and against the plant."""
+    steps = torch.diff(recording.time)
+    interval = float(steps.median()) if len(steps) else 0.0
+    return RecordingCheck(
+        source=recording.source,
+        samples=len(recording),
+        duration=float(recording.time[-1] - recording.time[0]) if len(recording) else 0.0,
+        interval=interval,
+        channels=tuple(_summaries(recording)),
+        findings=(
+            *_clock_findings(recording.time, steps, interval),
+            *_unknown_inputs(recording),
+            *_missing_readings(recording),
+            *_reading_findings(recording),
+            *_against_plant(recording, plant),
+        ),
+    )
+
+
+def _summaries(recording: Recording) -> Iterator[ChannelSummary]:
+    for name, unit, values in zip(recording.input_names, recording.input_units, recording.inputs.T, strict=True):
+        yield _summary(name, "input", unit, values, 0)
+    readings = zip(recording.output_names, recording.output_units, recording.outputs.T, recording.mask.T, strict=True)
+    for name, unit, values, mask in readings:
+        yield _summary(name, "output", unit, values, int((torch.isfinite(values) & ~mask).sum()))
+
+
+def _summary(name: str, role: str, unit: str, values: Tensor, masked: int) -> ChannelSummary:
+    known = values[torch.isfinite(values)]
+    missing = len(values) - len(known)
+    if not len(known):
+        nan = float("nan")
+        return ChannelSummary(name, role, unit, nan, nan, nan, 0.0, missing, masked)
+    low, high, mean = (float(f) for f in (known.min(), known.max(), known.mean()))
+    return ChannelSummary(name, role, unit, low, high, mean, resolution(known), missing, masked)
+
+
+def resolution(values: Tensor) -> float:
+    """The smallest step between two different values, rounding of the file apart; 0 for a constant."""
+    steps = torch.diff(values.unique())
+    steps = steps[steps > 1e-9 * float(values.abs().max())]
+    return float(steps.min()) if len(steps) else 0.0
+
+
+def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[Finding]:
+    gaps = (steps > GAP_STEPS * interval).nonzero().flatten()
+    if len(gaps):
+        longest = int(gaps[steps[gaps].argmax()])
+        text = (
+            f"{len(gaps)} gaps longer than {GAP_STEPS:g} sampling intervals ({interval:g} s), the longest of "
+            f"{float(steps[longest]):g} s after {float(time[longest]):g} s"
+        )
+        yield Finding("gap", "t", text, {"count": len(gaps), "longest": float(steps[longest])})
+    usual = steps[steps <= GAP_STEPS * interval]
+    jitter = float((usual - interval).abs().max()) if len(usual) else 0.0
+    if jitter > JITTER_SHARE * interval:
+        text = f"the sampling interval of {interval:g} s varies by up to {jitter:.3g} s"
+        yield Finding("clock", "t", text, {"interval": interval, "jitter": jitter})
+
+
+def _unknown_inputs(recording: Recording) -> Iterator[Finding]:
+    for name, values in zip(recording.input_names, recording.inputs.T, strict=True):
+        for first, last in _runs(torch.isnan(values)):
+            start, stop = float(recording.time[first]), float(recording.time[last])
+            text = f"unknown from {start:g} s to {stop:g} s ({last - first + 1} samples): the recording is cut there"
+            yield Finding("unknown", name, text, {"start": start, "stop": stop})
+
+
+def _missing_readings(recording: Recording) -> Iterator[Finding]:
+    for name, values in zip(recording.output_names, recording.outputs.T, strict=True):
+        missing = int(torch.isnan(values).sum())
+        if missing:
+            text = f"{missing} of {len(values)} readings are missing: they do not count"
+            yield Finding("missing", name, text, {"count": missing})
+
+
+def _reading_findings(recording: Recording) -> Iterator[Finding]:
+    for i, (name, unit) in enumerate(zip(recording.output_names, recording.output_units, strict=True)):
+        mask = recording.mask[:, i]
+        values = recording.outputs[mask, i]
+        if len(values) < 2:
+            continue
+        if bool((values == values[0]).all()):
+            text = f"constant at {_shown(values[0], unit)}: its correlation with anything is undefined"
+            yield Finding("constant", name, text, {"value": float(values[0])})
+            continue
+        yield from _clipped(name, values, unit)
+        yield from _frozen(name, values, recording.time[mask])
+        yield from _quantised(name, values, unit)
+
+
+def _clipped(name: str, values: Tensor, unit: str) -> Iterator[Finding]:
+    """An extreme value that is read again and again, much more often than the value next to it."""
+    distinct, counts = values.unique(return_counts=True)
+    for side, end, neighbour in (("lowest", 0, 1), ("highest", -1, -2)):
+        times = int(counts[end])
+        if times >= CLIPPED_SAMPLES and times >= CLIPPED_PILE * int(counts[neighbour]):
+            value = float(distinct[end])
+            text = f"the {side} value {_shown(value, unit)} was read {times} times: clipped there, or at rest"
+            yield Finding("clipped", name, text, {"value": value, "count": times})
+
+
+def _frozen(name: str, values: Tensor, time: Tensor) -> Iterator[Finding]:
+    """A value that repeats far longer than its readings usually do."""
+    lengths, ends = _repeats(values)
+    longest = int(lengths.argmax())
+    usual = float(lengths.double().mean())
+    if int(lengths[longest]) >= FROZEN_SAMPLES * usual:
+        count, last = int(lengths[longest]), int(ends[longest])
+        start, stop = float(time[last - count + 1]), float(time[last])
+        text = f"did not change for {count} samples, from {start:g} s to {stop:g} s (usually for {usual:.2g})"
+        yield Finding("frozen", name, text, {"start": start, "stop": stop, "count": count})
+
+
+def _quantised(name: str, values: Tensor, unit: str) -> Iterator[Finding]:
+    """Readings move in steps so coarse that most do not differ from the one before."""
+    same = float((torch.diff(values) == 0).double().mean())
+    step = resolution(values)
+    if same > COARSE_SHARE:
+        text = (
+            f"moves in steps of {_shown(step, unit)} and stays on one for {same:.0%} of the samples: rounded coarsely"
+        )
+        yield Finding("quantised", name, text, {"step": step, "share": same})
+
+
+def _against_plant(recording: Recording, plant: PlantDescription) -> Iterator[Finding]:
+    for sensor in plant.sensors:
+        if sensor.column in recording.output_names:
+            column = recording.output_names.index(sensor.column)
+            yield from _level_findings(sensor, plant, recording.outputs[recording.mask[:, column], column])
+    for pump in plant.pumps:
+        if pump.channel in recording.input_names:
+            yield from _pump_findings(pump, recording.inputs[:, recording.input_names.index(pump.channel)])
+    for valve in dict.fromkeys(pipe.valve for pipe in plant.pipes if pipe.valve):
+        if valve in recording.input_names:
+            yield from _valve_findings(valve, recording.inputs[:, recording.input_names.index(valve)])
+
+
+def _level_findings(sensor: Sensor, plant: PlantDescription, readings: Tensor) -> Iterator[Finding]:
+    rim = next(tank.height for tank in plant.tanks if tank.name == sensor.tank)
+    levels = (readings - sensor.offset) / sensor.gain
+    if not len(levels):
+        return
+    low, high = float(levels.min()), float(levels.max())
+    if high > 10 * rim or high < SMALL_SHARE * rim:
+        text = f"highest level {100 * high:.3g} cm, rim {100 * rim:.3g} cm: a wrong unit, or empty throughout?"
+        yield Finding("unit", sensor.column, text, {"high": high, "rim": rim})
+    elif high > (1 + RIM_MARGIN) * rim:
+        above = int((levels > (1 + RIM_MARGIN) * rim).sum())
+        text = f"{above} readings lie above the rim of {sensor.tank} ({100 * high:.4g} cm of {100 * rim:.4g} cm)"
+        yield Finding("range", sensor.column, text, {"high": high, "rim": rim, "count": above})
+    if low < -RIM_MARGIN * rim:
+        below = int((levels < -RIM_MARGIN * rim).sum())
+        text = f"{below} readings lie below the floor of {sensor.tank}, down to {100 * low:.4g} cm: an offset?"
+        yield Finding("range", sensor.column, text, {"low": low, "count": below})
+
+
+def _pump_findings(pump: Pump, command: Tensor) -> Iterator[Finding]:
+    flow = pump.gain * command[torch.isfinite(command)]
+    if not len(flow):
+        return
+    low, high = float(flow.min()), float(flow.max())
+    if high > 10 * pump.max_flow or 0 < high < SMALL_SHARE * pump.max_flow:
+        text = f"its highest flow is {1e6 * high:.3g} cm^3/s of {1e6 * pump.max_flow:.3g} cm^3/s: is its unit right?"
+        yield Finding("unit", pump.channel, text, {"high": high, "limit": pump.max_flow})
+    elif high > (1 + 1e-6) * pump.max_flow:
+        text = (
+            f"asks for up to {1e6 * high:.4g} cm^3/s of {pump.name}, which delivers {1e6 * pump.max_flow:.4g} at most"
+        )
+        yield Finding("range", pump.channel, text, {"high": high, "limit": pump.max_flow})
+    if low < 0:
+        text = f"asks for a negative flow of {pump.name}, down to {1e6 * low:.4g} cm^3/s: it delivers none"
+        yield Finding("range", pump.channel, text, {"low": low})
+
+
+def _valve_findings(valve: str, opening: Tensor) -> Iterator[Finding]:
+    known = opening[torch.isfinite(opening)]
+    if len(known) and (float(known.max()) > 1 + RIM_MARGIN or float(known.min()) < -RIM_MARGIN):
+        low, high = float(known.min()), float(known.max())
+        text = f"opens from {low:.3g} to {high:.3g} where 0 is closed and 1 is open: is its unit right (pct)?"
+        yield Finding("unit", valve, text, {"low": low, "high": high})
+
+
+def _shown(value: Tensor | float, unit: str) -> str:
+    label, scale = display_unit(unit)
+    return f"{scale * float(value):.4g} {label}".rstrip()
+
+
+def _runs(flags: Tensor) -> list[tuple[int, int]]:
+    """First and last index of each stretch of True."""
+    padded = flags.to(torch.int8)
+    edges = torch.diff(padded, prepend=padded.new_zeros(1), append=padded.new_zeros(1)).nonzero().flatten().tolist()
+    return [(first, after - 1) for first, after in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _repeats(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Lengths of the runs of equal values, and the index at which each ends."""
+    _, lengths = torch.unique_consecutive(values, return_counts=True)
+    return lengths, torch.cumsum(lengths, 0) - 1

@@ -1,0 +1,18 @@
+"""What the tests share: where real recordings lie."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real recordings; tests that need it are skipped where it is absent."""
+    here = Path(__file__).resolve().parents[1]
+    for folder in (os.environ.get("FDI_TORCH_DATA"), here.parent / "shared" / "data"):
+        if folder and Path(folder).is_dir():
+            return Path(folder)
+    pytest.skip("no real recordings: set FDI_TORCH_DATA")

@@ -1,0 +1,150 @@
+"""The command line: exit codes, one sentence for what is wrong, JSON alone where asked for."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from fdi_torch import cli
+from fdi_torch.cli.options import overrides
+from fdi_torch.cli.screen import Screen
+
+CSV = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n" + "".join(
+    f"{t},{50 + t % 7},50,{40 + t % 11},{30 + t % 5},{35 + t % 3}\n" for t in range(50)
+)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> str:
+    path = tmp_path / "rig.csv"
+    path.write_text(CSV)
+    return str(path)
+
+
+def test_without_a_command_it_says_which_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == cli.MISUSE
+    assert cli.main(["--help"]) == cli.DONE
+    shown = capsys.readouterr().out
+    assert all(f"  {command} " in shown for command in cli.COMMANDS)
+
+
+def test_an_unknown_command_is_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["chekc"]) == cli.MISUSE
+    assert "got 'chekc'; the nearest is 'check'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main([command, "--help"])
+    assert ended.value.code == cli.DONE
+    assert f"usage: fdi {command}" in capsys.readouterr().out
+
+
+def test_the_overview_does_not_wait_for_torch() -> None:
+    code = "import sys; from fdi_torch.cli import main; main(['--help']); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=False).returncode == 0
+
+
+def test_check_shows_channels_and_findings(rig: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", rig, "--plant", "three_tank"]) == cli.DONE
+    shown = capsys.readouterr().out
+    assert "50 samples, 49 s, one every 1 s" in shown
+    assert "h1       output  cm          40" in shown
+
+
+def test_check_as_json_prints_nothing_else(rig: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", rig, "--plant", "three_tank", "--json"]) == cli.DONE
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["format"] == "fdi_torch.check/1"
+    assert answer["recordings"][0]["interval"] == 1.0
+
+
+def test_check_of_a_run_file_says_what_is_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rig.csv").write_text(CSV.replace("20,56,50", "20,,50"))
+    (tmp_path / "run.yaml").write_text("recordings: [{file: rig.csv}]")
+    assert cli.main(["check", "--config", str(tmp_path / "run.yaml"), "--set", "recordings.0.start=5 s"]) == cli.DONE
+    assert "usable with all inputs known: 5 to 19 s, 21 to 49 s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["RIG"], "fdi check: expected a recording and --plant, or --config; fdi check --help tells more"),
+        (["RIG", "--plant", "three_tonk"], "got 'three_tonk'; the nearest is 'three_tank'"),
+        (["gone.csv", "--plant", "three_tank"], "fdi check: gone.csv: expected a file, got none there"),
+        (["RIG", "--plant", "dts200"], "expected a column for qL_cmd"),
+        (["--config", "gone.yaml"], "fdi check: gone.yaml: expected a file, got none there"),
+        (["--config", "CONFIG"], "fdi check: expected recordings in the run file, got a simulation"),
+    ],
+)
+def test_misuse_is_one_sentence_without_traceback(
+    rig: str, words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = {"RIG": rig, "CONFIG": "configs/default.yaml"}
+    assert cli.main(["check", *(places.get(word, word) for word in words)]) == cli.MISUSE
+    shown = capsys.readouterr()
+    assert sentence in shown.err and shown.err.count("\n") == 1 and "Traceback" not in shown.err + shown.out
+
+
+def test_traceback_on_request(rig: str) -> None:
+    with pytest.raises(ValueError, match="three_tonk"):
+        cli.main(["check", rig, "--plant", "three_tonk", "--traceback"])
+
+
+def command(run: Any) -> Any:
+    return SimpleNamespace(__doc__="", add_arguments=lambda parser: None, run=run)
+
+
+def test_interruption_has_its_own_code(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(arguments: Any, screen: Screen) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "fdi_torch.cli.check", command(interrupted))
+    assert cli.main(["check"]) == cli.INTERRUPTED
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_a_file_that_cannot_be_written_is_misuse(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def unwritable(arguments: Any, screen: Screen) -> int:
+        raise PermissionError(13, "Permission denied", "/logs/run.mcap")
+
+    monkeypatch.setitem(sys.modules, "fdi_torch.cli.check", command(unwritable))
+    assert cli.main(["check"]) == cli.MISUSE
+    assert capsys.readouterr().err == "fdi check: [Errno 13] Permission denied: '/logs/run.mcap'\n"
+
+
+def test_short_options_become_overrides_and_win() -> None:
+    arguments = SimpleNamespace(set=["seed=1"], out="here", device=None, seed=2)
+    assert overrides(arguments) == ["seed=1", "output.folder=here", "seed=2"]  # type: ignore[arg-type]
+
+
+def test_progress_is_plain_lines_on_standard_error_when_nobody_watches(capsys: pytest.CaptureFixture[str]) -> None:
+    with Screen(json=True).progress("searching") as advance:
+        advance(0.5, "best 1.0")
+        advance(1.0, "best 0.5")
+    shown = capsys.readouterr()
+    assert shown.err.splitlines() == ["searching ...", "searching 100% best 0.5"]
+    assert shown.out == ""
+
+
+def test_quiet_shows_no_progress_but_complaints(capsys: pytest.CaptureFixture[str]) -> None:
+    screen = Screen(quiet=True)
+    with screen.progress("searching") as advance:
+        advance(1.0)
+    screen.note("half way")
+    screen.complain("stuck")
+    assert capsys.readouterr().err == "stuck\n"
+
+
+def test_json_has_null_where_a_number_is_not_finite(capsys: pytest.CaptureFixture[str]) -> None:
+    Screen(json=True).result({"a": float("nan"), "b": float("inf")})
+    assert json.loads(capsys.readouterr().out) == {"a": None, "b": None}

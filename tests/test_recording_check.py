@@ -1,0 +1,174 @@
+"""Every finding of the check is made by a recording that has just that oddity, and by none without it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from fdi_torch.config import load_plant
+from fdi_torch.recording import Recording
+from fdi_torch.recording_check import RecordingCheck, check_recording
+
+PLANT = load_plant("three_tank")
+
+
+def healthy(samples: int = 400) -> Recording:
+    """Smooth levels with a little noise, both commands stepping: nothing to find."""
+    time = torch.arange(samples, dtype=torch.float64)
+    noise = 1e-3 * torch.randn(samples, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    levels = 0.4 + 0.1 * torch.sin(time / 50)[:, None] + noise
+    command = torch.where(time < samples / 2, 50e-6, 60e-6)[:, None].expand(samples, 2).clone()
+    return Recording(
+        time=time,
+        inputs=command,
+        outputs=levels,
+        input_names=("Q1", "Q2"),
+        output_names=("h1", "h2", "h3"),
+        input_units=("m^3/s", "m^3/s"),
+        output_units=("m", "m", "m"),
+    )
+
+
+def with_h1(values: torch.Tensor) -> Recording:
+    outputs = healthy().outputs.clone()
+    outputs[:, 0] = values
+    return replace(healthy(), outputs=outputs, mask=torch.isfinite(outputs))
+
+
+def with_q1(values: torch.Tensor) -> Recording:
+    inputs = healthy().inputs.clone()
+    inputs[:, 0] = values
+    return replace(healthy(), inputs=inputs)
+
+
+def found(check: RecordingCheck, kind: str) -> tuple[str, str]:
+    """Channel and text of the one finding, which must be of that kind."""
+    assert [finding.kind for finding in check.findings] == [kind]
+    return check.findings[0].channel, check.findings[0].text
+
+
+def test_nothing_is_found_in_a_healthy_recording() -> None:
+    check = check_recording(healthy(), PLANT)
+    assert check.findings == ()
+    assert (check.samples, check.duration, check.interval) == (400, 399.0, 1.0)
+    assert [(c.name, c.role) for c in check.channels][:3] == [("Q1", "input"), ("Q2", "input"), ("h1", "output")]
+
+
+def test_summary_tells_range_resolution_and_what_does_not_count() -> None:
+    h1 = (healthy().outputs[:, 0] / 0.01).round() * 0.01
+    h1[7] = float("nan")
+    summary = check_recording(with_h1(h1).masked([(10.0, 19.0)]), PLANT).channels[2]
+    assert (summary.missing, summary.masked) == (1, 10)
+    assert summary.resolution == pytest.approx(0.01)
+    assert (summary.low, summary.high) == (float(h1.nan_to_num(1).min()), float(h1.nan_to_num(0).max()))
+
+
+def test_gap_in_the_clock() -> None:
+    late = healthy().time + 30 * (healthy().time > 200)
+    channel, text = found(check_recording(replace(healthy(), time=late), PLANT), "gap")
+    assert (channel, text) == ("t", "1 gaps longer than 3 sampling intervals (1 s), the longest of 31 s after 200 s")
+
+
+def test_jittering_clock() -> None:
+    jitter = 0.2 * torch.rand(400, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    assert (
+        "varies by up to" in found(check_recording(replace(healthy(), time=healthy().time + jitter), PLANT), "clock")[1]
+    )
+
+
+def test_unknown_command() -> None:
+    q1 = healthy().inputs[:, 0].clone()
+    q1[100:150] = float("nan")
+    assert found(check_recording(with_q1(q1), PLANT), "unknown") == (
+        "Q1",
+        "unknown from 100 s to 149 s (50 samples): the recording is cut there",
+    )
+
+
+def test_missing_readings() -> None:
+    h1 = healthy().outputs[:, 0].clone()
+    h1[::10] = float("nan")
+    assert (
+        found(check_recording(with_h1(h1), PLANT), "missing")[1] == "40 of 400 readings are missing: they do not count"
+    )
+
+
+def test_constant_channel() -> None:
+    constant = check_recording(with_h1(torch.full((400,), 0.4, dtype=torch.float64)), PLANT)
+    assert found(constant, "constant")[1] == "constant at 40 cm: its correlation with anything is undefined"
+
+
+def test_clipped_channel() -> None:
+    clipped = check_recording(with_h1(healthy().outputs[:, 0].clamp(max=0.49)), PLANT)
+    assert "clipped" in {finding.kind for finding in clipped.findings}
+    assert "the highest value 49 cm was read" in clipped.findings[0].text
+
+
+def test_frozen_channel() -> None:
+    h1 = healthy().outputs[:, 0].clone()
+    h1[100:160] = h1[100]
+    assert found(check_recording(with_h1(h1), PLANT), "frozen")[1].startswith(
+        "did not change for 60 samples, from 100 s to 159 s"
+    )
+
+
+def test_coarsely_rounded_channel() -> None:
+    rounded = check_recording(with_h1((healthy().outputs[:, 0] / 0.02).round() * 0.02), PLANT)
+    assert found(rounded, "quantised")[1].startswith("moves in steps of 2 cm and stays on one for")
+
+
+def test_level_above_the_rim_and_below_the_floor() -> None:
+    assert (
+        "lie above the rim of T1" in found(check_recording(with_h1(healthy().outputs[:, 0] * 2.2), PLANT), "range")[1]
+    )
+    assert (
+        "lie below the floor of T1" in found(check_recording(with_h1(healthy().outputs[:, 0] - 0.4), PLANT), "range")[1]
+    )
+
+
+@pytest.mark.parametrize("factor", [100.0, 0.01])
+def test_level_in_the_wrong_unit(factor: float) -> None:
+    assert "a wrong unit" in found(check_recording(with_h1(healthy().outputs[:, 0] * factor), PLANT), "unit")[1]
+
+
+def test_commands_beyond_what_the_pump_can_do() -> None:
+    command = healthy().inputs[:, 0]
+    assert (
+        "asks for up to 120 cm^3/s of Q1, which delivers 90"
+        in found(check_recording(with_q1(2 * command), PLANT), "range")[1]
+    )
+    assert "asks for a negative flow of Q1" in found(check_recording(with_q1(-command), PLANT), "range")[1]
+    assert "is its unit right?" in found(check_recording(with_q1(1e3 * command), PLANT), "unit")[1]
+
+
+def test_valve_in_percent_taken_for_a_share() -> None:
+    rig = load_plant("dts200")
+    samples = healthy()
+    inputs = torch.zeros(400, 7, dtype=torch.float64)
+    inputs[:, :2] = samples.inputs
+    inputs[:, 2] = 60.0
+    recording = replace(
+        samples,
+        inputs=inputs,
+        input_names=rig.channels(),
+        input_units=tuple(rig.channel_units().values()),
+        output_names=tuple(sensor.column for sensor in rig.sensors),
+    )
+    assert found(check_recording(recording, rig), "unit") == (
+        "vLM",
+        "opens from 60 to 60 where 0 is closed and 1 is open: is its unit right (pct)?",
+    )
+
+
+@pytest.mark.data
+def test_what_is_odd_about_a_real_rig_is_found(real_data: Path) -> None:
+    """The tanks are empty for long: the sensors rest at their lowest value, R's 2 cm below its zero."""
+    from fdi_torch.config import RecordingConfig, read_recording
+
+    rig = load_plant("dts200")
+    file = RecordingConfig(file=str(real_data / "dts200" / "exp5_pump_staircase_drain__2194.csv"))
+    kinds = {(f.kind, f.channel) for f in check_recording(read_recording(file, rig), rig).findings}
+    assert {("unknown", "qL_cmd"), ("clipped", "h2_R"), ("frozen", "h1_L"), ("range", "h2_R")} <= kinds
