@@ -1,4 +1,4 @@
-"""Sealing, answering, scoring: tampering shows, interruptions resume, scores agree with hand counts and the protocol."""
+"""Sealing, answering, scoring: tampering shows, interruptions resume, scores agree with the protocol's."""
 
 from __future__ import annotations
 

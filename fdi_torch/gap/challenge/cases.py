@@ -13,6 +13,7 @@ from fdi_torch.gap.challenge.conditions import (
     RECORDED,
     Conditions,
     asked_of_pumps,
+    channel_to_rest,
     draw_conditions,
     kept_below_the_rim,
     levels_at_rest,
@@ -87,8 +88,9 @@ def make(
 
 def _conditions(plan: Plan, chosen: Chosen, rig: Rig, seed: int, rest: Array) -> Conditions:
     kind = KINDS[plan.kind]
-    inputs = "wide" if chosen.unknown and chosen.unknown.reversing else kind.inputs
-    return draw_conditions(rig, case_generator(seed, plan.kind, plan.index, 3), inputs, kind.coloured, rest)
+    rng = case_generator(seed, plan.kind, plan.index, 3)
+    resting = channel_to_rest(rig.plant, chosen.place) if chosen.unknown and chosen.unknown.reversing else None
+    return draw_conditions(rig, rng, kind.inputs, kind.coloured, rest, resting)
 
 
 def _deviations(
@@ -132,7 +134,7 @@ def _read(
     seed: int,
 ) -> Case:
     rng = case_generator(seed, plan.kind, plan.index, 5)
-    readings, noise_rms, gap_rms = [], {}, {}
+    readings, noise_rms, gap_rms, highest = [], {}, {}, []
     for lane, (part, samples) in enumerate(PARTS):
         clean = _sensed(rig, levels[:samples, :, lane], deviations)
         sound = _sensed(rig, levels[:samples, :, lane + 2], ())
@@ -141,11 +143,12 @@ def _read(
         readings.append(shown)
         noise_rms[part] = np.sqrt(np.mean((shown - clean) ** 2, axis=0)).tolist()
         gap_rms[part] = float(np.sqrt(np.mean((clean - sound) ** 2)))
+        highest.append(levels[:samples, :, lane].max(axis=0))
     truth = _truth(plan, chosen, deviations) | {
         "noise_rms_m": noise_rms,
         "gap_rms_m": gap_rms,
         "colour": conditions.colour,
-        "over_rim": bool((levels[:, :, :2].max(axis=(0, 2)) > [t.height for t in rig.plant.tanks]).any()),
+        "over_rim": bool((np.array(highest) > [t.height for t in rig.plant.tanks]).any()),
     }
     return Case(plan, conditions.commands, (readings[0], readings[1]), truth)
 

@@ -37,14 +37,16 @@ def command_unit(pump: Pump) -> str:
     return "cm3_s" if pump.gain_unit == "1" else "V" if pump.gain_unit.endswith("/V") else "1"
 
 
-def draw_conditions(rig: Rig, rng: np.random.Generator, inputs: str, coloured: float, rest: Array) -> Conditions:
-    """inputs: 'steps' (random steps), 'wide' (from standstill up) or 'poor' (two steps).
+def draw_conditions(
+    rig: Rig, rng: np.random.Generator, inputs: str, coloured: float, rest: Array, resting: str | None = None
+) -> Conditions:
+    """inputs: 'steps' (random steps) or 'poor' (two steps in the recording). coloured: chance of AR(1) noise.
 
-    coloured: chance of AR(1) noise. rest (N,): the sound rig's levels at middling inputs, m.
+    rest (N,): the sound rig's levels at middling inputs, m. resting: a channel that often stands still.
     """
     plant = rig.plant
-    recorded = two_steps(rig, rng) if inputs == "poor" else random_steps(rig, rng, RECORDED, inputs == "wide")
-    held_out = random_steps(rig, rng, HELD_OUT, inputs == "wide")
+    recorded = two_steps(rig, rng) if inputs == "poor" else random_steps(rig, rng, RECORDED, resting)
+    held_out = random_steps(rig, rng, HELD_OUT, resting)
     heights = np.array([t.height for t in plant.tanks])
     starts = np.minimum(rest * rng.uniform(0.75, 1.25, size=(2, len(rest))), 0.85 * heights)
     constants = sound_conductance(plant) * (
@@ -66,28 +68,39 @@ def tolerance(plant: PlantDescription) -> Array:
     return np.array([plant.tolerances.get(f"{p.name}.discharge_coefficient", 0.0) for p in plant.pipes])
 
 
-def channel_limits(rig: Rig, wide: bool = False) -> Array:
+def channel_limits(rig: Rig) -> Array:
     """(C, 2): lowest and highest command of each channel, in the header's unit."""
-    low, high = (0.0, 1.1 * rig.input_high) if wide else (rig.input_low, rig.input_high)
     rows = []
     for channel in rig.plant.channels():
         pump = next(p for p in rig.plant.pumps if p.channel == channel)
         full = pump.max_flow / pump.gain / _FACTORS[command_unit(pump)]
-        rows.append((low * full, min(high, 1.0) * full))
+        rows.append((rig.input_low * full, rig.input_high * full))
     return np.array(rows)
 
 
-def random_steps(rig: Rig, rng: np.random.Generator, samples: int, wide: bool = False) -> Array:
-    """Each channel takes a random value for a random while; wide: one in five is a standstill."""
+def random_steps(rig: Rig, rng: np.random.Generator, samples: int, resting: str | None = None) -> Array:
+    """Each channel takes a random value for a random while.
+
+    Where one is to rest, two in five of its whiles are long standstills, in which the others' steps turn flows round.
+    """
     out = np.empty((samples, len(rig.plant.channels())))
-    for column, (low, high) in enumerate(channel_limits(rig, wide)):
+    for column, (channel, (low, high)) in enumerate(zip(rig.plant.channels(), channel_limits(rig), strict=True)):
         at = 0
         while at < samples:
-            hold = int(rng.integers(SHORTEST_HOLD, LONGEST_HOLD))
-            value = 0.0 if wide and rng.random() < 0.2 else rng.uniform(low, high)
+            hold, value = int(rng.integers(SHORTEST_HOLD, LONGEST_HOLD)), rng.uniform(low, high)
+            if channel == resting and rng.random() < 0.4:
+                hold, value = int(rng.integers(2 * LONGEST_HOLD, 4 * LONGEST_HOLD)), 0.0
             out[at : at + hold, column] = value
             at += hold
     return in_print(rig, out)
+
+
+def channel_to_rest(plant: PlantDescription, pipe: str) -> str:
+    """The channel whose rest turns the flow of a pipe round: it feeds its source, or at least not its target."""
+    p = next(p for p in plant.pipes if p.name == pipe)
+    feeding = [q.channel for q in plant.pumps if q.target == p.source]
+    others = [q.channel for q in plant.pumps if q.target != p.target]
+    return (*feeding, *others, plant.channels()[0])[0]
 
 
 def two_steps(rig: Rig, rng: np.random.Generator) -> Array:
@@ -123,29 +136,31 @@ def levels_at_rest(rig: Rig) -> Array:
     return simulate(rigs, asked, start, _COARSE)[-1, :, 0]
 
 
-def sound_levels(rig: Rig, all_conditions: list[Conditions]) -> Array:
-    """(T, N, L) m: each recording as the rig without any effect would run, coarsely."""
-    asked = np.stack([asked_of_pumps(rig.plant, c.commands[0]) for c in all_conditions], axis=-1)
-    start = np.stack([c.starts[0] for c in all_conditions], axis=-1)
+def sound_levels(rig: Rig, all_conditions: list[Conditions], part: int) -> Array:
+    """(T, N, L) m: each recording (0) or hold-out (1) as the rig without any effect would run, coarsely."""
+    asked = np.stack([asked_of_pumps(rig.plant, c.commands[part]) for c in all_conditions], axis=-1)
+    start = np.stack([c.starts[part] for c in all_conditions], axis=-1)
     conductance = np.stack([c.conductance for c in all_conditions], axis=-1)
     return simulate(HiddenRigs(rig.plant, conductance, [()] * len(all_conditions)), asked, start, _COARSE)
 
 
 def kept_below_the_rim(rig: Rig, all_conditions: list[Conditions]) -> tuple[list[Conditions], Array]:
-    """Turns the inputs of those down whose sound rig comes near its rim; with the sound levels (T, N, L).
+    """Turns the inputs of those down whose sound rig comes near its rim; with the sound levels (T, N, L) recorded.
 
     Raises ValueError where that does not help.
     """
-    rim = np.array([0.85 * t.height for t in rig.plant.tanks])
-    kept, levels = list(all_conditions), sound_levels(rig, all_conditions)
+    rim = np.array([0.85 * t.height for t in rig.plant.tanks])[:, None]
+    kept = list(all_conditions)
+    recorded, held_out = (sound_levels(rig, kept, part) for part in (0, 1))
     for _ in range(6):
-        high = np.flatnonzero((levels.max(axis=0) > rim[:, None]).any(axis=0))
+        high = np.flatnonzero((np.maximum(recorded.max(axis=0), held_out.max(axis=0)) > rim).any(axis=0))
         if not len(high):
-            return kept, levels
+            return kept, recorded
         for lane in high:
-            recorded, held_out = (in_print(rig, 0.85 * c) for c in kept[lane].commands)
-            kept[lane] = replace(kept[lane], commands=(recorded, held_out))
-        levels[:, :, high] = sound_levels(rig, [kept[lane] for lane in high])
+            first, second = (in_print(rig, 0.85 * c) for c in kept[lane].commands)
+            kept[lane] = replace(kept[lane], commands=(first, second))
+        turned_down = [kept[lane] for lane in high]
+        recorded[:, :, high], held_out[:, :, high] = (sound_levels(rig, turned_down, part) for part in (0, 1))
     raise ValueError(
         f"rig {rig.plant.name}: expected inputs that keep it below its rim, got overflow; lower input_high"
     )

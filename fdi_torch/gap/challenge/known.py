@@ -46,13 +46,14 @@ def pump_back_pressure(s: Surroundings, at: str) -> Deviation:
 
 
 def laminar_flow(s: Surroundings, at: str) -> Deviation:
-    law = s.one_of("viscous_and_inertial", "reynolds_blend")
-    low, high = (0.05, 0.3) if law == "viscous_and_inertial" else (0.3, 0.9)
-    return Deviation("laminar_flow", at, law, {"head": s.size(low, high) * s.head(at, 0.5)})
+    """The size is the share of flow lost at the middling head, f = 1 - size, solved for the law's own head."""
+    law, kept = s.one_of("viscous_and_inertial", "reynolds_blend"), 1 - s.size(0.07, 0.22)
+    ratio = (1 / kept - kept) ** 2 if law == "viscous_and_inertial" else np.arctanh(kept) ** -2
+    return Deviation("laminar_flow", at, law, {"head": float(ratio) * s.head(at, 0.5)})
 
 
 def flow_exponent(s: Surroundings, at: str) -> Deviation:
-    numbers = {"power": 0.5 + s.either(0.06, 0.15), "reference": s.uniform(0.6, 1.6) * s.head(at, 0.5)}
+    numbers = {"power": 0.5 + s.either(0.07, 0.16), "reference": s.uniform(0.6, 1.6) * s.head(at, 0.5)}
     return Deviation("flow_exponent", at, "other_power", numbers)
 
 
@@ -102,9 +103,9 @@ def area_taper(s: Surroundings, at: str) -> Deviation:
 
 
 def internal_body(s: Surroundings, at: str) -> Deviation:
-    numbers = {"low": s.tank(at, s.uniform(0.05, 0.35)), "high": s.tank(at, s.uniform(0.65, 0.95))}
+    numbers = {"low": s.tank(at, s.uniform(0.05, 0.3)), "high": s.tank(at, s.uniform(0.7, 0.95))}
     law = s.one_of("block", "barrel")
-    numbers |= {"share": s.size(0.15, 0.45)} | ({"chamfer": s.uniform(0.05, 0.2)} if law == "block" else {})
+    numbers |= {"share": s.size(0.2, 0.45)} | ({"chamfer": s.uniform(0.05, 0.2)} if law == "block" else {})
     return Deviation("internal_body", at, law, numbers)
 
 

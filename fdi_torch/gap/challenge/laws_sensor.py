@@ -95,6 +95,16 @@ def rounded(x: Array, time: Array, p: Numbers) -> Array:
     return p["step"] * np.round(x / p["step"])
 
 
+def bursting(x: Array, time: Array, p: Numbers) -> Array:
+    """Short bursts of outliers: each begins with this chance, lasts up to four samples, and has one height."""
+    out = x.copy()
+    for column, (seed, chance, height) in enumerate(zip(p["seed"], p["chance"], p["height"], strict=True)):
+        rng = np.random.default_rng(int(seed))
+        for start in np.flatnonzero(rng.random(len(x)) < chance):
+            out[start : start + rng.integers(1, 5), column] += height * rng.choice((-1, 1)) * (0.5 + rng.exponential())
+    return out
+
+
 SENSOR_LAWS = {
     law.__name__: law
     for law in (
@@ -111,4 +121,4 @@ SENSOR_LAWS = {
         clipped,
     )
 }
-READOUT_LAWS = {"rounded": rounded}
+READOUT_LAWS = {"bursting": bursting, "rounded": rounded}

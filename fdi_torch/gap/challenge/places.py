@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import OUTSIDE, PlantDescription
 
 PUMP, PIPE, OUTLET, TANK, PAIR, SENSOR = "pump", "pipe", "outlet", "tank", "pair", "sensor"
 
@@ -58,11 +58,11 @@ def effect_places(plant: PlantDescription) -> tuple[Cause, ...]:
 
 
 def canonical(cause: Cause, plant: PlantDescription) -> Cause:
-    """A leak at a drained tank's floor and a wider outlet are one thing; it is called the leak."""
+    """A leak at a drained tank's floor and a wider outlet to the outside are one thing; it is called the leak."""
     effect, location = cause
     if effect == "plugging":
         for pipe in plant.pipes:
-            if pipe.name == location and pipe.is_outlet:
+            if pipe.name == location and pipe.target == OUTSIDE:
                 return "leak", pipe.source
     return cause
 

@@ -56,7 +56,7 @@ def three_tank() -> Rig:
 
 
 def quadruple_tank() -> Rig:
-    """Four tanks, two pumps split over an upper and a lower tank each (after Johansson, 2000, minimum-phase split).
+    """Four tanks, two pumps split over an upper and a lower tank each (layout of Johansson, 2000).
 
     A split pump is written as two pumps on one command.
     """
@@ -65,8 +65,8 @@ def quadruple_tank() -> Rig:
     pipes = (
         Pipe("O1", "T1", OUTSIDE, 0.071 * CM2, 0.95),
         Pipe("O2", "T2", OUTSIDE, 0.057 * CM2, 0.95),
-        Pipe("O3", "T3", "T1", 0.071 * CM2, 0.95, free_fall=True),
-        Pipe("O4", "T4", "T2", 0.057 * CM2, 0.95, free_fall=True),
+        Pipe("O3", "T3", "T1", 0.033 * CM2, 0.95, free_fall=True),
+        Pipe("O4", "T4", "T2", 0.028 * CM2, 0.95, free_fall=True),
     )
     gain_a, gain_b = 3.33 * CM3, 3.35 * CM3
     pumps = (

@@ -10,7 +10,7 @@ from fdi_torch.gap.challenge.conditions import HELD_OUT
 from fdi_torch.gap.challenge.intervals import clopper_pearson, mean_interval
 from fdi_torch.gap.challenge.places import Cause, canonical, effect_places
 from fdi_torch.parameters import unit_factor
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import OUTSIDE, PlantDescription
 
 Answer = Mapping[str, Any]
 Row = dict[str, Any]
@@ -55,6 +55,7 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
     row: Row = {
         "kind": kind,
         "truth": true,
+        "effect": truth["causes"][0].get("really", true[0][0]) if true else "none",
         "verdict": verdict,
         "causes": causes,
         "set_size": len(sets),
@@ -69,7 +70,7 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
         return row | _judge_nameless(true, verdict, [w["location"] for w in answer.get("where") or []])
     if kind == "messy":
         return row | _judge_messy(true[0], causes, verdict)
-    tolerated = verdict == "no_gap" and true in [[("leak", p.source)] for p in plant.pipes if p.is_outlet]
+    tolerated = verdict == "no_gap" and true in [[("leak", p.source)] for p in plant.pipes if p.target == OUTSIDE]
     return row | _judge_named(true, causes, sets, verdict, tolerated)
 
 
@@ -132,10 +133,9 @@ def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
 
 
 def by_effect(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """The same for each effect that is the only cause of its case."""
+    """The same for each effect that is the only cause of its case; those without a name go by their law."""
     lone = [r for r in rows if len(r["truth"]) == 1]
-    effects = sorted({r["truth"][0][0] for r in lone})
-    return {effect: _stratum([r for r in lone if r["truth"][0][0] == effect]) for effect in effects}
+    return {e: _stratum([r for r in lone if r["effect"] == e]) for e in sorted({r["effect"] for r in lone})}
 
 
 def _stratum(rows: Sequence[Row]) -> dict[str, Any]:

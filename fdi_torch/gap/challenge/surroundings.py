@@ -84,7 +84,3 @@ class Surroundings:
         reference = component.leak_reference if isinstance(component, Tank) else None
         touching = [p.name for p in self.plant.pipes if tank in (p.source, p.target)]
         return self.conductance_of(reference or touching[0])
-
-    def is_drained(self, tank: str) -> bool:
-        """Whether an outlet leaves the tank's floor, so that a leak there is the same thing as a wider outlet."""
-        return any(p.is_outlet and p.source == tank for p in self.plant.pipes)

@@ -16,7 +16,7 @@ from fdi_torch.gap.challenge.surroundings import Surroundings
 class Unknown:
     """law: its equation. at: kinds of places. aliases: it is unknown only to libraries without these names.
 
-    reversing: needs inputs that turn the flow round.
+    reversing: shows only where the flow turns round.
     """
 
     law: str
@@ -99,6 +99,11 @@ def _freezing(s: Surroundings, at: str) -> dict[str, float]:
     return {"period": s.uniform(150, 400)}
 
 
+def _bursting(s: Surroundings, at: str) -> dict[str, float]:
+    seed, height = float(s.rng.integers(2**31)), s.size(0.03, 0.07) * s.span(s.tank_of(at))
+    return {"seed": seed, "chance": s.uniform(0.01, 0.03), "height": height}
+
+
 UNKNOWN = (
     Unknown("pulsating", (PUMP,), _pulsating, ("pump_pulsation", "pulsing_pump", "pump_ripple")),
     Unknown("backlash", (PUMP,), _backlash, ("pump_backlash", "pump_hysteresis")),
@@ -115,6 +120,7 @@ UNKNOWN = (
     Unknown("bowed", (SENSOR,), _bowed, ("sensor_curvature", "sensor_nonlinearity")),
     Unknown("sticking_float", (SENSOR,), _sticking_float, ("sensor_hysteresis", "sensor_backlash")),
     Unknown("humming", (SENSOR,), _humming, ("sensor_ripple", "sensor_hum")),
+    Unknown("bursting", (SENSOR,), _bursting, ("outliers", "sensor_outliers")),
     Unknown("freezing", (SENSOR,), _freezing, ("sensor_freeze", "sensor_stuck")),
 )
 
