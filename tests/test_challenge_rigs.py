@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from fdi_torch.effects import build_network
 from fdi_torch.gap.challenge.cases import make, noise, plans
-from fdi_torch.gap.challenge.conditions import random_steps, two_steps
+from fdi_torch.gap.challenge.conditions import asked_of_pumps, random_steps, sound_conductance, two_steps
 from fdi_torch.gap.challenge.kinds import KINDS, STANDARD, choose
 from fdi_torch.gap.challenge.known import KNOWN
 from fdi_torch.gap.challenge.laws_sensor import SENSOR_LAWS
@@ -18,7 +21,11 @@ from fdi_torch.gap.challenge.places import EFFECTS, canonical, effect_places
 from fdi_torch.gap.challenge.plants import Rig, cascaded_tanks, quadruple_tank, three_tank
 from fdi_torch.gap.challenge.simulator import HiddenRigs, simulate
 from fdi_torch.gap.challenge.unknown import UNKNOWN, unknown_to
+from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.integrate import ReferenceEngine
 
 AREA = 0.016
 
@@ -139,6 +146,30 @@ def test_noise_has_the_colour_and_size_asked_for() -> None:
     e = noise(np.random.default_rng(1), (20000, 1), 0.3, 0.8)[:, 0]
     assert e.std() == pytest.approx(0.3, rel=0.05)
     assert np.corrcoef(e[1:], e[:-1])[0, 1] == pytest.approx(0.8, abs=0.02)
+
+
+@pytest.mark.parametrize("rig", [three_tank(), quadruple_tank(), cascaded_tanks()], ids=lambda r: r.plant.name)
+def test_two_independent_simulations_of_a_sound_rig_agree(rig: Rig) -> None:
+    """The hidden rig without any effect and the library's plant: other code, other integrator, the same water."""
+    plant, seconds = rig.plant, 200
+    commands = random_steps(rig, np.random.default_rng(2), seconds + 1)
+    start = [0.2 * t.height * (1 + 0.3 * i) for i, t in enumerate(plant.tanks)]
+    rigs = HiddenRigs(plant, sound_conductance(plant)[:, None], [()])
+    hidden = simulate(rigs, asked_of_pumps(plant, commands)[..., None], np.array(start)[:, None])[:, :, 0]
+    started = replace(plant, tanks=tuple(replace(t, start_level=h) for t, h in zip(plant.tanks, start, strict=True)))
+    si = commands * [1e-6 if p.gain_unit == "1" else 1.0 for p in (plant.pumps[0],) * commands.shape[1]]
+    recording = Recording(
+        time=torch.arange(seconds + 1, dtype=torch.float64),
+        inputs=torch.tensor(si),
+        outputs=torch.zeros(seconds + 1, len(plant.sensors), dtype=torch.float64),
+        input_names=plant.channels(),
+        output_names=tuple(s.name for s in plant.sensors),
+        input_units=("m^3/s",) * commands.shape[1],
+        output_units=("m",) * len(plant.sensors),
+    )
+    engine = ReferenceEngine(build_network(started), ParameterSpace(), lay_out(recording, plant.channels(), 0.5))
+    library = engine.levels(torch.zeros(1, 0, dtype=torch.float64))[0].numpy()
+    np.testing.assert_allclose(hidden, library, atol=2e-5)
 
 
 def test_a_step_that_does_not_divide_a_second_is_refused() -> None:
