@@ -49,7 +49,10 @@ def _run(name: str, words: list[str]) -> int:
     command = importlib.import_module(f"fdi_torch.cli.{name}")
     arguments = _parser(name, command).parse_args(words)
     from fdi_torch.cli.screen import Screen
+    from fdi_torch.logbook import exit_on_sigterm
 
+    # An open log is then finished like any other.
+    exit_on_sigterm()
     screen = Screen(json=arguments.json, quiet=arguments.quiet)
     try:
         return int(command.run(arguments, screen))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,7 +12,9 @@ from pydantic import BeforeValidator, Field
 
 from fdi_torch.config.files import find_data
 from fdi_torch.config.problems import ConfigError, unknown
+from fdi_torch.config.recording_mcap import read_mcap
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
+from fdi_torch.logbook import LogError
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recording_csv import ChannelSource, read_csv
@@ -43,7 +45,7 @@ StartLevels = Annotated[Any, BeforeValidator(_start_levels)]
 
 
 class ColumnConfig(Strict):
-    column: str | None = Field(None, description="header of the column, or topic/field of an MCAP file")
+    column: str | None = Field(None, description="header of the column, or TOPIC:FIELD of an MCAP file")
     unit: str | None = Field(None, description="unit of its numbers, where the header does not end in it")
     constant: Amount | None = Field(None, description="the value of an input that was not recorded")
     recorded: bool = Field(True, description="false for an output that the file does not have")
@@ -103,13 +105,13 @@ def read_recording(config: RecordingConfig, plant: PlantDescription, base: Path 
         start = -math.inf if config.start is None else config.start
         window = recording.window(start, math.inf if config.stop is None else config.stop)
         return window.masked(config.mask).every(config.every)
-    except ValueError as error:
+    except (ValueError, LogError) as error:
         raise ConfigError([str(error)]) from error
 
 
-def _reader(path: Path) -> Any:
-    """By the file's ending: an MCAP log, or else CSV."""
-    return read_csv
+def _reader(path: Path) -> Callable[..., Recording]:
+    """By the file's ending: an MCAP log (also one that was cut off while written), or else CSV."""
+    return read_mcap if ".mcap" in path.suffixes else read_csv
 
 
 def _mapping(config: RecordingConfig, plant: PlantDescription) -> dict[str, ChannelSource]:

@@ -1,0 +1,134 @@
+"""Recordings from MCAP logs: our own by channel name, foreign ones by `TOPIC:FIELD` for each channel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from fdi_torch.config.problems import unknown
+from fdi_torch.logbook import Signals, mapped_signals, own_signals, read_run
+from fdi_torch.parameters import si_unit_of, unit_factor
+from fdi_torch.recording import Hold, Recording
+from fdi_torch.recording_csv import ChannelSource, file_sha256
+
+
+def read_mcap(
+    path: Path,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    mapping: Mapping[str, ChannelSource] | None = None,
+    hold: Hold = "zero_order",
+) -> Recording:
+    """The named channels of a log as a recording in SI; as `read_csv`, with messages in the place of rows.
+
+    A log of ours needs no mapping. In a foreign one each channel has a column 'TOPIC:FIELD' and a unit; the column of
+    `t` is the field that holds the time (the log's own time where it is not given).
+    Raises ValueError, naming the file, for what is not in it, and LogError for a damaged one.
+    """
+    mapping = mapping or {}
+    run = read_run(path)
+    channels = {name: mapping.get(name, ChannelSource()) for name in (*inputs, *outputs)}
+    wanted = {name: source for name, source in channels.items() if source.constant is None}
+    if any(":" in (source.column or "") for source in wanted.values()):
+        places = {name: _place(path, name, source) for name, source in wanted.items()}
+        time, scale = mapping.get("t", ChannelSource()), _seconds(path, mapping.get("t"))
+        signals = mapped_signals(
+            run,
+            {name: places[name] for name in inputs if name in places},
+            {name: places[name] for name in outputs if name in places},
+            time.column,
+        )
+        table = _by_name(signals)
+    else:
+        signals, scale = own_signals(run), 1.0
+        logged = _by_name(signals)
+        table = {name: _find(path, name, source, logged) for name, source in wanted.items()}
+        hold = "linear" if signals.hold == "linear" else "zero_order"
+    return _recording(path, signals, scale, table, channels, tuple(inputs), tuple(outputs), hold)
+
+
+def _seconds(path: Path, time: ChannelSource | None) -> float:
+    """How many seconds one of the time field's units is."""
+    try:
+        return unit_factor(time.unit, "s") if time and time.unit else 1.0
+    except ValueError as error:
+        raise ValueError(f"{path}: t: {error}") from error
+
+
+Column = tuple[np.ndarray, np.ndarray, str]
+"""Values (T,), whether each counts (T,), and their unit ('' where the log does not state it)."""
+
+
+def _recording(
+    path: Path,
+    signals: Signals,
+    scale: float,
+    table: Mapping[str, Column],
+    channels: Mapping[str, ChannelSource],
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    hold: Hold,
+) -> Recording:
+    samples = len(signals.time)
+    columns = {name: _in_si(path, name, source, table, samples) for name, source in channels.items()}
+
+    def stacked(names: Sequence[str], part: int) -> torch.Tensor:
+        arrays = [columns[name][part] for name in names]
+        return torch.from_numpy(np.stack(arrays, axis=1) if arrays else np.zeros((samples, 0)))
+
+    return Recording(
+        time=torch.from_numpy(signals.time * scale),
+        inputs=stacked(inputs, 0),
+        outputs=stacked(outputs, 0),
+        mask=stacked(outputs, 1).to(torch.bool),
+        input_names=inputs,
+        output_names=outputs,
+        input_units=tuple(columns[name][2] for name in inputs),
+        output_units=tuple(columns[name][2] for name in outputs),
+        hold=hold,
+        source=str(path),
+        sha256=file_sha256(path),
+    )
+
+
+def _in_si(path: Path, name: str, source: ChannelSource, table: Mapping[str, Column], samples: int) -> Column:
+    if source.constant is not None:
+        values = np.full(samples, source.constant)
+        return values, np.isfinite(values), source.unit or "1"
+    values, counts, logged_unit = table[name]
+    unit = source.unit or logged_unit
+    if not unit:
+        raise ValueError(f"{path}: {name}: expected a unit, got none; give it under columns: {{{name}: {{unit: cm}}}}")
+    si_unit = si_unit_of(unit)
+    values = values * unit_factor(unit, si_unit)
+    return values, counts & np.isfinite(values), si_unit
+
+
+def _by_name(signals: Signals) -> dict[str, Column]:
+    always = np.ones(len(signals.time), dtype=bool)
+    inputs = zip(signals.input_names, signals.inputs.T, signals.input_units, strict=True)
+    outputs = zip(signals.output_names, signals.outputs.T, signals.mask.T, signals.output_units, strict=True)
+    return {
+        **{name: (values, always, unit) for name, values, unit in inputs},
+        **{name: (values, mask, unit) for name, values, mask, unit in outputs},
+    }
+
+
+def _find(path: Path, name: str, source: ChannelSource, table: Mapping[str, Column]) -> Column:
+    column = source.column or name
+    if column not in table:
+        raise ValueError(f"{path}: {name}: {unknown('a channel of the log', column, table)}")
+    return table[column]
+
+
+def _place(path: Path, name: str, source: ChannelSource) -> tuple[str, str]:
+    topic, _, field = (source.column or "").rpartition(":")
+    if not topic or not field:
+        raise ValueError(
+            f"{path}: {name}: expected a column TOPIC:FIELD as in /rig/levels:left, got '{source.column}'; "
+            f"map it under columns: {{{name}: {{column: ..., unit: ...}}}}"
+        )
+    return topic, field
