@@ -135,14 +135,6 @@ def parse_quantity(text: str, unit: str) -> float:
         raise ValueError(f"expected a quantity in {unit} such as '1 {unit}', got '{text}'") from error
 
 
-def base_quantity(text: str) -> float:
-    """'8 s' -> 8.0, '1 mm/h' -> 2.8e-7: the number in SI base units, whatever the dimension."""
-    try:
-        return float(_units.Quantity(text).to_base_units().magnitude)
-    except Exception as error:
-        raise ValueError(f"expected a quantity such as '8 s', got '{text}'") from error
-
-
 @lru_cache(maxsize=256)
 def unit_factor(unit: str, si_unit: str) -> float:
     """How many `si_unit` one `unit` is: unit_factor('cm', 'm') = 0.01."""

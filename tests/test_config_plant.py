@@ -80,11 +80,10 @@ def test_a_plant_reads_back_as_it_was_written(name: str) -> None:
 
 def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
     data = changed("tanks.T1.area", f"{0.1 + 0.2} m^2")
-    data["effects"] = [
-        {"effect": "pump_lag", "location": "Q1", "parameters": {"time_constant": "1 minute", "share": 1 / 3}}
-    ]
+    leak = {"effect": "leak", "location": "T1", "parameters": {"size": 1 / 3, "onset": "1 minute", "height": "7 mm"}}
+    data["effects"] = [leak]
     plant = build_plant(data, "plant.yaml")
-    assert plant.effects[0].parameters == {"time_constant": 60.0, "share": 1 / 3}
+    assert plant.effects[0].parameters == {"size": 1 / 3, "onset": 60.0, "height": 0.007}
     assert build_plant(yaml.safe_load(dump_plant(plant)), "again") == plant
 
 
@@ -115,7 +114,23 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
         ("tanks.T1.leak_reference", "P9", "tanks.T1.leak_reference: expected one of the pipes P12, got 'P9'"),
         ("tolerances", {"P12.discharge": 0.1}, "got 'P12.discharge'; the nearest is 'P12.discharge_coefficient'"),
         ("tolerances", {"*.area": "-3 %"}, "tolerances.\\*.area: expected a positive tolerance such as 3 %, got -3 %"),
-        ("effects", [{"effect": "leak", "location": "T1", "parameters": {"height": "3 furrows"}}], "got '3 furrows'"),
+        (
+            "effects",
+            [{"effect": "leak", "location": "T1", "parameters": {"height": "3 s"}}],
+            "p.yaml: effects.0.parameters.height: expected a quantity in m .* got '3 s'",
+        ),
+        (
+            "effects",
+            [{"effect": "leak", "location": "T1", "parameters": {"hight": "3 cm"}}],
+            "effects.0.parameters: expected a parameter of leak .* the nearest is 'height'",
+        ),
+        ("effects", [{"effect": "leek", "location": "T1"}], "effects.0: expected an effect of the library, got 'leek'"),
+        (
+            "effects",
+            [{"effect": "leak", "location": "Q1"}],
+            "effects.0: expected a place of kind tank for leak, got Q1",
+        ),
+        ("effects", [{"effect": "leak", "location": "T9"}], "effects.0: plant p: expected one of .* got T9"),
     ],
 )
 def test_an_impossible_plant_is_refused_in_one_sentence(path: str, value: Any, sentence: str) -> None:

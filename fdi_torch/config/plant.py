@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,8 +13,10 @@ from pydantic import BeforeValidator, Field, ValidationError
 from fdi_torch.config.files import find_plant, read_yaml
 from fdi_torch.config.problems import ConfigError, explain, unknown
 from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Share, Strict, quantity
-from fdi_torch.parameters import base_quantity
+from fdi_torch.effects import effect
+from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.effect import fits
 
 PUMP_GAIN_UNITS = ("1", "m^3/s/V", "m^3/s")
 SENSOR_UNITS = {"1": "m", "V/m": "V", "1/m": "1"}
@@ -100,16 +103,16 @@ def build_plant(data: dict[str, Any], source: str) -> PlantDescription:
 
 def _description(config: PlantConfig) -> PlantDescription:
     sensors = tuple(_sensor(name, sensor) for name, sensor in config.sensors.items())
-    return PlantDescription(
+    plant = PlantDescription(
         name=config.name,
         tanks=tuple(Tank(name, **dict(tank)) for name, tank in config.tanks.items()),
         pipes=tuple(Pipe(name, **dict(pipe)) for name, pipe in config.pipes.items()),
         pumps=tuple(_pump(name, pump) for name, pump in config.pumps.items()),
         sensors=sensors,
-        effects=tuple(_effect(i, effect) for i, effect in enumerate(config.effects)),
         tolerances=_tolerances(config, sensors),
         gravity=config.gravity,
     )
+    return replace(plant, effects=tuple(_effect(i, e, plant) for i, e in enumerate(config.effects)))
 
 
 def _pump(name: str, pump: PumpConfig) -> Pump:
@@ -129,10 +132,25 @@ def _sensor(name: str, sensor: SensorConfig) -> Sensor:
     return Sensor(name, sensor.tank, unit, gain, offset, sensor.channel, reading("low"), reading("high"))
 
 
-def _effect(index: int, effect: EffectConfig) -> PlacedEffect:
-    place = f"effects.{index}.parameters"
-    values = {name: _base(f"{place}.{name}", value) for name, value in effect.parameters.items()}
-    return PlacedEffect(effect.effect, effect.location, values)
+def _effect(index: int, config: EffectConfig, plant: PlantDescription) -> PlacedEffect:
+    place = f"effects.{index}"
+    try:
+        known = effect_parameters(config.effect, config.location, plant)
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
+    for name in config.parameters:
+        if name not in known:
+            raise ValueError(f"{place}.parameters: {unknown(f'a parameter of {config.effect}', name, known)}")
+    values = {n: _amount(f"{place}.parameters.{n}", v, known[n].unit) for n, v in config.parameters.items()}
+    return PlacedEffect(config.effect, config.location, values)
+
+
+def effect_parameters(name: str, location: str, plant: PlantDescription) -> dict[str, Parameter]:
+    """The parameters of an effect at a place, by their short names. Raises ValueError where it cannot be there."""
+    found = effect(name)
+    if not fits(found, plant, location):
+        raise ValueError(f"expected a place of kind {' or '.join(found.places)} for {name}, got {location}")
+    return {p.name: p for p in found.parameters(location, plant)}
 
 
 def _tolerances(config: PlantConfig, sensors: Sequence[Sensor]) -> dict[str, float]:
@@ -174,12 +192,5 @@ def _amount_in_one_of(place: str, value: Amount, units: tuple[str, ...]) -> tupl
 def _amount(place: str, value: Amount, unit: str) -> float:
     try:
         return quantity(value, unit)
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
-
-
-def _base(place: str, value: Amount) -> float:
-    try:
-        return base_quantity(value) if isinstance(value, str) else float(value)
     except ValueError as error:
         raise ValueError(f"{place}: {error}") from error

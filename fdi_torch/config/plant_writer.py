@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from fdi_torch.config.files import write_yaml
-from fdi_torch.config.plant import SENSOR_UNITS
+from fdi_torch.config.plant import SENSOR_UNITS, effect_parameters
 from fdi_torch.parameters import parse_quantity
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 
 
 def dump_plant(plant: PlantDescription) -> str:
@@ -26,9 +26,7 @@ def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
     data["tolerances"] = {
         name: _text(v, units.get(name, "1"), units.get(name, "1")) for name, v in plant.tolerances.items()
     }
-    data["effects"] = [
-        {"effect": e.effect, "location": e.location, "parameters": dict(e.parameters)} for e in plant.effects
-    ]
+    data["effects"] = [_effect_mapping(placed, plant) for placed in plant.effects]
     return {key: value for key, value in data.items() if value}
 
 
@@ -82,6 +80,12 @@ def _sensor_mapping(sensor: Sensor) -> dict[str, Any]:
         low=reading(sensor.low),
         high=reading(sensor.high),
     )
+
+
+def _effect_mapping(placed: PlacedEffect, plant: PlantDescription) -> dict[str, Any]:
+    known = effect_parameters(placed.effect, placed.location, plant)
+    values = {name: _text(value, known[name].unit, known[name].unit) for name, value in placed.parameters.items()}
+    return {"effect": placed.effect, "location": placed.location, "parameters": values}
 
 
 def _given(**fields: Any) -> dict[str, Any]:
