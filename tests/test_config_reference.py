@@ -1,0 +1,32 @@
+"""The reference of keys: complete, and every key in it is one that a file may have."""
+
+from __future__ import annotations
+
+import pytest
+
+from fdi_torch.config import ConfigError, RunConfig, load_run
+from fdi_torch.config.plant import PlantConfig
+from fdi_torch.config.reference import config_reference, keys
+
+RUN = {path: (default, meaning) for path, default, meaning in keys(RunConfig)}
+
+
+def test_keys_of_all_depths_are_there_with_default_and_meaning() -> None:
+    assert RUN["seed"] == ("0", "of everything drawn at random")
+    assert RUN["simulate.duration"] == ("1000.0", "length of the recording, s")
+    assert RUN["recordings.N.columns.NAME.unit"][0] == "none"
+    assert RUN["recordings.N.file"][0] == "required"
+    assert RUN["estimate.search.strategy"][0] == "l-shade"
+
+
+@pytest.mark.parametrize("path", [p for p in RUN if p.startswith("estimate.search.")])
+def test_every_key_is_known_to_the_models(path: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        load_run(overrides=[f"{path}=[wrong]"])
+    assert "known key" not in str(error.value)
+
+
+def test_reference_has_one_line_a_key() -> None:
+    lines = config_reference(PlantConfig).splitlines()
+    assert len(lines) == len(list(keys(PlantConfig)))
+    assert any(line.startswith("pipes.NAME.discharge_coefficient  [required]") for line in lines)
