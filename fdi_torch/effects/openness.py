@@ -10,7 +10,7 @@ from fdi_torch.plant.effect import Effect, Local, Stage, Values
 
 
 class Openness(Effect):
-    """The flow is theta times its law; nominal 1. At a pipe theta_4 = 1 - b_1 and theta_5 = 1 - b_3 (2020 paper, eq. 31).
+    """The flow is theta times its law; nominal 1. At a pipe theta_4 = 1 - b_1, theta_5 = 1 - b_3 (2020 paper, eq. 31).
 
     It is plugging counted from the other end; use one of the two at a place.
     """

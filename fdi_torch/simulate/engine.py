@@ -66,5 +66,8 @@ class Engine(Protocol):
         ...
 
     def gram(self, theta: Tensor, data: Readings) -> Tensor:
-        """theta (problems, N, P) -> weighted sums of products of [d prediction/d theta, r, y', 1], (problems, N, C, P+3, P+3)."""
+        """theta (problems, N, P) -> weighted sums of products of [d prediction/d theta, r, y', 1].
+
+        (problems, N, C, P+3, P+3).
+        """
         ...

@@ -17,7 +17,7 @@ class Experiment:
 
     nodes (K+1,) s: the ends of the integration steps, which hit every switch of a held input they can.
     inputs (K, channels): each channel's exact mean over each step. signal: the same for any delayed interval.
-    sample_times (S,) s; sample k lies at share `sample_share` (0..1] of step `sample_step` (the first one at 0 of step 0).
+    sample_times (S,) s; sample k lies at share `sample_share` (0..1] of step `sample_step` (the first at 0 of step 0).
     resolution: the longest step, s.
     """
 

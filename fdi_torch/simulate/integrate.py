@@ -54,7 +54,7 @@ class ReferenceEngine:
         return levels.movedim(1, 0).reshape(*theta.shape[:-1], *levels.shape[::2])
 
     def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """theta (*batch, P) -> readings (*batch, S, sensors) and their Jacobian (*batch, S, sensors, P), forward mode."""
+        """theta (*batch, P) -> readings (*batch, S, sensors), their Jacobian (*batch, S, sensors, P), forward mode."""
         count = theta.shape[-1]
         tangents = torch.eye(count, dtype=theta.dtype, device=theta.device)
         tangents = tangents.reshape(count, *[1] * (theta.dim() - 1), count).expand(count, *theta.shape)
@@ -124,7 +124,7 @@ class ReferenceEngine:
         return torch.stack(rows)
 
     def _sample(self, levels: Tensor, commands: Tensor, values: PlaceValues) -> Tensor:
-        """Levels at the samples (S, L, tanks): the nodes themselves, or the cubic through both ends' levels and slopes."""
+        """Levels at the samples (S, L, tanks): the nodes themselves, or the cubic through both ends' levels, slopes."""
         e = self.experiment
         left, right = levels[e.sample_step], levels[e.sample_step + 1]
         inside = (e.sample_share > 0.0) & (e.sample_share < 1.0)
