@@ -1,4 +1,4 @@
-"""The parameter-linear form x' = F(x) theta + B u of a plant (2020 paper, eq. 32, 33), taken from its right-hand side."""
+"""The parameter-linear form x' = F(x) theta + B u of a plant (2020 paper, eq. 32, 33), from its right-hand side."""
 
 from __future__ import annotations
 
