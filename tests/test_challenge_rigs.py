@@ -88,10 +88,10 @@ def test_water_that_only_changes_tanks_stays_in_them(off: tuple[Deviation, ...])
 
 
 def test_what_a_conical_tank_is_given_is_in_it() -> None:
-    slope, flow, seconds = 0.5, 5e-5, 100
-    cone = Deviation("area_taper", "A", "cone", {"slope": slope})
+    slope, middle, flow, seconds = 0.5, 0.4, 5e-5, 100
+    cone = Deviation("area_taper", "A", "cone", {"slope": slope, "reference": middle})
     levels = run(rig_of((), PUMP), 0.0, [0.2, 0.0], seconds, cone, asked=flow)[:, 0]
-    volume = AREA * ((1 + slope * levels) ** 3 - 1) / (3 * slope)
+    volume = AREA * ((1 + slope * levels) ** 3 - 1) / (3 * slope) / (1 + slope * middle) ** 2
     np.testing.assert_allclose(volume - volume[0], flow * np.arange(seconds + 1), atol=1e-9)
 
 

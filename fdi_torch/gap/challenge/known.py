@@ -11,6 +11,7 @@ import numpy as np
 
 from fdi_torch.gap.challenge.moment import Deviation
 from fdi_torch.gap.challenge.surroundings import Surroundings
+from fdi_torch.plant.description import Tank
 
 Draw = Callable[[Surroundings, str], Deviation]
 
@@ -98,8 +99,11 @@ def unmetered_flow(s: Surroundings, at: str) -> Deviation:
 
 
 def area_taper(s: Surroundings, at: str) -> Deviation:
+    """The cross-section believed in was measured at the floor, or is that at half height."""
     slope = ((1 + s.either(0.15, 0.4)) ** 0.5 - 1) / s.tank(at, 0.98)
-    return Deviation("area_taper", at, "cone", {"slope": slope})
+    tank = s.plant.component(at)
+    half = 0.5 * tank.height if isinstance(tank, Tank) and s.rng.random() < 0.5 else 0.0
+    return Deviation("area_taper", at, "cone", {"slope": slope, "reference": half})
 
 
 def internal_body(s: Surroundings, at: str) -> Deviation:

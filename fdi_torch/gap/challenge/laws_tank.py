@@ -73,8 +73,8 @@ def float_valve(level: Array, other: Array, now: Moment, p: Numbers, state: Any)
 
 
 def cone(level: Array, p: Numbers) -> Array:
-    """Width grows evenly, so the cross-section with the square: (1 + b h)^2."""
-    return (1 + p["slope"] * level) ** 2
+    """Width grows evenly, so the cross-section with the square: (1 + b h)^2, as believed at a reference level."""
+    return ((1 + p["slope"] * level) / (1 + p["slope"] * p["reference"])) ** 2
 
 
 def block(level: Array, p: Numbers) -> Array:
