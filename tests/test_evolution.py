@@ -164,7 +164,7 @@ def test_problem_is_bit_equal_alone_and_among_neighbours_that_finish_or_fail(
 @pytest.mark.parametrize("settings", [RAND_1, L_SHADE], ids=["rand/1/bin", "l-shade"])
 def test_large_batch_on_several_threads_changes_no_bit(settings: EvolutionSettings) -> None:
     """Vectorised kernels treat the tails of a tensor apart; where a problem falls must not matter."""
-    settings = replace(settings, evaluations=500)
+    settings = replace(settings, evaluations=320)
     low, high = box(2.0, (257,))
     seeds, threads = torch.arange(257), torch.get_num_threads()
     torch.set_num_threads(2)

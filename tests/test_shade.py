@@ -11,7 +11,6 @@ from fdi_torch.estimate.shade import (
     draw_factor,
     draw_rate,
     lehmer_mean,
-    row_sum,
     success_weights,
     update_archive,
     update_memory,
@@ -80,13 +79,6 @@ def test_infinite_gain_counts_as_the_largest_finite_one() -> None:
     gain, success = row(math.inf, 2.0, 1.0, math.nan), torch.tensor([[True, True, True, False]])
     assert torch.equal(success_weights(gain, success), row(1.0, 1.0, 0.5, 0.0))
     assert lehmer_mean(row(0.3), row(0.0)).item() == 0.0
-
-
-def test_row_sum_keeps_its_bits_in_any_batch() -> None:
-    values = torch.rand(300, 37, dtype=DOUBLE, generator=torch.Generator().manual_seed(1))
-    total = row_sum(values)
-    torch.testing.assert_close(total, values.sum(-1))
-    assert all(torch.equal(row_sum(values[i : i + 1]), total[i : i + 1]) for i in range(0, 300, 7))
 
 
 def test_archive_fills_in_order_then_replaces_at_random() -> None:

@@ -12,6 +12,8 @@ import math
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.batch_algebra import row_sum
+
 TERMINAL = -1.0
 _SPREAD = 0.1
 
@@ -30,15 +32,6 @@ def draw_factor(memory: Tensor, u: Tensor) -> Tensor:
     below_zero = 0.5 - torch.atan(memory / _SPREAD) / math.pi
     share = below_zero + u * (1.0 - below_zero)
     return (memory + _SPREAD * torch.tan(math.pi * (share - 0.5))).clamp(1e-12, 1.0)
-
-
-def row_sum(values: Tensor) -> Tensor:
-    """Sum over the last dimension in an order that depends on its length alone, not on the batch: (..., N) -> (...)."""
-    while values.shape[-1] > 1:
-        half = (values.shape[-1] + 1) // 2
-        rest = torch.nn.functional.pad(values[..., half:], (0, 2 * half - values.shape[-1]))
-        values = values[..., :half] + rest
-    return values[..., 0]
 
 
 def lehmer_mean(values: Tensor, weights: Tensor) -> Tensor:

@@ -1,0 +1,280 @@
+"""Levenberg-Marquardt, L-BFGS and Adam against SciPy and closed forms; members of a batch never feel one another."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import least_squares, lsq_linear
+from torch import Tensor
+
+from fdi_torch.estimate.adam import AdamSettings, adam
+from fdi_torch.estimate.batch_algebra import apply, row_sum, solve_positive
+from fdi_torch.estimate.lbfgs import LbfgsSettings, lbfgs
+from fdi_torch.estimate.refine import Linearisation, Progress, RefineSettings, levenberg_marquardt
+
+DOUBLE = torch.float64
+INF = math.inf
+TIME = torch.linspace(0.0, 4.0, 41, dtype=DOUBLE)
+
+
+def rows(*values: list[float]) -> Tensor:
+    return torch.tensor(values, dtype=DOUBLE)
+
+
+@dataclass
+class LeastSquares:
+    """cost = |r|^2 / 2 with explicit sums; residual(theta (L, P), lanes (L,)) -> r (L, S), J (L, S, P)."""
+
+    residual: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    calls: int = 0
+
+    def linearise(self, theta: Tensor, lanes: Tensor) -> Linearisation:
+        self.calls += 1
+        r, jacobian = self.residual(theta, lanes)
+        columns = jacobian.mT
+        curvature = row_sum(columns[:, :, None, :] * columns[:, None, :, :])
+        return Linearisation(0.5 * row_sum(r * r), apply(columns, r), curvature)
+
+    def value_and_gradient(self, theta: Tensor, lanes: Tensor) -> tuple[Tensor, Tensor]:
+        model = self.linearise(theta, lanes)
+        return model.cost, model.gradient
+
+
+def rosenbrock(theta: Tensor, lanes: Tensor) -> tuple[Tensor, Tensor]:
+    x, y = theta.unbind(-1)
+    zero = torch.zeros_like(x)
+    jacobian = torch.stack((torch.stack((-20.0 * x, zero + 10.0), -1), torch.stack((zero - 1.0, zero), -1)), -2)
+    return torch.stack((10.0 * (y - x * x), 1.0 - x), -1), jacobian
+
+
+def decays(theta: Tensor) -> tuple[Tensor, Tensor]:
+    """a exp(-b t) + c exp(-d t) and its Jacobian."""
+    a, b, c, d = theta[..., None].unbind(-2)
+    first, second = torch.exp(-b * TIME), torch.exp(-d * TIME)
+    jacobian = torch.stack((first, -a * TIME * first, second, -c * TIME * second), -1)
+    return a * first + c * second, jacobian
+
+
+TRUTH = rows([2.0, 0.4, 1.0, 3.0])[0]
+DATA = decays(TRUTH)[0] + 0.02 * torch.randn(12, 41, dtype=DOUBLE, generator=torch.Generator().manual_seed(3))
+DECAYS = LeastSquares(lambda theta, lanes: (decays(theta)[0] - DATA[lanes], decays(theta)[1]))
+START = rows([1.0, 0.2, 0.5, 2.0]).expand(12, 4)
+FREE = (torch.full((4,), -INF, dtype=DOUBLE), torch.full((4,), INF, dtype=DOUBLE))
+BOXED = (rows([0.0, 0.0, 0.0, 0.0])[0], rows([1.8, 10.0, 10.0, 2.5])[0])
+TIGHT = RefineSettings(decrease_tolerance=1e-18)
+
+
+def by_scipy(lane: int, low: Tensor, high: Tensor) -> np.ndarray:
+    def residual(theta: np.ndarray) -> np.ndarray:
+        return (decays(torch.from_numpy(theta))[0] - DATA[lane]).numpy()
+
+    return least_squares(
+        residual, START[lane].numpy(), bounds=(low.numpy(), high.numpy()), xtol=1e-15, ftol=1e-15, gtol=1e-15
+    ).x
+
+
+def test_rosenbrock_from_the_classical_start() -> None:
+    start = rows([-1.2, 1.0], [5.0, -5.0])
+    problem = LeastSquares(rosenbrock)
+    result = levenberg_marquardt(problem.linearise, start, -FREE[1][:2], FREE[1][:2], TIGHT)
+    torch.testing.assert_close(result.theta, torch.ones(2, 2, dtype=DOUBLE), rtol=0, atol=1e-8)
+    assert result.statuses() == ["converged", "converged"]
+    assert problem.calls <= 60
+
+
+@pytest.mark.parametrize("bounds", [FREE, BOXED], ids=["free", "boxed"])
+def test_exponentials_end_where_scipy_ends(bounds: tuple[Tensor, Tensor]) -> None:
+    low, high = bounds
+    result = levenberg_marquardt(DECAYS.linearise, START, low, high, TIGHT)
+    assert set(result.statuses()) == {"converged"}
+    for lane in range(12):
+        np.testing.assert_allclose(result.theta[lane].numpy(), by_scipy(lane, low, high), rtol=2e-6)
+    assert bool(result.held.any()) is (bounds is BOXED)
+
+
+def test_solution_at_a_bound_satisfies_karush_kuhn_tucker() -> None:
+    low, high = BOXED
+    result = levenberg_marquardt(DECAYS.linearise, START, low, high, TIGHT)
+    at_low, at_high = result.theta == low, result.theta == high
+    assert (at_low | at_high).any(-1).all()
+    assert torch.equal(result.held, at_low | at_high)
+    scale = result.curvature.diagonal(dim1=-2, dim2=-1).sqrt()
+    free = torch.where(result.held, 0.0, result.gradient / scale)
+    assert free.abs().max() < 1e-7
+    assert (result.gradient[at_high] < 0).all() and (result.gradient[at_low] > 0).all()
+
+
+def test_bounds_may_differ_from_member_to_member_and_hold_a_parameter_fast() -> None:
+    low, high = FREE[0].expand(12, 4).clone(), FREE[1].expand(12, 4).clone()
+    low[3, 1] = high[3, 1] = 0.5
+    result = levenberg_marquardt(DECAYS.linearise, START, low, high, TIGHT)
+    free = levenberg_marquardt(DECAYS.linearise, START, *FREE, TIGHT)
+    assert result.theta[3, 1] == 0.5 and result.held[3].tolist() == [False, True, False, False]
+    others = torch.arange(12) != 3
+    assert torch.equal(result.theta[others], free.theta[others])
+
+
+def test_linear_problem_of_mixed_units_with_many_active_bounds() -> None:
+    """A quadratic in 12 dimensions whose unbounded optimum lies outside of the box in many of them."""
+    generator = torch.Generator().manual_seed(0)
+    design = torch.randn(60, 12, dtype=DOUBLE, generator=generator)
+    data = 2.0 * torch.randn(5, 60, dtype=DOUBLE, generator=generator)
+    scale = 10.0 ** torch.arange(-6, 6, dtype=DOUBLE)
+
+    def residual(theta: Tensor, lanes: Tensor) -> tuple[Tensor, Tensor]:
+        return apply(design, theta * scale) - data[lanes], (design * scale).expand(len(lanes), -1, -1)
+
+    problem = LeastSquares(residual)
+    start, half = torch.zeros(5, 12, dtype=DOUBLE), 0.1 / scale
+    result = levenberg_marquardt(problem.linearise, start, -half, half, TIGHT)
+    assert set(result.statuses()) == {"converged"} and result.held.any(-1).all()
+    for lane in range(5):
+        box = (-0.1 * np.ones(12), 0.1 * np.ones(12))
+        exact = lsq_linear(design.numpy(), data[lane].numpy(), bounds=box, tol=1e-15)
+        np.testing.assert_allclose((result.theta[lane] * scale).numpy(), exact.x, atol=1e-7)
+    free = levenberg_marquardt(problem.linearise, start, -torch.full_like(half, INF), torch.full_like(half, INF), TIGHT)
+    solution = torch.linalg.lstsq(design, data.mT).solution.mT
+    torch.testing.assert_close(free.theta * scale, solution, rtol=1e-9, atol=1e-9)
+
+
+def with_trouble(theta: Tensor, lanes: Tensor) -> tuple[Tensor, Tensor]:
+    """Member 4 is NaN from the start; member 7 cannot be evaluated where b > 0.38, on the way to its optimum."""
+    model, jacobian = decays(theta)
+    bad = (lanes == 4) | ((lanes == 7) & (theta[:, 1] > 0.38))
+    return torch.where(bad[:, None], math.nan, model - DATA[lanes]), jacobian
+
+
+def refinements() -> list[tuple[str, Callable[[Callable, Tensor], object]]]:
+    def lm(residual: Callable, start: Tensor) -> object:
+        return levenberg_marquardt(LeastSquares(residual).linearise, start, *BOXED)
+
+    def quasi(residual: Callable, start: Tensor) -> object:
+        return lbfgs(LeastSquares(residual).value_and_gradient, start, *BOXED, LbfgsSettings(iterations=80))
+
+    def moments(residual: Callable, start: Tensor) -> object:
+        return adam(LeastSquares(residual).value_and_gradient, start, *BOXED, AdamSettings(iterations=40))
+
+    return [("levenberg-marquardt", lm), ("l-bfgs", quasi), ("adam", moments)]
+
+
+@pytest.mark.parametrize(("name", "method"), refinements(), ids=lambda value: value if isinstance(value, str) else "")
+def test_member_is_bit_equal_alone_and_beside_members_in_trouble(name: str, method: Callable) -> None:
+    together = method(with_trouble, START)
+    assert together.statuses()[4] == "failed"
+    assert torch.equal(together.theta[4], START[4]) and "failed" not in np.delete(together.statuses(), 4)
+    assert torch.isfinite(together.cost[7]) and together.theta[7, 1] <= 0.38
+    for lane in (0, 4, 5, 7, 11):
+        alone = method(lambda theta, _, b=lane: with_trouble(theta, torch.full((1,), b)), START[lane])
+        for field, value in vars(alone).items():
+            if value is not None:
+                inside = getattr(together, field)[lane]
+                assert torch.equal(value.nan_to_num(-7.0), inside.nan_to_num(-7.0)), (lane, field)
+
+
+def test_unidentifiable_direction_survives() -> None:
+    """Only the product a c of a exp(-b t) c is determined, and d does nothing at all."""
+
+    def residual(theta: Tensor, lanes: Tensor) -> tuple[Tensor, Tensor]:
+        a, b, c, _ = theta[..., None].unbind(-2)
+        shape = torch.exp(-b * TIME)
+        jacobian = torch.stack((c * shape, -a * c * TIME * shape, a * shape, torch.zeros_like(shape)), -1)
+        return a * c * shape - 6.0 * torch.exp(-0.7 * TIME), jacobian
+
+    result = levenberg_marquardt(LeastSquares(residual).linearise, START[:2], *FREE, TIGHT)
+    assert result.statuses() == ["converged"] * 2
+    torch.testing.assert_close(result.theta[:, 0] * result.theta[:, 2], torch.full((2,), 6.0, dtype=DOUBLE))
+    torch.testing.assert_close(result.theta[:, 1], torch.full((2,), 0.7, dtype=DOUBLE))
+    assert torch.equal(result.theta[:, 3], START[:2, 3])
+
+
+def test_units_of_the_parameters_change_only_the_rounding() -> None:
+    unit = rows([1e-6, 1e3, 1e4, 1e-3])[0]
+
+    def residual(theta: Tensor, lanes: Tensor) -> tuple[Tensor, Tensor]:
+        model, jacobian = decays(theta / unit)
+        return model - DATA[lanes], jacobian / unit
+
+    scaled = levenberg_marquardt(LeastSquares(residual).linearise, START * unit, *FREE, TIGHT)
+    plain = levenberg_marquardt(DECAYS.linearise, START, *FREE, TIGHT)
+    torch.testing.assert_close(scaled.theta / unit, plain.theta, rtol=1e-8, atol=0)
+
+
+def test_status_says_out_of_iterations_or_stalled() -> None:
+    few = levenberg_marquardt(DECAYS.linearise, START, *FREE, RefineSettings(iterations=2))
+    assert set(few.statuses()) == {"max_iterations"} and set(few.iterations.tolist()) == {2}
+    assert (few.promised > 1e-6).all()
+
+    def wrong_way(theta: Tensor, lanes: Tensor) -> Linearisation:
+        model = DECAYS.linearise(theta, lanes)
+        return replace(model, gradient=-model.gradient)
+
+    stalled = levenberg_marquardt(wrong_way, START, *FREE)
+    assert set(stalled.statuses()) == {"stalled"} and torch.equal(stalled.theta, START)
+
+
+def test_every_iteration_is_shown_and_costs_only_fall() -> None:
+    seen: list[Progress] = []
+    levenberg_marquardt(DECAYS.linearise, START, *BOXED, on_iteration=seen.append)
+    assert [p.iteration for p in seen] == list(range(1, len(seen) + 1))
+    cost = torch.full((12,), INF, dtype=DOUBLE)
+    for p in seen:
+        assert (p.cost <= cost[p.lanes]).all() and ((p.cost < cost[p.lanes]) >= p.accepted).all()
+        cost[p.lanes] = p.cost
+    assert len(seen[-1].lanes) < 12
+
+
+@pytest.mark.parametrize("bounds", [FREE, BOXED], ids=["free", "boxed"])
+def test_l_bfgs_ends_where_levenberg_marquardt_ends(bounds: tuple[Tensor, Tensor]) -> None:
+    settings = LbfgsSettings(iterations=2000, decrease_tolerance=1e-15)
+    result = lbfgs(DECAYS.value_and_gradient, START, *bounds, settings)
+    exact = levenberg_marquardt(DECAYS.linearise, START, *bounds, TIGHT)
+    torch.testing.assert_close(result.cost, exact.cost, rtol=1e-9, atol=0)
+    torch.testing.assert_close(result.theta, exact.theta, rtol=2e-3, atol=0)
+    assert set(result.statuses()) == {"converged"}
+    assert torch.equal(result.held, exact.held)
+
+
+def test_adam_comes_close_to_levenberg_marquardt() -> None:
+    result = adam(DECAYS.value_and_gradient, START, *BOXED, AdamSettings(iterations=2000))
+    exact = levenberg_marquardt(DECAYS.linearise, START, *BOXED, TIGHT)
+    torch.testing.assert_close(result.cost, exact.cost, rtol=1e-6, atol=0)
+    assert set(result.statuses()) == {"converged"}
+    assert ((result.theta >= BOXED[0]) & (result.theta <= BOXED[1])).all()
+
+
+@pytest.mark.parametrize("parameters", [1, 2, 5, 30])
+def test_solver_solves_and_keeps_its_bits_in_any_batch(parameters: int) -> None:
+    generator = torch.Generator().manual_seed(parameters)
+    factor = torch.randn(50, parameters, parameters, dtype=DOUBLE, generator=generator)
+    matrix = factor @ factor.mT + 0.1 * torch.eye(parameters, dtype=DOUBLE)
+    right = torch.randn(50, parameters, dtype=DOUBLE, generator=generator)
+    solution, positive = solve_positive(matrix, right)
+    assert positive.all()
+    torch.testing.assert_close(solution, torch.linalg.solve(matrix, right), rtol=1e-8, atol=1e-10)
+    assert all(torch.equal(solve_positive(matrix[i], right[i])[0], solution[i]) for i in range(50))
+    assert not solve_positive(-matrix, right)[1].any()
+    assert not solve_positive(matrix * math.nan, right)[1].any()
+
+
+def test_row_sum_keeps_its_bits_in_any_batch() -> None:
+    values = torch.rand(300, 37, dtype=DOUBLE, generator=torch.Generator().manual_seed(1))
+    total = row_sum(values)
+    torch.testing.assert_close(total, values.sum(-1))
+    assert all(torch.equal(row_sum(values[i : i + 1]), total[i : i + 1]) for i in range(0, 300, 7))
+    assert torch.equal(row_sum(values[:, :0]), torch.zeros(300, dtype=DOUBLE))
+
+
+def test_misuse_is_refused_in_words() -> None:
+    with pytest.raises(ValueError, match=r"expected cost \(L,\), gradient \(L, P\) and curvature"):
+        levenberg_marquardt(lambda x, _: Linearisation(x, x, x), START, *FREE)
+    with pytest.raises(ValueError, match="expected low <= high"):
+        levenberg_marquardt(DECAYS.linearise, START, FREE[1], FREE[0])
+    with pytest.raises(ValueError, match="expected iterations >= 1, damping > 0"):
+        RefineSettings(damping=0.0)
+    with pytest.raises(ValueError, match="expected iterations, memory >= 1"):
+        LbfgsSettings(memory=0)
+    with pytest.raises(ValueError, match="expected iterations >= 1, positive rate"):
+        AdamSettings(learning_rate=0.0)
