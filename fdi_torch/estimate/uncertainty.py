@@ -1,0 +1,180 @@
+"""An estimate with all that is to be said of it: value, standard error, what is not determined, fit and status."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import NormalDist
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.information import RELATIVE_EIGENVALUE, Certainty, certainty, determined_combinations
+from fdi_torch.parameters import ParameterSpace
+
+# Closer to a bound than this share of the range counts as at it.
+_AT_BOUND = 1e-9
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The result for one set of parameters, SI.
+
+    std: standard errors, the tolerances of constants included through the priors; infinite for what is not determined.
+    covariance (P, P): free of bounds; infinite and NaN in the rows of what is not determined.
+    at_bounds: 'low' or 'high' by name. undetermined: one sentence for each group of parameters.
+    noise_std (C,): noise level of each channel, known or estimated, in its unit. chi_square: of the residuals against
+    the noise, with its degrees of freedom. reached: how the estimate was found; plain values.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    value: Tensor
+    std: Tensor
+    covariance: Tensor
+    status: str = ""
+    at_bounds: Mapping[str, str] = field(default_factory=dict)
+    undetermined: tuple[str, ...] = ()
+    noise_std: Tensor | None = None
+    chi_square: float | None = None
+    degrees_of_freedom: int | None = None
+    reached: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def correlation(self) -> Tensor:
+        """(P, P); NaN beside what is not determined."""
+        return self.covariance / (self.std[:, None] * self.std[None, :])
+
+    @property
+    def p_value(self) -> float | None:
+        """The probability of residuals at least as large, if the model and the noise level are right."""
+        if self.chi_square is None or not self.degrees_of_freedom:
+            return None
+        half = torch.tensor([0.5 * self.degrees_of_freedom, 0.5 * self.chi_square], dtype=torch.float64)
+        return float(torch.special.gammaincc(half[0], half[1]))
+
+    def interval(self, confidence: float = 0.95) -> tuple[Tensor, Tensor]:
+        """Lower and upper end (P,) of each parameter's confidence interval, by the normal distribution."""
+        reach = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * self.std
+        return self.value - reach, self.value + reach
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values that JSON can carry. A number that is not finite becomes None: of `std`, "not determined".
+
+        The covariance is flat, row after row, with its shape beside it.
+        """
+        plain = {name: plain_value(value, name) for name, value in vars(self).items() if name != "covariance"}
+        flat = plain_value(self.covariance.flatten(), "covariance")
+        p_value = plain_value(self.p_value, "p_value")
+        return plain | {"covariance": flat, "covariance_shape": list(self.covariance.shape), "p_value": p_value}
+
+
+def make_estimate(
+    space: ParameterSpace,
+    theta: Tensor,
+    information: Tensor,
+    *,
+    status: str = "",
+    noise_std: Tensor | None = None,
+    chi_square: float | None = None,
+    degrees_of_freedom: int | None = None,
+    reached: Mapping[str, Any] | None = None,
+    threshold: float = RELATIVE_EIGENVALUE,
+) -> Estimate:
+    """The estimate theta (P,) with what the Fisher information (P, P) there, priors included, says of it."""
+    parameters = len(space)
+    if theta.shape != (parameters,) or information.shape != (parameters, parameters):
+        raise ValueError(
+            f"expected theta ({parameters},) and information ({parameters}, {parameters}), got {tuple(theta.shape)} "
+            f"and {tuple(information.shape)}; make one estimate for each member of a batch"
+        )
+    sure = certainty(information, threshold=threshold)
+    return Estimate(
+        names=space.names,
+        units=tuple(p.unit for p in space),
+        value=theta,
+        std=sure.std,
+        covariance=sure.covariance,
+        status=status,
+        at_bounds=parameters_at_bounds(space, theta),
+        undetermined=(*undetermined_in_words(space.names, sure), *wider_than_range(space, sure.std)),
+        noise_std=noise_std,
+        chi_square=chi_square,
+        degrees_of_freedom=degrees_of_freedom,
+        reached=dict(reached or {}),
+    )
+
+
+def parameters_at_bounds(space: ParameterSpace, theta: Tensor) -> dict[str, str]:
+    """'low' or 'high' for each parameter whose value lies at an end of its range; theta (P,)."""
+    found = {}
+    for p, value in zip(space, theta.tolist(), strict=True):
+        near = _AT_BOUND * (p.high - p.low) if math.isfinite(p.high - p.low) else 0.0
+        if value <= p.low + near:
+            found[p.name] = "low"
+        elif value >= p.high - near:
+            found[p.name] = "high"
+    return found
+
+
+def undetermined_in_words(names: Sequence[str], sure: Certainty) -> tuple[str, ...]:
+    """One sentence for each group of parameters that are undetermined together, of one member's certainty."""
+    return tuple(
+        _sentence([names[i] for i in members], rows.tolist())
+        for members, rows in determined_combinations(sure.null, sure.scale)
+    )
+
+
+def _sentence(names: list[str], rows: list[list[float]]) -> str:
+    if not rows:
+        verb = "is" if len(names) == 1 else "are"
+        return (
+            f"{_listed(names)} {verb} not determined: the readings do not depend on {'it' if verb == 'is' else 'them'}"
+        )
+    verb = "is" if len(rows) == 1 else "are"
+    return f"of {_listed(names)}, only {_listed([_combination(names, row) for row in rows])} {verb} determined"
+
+
+def _combination(names: list[str], row: list[float]) -> str:
+    """'a + 0.8 b - 2 c', coefficients in SI units."""
+    size = max(abs(c) for c in row)
+    text = ""
+    for name, c in zip(names, row, strict=True):
+        if abs(c) > 1e-6 * size:
+            sign = ("- " if c < 0 else "+ ") if text else ("-" if c < 0 else "")
+            number = "" if f"{abs(c):.3g}" == "1" else f"{abs(c):.3g} "
+            text += f"{' ' if text else ''}{sign}{number}{name}"
+    return text
+
+
+def _listed(items: list[str]) -> str:
+    return items[0] if len(items) == 1 else ", ".join(items[:-1]) + " and " + items[-1]
+
+
+def wider_than_range(space: ParameterSpace, std: Tensor) -> tuple[str, ...]:
+    """One sentence for each parameter with a standard error (P,) that is finite and yet larger than its whole range."""
+    return tuple(
+        f"{p.name} is hardly determined: standard error {error:.3g} {p.unit}, more than its range {p.low:g}..{p.high:g}"
+        for p, error in zip(space, std.tolist(), strict=True)
+        if p.high - p.low < error < math.inf
+    )
+
+
+def plain_value(value: Any, name: str) -> Any:
+    """Numbers, text, lists and dicts only; a number that is not finite becomes None.
+
+    Raises ValueError for anything that has no plain form.
+    """
+    if isinstance(value, Tensor):
+        value = value.tolist()
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): plain_value(item, f"{name}.{key}") for key, item in value.items()}
+    if isinstance(value, Sequence):
+        return [plain_value(item, name) for item in value]
+    raise ValueError(f"{name}: expected numbers, text, tensors, lists or dicts, got {type(value).__name__}; convert it")
