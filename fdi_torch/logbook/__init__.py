@@ -4,6 +4,7 @@ from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.follow import follow
 from fdi_torch.logbook.reader import Message, Run, read_run
+from fdi_torch.logbook.recover import Recovery, recover
 from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, own_signals, series
 from fdi_torch.logbook.terminate import Terminated, exit_on_sigterm
 from fdi_torch.logbook.writer import RunLog
@@ -11,6 +12,7 @@ from fdi_torch.logbook.writer import RunLog
 __all__ = [
     "LogError",
     "Message",
+    "Recovery",
     "Run",
     "RunLog",
     "Signals",
@@ -22,5 +24,6 @@ __all__ = [
     "mapped_signals",
     "own_signals",
     "read_run",
+    "recover",
     "series",
 ]

@@ -11,16 +11,19 @@ from fdi_torch.logbook.reader import Run, read_run
 from fdi_torch.logbook.scan import Frame
 from fdi_torch.logbook.sink import Sink
 
-Extra = Mapping[str, Mapping[str, str]]
+Extra = Callable[[Run, int], Mapping[str, Mapping[str, str]]]
 
 
-def copy_log(source: Path, target: Path, salvage: bool = False, extra: Callable[[Run], Extra] | None = None) -> Run:
-    """Write every record of `source` that can be read to the new file `target`, then the metadata of `extra`."""
+def copy_log(source: Path, target: Path, salvage: bool = False, extra: Extra | None = None) -> Run:
+    """Write every record of `source` that can be read to the new file `target`, then the metadata of `extra`.
+
+    extra: called with the run and the number of its messages when all are copied.
+    """
     run = read_run(source, salvage=salvage)
     sink = Sink(target, run.library, run.profile)
     try:
-        copy_records(run, sink)
-        for name, values in (extra(run) if extra else {}).items():
+        messages = copy_records(run, sink)
+        for name, values in (extra(run, messages) if extra else {}).items():
             sink.metadata(name, values)
     except BaseException:
         sink.abandon()
@@ -29,12 +32,15 @@ def copy_log(source: Path, target: Path, salvage: bool = False, extra: Callable[
     return run
 
 
-def copy_records(run: Run, sink: Sink) -> None:
-    """Metadata, attachments and messages in the order of the file."""
+def copy_records(run: Run, sink: Sink) -> int:
+    """Metadata, attachments and messages in the order of the file. Returns the number of messages."""
+    count = 0
     for part in run.walk():
         if not isinstance(part, Frame):
+            count += 1
             sink.message(part.channel, part.log_time, part.publish_time, part.sequence, part.data)
         elif part.opcode == Opcode.METADATA:
             sink.metadata(*run.metadata_at(part))
         elif part.opcode == Opcode.ATTACHMENT:
             sink.attachment(*run.attachment_at(part))
+    return count

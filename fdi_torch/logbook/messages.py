@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import orjson
 
+from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, plain
 from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, json_schema, topic_definition
-from fdi_torch.logbook.sink import Channel
 
 Named = Mapping[str, Any]
 _RESERVED = ("t", NON_FINITE, WALL, "masked")

@@ -20,9 +20,10 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Header, Metadata, Schema
 
 from fdi_torch.logbook import scan
+from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.payload import decode
-from fdi_torch.logbook.sink import EPOCH_NS, Channel
+from fdi_torch.logbook.sink import EPOCH_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +77,8 @@ class Run:
         self.damages: list[scan.Damage] = []
         self.data = map_file(self.path)
         self.parts = list(scan.frames(self.data))
-        self.complete = scan.ends_whole(self.data) and not any(isinstance(part, scan.Damage) for part in self.parts)
+        self.ended = scan.ends_whole(self.data)
+        self.complete = self.ended and not any(isinstance(part, scan.Damage) for part in self.parts)
         if self.data[:8] != scan.MAGIC and not any(isinstance(part, scan.Frame) for part in self.parts):
             raise LogError(f"{self.path}: expected an MCAP file, got something else; check the path")
         self._read_head()
@@ -181,10 +183,10 @@ def read_run(path: str | Path, salvage: bool = False, max_chunk_bytes: int = sca
 class Directory:
     """Channels by their number, learnt from the records that announce them."""
 
-    def __init__(self, fallback: Iterable[Schema | ChannelRecord] = ()) -> None:
+    def __init__(self, summary: Iterable[Schema | ChannelRecord] = ()) -> None:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        for record in fallback:
+        for record in summary:
             self.learn(record)
 
     def learn(self, record: Schema | ChannelRecord) -> None:

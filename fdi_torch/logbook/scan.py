@@ -189,12 +189,12 @@ def _text_end(data: Buffer, place: int, end: int) -> int:
 
 
 def _map_ends_at(data: Buffer, place: int, end: int) -> bool:
-    """A map of texts that fills place..end."""
+    """A map of texts, name and value in turn, that fills place..end."""
     if place + 4 + _u32(data, place) != end:
         return False
     place += 4
     while place < end:
-        place = _text_end(data, place, end)
+        place = _text_end(data, _text_end(data, place, end), end)
     return place == end
 
 

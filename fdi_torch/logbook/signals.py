@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import orjson
 
+from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.reader import Message, Run
 from fdi_torch.logbook.schemas import topic_definition
-from fdi_torch.logbook.sink import EPOCH_NS, Channel
+from fdi_torch.logbook.sink import EPOCH_NS
 
 MAX_ARRAY_BYTES = 2**30
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")

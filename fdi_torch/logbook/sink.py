@@ -9,29 +9,18 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mcap import records
 from mcap.writer import CompressionType, Writer
 
+from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError, log_error
 
 PROFILE = "fdi_torch"
 CHUNK_BYTES = 256 * 1024
 EPOCH_NS = 946_684_800 * 10**9  # 2000-01-01T00:00:00Z: plant time 0; leaves room for negative times
-
-
-@dataclass(frozen=True)
-class Channel:
-    """What is said about a topic: encoding, schema, metadata (pairs, so that channels can be compared and counted)."""
-
-    topic: str
-    encoding: str = "json"
-    schema_name: str = ""
-    schema_encoding: str = ""
-    schema_data: bytes = b""
-    metadata: tuple[tuple[str, str], ...] = ()
 
 
 class Stream:
@@ -76,6 +65,9 @@ class Sink:
         self.path = path
         self._channels: dict[Channel, int] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._records: dict[int, tuple[records.Schema | None, records.Channel]] = {}
+        self._told: set[int] = set()
+        self._chunk_start = 0
         self._dead: LogError | None = None
         output: Any = self._stream
         self._writer = Writer(
@@ -101,7 +93,10 @@ class Sink:
         self._guarded(self._writer.add_attachment, EPOCH_NS, EPOCH_NS, name, media_type, data)
 
     def message(self, channel: Channel, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
+        if self._chunk_start != self.size:
+            self._chunk_start, self._told = self.size, set()
         number = self._channels.get(channel) or self._register(channel)
+        self._repeat_in_chunk(number)
         self._guarded(self._writer.add_message, number, log_time, data, publish_time, sequence)
 
     def flush(self) -> None:
@@ -129,7 +124,25 @@ class Sink:
             self._writer.register_channel, channel.topic, channel.encoding, number, dict(channel.metadata)
         )
         self._channels[channel] = known
+        self._records[known] = _records(known, number, channel)
+        self._told.add(known)
         return int(known)
+
+    def _repeat_in_chunk(self, number: int) -> None:
+        """Describe a channel in each chunk that uses it, so that no chunk needs another one to be read.
+
+        The library has no public way to do so; should its inside change, only this repetition is lost.
+        """
+        if self._chunk_start != self.size:
+            self._chunk_start, self._told = self.size, set()
+        chunk = getattr(self._writer, "_Writer__chunk_builder", None)
+        if number in self._told or chunk is None:
+            return
+        self._told.add(number)
+        schema, channel = self._records[number]
+        if schema is not None:
+            chunk.add_schema(schema)
+        chunk.add_channel(channel)
 
     def _guarded(self, call: Any, *arguments: Any) -> Any:
         if self._dead is not None:
@@ -139,6 +152,13 @@ class Sink:
         except OSError as error:
             self._dead = log_error(self.path, error)
             raise self._dead from error
+
+
+def _records(number: int, schema_id: int, channel: Channel) -> tuple[records.Schema | None, records.Channel]:
+    """A channel and its schema (number 0: none) as records of the format."""
+    schema = records.Schema(schema_id, channel.schema_data, channel.schema_encoding, channel.schema_name)
+    told = records.Channel(number, channel.topic, channel.encoding, dict(channel.metadata), schema_id)
+    return (schema if schema_id else None), told
 
 
 def log_time_of(t: float) -> int:

@@ -23,12 +23,13 @@ from typing import Any
 import numpy as np
 import orjson
 
+from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.copying import copy_log
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.payload import as_array, plain
 from fdi_torch.logbook.provenance import environment, git_state
 from fdi_torch.logbook.schemas import FORMAT_VERSION
-from fdi_torch.logbook.sink import Channel, Sink, log_time_of
+from fdi_torch.logbook.sink import Sink, log_time_of
 from fdi_torch.logbook.terminate import Terminated
 from fdi_torch.logbook.topics import Topics
 
