@@ -1,0 +1,118 @@
+"""Detectors on white residuals: fixed threshold, CUSUM and GLR, held to a wished time between false alarms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from fdi_torch.monitor.run_length import cusum_threshold, fixed_threshold, simulated_threshold
+
+Chart = Literal["fixed", "cusum", "glr"]
+CHARTS: tuple[Chart, ...] = ("fixed", "cusum", "glr")
+
+# CUSUM's drift: half the shift, in standard deviations of the white residual, that is to be found soonest.
+DRIFT = 0.5
+LONGEST_WINDOW = 200
+NEVER = -1
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A statistic of white residuals (*batch, S, C) -> (*batch, S), the threshold it is held against, and its memory.
+
+    memory: how many samples back the statistic is worth looking; further ones hardly change it.
+    """
+
+    chart: str
+    statistic: Callable[[Tensor], Tensor]
+    threshold: float
+    memory: int
+
+    def first_alarm(self, white: Tensor) -> Tensor:
+        """Index of the first sample above the threshold, (*batch); NEVER where there is none."""
+        above = self.statistic(white) > self.threshold
+        first = above.to(torch.int8).argmax(dim=-1)
+        return torch.where(above.any(dim=-1), first, torch.full_like(first, NEVER))
+
+    def alarms(self, white: Tensor) -> Tensor:
+        """(*batch, S), True where an alarm is raised. After each the detector starts afresh with the next sample."""
+        rest = torch.nan_to_num(white, nan=0.0)
+        index = torch.arange(rest.shape[-2], device=rest.device)
+        found = torch.zeros(rest.shape[:-1], dtype=torch.bool, device=rest.device)
+        while True:
+            first = self.first_alarm(rest).unsqueeze(-1)
+            if not bool((first != NEVER).any()):
+                return found
+            found = found | (index == first)
+            rest = torch.where((index <= first).unsqueeze(-1), torch.zeros_like(rest), rest)
+
+
+def make_detector(
+    chart: Chart,
+    time_between_false_alarms: float,
+    sampling: float,
+    channels: int,
+    generator: torch.Generator,
+    drift: float = DRIFT,
+    window: int = LONGEST_WINDOW,
+) -> Detector:
+    """A detector whose mean time between false alarms, all channels taken together, is the requested one (s).
+
+    sampling: s between samples. drift: of the CUSUM. window: the longest of the GLR, in samples. Raises ValueError.
+    """
+    run_length = time_between_false_alarms / sampling
+    if chart == "fixed":
+        return Detector(chart, largest, fixed_threshold(run_length, channels), 1)
+    if chart == "cusum":
+        if not drift > 0:
+            raise ValueError(f"expected a positive drift of the CUSUM, got {drift}")
+        threshold = cusum_threshold(run_length, channels, drift)
+        return Detector(chart, lambda e: cusum(e, drift), threshold, math.ceil(10 * threshold / drift))
+    if chart == "glr":
+        lengths = window_lengths(window)
+
+        def statistic(white: Tensor) -> Tensor:
+            return glr(white, lengths)
+
+        return Detector(chart, statistic, simulated_threshold(statistic, run_length, channels, generator), window)
+    raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
+
+
+def largest(white: Tensor) -> Tensor:
+    """max over channels of |e|."""
+    return torch.nan_to_num(white, nan=0.0).abs().amax(dim=-1)
+
+
+def cusum(white: Tensor, drift: float) -> Tensor:
+    """The highest of 2 C one-sided sums g = max(0, g +- e - drift) (Page 1954), as a sum less its running minimum."""
+    known = torch.nan_to_num(white, nan=0.0)
+    sums = torch.cumsum(torch.cat([known, -known], dim=-1) - drift, dim=-2)
+    lowest = torch.cummin(sums, dim=-2).values.clamp(max=0.0)
+    return (sums - lowest).amax(dim=-1)
+
+
+def glr(white: Tensor, lengths: tuple[int, ...]) -> Tensor:
+    """The largest over windows of the last n samples of |sum e|^2 / n: twice the log likelihood ratio of a changed mean
+    in any channels (Willsky & Jones 1976), n from `lengths`.
+    """
+    sums = torch.cumsum(torch.nan_to_num(white, nan=0.0), dim=-2)
+    best = torch.zeros_like(sums[..., 0])
+    for n in lengths:
+        if n > sums.shape[-2]:
+            break
+        shifted = torch.cat([torch.zeros_like(sums[..., :n, :]), sums[..., :-n, :]], dim=-2)
+        best = torch.maximum(best, (sums - shifted).square().sum(dim=-1) / n)
+    return best
+
+
+def window_lengths(longest: int) -> tuple[int, ...]:
+    """1, 2, 3, 4, 6, 8, 11, 16, ... up to `longest`: half an octave apart, which loses 1.5 % of a shift's evidence."""
+    if longest < 1:
+        raise ValueError(f"expected a GLR window of at least one sample, got {longest}")
+    lengths = {min(round(2.0 ** (i / 2)), longest) for i in range(2 * math.ceil(math.log2(max(longest, 2))) + 1)}
+    return tuple(sorted(lengths))

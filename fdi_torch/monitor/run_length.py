@@ -1,0 +1,88 @@
+"""Thresholds from a wished mean time between false alarms: run lengths of charts on white residuals of unit spread."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+CHAIN_STATES = 400
+# Simulated blocks: the chance of an alarm within one is fitted over thresholds, which needs fewer draws than counting.
+BLOCKS, BLOCK, BURN_IN = 4000, 1500, 500
+
+
+def fixed_threshold(run_length: float, channels: int) -> float:
+    """h at which max |e| of white Gaussian channels crosses once in `run_length` samples: 1 - (1 - 2 Q(h))^C = 1/N."""
+    _expect_rare(run_length)
+    one = -math.expm1(math.log1p(-1.0 / run_length) / channels)
+    return -float(torch.special.ndtri(torch.tensor(0.5 * one, dtype=torch.float64)))
+
+
+def cusum_run_length(threshold: float, drift: float, states: int = CHAIN_STATES) -> float:
+    """Mean number of samples until max(0, g + e - drift) from g = 0 exceeds the threshold; e standard normal.
+
+    Brook & Evans (1972): g on a grid as a Markov chain.
+    """
+    width = threshold / (states - 0.5)
+    centres = width * torch.arange(states, dtype=torch.float64)
+    rise = centres[None, :] - centres[:, None] + drift
+    upper = torch.special.ndtr(rise + 0.5 * width)
+    lower = torch.special.ndtr(rise - 0.5 * width)
+    lower[:, 0] = 0.0
+    stay = upper - lower
+    ones = torch.ones(states, dtype=torch.float64)
+    return float(torch.linalg.solve(torch.eye(states, dtype=torch.float64) - stay, ones)[0])
+
+
+def cusum_threshold(run_length: float, channels: int, drift: float) -> float:
+    """h of 2 C one-sided charts that alarm, taken together, once in `run_length` samples (their rates add)."""
+    _expect_rare(run_length)
+    wanted = 2.0 * channels * run_length
+    low, high = 1e-3, 1.0
+    while cusum_run_length(high, drift) < wanted:
+        high *= 2.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if cusum_run_length(middle, drift) < wanted else (low, middle)
+    return 0.5 * (low + high)
+
+
+def simulated_threshold(
+    statistic: Callable[[Tensor], Tensor], run_length: float, channels: int, generator: torch.Generator
+) -> float:
+    """h of any statistic (*batch, S, C) -> (*batch, S), by simulation of white residuals.
+
+    In stationarity the chance of an alarm within a block of B samples is 1 - exp(-B / N). log(-log P(no alarm)) is
+    fitted as a parabola in h, so that all blocks tell where a rare alarm begins. Raises ValueError below 20 samples.
+    """
+    _expect_rare(run_length)
+    highest = []
+    for _ in range(BLOCKS // 200):
+        noise = torch.randn(200, BURN_IN + BLOCK, channels, generator=generator, dtype=torch.float64)
+        highest.append(statistic(noise)[:, BURN_IN:].amax(dim=1))
+    peaks = torch.cat(highest).sort().values
+    share = (torch.arange(len(peaks), dtype=torch.float64) + 0.5) / len(peaks)
+    used = (share > 0.02) & (share < 0.995)
+    hazard = torch.log(-torch.log(share[used]))
+    centre = peaks[used].mean()
+    powers = torch.stack([(peaks[used] - centre) ** i for i in range(3)], dim=1)
+    c0, c1, c2 = torch.linalg.lstsq(powers, hazard.unsqueeze(1)).solution.flatten().tolist()
+    return float(centre) + _falling_root(c0 - math.log(BLOCK / run_length), c1, c2)
+
+
+def _falling_root(c0: float, c1: float, c2: float) -> float:
+    """Where c0 + c1 x + c2 x^2 passes zero on its falling side; the tangent's root where it never does."""
+    inside = c1 * c1 - 4.0 * c2 * c0
+    if inside <= 0.0 or abs(c2) < 1e-12:
+        return -c0 / c1
+    return 2.0 * c0 / (-c1 + math.sqrt(inside))
+
+
+def _expect_rare(run_length: float) -> None:
+    if not run_length >= 20.0:
+        raise ValueError(
+            f"expected a mean time between false alarms of at least 20 samples, got {run_length:g} samples; "
+            "ask for fewer false alarms"
+        )

@@ -1,0 +1,97 @@
+"""The level and colour of fault-free residuals, and their removal: what is left is white and of unit spread."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+HIGHEST_ORDER = 8
+FEWEST_SAMPLES = 100
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """e_k = W (r_k - m - sum_j A_j (r_(k-j) - m)): residuals as a vector autoregression driven by unit white noise.
+
+    mean m (C,) in the readings' units, zero where the recording shows none; coefficients A (order, C, C);
+    whitener W (C, C), lower triangular. samples: how many it was estimated from.
+    """
+
+    mean: Tensor
+    coefficients: Tensor
+    whitener: Tensor
+    samples: int
+
+    @property
+    def order(self) -> int:
+        return len(self.coefficients)
+
+    def __call__(self, residual: Tensor) -> Tensor:
+        """residual (*batch, S, C) -> white (*batch, S, C), NaN where it, or one before it that counts, is missing."""
+        return self.filter(residual - self.mean)
+
+    def filter(self, residual: Tensor) -> Tensor:
+        """The same without the mean: what a fault adds to the residual -> what it adds to the white residual.
+
+        Nothing is known before the first sample; it counts as zero there.
+        """
+        rest = residual
+        for lag, matrix in enumerate(self.coefficients, start=1):
+            before = torch.zeros_like(residual)
+            before[..., lag:, :] = residual[..., :-lag, :]
+            rest = rest - _apply(matrix, before)
+        return _apply(self.whitener, rest)
+
+
+def fit_whitening(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> Whitening:
+    """From the residuals (S, C) of one fault-free recording; order and mean by the Bayesian information criterion."""
+    return score_whitenings(residual, highest_order)[0][1]
+
+
+def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> list[tuple[float, Whitening]]:
+    """Whitenings of all orders with and without a mean, and their Bayesian information criterion, best first.
+
+    Raises ValueError where the recording is too short, or a channel does not vary.
+    """
+    known = torch.isfinite(residual).all(dim=1)
+    if int(known.sum()) < FEWEST_SAMPLES:
+        raise ValueError(
+            f"expected at least {FEWEST_SAMPLES} fault-free samples to learn the noise from, got {int(known.sum())}; "
+            "give a longer recording"
+        )
+    flat = residual[known].std(dim=0) <= 1e-12 * residual[known].abs().amax()
+    if bool(flat.any()):
+        raise ValueError(
+            f"expected residuals that vary, got none in channel {int(flat.nonzero()[0]) + 1}: no noise can be learnt "
+            "from it; give a recording with measurement noise"
+        )
+    fits = [_fit(residual, order, highest_order, mean) for order in range(highest_order + 1) for mean in (False, True)]
+    return sorted(fits, key=lambda fit: fit[0])
+
+
+def _fit(residual: Tensor, order: int, highest: int, with_mean: bool) -> tuple[float, Whitening]:
+    """Least squares of r_k on its past, and its BIC over the samples that every order can use."""
+    count, channels = residual.shape
+    mean = residual.nanmean(dim=0) if with_mean else residual.new_zeros(channels)
+    centred = residual - mean
+    target = centred[highest:]
+    past = [centred[highest - lag : count - lag] for lag in range(1, order + 1)]
+    regressors = torch.cat(past, dim=1) if past else target[:, :0]
+    usable = torch.isfinite(target).all(1) & torch.isfinite(regressors).all(1)
+    target, regressors = target[usable], regressors[usable]
+    solution = torch.linalg.lstsq(regressors, target).solution if order else regressors.new_zeros(0, channels)
+    error = target - regressors @ solution
+    spent = order * channels + int(with_mean)
+    covariance = error.mT @ error / max(len(error) - spent, 1)
+    matrices = solution.reshape(order, channels, channels).mT
+    whitener = torch.linalg.inv(torch.linalg.cholesky(covariance))
+    score = len(error) * float(torch.logdet(covariance)) + spent * channels * math.log(len(error))
+    return score, Whitening(mean, matrices, whitener, len(error))
+
+
+def _apply(matrix: Tensor, values: Tensor) -> Tensor:
+    """matrix (C, C) times values (..., C) as explicit sums, so that a lane does not depend on its neighbours."""
+    return sum((matrix[:, c] * values[..., c : c + 1] for c in range(values.shape[-1])), torch.zeros_like(values))

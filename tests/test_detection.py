@@ -1,0 +1,124 @@
+"""Thresholds against published run lengths, and false alarms counted on noise of several colours."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from fdi_torch.monitor.detection import CHARTS, NEVER, Detector, cusum, glr, largest, make_detector, window_lengths
+from fdi_torch.monitor.run_length import cusum_run_length, cusum_threshold, fixed_threshold, simulated_threshold
+from fdi_torch.monitor.whitening import fit_whitening
+
+
+def noise(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("threshold", "run_length"), [(4.0, 335.4), (5.0, 930.9)])
+def test_cusum_run_length_is_the_published_one(threshold: float, run_length: float) -> None:
+    # Montgomery, Introduction to Statistical Quality Control, table 9.3: 168 and 465 for two-sided charts.
+    assert cusum_run_length(threshold, 0.5) == pytest.approx(run_length, rel=2e-3)
+
+
+def test_fixed_threshold_shares_the_false_alarms_among_channels() -> None:
+    h = fixed_threshold(370.4, 1)
+    assert h == pytest.approx(3.0, abs=1e-3)
+    assert fixed_threshold(1000.0, 3) > fixed_threshold(1000.0, 1)
+
+
+@pytest.mark.parametrize("chart", CHARTS)
+def test_false_alarms_come_as_often_as_asked_for(chart: str) -> None:
+    detector = make_detector(chart, 2000.0, 1.0, 3, torch.Generator().manual_seed(1))  # type: ignore[arg-type]
+    count = sum(int(detector.alarms(noise(100, 4000, 3, seed=s)).sum()) for s in range(3))
+    expected = 3 * 100 * 4000 / 2000.0
+    assert abs(count - expected) < 3.0 * math.sqrt(expected) + 0.04 * expected
+
+
+def test_simulated_threshold_agrees_with_the_exact_one() -> None:
+    found = simulated_threshold(largest, 5000.0, 3, torch.Generator().manual_seed(0))
+    assert found == pytest.approx(fixed_threshold(5000.0, 3), abs=0.03)
+
+
+def test_a_shift_is_found_sooner_by_cusum_than_by_a_fixed_threshold() -> None:
+    shifted = noise(200, 3000, 3)
+    shifted[:, 1000:, 1] += 0.7
+    delays = {}
+    for chart in CHARTS:
+        first = make_detector(chart, 20000.0, 1.0, 3, torch.Generator().manual_seed(0)).first_alarm(shifted)
+        late = torch.where(first == NEVER, 3000, first)
+        delays[chart] = float(late[late > 1000].median() - 1000)
+    assert delays["cusum"] < 0.5 * delays["fixed"] and delays["glr"] < 0.5 * delays["fixed"]
+
+
+def test_cusum_is_pages_recursion() -> None:
+    e, drift = noise(50, 2), 0.3
+    up = down = torch.zeros(2, dtype=torch.float64)
+    for k in range(50):
+        up, down = (up + e[k] - drift).clamp(min=0.0), (down - e[k] - drift).clamp(min=0.0)
+        assert float(cusum(e, drift)[k]) == pytest.approx(float(torch.maximum(up, down).max()), abs=1e-12)
+
+
+def test_glr_is_the_largest_normalised_sum() -> None:
+    e = noise(40, 2)
+    lengths = window_lengths(10)
+    k = 25
+    expected = max(float(e[k - n + 1 : k + 1].sum(0).square().sum() / n) for n in lengths)
+    assert float(glr(e, lengths)[k]) == pytest.approx(expected, rel=1e-12)
+
+
+def test_an_alarm_starts_the_detector_afresh() -> None:
+    e = torch.zeros(20, 1, dtype=torch.float64)
+    e[5], e[6], e[12] = 10.0, 10.0, 10.0
+    raised = Detector("cusum", lambda x: cusum(x, 0.5), 5.0, 10).alarms(e)
+    assert raised.nonzero().flatten().tolist() == [5, 6, 12]
+    quiet = Detector("cusum", lambda x: cusum(x, 0.5), 15.0, 10).alarms(e)
+    assert quiet.nonzero().flatten().tolist() == [6]
+
+
+def test_a_missing_reading_neither_alarms_nor_stops_the_detector() -> None:
+    e = torch.zeros(20, 2, dtype=torch.float64)
+    e[3:6, 0] = torch.nan
+    e[10, 1] = 9.0
+    assert make_detector("fixed", 1000.0, 1.0, 2, torch.Generator()).alarms(e).nonzero().flatten().tolist() == [10]
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 0.8])
+def test_coloured_noise_becomes_white(coefficient: float) -> None:
+    drive, series = noise(4000, 2), torch.zeros(4000, 2, dtype=torch.float64)
+    for k in range(1, 4000):
+        series[k] = coefficient * series[k - 1] + drive[k]
+    whitening = fit_whitening(1e-3 * series + torch.tensor([0.0, 5e-3], dtype=torch.float64))
+    assert whitening.order == (1 if coefficient else 0)
+    white = whitening(1e-3 * series + torch.tensor([0.0, 5e-3], dtype=torch.float64))[10:]
+    torch.testing.assert_close(white.std(0), torch.ones(2, dtype=torch.float64), rtol=0.02, atol=0)
+    assert (white[1:] * white[:-1]).mean().abs() < 0.03
+    assert float(whitening.mean[1]) == pytest.approx(5e-3, rel=0.1)
+
+
+def test_channels_that_move_together_are_separated() -> None:
+    e = noise(3000, 2)
+    mixed = torch.stack([e[:, 0], 0.9 * e[:, 0] + 0.3 * e[:, 1]], dim=1)
+    white = fit_whitening(mixed)(mixed)
+    assert (white[:, 0] * white[:, 1]).mean().abs() < 0.03
+
+
+def test_misuse_is_refused() -> None:
+    generator = torch.Generator()
+    with pytest.raises(ValueError, match="expected a detector of fixed, cusum, glr, got 'cusam'"):
+        make_detector("cusam", 1000.0, 1.0, 3, generator)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected a positive drift"):
+        make_detector("cusum", 1000.0, 1.0, 3, generator, drift=0.0)
+    with pytest.raises(ValueError, match="at least 20 samples"):
+        make_detector("fixed", 10.0, 1.0, 3, generator)
+    with pytest.raises(ValueError, match="at least one sample"):
+        make_detector("glr", 1000.0, 1.0, 3, generator, window=0)
+    with pytest.raises(ValueError, match="at least 100 fault-free samples"):
+        fit_whitening(noise(50, 2))
+    with pytest.raises(ValueError, match="none in channel 2"):
+        fit_whitening(noise(200, 2) * torch.tensor([1.0, 0.0], dtype=torch.float64))
+
+
+def test_cusum_threshold_is_for_all_channels_together() -> None:
+    assert cusum_run_length(cusum_threshold(1000.0, 3, 0.25), 0.25) == pytest.approx(6000.0, rel=1e-3)

@@ -1,0 +1,214 @@
+"""The observer against linear theory, SciPy's Riccati solution and a plant whose middle level nobody measures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.linalg import solve_discrete_are
+
+from fdi_torch.config.plant import load_plant
+from fdi_torch.effects import build_network, place
+from fdi_torch.monitor.gain import hand_gain, kalman_gain, linearised, riccati, spectral_radius, timed_gain
+from fdi_torch.monitor.noise import learn_noise, operating_point
+from fdi_torch.monitor.observer import Observer, bound
+from fdi_torch.monitor.samples import Samples, stack, take
+from fdi_torch.monitor.stepper import PlantState, Stepper
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.equilibrium import equilibrium
+from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.integrate import ReferenceEngine
+
+PLANT = load_plant("three_tank")
+NETWORK = build_network(PLANT)
+INPUTS = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
+REST = equilibrium(NETWORK, INPUTS)
+NOISE = torch.full((3,), 1e-3, dtype=torch.float64)
+START = torch.full((3,), 1.0, dtype=torch.float64)
+LINEAR = linearised(Stepper(NETWORK), REST, INPUTS, 1.0, bound(NETWORK, None, None))
+
+
+def at_rest(samples: int, runs: tuple[int, ...] = (), seed: int = 0, std: float = 1e-3) -> Samples:
+    generator = torch.Generator().manual_seed(seed)
+    noise = std * torch.randn(*runs, samples, 3, generator=generator, dtype=torch.float64)
+    time = torch.arange(samples, dtype=torch.float64)
+    return Samples(time, INPUTS.expand(samples, 2), REST + noise)
+
+
+def test_the_stepper_is_the_reference_engine_sample_by_sample() -> None:
+    time = torch.arange(0.0, 60.0, 2.0, dtype=torch.float64)
+    inputs = torch.stack([50e-6 + 30e-6 * torch.sin(time), 20e-6 + 0 * time], dim=1)
+    network = build_network(
+        replace(PLANT, tanks=tuple(replace(t, start_level=0.2 + 0.1 * i) for i, t in enumerate(PLANT.tanks)))
+    )
+    recording = Recording(
+        time, inputs, inputs.new_zeros(30, 3), ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3
+    )
+    experiment = lay_out(recording, PLANT.channels(), 1.0)
+    truth = ReferenceEngine(network, ParameterSpace(), experiment).levels(inputs.new_zeros(0))
+    samples = take(replace(recording, outputs=truth), PLANT)
+    seen = Observer(network, hand_gain(torch.zeros(3, 3, dtype=torch.float64))).run(samples, truth[0])
+    assert seen.residual.abs().max() < 1e-12
+
+
+def test_riccati_equals_scipys() -> None:
+    process, reading = torch.diag(NOISE**2) * 1e-4, torch.diag(NOISE**2)
+    expected = solve_discrete_are(
+        LINEAR.transition.mT.numpy(), LINEAR.output.mT.numpy(), process.numpy(), reading.numpy()
+    )
+    torch.testing.assert_close(riccati(LINEAR, process, reading), torch.from_numpy(expected), rtol=1e-8, atol=0)
+
+
+def test_an_error_decays_with_the_time_constant_asked_for() -> None:
+    gain = timed_gain(LINEAR, 1.0, 40.0, NOISE, START)
+    assert float(spectral_radius(LINEAR, gain.steady)) == pytest.approx(math.exp(-1 / 40.0), rel=1e-6)
+    observer = Observer(NETWORK, replace(gain, opening=gain.opening[:0], inflation=gain.inflation[:0]))
+    sound = observer.run(at_rest(400, std=0.0), REST)
+    late = (observer.run(at_rest(400, std=0.0), REST + 1e-4).levels - sound.levels).norm(dim=1)
+    assert math.log(float(late[340] / late[300])) == pytest.approx(-1.0, abs=0.02)
+
+
+def test_a_time_constant_that_no_gain_gives_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected a time constant between"):
+        timed_gain(LINEAR, 1.0, 1e6, NOISE, START)
+    with pytest.raises(ValueError, match="positive time constant"):
+        timed_gain(LINEAR, 1.0, 0.0, NOISE, START)
+
+
+def test_innovations_are_white_with_the_predicted_spread_from_the_first_sample() -> None:
+    gain = kalman_gain(LINEAR, 0.01 * NOISE, NOISE, START)
+    seen = Observer(NETWORK, gain).run(at_rest(120, (400,)))
+    own = seen.steady_residual[:, 1:]
+    spread = own.std(dim=0)
+    # 400 runs: a standard deviation is known to 3.5 %; the wander allowed for is absent, which shows late and little.
+    assert float(spread[:5].mean()) == pytest.approx(float(spread[-40:].mean()), rel=0.05)
+    lagged = (own[:, 1:] * own[:, :-1]).mean() / (own**2).mean()
+    assert abs(float(lagged)) < 0.03
+
+
+def test_an_unmeasured_level_is_found() -> None:
+    plant = replace(PLANT, sensors=PLANT.sensors[:2])
+    network = build_network(plant)
+    samples = replace(at_rest(1500, std=1e-5), readings=at_rest(1500, std=1e-5).readings[:, :2])
+    linear = linearised(Stepper(network), REST, INPUTS, 1.0, bound(network, None, None))
+    observer = Observer(network, kalman_gain(linear, 1e-6 * torch.ones(3, dtype=torch.float64), NOISE[:2], START))
+    seen = observer.run(samples, REST + torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64))
+    assert (seen.levels[-1] - REST).abs().max() < 2e-4
+    assert observer.check_stable(samples, seen) < 1.0
+
+
+def test_a_gain_that_lets_errors_grow_is_refused_with_the_place() -> None:
+    observer = Observer(NETWORK, hand_gain(-0.1 * torch.eye(3, dtype=torch.float64)))
+    samples = at_rest(20, std=0.0)
+    with pytest.raises(ValueError, match="lets them grow by"):
+        observer.check_stable(samples, observer.run(samples, REST))
+
+
+def test_a_gain_of_the_wrong_shape_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected a gain of 3 tanks x 3 sensors, got 2 x 3"):
+        Observer(NETWORK, hand_gain(torch.zeros(2, 3, dtype=torch.float64)))
+
+
+def test_parameters_without_their_space_are_refused() -> None:
+    with pytest.raises(ValueError, match="expected a parameter space together with its values"):
+        Observer(NETWORK, hand_gain(torch.zeros(3, 3, dtype=torch.float64)), theta=torch.zeros(1, dtype=torch.float64))
+
+
+def test_an_unseen_level_that_never_settles_is_refused() -> None:
+    linear = replace(LINEAR, transition=torch.eye(3, dtype=torch.float64), output=LINEAR.output[:2])
+    with pytest.raises(ValueError, match="can all be observed"):
+        riccati(linear, torch.eye(3, dtype=torch.float64), torch.eye(2, dtype=torch.float64))
+
+
+def test_a_missing_reading_leaves_the_other_channels_at_work() -> None:
+    samples = at_rest(50)
+    holes = samples.readings.clone()
+    holes[10:20, 1] = torch.nan
+    gain = kalman_gain(LINEAR, 0.01 * NOISE, NOISE, START)
+    seen = Observer(NETWORK, gain).run(replace(samples, readings=holes))
+    assert torch.isnan(seen.residual[10:20, 1]).all()
+    assert torch.isfinite(seen.residual[:, [0, 2]]).all() and torch.isfinite(seen.levels).all()
+
+
+def test_a_run_is_the_same_alone_and_beside_a_nan_neighbour() -> None:
+    samples = at_rest(60, (5,))
+    samples.readings[3] = torch.nan
+    gain = kalman_gain(LINEAR, 0.01 * NOISE, NOISE, START)
+    together = Observer(NETWORK, gain).run(samples).residual[1]
+    alone = Observer(NETWORK, gain).run(replace(samples, readings=samples.readings[1])).residual
+    assert torch.equal(together, alone)
+
+
+def test_the_recorded_step_is_the_plain_one_to_the_last_bit() -> None:
+    stepper, values = Stepper(NETWORK), bound(NETWORK, None, None)
+    state = stepper.start(REST + 0.01, INPUTS, values)
+    move = stepper.recorded(state.levels, INPUTS, values)
+    plain = stepper.advance(state, lambda share: INPUTS, 3.0, 2.5, values)
+    assert torch.equal(plain.levels, stepper.advance(state, lambda share: INPUTS, 3.0, 2.5, values, move).levels)
+
+
+def test_noise_is_learnt_from_a_fault_free_recording() -> None:
+    generator = torch.Generator().manual_seed(3)
+    stepper, values = Stepper(NETWORK), bound(NETWORK, None, None)
+    state, readings = stepper.start(REST, INPUTS, values), []
+    for k in range(1500):
+        readings.append(state.levels + 1e-3 * torch.randn(3, generator=generator, dtype=torch.float64))
+        state = stepper.advance(state, lambda share: INPUTS, float(k), 1.0, values)
+        state = PlantState(state.levels + 1e-4 * torch.randn(3, generator=generator, dtype=torch.float64))
+    samples = Samples(torch.arange(1500, dtype=torch.float64), INPUTS.expand(1500, 2), torch.stack(readings))
+    noise, _ = learn_noise(NETWORK, samples)
+    torch.testing.assert_close(noise.reading_std, NOISE, rtol=0.06, atol=0)
+    assert 5e-5 < float(noise.process_std[0]) < 2e-4
+    assert noise.whitening.order == 0
+
+
+def test_learning_noise_from_several_recordings_at_once_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected one fault-free recording"):
+        learn_noise(NETWORK, at_rest(200, (2,)))
+
+
+def test_a_plant_with_a_pure_delay_or_no_step_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected a positive integration step"):
+        Stepper(NETWORK, 0.0)
+
+
+def test_recordings_on_different_clocks_do_not_stack() -> None:
+    def recording(step: float) -> Recording:
+        time = step * torch.arange(5, dtype=torch.float64)
+        return Recording(
+            time,
+            time.new_zeros(5, 2),
+            time.new_zeros(5, 3),
+            ("Q1", "Q2"),
+            ("h1", "h2", "h3"),
+            ("m^3/s",) * 2,
+            ("m",) * 3,
+        )
+
+    assert stack([recording(1.0), recording(1.0)], PLANT).batch == (2,)
+    with pytest.raises(ValueError, match="expected recordings on one clock"):
+        stack([recording(1.0), recording(2.0)], PLANT)
+    with pytest.raises(ValueError, match="expected at least one recording"):
+        stack([], PLANT)
+    with pytest.raises(ValueError, match="expected an input 'Q2'"):
+        take(replace(recording(1.0), input_names=("Q1", "Qx")), PLANT)
+
+
+def test_operating_point_is_about_the_middle_of_the_readings() -> None:
+    torch.testing.assert_close(
+        operating_point(NETWORK, at_rest(50)).transition, LINEAR.transition, rtol=1e-2, atol=1e-3
+    )
+
+
+def test_a_fault_shows_in_the_residual_with_its_sign() -> None:
+    leaking = build_network(PLANT, [place("leak", "T1")])
+    space = ParameterSpace([leaking.constants["T1.leak.size"]])
+    samples = at_rest(300, std=0.0)
+    gain = timed_gain(LINEAR, 1.0, 60.0, NOISE, START)
+    sound = Observer(leaking, gain, space, torch.tensor([0.0], dtype=torch.float64)).run(samples, REST)
+    believing = Observer(leaking, gain, space, torch.tensor([0.1], dtype=torch.float64)).run(samples, REST)
+    assert sound.residual.abs().max() < 1e-6  # m; rest was found with sharper roots than a step of 1 s has
+    assert float(believing.residual[-1, 0]) > 1e-3  # the observer that believes in a leak expects less water
