@@ -43,5 +43,5 @@ def weir_flow(excess: Tensor, tank_area: Tensor, gravity: Tensor, resolution: Te
     """
     above = torch.clamp(excess, min=0.0)
     crest = 2.0 * torch.sqrt(math.pi * tank_area)
-    weir = (2.0 / 3.0) * WEIR_COEFFICIENT * torch.sqrt(2.0 * gravity) * crest * above * above / torch.sqrt(above + _DRY)
+    weir = (2.0 / 3.0) * WEIR_COEFFICIENT * torch.sqrt(2.0 * gravity) * crest * above * torch.sqrt(above + _DRY)
     return torch.minimum(weir, tank_area * above / resolution)

@@ -54,6 +54,10 @@ class CumulativeSignal:
         left = torch.clamp(after - 1, min=0)
         return self.integral[left, channel] + self.slopes[after, channel] * (instant - self.time[left])
 
+    def slope_at(self, instant: Tensor, channel: int) -> Tensor:
+        """The slope of the integral just after `instant`: the signal's mean between the samples around it."""
+        return self.slopes[torch.searchsorted(self.time, instant.detach().contiguous(), right=True), channel]
+
     def average(self, start: Tensor, step: Tensor, channel: int, delay: Tensor | float = 0.0) -> Tensor:
         """The mean over [start - delay, start + step - delay]; shapes broadcast."""
         begin = start - delay

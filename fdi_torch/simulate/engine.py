@@ -22,6 +22,16 @@ class Readings:
     weight: Tensor
     ar: Tensor | None = None
 
+    def __post_init__(self) -> None:
+        if self.values.dim() < 2 or self.weight.shape != self.values.shape:
+            raise ValueError(
+                f"expected values and weights of one shape (*problems, samples, channels), got "
+                f"{tuple(self.values.shape)} and {tuple(self.weight.shape)}"
+            )
+        expected = self.values.shape[:-2] + self.values.shape[-1:]
+        if self.ar is not None and self.ar.shape != expected:
+            raise ValueError(f"expected ar of shape {tuple(expected)}, got {tuple(self.ar.shape)}")
+
     @property
     def count(self) -> Tensor:
         """The number of readings that count, (C,) or (problems, C)."""
@@ -30,9 +40,17 @@ class Readings:
     @property
     def centred(self) -> Tensor:
         """Values less their channel's mean; zero where masked."""
-        filled = torch.where(self.weight > 0, self.values, torch.zeros_like(self.values))
-        mean = (filled * self.weight).sum(dim=-2, keepdim=True) / self.count.unsqueeze(-2).clamp(min=1.0)
-        return torch.where(self.weight > 0, filled - mean, torch.zeros_like(filled))
+        return torch.where(self.weight > 0, self.known - self.centre.unsqueeze(-2), 0.0)
+
+    @property
+    def known(self) -> Tensor:
+        """The values, 0 where masked."""
+        return torch.where(self.weight > 0, self.values, 0.0)
+
+    @property
+    def centre(self) -> Tensor:
+        """Weighted means, (C,) or (problems, C); 0 where nothing counts."""
+        return (self.known * self.weight).sum(dim=-2) / torch.where(self.count > 0, self.count, 1.0)
 
     def of(self, lanes: Tensor) -> Readings:
         """The sets of some problems; readings shared by all are passed on as they are."""
@@ -45,6 +63,7 @@ class Engine(Protocol):
     """A plant under one experiment, run for many parameter vectors at once."""
 
     name: str
+    why: str  # a plain sentence on why this engine was chosen
 
     def readings(self, theta: Tensor) -> Tensor:
         """theta (*batch, P) -> readings (*batch, S, C) in SI."""
@@ -71,3 +90,42 @@ class Engine(Protocol):
         (problems, N, C, P+3, P+3).
         """
         ...
+
+
+def expect_problems(theta: Tensor, data: Readings) -> None:
+    """Raises ValueError where theta (*problems, N, P) and the data speak of different problems."""
+    problems = data.values.shape[:-2]
+    if problems and theta.shape[:-2] != problems:
+        raise ValueError(
+            f"expected theta of shape (*problems, N, P) with problems {tuple(problems)} as in the data, "
+            f"got {tuple(theta.shape)}"
+        )
+
+
+def moments_of(readings: Tensor, data: Readings) -> Tensor:
+    """`Engine.moments` from readings (*problems, N, S, sensors)."""
+    y, w = data.known.unsqueeze(-3), data.weight.unsqueeze(-3)
+    residual = y - readings
+    columns = (torch.ones_like(residual), residual, y - data.centre.unsqueeze(-2).unsqueeze(-3))
+    return torch.stack([(w * residual * c).sum(-2) for c in columns], dim=-1)
+
+
+def gram_of(readings: Tensor, jacobian: Tensor, data: Readings) -> Tensor:
+    """`Engine.gram` from readings (*problems, N, S, sensors) and their Jacobian (..., P)."""
+    y, w = data.known.unsqueeze(-3), data.weight.unsqueeze(-3).expand(readings.shape)
+    residual = y - readings
+    centred = (y - data.centre.unsqueeze(-2).unsqueeze(-3)).expand(residual.shape)
+    others = torch.stack([residual, centred, torch.ones_like(residual)], dim=-1)
+    columns = torch.cat([jacobian, others], dim=-1)
+    if data.ar is not None:
+        columns = whitened(columns, w, data.ar.unsqueeze(-2).unsqueeze(-3))
+    columns = torch.where(w.unsqueeze(-1) > 0, columns, 0.0).movedim(-2, -3)
+    return (columns * w.movedim(-1, -2).unsqueeze(-1)).mT @ columns
+
+
+def whitened(columns: Tensor, weight: Tensor, ar: Tensor) -> Tensor:
+    """columns (..., S, sensors, M) -> x_k - ar x_(k-1); sqrt(1 - ar^2) x_k where no reading stands before it."""
+    ar = ar.expand(weight.shape).unsqueeze(-1)
+    before = torch.cat([torch.zeros_like(columns[..., :1, :, :]), columns[..., :-1, :, :]], dim=-3)
+    follows = torch.cat([torch.zeros_like(weight[..., :1, :]), weight[..., :-1, :]], dim=-2).unsqueeze(-1) > 0
+    return torch.where(follows, columns - ar * before, torch.sqrt(1.0 - ar * ar) * columns)

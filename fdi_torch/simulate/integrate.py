@@ -13,6 +13,7 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
+from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
 
 
@@ -33,8 +34,9 @@ class ReferenceEngine:
         method: str = "rk4",
         rtol: float = 1e-10,
         atol: float = 1e-12,
+        why: str = "",
     ) -> None:
-        self.network, self.space, self.experiment = network, space, experiment
+        self.network, self.space, self.experiment, self.why = network, space, experiment, why
         self.method, self.rtol, self.atol = method, rtol, atol
 
     def readings(self, theta: Tensor) -> Tensor:
@@ -54,7 +56,10 @@ class ReferenceEngine:
         return levels.movedim(1, 0).reshape(*theta.shape[:-1], *levels.shape[::2])
 
     def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """theta (*batch, P) -> readings (*batch, S, sensors), their Jacobian (*batch, S, sensors, P), forward mode."""
+        """theta (*batch, P) -> readings (*batch, S, sensors), their Jacobian (*batch, S, sensors, P), forward mode.
+
+        Slow: torch differentiates each operation in Python; the other engines differentiate the equations beforehand.
+        """
         count = theta.shape[-1]
         tangents = torch.eye(count, dtype=theta.dtype, device=theta.device)
         tangents = tangents.reshape(count, *[1] * (theta.dim() - 1), count).expand(count, *theta.shape)
@@ -64,6 +69,16 @@ class ReferenceEngine:
         if slopes is None:
             slopes = torch.zeros_like(readings)
         return readings[0], slopes.movedim(0, -1)
+
+    def moments(self, theta: Tensor, data: Readings) -> Tensor:
+        """As `Engine.moments`."""
+        expect_problems(theta, data)
+        return moments_of(self.readings(theta), data)
+
+    def gram(self, theta: Tensor, data: Readings) -> Tensor:
+        """As `Engine.gram`."""
+        expect_problems(theta, data)
+        return gram_of(*self.linearise(theta), data)
 
     def _run(self, lanes: Tensor) -> Tensor:
         """lanes (L, P) -> readings (S, L, sensors)."""

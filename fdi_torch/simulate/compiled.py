@@ -1,0 +1,183 @@
+"""The fast engine: the plant's own equations, traced and compiled into one loop over blocks of lanes."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.simulate.build import is_cached, load_library
+from fdi_torch.simulate.emit import emit
+from fdi_torch.simulate.engine import Readings, expect_problems
+from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.program import build_program
+
+_INTEGERS = ("lanes", "lanes_per_problem", "steps", "samples", "signal_samples", "mode", "threads")
+_ARRAYS = (
+    "theta", "nominal", "lifted", "resolution", "starts", "spans", "means", "first_sample", "sample_times",
+    "sample_intervals", "sample_shares", "signal_times", "signal_integral", "signal_slopes", "values", "weights",
+    "centres", "memory", "out", "jacobian",
+)  # fmt: skip
+_MODES = {"levels": 0, "readings": 1, "moments": 2, "linearise": 3, "gram": 4}
+_REALS = {torch.float64: "double", torch.float32: "float"}
+VALUE_LANES, TANGENT_LANES = 32, 16
+
+
+class _Job(ctypes.Structure):
+    """`struct Job` of kernel.hpp."""
+
+    _fields_ = [(n, ctypes.c_int64) for n in _INTEGERS] + [(n, ctypes.c_void_p) for n in _ARRAYS]
+
+
+class CompiledEngine:
+    """Readings of many parameter vectors at once, by the same fixed-step RK4 as the reference engine.
+
+    Compiles at the first use of each kind (values, sensitivities; float64, float32 as theta is) and at most once a
+    machine. Raises BuildError where there is no compiler. Threads: as many as torch is set to.
+    """
+
+    name = "compiled"
+
+    def __init__(self, network: TankNetwork, space: ParameterSpace, experiment: Experiment, why: str = "") -> None:
+        self.network, self.space, self.experiment, self.why = network, space, experiment, why
+        shares = experiment.sample_share
+        self._inner = bool(((shares > 0) & (shares < 1)).any())
+        self._tables: dict[torch.dtype, dict[str, Tensor]] = {}
+
+    def levels(self, theta: Tensor) -> Tensor:
+        out = self._empty(theta, len(self.network.description.tanks))
+        self._run("levels", theta, out)
+        return out
+
+    def readings(self, theta: Tensor) -> Tensor:
+        out = self._empty(theta, self._sensors)
+        self._run("readings", theta, out)
+        return out
+
+    def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        out = self._empty(theta, self._sensors)
+        jacobian = self._empty(theta, self._sensors, len(self.space))
+        self._run("linearise", theta, out, jacobian)
+        return out, jacobian
+
+    def moments(self, theta: Tensor, data: Readings) -> Tensor:
+        out = theta.new_empty(*theta.shape[:-1], self._sensors, 3)
+        self._run("moments", theta, out, data=data)
+        return out
+
+    def gram(self, theta: Tensor, data: Readings) -> Tensor:
+        width = len(self.space) + 3
+        out = theta.new_empty(*theta.shape[:-1], self._sensors, width, width)
+        self._run("gram", theta, out, data=data)
+        return out
+
+    def prepare(self, tangent: bool = False, dtype: torch.dtype = torch.float64) -> None:
+        """Compiles ahead of the first use."""
+        _kernel(self.network, self.space.names, tangent, self._inner, _REALS[dtype])
+
+    def is_built(self, tangent: bool = False, dtype: torch.dtype = torch.float64) -> bool:
+        """Whether the kernel lies in the cache already."""
+        return is_cached(_source(self.network, self.space.names, tangent, self._inner, _REALS[dtype]))
+
+    @property
+    def _sensors(self) -> int:
+        return len(self.network.description.sensors)
+
+    def _empty(self, theta: Tensor, *width: int) -> Tensor:
+        return theta.new_empty(*theta.shape[:-1], len(self.experiment.sample_times), *width)
+
+    def _run(
+        self, mode: str, theta: Tensor, out: Tensor, jacobian: Tensor | None = None, data: Readings | None = None
+    ) -> None:
+        lanes = self._lanes(theta)
+        tangent = mode in ("linearise", "gram")
+        run, lifted = _kernel(self.network, self.space.names, tangent, self._inner, _REALS[theta.dtype])
+        arrays = self._experiment(theta)
+        arrays |= {"theta": lanes, "out": out, "jacobian": jacobian, "lifted": lifted.to(theta)}
+        per_problem = max(len(lanes), 1)
+        if data is not None:
+            expect_problems(theta, data)
+            arrays |= self._data(theta, data)
+            if data.values.dim() > 2:
+                per_problem = theta.shape[-2]
+        if len(lanes) == 0:
+            return
+        sizes = {
+            "lanes": len(lanes),
+            "lanes_per_problem": per_problem,
+            "steps": len(self.experiment.nodes) - 1,
+            "samples": len(self.experiment.sample_times),
+            "signal_samples": len(self.experiment.signal.time),
+            "mode": _MODES[mode],
+            "threads": torch.get_num_threads(),
+        }
+        pointers = {name: None if a is None else a.data_ptr() for name, a in arrays.items()}
+        run(ctypes.byref(_Job(**sizes, **pointers)))
+
+    def _lanes(self, theta: Tensor) -> Tensor:
+        if theta.dtype not in _REALS or theta.device.type != "cpu":
+            raise ValueError(
+                f"expected theta in float64 or float32 on the CPU, got {theta.dtype} on {theta.device}; "
+                "use the traced engine there"
+            )
+        if theta.shape[-1] != len(self.space):
+            raise ValueError(f"expected theta with {len(self.space)} columns, got {tuple(theta.shape)}")
+        return theta.detach().reshape(theta.shape[:-1].numel(), len(self.space)).contiguous()
+
+    def _experiment(self, like: Tensor) -> dict[str, Tensor | None]:
+        if like.dtype not in self._tables:
+            e = self.experiment
+            times, steps = e.sample_times, torch.arange(len(e.nodes), device=e.nodes.device)
+            tables = {
+                "nominal": self.network.nominal,
+                "resolution": e.resolution,
+                "starts": e.nodes[:-1],
+                "spans": e.steps,
+                "means": e.inputs,
+                "sample_times": times,
+                "sample_intervals": torch.diff(times, prepend=2 * times[:1] - times[1:2]),
+                "sample_shares": e.sample_share,
+                "signal_times": e.signal.time,
+                "signal_integral": e.signal.integral,
+                "signal_slopes": e.signal.slopes,
+            }
+            kept = {name: t.detach().to(like.dtype).contiguous() for name, t in tables.items()}
+            kept["first_sample"] = torch.searchsorted(e.sample_step.contiguous(), steps).contiguous()
+            self._tables[like.dtype] = kept
+        return dict(self._tables[like.dtype])
+
+    def _data(self, like: Tensor, data: Readings) -> dict[str, Tensor | None]:
+        expected = (len(self.experiment.sample_times), self._sensors)
+        if data.values.shape[-2:] != expected:
+            raise ValueError(f"expected data of {expected} samples and sensors, got {tuple(data.values.shape[-2:])}")
+
+        def table(t: Tensor) -> Tensor:
+            return t.detach().to(like.dtype).contiguous()
+
+        memory = None if data.ar is None else table(data.ar)
+        return {
+            "values": table(data.known),
+            "weights": table(data.weight),
+            "centres": table(data.centre),
+            "memory": memory,
+        }
+
+
+@lru_cache(maxsize=128)
+def _source(network: TankNetwork, names: tuple[str, ...], tangent: bool, inner: bool, real: str) -> str:
+    lanes = TANGENT_LANES if tangent else VALUE_LANES
+    return emit(build_program(network, names, tangent), inner, real, lanes)
+
+
+@lru_cache(maxsize=128)
+def _kernel(network: TankNetwork, names: tuple[str, ...], tangent: bool, inner: bool, real: str) -> tuple[Any, Tensor]:
+    """The compiled function, and the numbers of the equations that it is handed."""
+    run = load_library(_source(network, names, tangent, inner, real)).run
+    run.restype, run.argtypes = None, [ctypes.c_void_p]
+    lifted = build_program(network, names, tangent).graph.lifted
+    return run, torch.tensor(lifted or [0.0], dtype=torch.float64)

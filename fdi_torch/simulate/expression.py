@@ -1,0 +1,202 @@
+"""Flat pointwise programs: a graph of operations in which equal subexpressions are one node.
+
+Every node knows what it varies with: from lane to lane, from step to step, both, or neither. What does not vary in
+time is computed once, what does not vary between lanes once for all of them; nobody has to say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntFlag
+
+from fdi_torch.simulate.operations import FOLDED, OPERATIONS
+
+
+class Varies(IntFlag):
+    """With what a value changes."""
+
+    NEVER = 0
+    LANE = 1
+    STEP = 2
+    BOTH = 3
+
+
+@dataclass(frozen=True)
+class Node:
+    """operation: a row of OPERATIONS, 'literal' or 'input'. arguments: node numbers; kind and index name an input."""
+
+    operation: str
+    arguments: tuple[int, ...]
+    varies: Varies
+    value: float | None = None
+    kind: str = ""
+    index: int = 0
+
+    @property
+    def boolean(self) -> bool:
+        return self.operation in OPERATIONS and OPERATIONS[self.operation].boolean
+
+
+class Graph:
+    """Nodes in an order in which each follows its arguments.
+
+    lifted: numbers from the equations that are handed to a program when it runs, so that plants that differ only
+    in such numbers share one program; simple ones (halves, small integers) stay in the program.
+    """
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self.lifted: list[float] = []
+        self._known: dict[tuple[object, ...], int] = {}
+
+    def input(self, kind: str, index: int, varies: Varies) -> int:
+        return self._intern(Node("input", (), varies, None, kind, index))
+
+    def literal(self, value: float) -> int:
+        return self._intern(Node("literal", (), Varies.NEVER, float(value)))
+
+    def number(self, value: float) -> int:
+        """A number of the equations: kept if simple, else lifted."""
+        if value * 8 == int(value * 8) and abs(value) <= 64 if abs(value) < 1e18 else False:
+            return self.literal(value)
+        if value not in self.lifted:
+            self.lifted.append(value)
+        return self.input("lifted", self.lifted.index(value), Varies.NEVER)
+
+    def value(self, node: int) -> float | None:
+        return self.nodes[node].value
+
+    def apply(self, operation: str, *arguments: int) -> int:
+        """The node for an operation, simplified where the result is the same to rounding."""
+        values = [self.value(a) for a in arguments]
+        if operation in FOLDED and all(v is not None for v in values):
+            return self.literal(FOLDED[operation](*values))
+        simpler = self._simplify(operation, arguments)
+        if simpler is not None:
+            return simpler
+        varies = Varies.NEVER
+        for a in arguments:
+            varies |= self.nodes[a].varies
+        return self._intern(Node(operation, tuple(arguments), varies))
+
+    def total(self, terms: Iterable[int]) -> int | None:
+        """The sum of some nodes, or None of none."""
+        result = None
+        for term in terms:
+            result = term if result is None else self.apply("add", result, term)
+        return result
+
+    def reach(self, outputs: Iterable[int], stop: Iterable[int] = ()) -> list[int]:
+        """All nodes that the outputs need, in order; what stands behind a node of `stop` is not followed."""
+        ends = set(stop)
+        seen: set[int] = set()
+        queue = list(outputs)
+        while queue:
+            node = queue.pop()
+            if node not in seen:
+                seen.add(node)
+                if node not in ends:
+                    queue.extend(self.nodes[node].arguments)
+        return sorted(seen)
+
+    def substitute(self, outputs: Sequence[int], replacements: Mapping[int, int]) -> list[int]:
+        """The outputs with some nodes replaced by others."""
+        done = dict(replacements)
+        for i in self.reach(outputs, stop=replacements):
+            node = self.nodes[i]
+            if i not in done:
+                moved = [done[a] for a in node.arguments]
+                done[i] = self.apply(node.operation, *moved) if moved else i
+        return [done[o] for o in outputs]
+
+    def partials(self, outputs: Sequence[int], inputs: Iterable[int]) -> list[dict[int, int]]:
+        """For each output, the nodes of its derivatives by the inputs, where these are not zero.
+
+        The inputs may be nodes within the graph: what stands behind them counts as constant.
+        """
+        wanted = set(inputs)
+        slopes: dict[int, dict[int, int]] = {}
+        for i in self.reach(outputs, stop=wanted):
+            slopes[i] = {i: self.literal(1.0)} if i in wanted else self._chain(i, slopes)
+        return [slopes[o] for o in outputs]
+
+    def _chain(self, i: int, slopes: Mapping[int, Mapping[int, int]]) -> dict[int, int]:
+        node = self.nodes[i]
+        rule = OPERATIONS[node.operation].partials if node.operation in OPERATIONS else None
+        if rule is None or not any(slopes[a] for a in node.arguments):
+            return {}
+        result: dict[int, int] = {}
+        for a, factor in zip(node.arguments, rule(self, i, node.arguments), strict=True):
+            if factor is None or self.value(factor) == 0.0:
+                continue
+            for source, slope in slopes[a].items():
+                term = self.apply("mul", factor, slope)
+                result[source] = self.apply("add", result[source], term) if source in result else term
+        return result
+
+    def _simplify(self, operation: str, a: Sequence[int]) -> int | None:
+        value = [self.value(x) for x in a]
+        if operation == "mul":
+            for x, v in ((a[1], value[0]), (a[0], value[1])):
+                if v == 1.0:
+                    return x
+                if v == -1.0:
+                    return self.apply("neg", x)
+            return self._negated(operation, a)
+        if operation == "add":
+            return self._add(a, value)
+        if operation == "sub":
+            if value[1] == 0.0:
+                return a[0]
+            return self.apply("neg", a[1]) if value[0] == 0.0 else self._subtract(a)
+        if operation == "div":
+            return a[0] if value[1] == 1.0 else self._divide(a, value)
+        if operation == "neg" and self.nodes[a[0]].operation == "neg":
+            return self.nodes[a[0]].arguments[0]
+        if operation == "where" and a[1] == a[2]:
+            return a[1]
+        return None
+
+    def _add(self, a: Sequence[int], value: Sequence[float | None]) -> int | None:
+        if value[0] == 0.0:
+            return a[1]
+        if value[1] == 0.0:
+            return a[0]
+        if self.nodes[a[1]].operation == "neg":
+            return self.apply("sub", a[0], self.nodes[a[1]].arguments[0])
+        if self.nodes[a[0]].operation == "neg":
+            return self.apply("sub", a[1], self.nodes[a[0]].arguments[0])
+        return None
+
+    def _subtract(self, a: Sequence[int]) -> int | None:
+        if self.nodes[a[1]].operation == "neg":
+            return self.apply("add", a[0], self.nodes[a[1]].arguments[0])
+        return None
+
+    def _divide(self, a: Sequence[int], value: Sequence[float | None]) -> int | None:
+        """By what varies less: a product with its inverse, which is computed less often."""
+        top, bottom = (self.nodes[x].varies for x in a)
+        if value[0] == 1.0 or top | bottom == bottom:
+            return None
+        return self.apply("mul", a[0], self.apply("div", self.literal(1.0), a[1]))
+
+    def _negated(self, operation: str, a: Sequence[int]) -> int | None:
+        """(-x) y = -(x y), so that x y is one node whatever its sign."""
+        for i, x in enumerate(a):
+            if self.nodes[x].operation == "neg":
+                bare = list(a)
+                bare[i] = self.nodes[x].arguments[0]
+                return self.apply("neg", self.apply(operation, *bare))
+        return None
+
+    def _intern(self, node: Node) -> int:
+        arguments = node.arguments
+        if node.operation in ("add", "mul", "minimum", "maximum", "eq", "ne", "and", "or"):
+            arguments = tuple(sorted(arguments))
+        # the sign of a zero is part of a literal
+        key = (node.operation, arguments, str(node.value), node.kind, node.index)
+        if key not in self._known:
+            self._known[key] = len(self.nodes)
+            self.nodes.append(node)
+        return self._known[key]

@@ -1,0 +1,347 @@
+// The loop over blocks of lanes, steps and samples around a plant's generated sections.
+//
+// A block is LANES trajectories side by side: each array below has one number a lane, each inner loop runs over
+// lanes and becomes vector instructions. No lane reads another's numbers, and every block is full (a last, short one
+// repeats its last lane), so a trajectory does not depend on its neighbours, their number, or the threads.
+#include <atomic>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <thread>
+#include <vector>
+
+#define EACH_LANE _Pragma("GCC ivdep") for (int l = 0; l < LANES; ++l)
+#define SOME(n) ((n) > 0 ? (n) : 1)
+
+static inline real MINIMUM(real a, real b) { return (a < b) | (a != a) ? a : b; }
+static inline real MAXIMUM(real a, real b) { return (a > b) | (a != a) ? a : b; }
+static inline real SIGN(real a) { return a > 0 ? real(1) : a < 0 ? real(-1) : a; }
+
+enum Mode { LEVELS, READINGS, MOMENTS, LINEARISE, GRAM };
+
+struct Job {
+    int64_t lanes, lanes_per_problem, steps, samples, signal_samples, mode, threads;
+    const real *theta, *nominal, *lifted, *resolution;
+    const real *starts, *spans, *means;                      // (K), (K), (K, CHANNELS)
+    const int64_t *first_sample;                             // (K + 1): step k holds samples first[k] .. first[k + 1]
+    const real *sample_times, *sample_intervals, *sample_shares;
+    const real *signal_times, *signal_integral, *signal_slopes;  // (T), (T, CHANNELS), (T + 1, CHANNELS)
+    const real *values, *weights, *centres, *memory;         // (problems, S, SENSORS) twice, (problems, SENSORS) twice
+    real *out, *jacobian;
+};
+
+using Lane = real[LANES];
+
+struct Block {
+    Lane theta[SOME(COLUMNS)], lane[SOME(LANE_CONSTANTS)];
+    real uniform[SOME(UNIFORM_CONSTANTS)];
+    Lane level[TANKS], before[TANKS], sample[TANKS], slope_left[TANKS], slope_right[TANKS];
+    Lane action[SOME(ACTUATORS)], command_memory[SOME(COMMAND_MEMORY)], late_channel[SOME(LATE_ACTUATORS)];
+    Lane command_delay[SOME(LATE_ACTUATORS)], reading_delay[SOME(LATE_SENSORS)];
+    Lane seen[SENSORS], reading[SENSORS], reading_memory[SOME(READING_MEMORY)];
+    int64_t begin[SOME(LATE_ACTUATORS)][LANES], end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
+    Lane value, weight, centre;
+    Lane squares[SENSORS][3];
+    int64_t problem[LANES];
+    bool one_problem;
+    const real *nominal, *lifted;
+    real resolution;
+    std::vector<real> history;                               // (LATE_SENSORS, S, LANES)
+#if TANGENT
+    Lane row[SOME(ROWS)][COLUMNS];                           // what theta alone does to each output
+    Lane d_level[COLUMNS][TANKS], d_before[COLUMNS][TANKS], d_sample[COLUMNS][TANKS];
+    Lane d_slope_left[COLUMNS][TANKS], d_slope_right[COLUMNS][TANKS], d_action[COLUMNS][SOME(ACTUATORS)];
+    Lane d_command_memory[COLUMNS][SOME(COMMAND_MEMORY)], d_late_channel[COLUMNS][SOME(LATE_ACTUATORS)];
+    Lane d_command_delay[COLUMNS][SOME(LATE_ACTUATORS)], d_reading_delay[COLUMNS][SOME(LATE_SENSORS)];
+    Lane d_seen[COLUMNS][SENSORS], d_reading[COLUMNS][SENSORS], d_reading_memory[COLUMNS][SOME(READING_MEMORY)];
+    Lane gram[SENSORS][PAIRS], previous[SENSORS][WIDTH], column[WIDTH], previous_weight[SENSORS];
+    std::vector<real> d_history;                             // (COLUMNS, LATE_SENSORS, S, LANES)
+#endif
+};
+
+//@SECTIONS@
+
+// The mean of a held or linear signal over [start - delay, start - delay + span], exactly.
+static void look_up_late_channels(const Job &job, Block &b, real start, real span) {
+    const int64_t n = job.signal_samples;
+    for (int j = 0; j < LATE_ACTUATORS; ++j) {
+        const int c = LATE_CHANNEL[j];
+        for (int l = 0; l < LANES; ++l) {
+            const real from = start - b.command_delay[j][l], to = from + span;
+            int64_t &i = b.begin[j][l], &k = b.end[j][l];
+            while (i < n && job.signal_times[i] <= from) ++i;
+            while (k < n && job.signal_times[k] <= to) ++k;
+            const int64_t left = i > 0 ? i - 1 : 0, right = k > 0 ? k - 1 : 0;
+            const real slope_from = job.signal_slopes[i * CHANNELS + c], slope_to = job.signal_slopes[k * CHANNELS + c];
+            const real before = job.signal_integral[left * CHANNELS + c] + slope_from * (from - job.signal_times[left]);
+            const real after = job.signal_integral[right * CHANNELS + c] + slope_to * (to - job.signal_times[right]);
+            b.late_channel[j][l] = (after - before) / span;
+#if TANGENT
+            for (int p = 0; p < COLUMNS; ++p)
+                b.d_late_channel[p][j][l] = -(slope_to - slope_from) / span * b.d_command_delay[p][j][l];
+#endif
+        }
+    }
+}
+
+// Each late sensor sees the level that its tank had earlier, between the samples on a straight line.
+static void look_up_late_levels(const Job &job, Block &b, int64_t s) {
+    for (int j = 0; j < LATE_SENSORS; ++j) {
+        Lane *history = reinterpret_cast<Lane *>(b.history.data()) + j * job.samples;
+        const int i = LATE_SENSOR[j];
+        std::memcpy(history[s], b.seen[i], sizeof(Lane));
+#if TANGENT
+        for (int p = 0; p < COLUMNS; ++p)
+            std::memcpy(b.d_history.data() + ((p * LATE_SENSORS + j) * job.samples + s) * LANES, b.d_seen[p][i], sizeof(Lane));
+#endif
+        if (s == 0) continue;
+        for (int l = 0; l < LANES; ++l) {
+            const real delay = b.reading_delay[j][l];
+            const real wanted = job.sample_times[s] - (delay < 0 ? 0 : delay);
+            int64_t &k = b.past[j][l];
+            while (k < s && job.sample_times[k] < wanted) ++k;
+            const int64_t right = k > 1 ? k : 1, left = right - 1;
+            const real gap = job.sample_times[right] - job.sample_times[left];
+            const real linear = (wanted - job.sample_times[left]) / gap, share = linear < 0 ? 0 : linear;
+            const real rise = history[right][l] - history[left][l];
+            b.seen[i][l] = history[left][l] + share * rise;
+#if TANGENT
+            const real slope = linear >= 0 && delay >= 0 ? -rise / gap : 0;
+            for (int p = 0; p < COLUMNS; ++p) {
+                const real *past = b.d_history.data() + ((p * LATE_SENSORS + j) * job.samples) * LANES + l;
+                const real first = past[left * LANES];
+                b.d_seen[p][i][l] = first + share * (past[right * LANES] - first) + slope * b.d_reading_delay[p][j][l];
+            }
+#endif
+        }
+    }
+}
+
+static void copy_levels(Block &b, bool from_before) {
+    std::memcpy(b.sample, from_before ? b.before : b.level, sizeof b.sample);
+#if TANGENT
+    std::memcpy(b.d_sample, from_before ? b.d_before : b.d_level, sizeof b.d_sample);
+#endif
+}
+
+// The cubic through the levels and slopes at both ends of a step.
+static void interpolate(Lane *out, const Lane *left, const Lane *right, const Lane *slope_left, const Lane *slope_right,
+                        real span, real share) {
+    const real rest = 1 - share, bend_left = share * rest * rest, bend_right = share * share * rest;
+    const real blend = share * share * (3 - 2 * share);
+    for (int i = 0; i < TANKS; ++i)
+        EACH_LANE out[i][l] = left[i][l] + blend * (right[i][l] - left[i][l])
+                              + span * (bend_left * slope_left[i][l] - bend_right * slope_right[i][l]);
+}
+
+static void take_sample(Block &b, real span, real share) {
+    if (share >= 1) return copy_levels(b, false);
+    interpolate(b.sample, b.before, b.level, b.slope_left, b.slope_right, span, share);
+#if TANGENT
+    for (int p = 0; p < COLUMNS; ++p)
+        interpolate(b.d_sample[p], b.d_before[p], b.d_level[p], b.d_slope_left[p], b.d_slope_right[p], span, share);
+#endif
+}
+
+static void fetch_data(const Job &job, Block &b, int64_t s, int c) {
+    const int64_t at = s * SENSORS + c, size = job.samples * SENSORS;
+    for (int l = 0; l < LANES; ++l) {
+        const int64_t problem = b.one_problem ? b.problem[0] : b.problem[l];
+        b.value[l] = job.values[problem * size + at];
+        b.weight[l] = job.weights[problem * size + at];
+        b.centre[l] = job.centres[problem * SENSORS + c];
+    }
+}
+
+static void add_moments(const Job &job, Block &b, int64_t s) {
+    for (int c = 0; c < SENSORS; ++c) {
+        fetch_data(job, b, s, c);
+        EACH_LANE {
+            const real r = b.value[l] - b.reading[c][l], wr = b.weight[l] * r;
+            b.squares[c][0][l] += wr;
+            b.squares[c][1][l] += wr * r;
+            b.squares[c][2][l] += wr * (b.value[l] - b.centre[l]);
+        }
+    }
+}
+
+#if TANGENT
+// x_k - phi x_{k-1}, or sqrt(1 - phi^2) x_k where nothing was read before it.
+static void whiten(const Job &job, Block &b, int c) {
+    for (int l = 0; l < LANES; ++l) {
+        const real phi = job.memory[b.problem[l] * SENSORS + c];
+        const bool follows = b.previous_weight[c][l] > 0;
+        b.value[l] = follows ? phi : 0;
+        b.centre[l] = follows ? 1 : std::sqrt(1 - phi * phi);
+    }
+    for (int m = 0; m < WIDTH; ++m) EACH_LANE {
+        const real x = b.column[m][l], earlier = b.value[l] != 0 ? b.value[l] * b.previous[c][m][l] : 0;
+        b.column[m][l] = b.centre[l] * x - earlier;
+        b.previous[c][m][l] = x;
+    }
+    EACH_LANE b.previous_weight[c][l] = b.weight[l];
+}
+
+static void add_gram(const Job &job, Block &b, int64_t s) {
+    for (int c = 0; c < SENSORS; ++c) {
+        fetch_data(job, b, s, c);
+        for (int p = 0; p < COLUMNS; ++p) EACH_LANE b.column[p][l] = b.d_reading[p][c][l];
+        EACH_LANE {
+            b.column[COLUMNS][l] = b.value[l] - b.reading[c][l];
+            b.column[COLUMNS + 1][l] = b.value[l] - b.centre[l];
+            b.column[COLUMNS + 2][l] = 1;
+        }
+        if (job.memory) whiten(job, b, c);
+        Lane *sum = b.gram[c];
+        for (int m = 0; m < WIDTH; ++m) {
+            Lane weighted;
+            EACH_LANE weighted[l] = b.weight[l] != 0 ? b.weight[l] * b.column[m][l] : 0;
+            for (int n = 0; n <= m; ++n, ++sum) EACH_LANE (*sum)[l] += weighted[l] * b.column[n][l];
+        }
+    }
+}
+#endif
+
+struct Rows {  // where the lanes of a block stand in the results
+    int64_t first, count;
+};
+
+static void write(const Job &job, Block &b, const Rows &rows, int64_t s) {
+    const bool levels = job.mode == LEVELS;
+    const int width = levels ? TANKS : SENSORS;
+    const Lane *from = levels ? b.sample : b.reading;
+    for (int64_t l = 0; l < rows.count; ++l) {
+        real *out = job.out + ((rows.first + l) * job.samples + s) * width;
+        for (int i = 0; i < width; ++i) out[i] = from[i][l];
+    }
+#if TANGENT
+    if (job.mode != LINEARISE) return;
+    for (int64_t l = 0; l < rows.count; ++l) {
+        real *out = job.jacobian + ((rows.first + l) * job.samples + s) * SENSORS * COLUMNS;
+        for (int i = 0; i < SENSORS; ++i)
+            for (int p = 0; p < COLUMNS; ++p) *out++ = b.d_reading[p][i][l];
+    }
+#endif
+}
+
+static void consume(const Job &job, Block &b, const Rows &rows, int64_t s) {
+    if (job.mode == LEVELS) return write(job, b, rows, s);
+    for (int i = 0; i < SENSORS; ++i) {
+        std::memcpy(b.seen[i], b.sample[SENSOR_TANK[i]], sizeof(Lane));
+#if TANGENT
+        for (int p = 0; p < COLUMNS; ++p) std::memcpy(b.d_seen[p][i], b.d_sample[p][SENSOR_TANK[i]], sizeof(Lane));
+#endif
+    }
+    look_up_late_levels(job, b, s);
+    const real clock[2] = {job.sample_times[s] - job.sample_intervals[s], job.sample_intervals[s]};
+    if (s == 0) settle_readings(b, clock, nullptr);
+    read(b, clock, nullptr);
+    if (job.mode == READINGS || job.mode == LINEARISE) write(job, b, rows, s);
+    if (job.mode == MOMENTS) add_moments(job, b, s);
+#if TANGENT
+    if (job.mode == GRAM) add_gram(job, b, s);
+#endif
+}
+
+static void load(const Job &job, Block &b, const Rows &rows) {
+    for (int l = 0; l < LANES; ++l) {
+        const int64_t lane = rows.first + (l < rows.count ? l : rows.count - 1);
+        for (int i = 0; i < COLUMNS; ++i) b.theta[i][l] = job.theta[lane * COLUMNS + i];
+        b.problem[l] = lane / job.lanes_per_problem;
+    }
+    b.one_problem = b.problem[0] == b.problem[LANES - 1];
+    std::memset(b.begin, 0, sizeof b.begin);
+    std::memset(b.end, 0, sizeof b.end);
+    std::memset(b.past, 0, sizeof b.past);
+    std::memset(b.squares, 0, sizeof b.squares);
+#if TANGENT
+    std::memset(b.d_level, 0, sizeof b.d_level);
+    std::memset(b.d_command_memory, 0, sizeof b.d_command_memory);
+    std::memset(b.d_reading_memory, 0, sizeof b.d_reading_memory);
+    std::memset(b.gram, 0, sizeof b.gram);
+    std::memset(b.previous_weight, 0, sizeof b.previous_weight);
+#endif
+}
+
+static void finish(const Job &job, const Block &b, const Rows &rows) {
+    for (int64_t l = 0; l < rows.count; ++l) {
+        if (job.mode == MOMENTS) {
+            real *out = job.out + (rows.first + l) * SENSORS * 3;
+            for (int c = 0; c < SENSORS; ++c)
+                for (int m = 0; m < 3; ++m) *out++ = b.squares[c][m][l];
+        }
+#if TANGENT
+        if (job.mode != GRAM) continue;
+        for (int c = 0; c < SENSORS; ++c) {
+            real *out = job.out + ((rows.first + l) * SENSORS + c) * WIDTH * WIDTH;
+            for (int m = 0, pair = 0; m < WIDTH; ++m)
+                for (int n = 0; n <= m; ++n, ++pair) out[m * WIDTH + n] = out[n * WIDTH + m] = b.gram[c][pair][l];
+        }
+#endif
+    }
+}
+
+static bool has_inner_sample(const Job &job, int64_t k) {
+    for (int64_t s = job.first_sample[k]; s < job.first_sample[k + 1]; ++s)
+        if (job.sample_shares[s] > 0 && job.sample_shares[s] < 1) return true;
+    return false;
+}
+
+static void run_block(const Job &job, Block &b, const Rows &rows) {
+    load(job, b, rows);
+    prepare(b, nullptr, nullptr);
+    for (int64_t k = 0; k < job.steps; ++k) {
+        const real clock[2] = {job.starts[k], job.spans[k]};
+        const real *channel = job.means + k * CHANNELS;
+        int64_t s = job.first_sample[k];
+        const int64_t stop = job.first_sample[k + 1];
+        if (LATE_ACTUATORS) look_up_late_channels(job, b, clock[0], clock[1]);
+        if (k == 0) settle_commands(b, clock, channel);
+        for (; s < stop && job.sample_shares[s] <= 0; ++s) {
+            copy_levels(b, false);
+            consume(job, b, rows, s);
+        }
+#if INNER_SAMPLES
+        const bool inner = has_inner_sample(job, k);
+        if (inner) {
+            std::memcpy(b.before, b.level, sizeof b.level);
+#if TANGENT
+            std::memcpy(b.d_before, b.d_level, sizeof b.d_level);
+#endif
+        }
+#endif
+        step(b, clock, channel);
+#if INNER_SAMPLES
+        if (inner) end(b, clock, channel);
+#endif
+        for (; s < stop; ++s) {
+            take_sample(b, clock[1], job.sample_shares[s]);
+            consume(job, b, rows, s);
+        }
+    }
+    finish(job, b, rows);
+}
+
+static void work(const Job &job, std::atomic<int64_t> &next) {
+    std::unique_ptr<Block> b(new Block());
+    b->nominal = job.nominal;
+    b->lifted = job.lifted;
+    b->resolution = *job.resolution;
+    b->history.resize(LATE_SENSORS * job.samples * LANES);
+#if TANGENT
+    b->d_history.resize(COLUMNS * LATE_SENSORS * job.samples * LANES);
+#endif
+    for (int64_t first; (first = LANES * next++) < job.lanes;)
+        run_block(job, *b, {first, job.lanes - first < LANES ? job.lanes - first : LANES});
+}
+
+extern "C" void run(const Job *job) {
+    std::atomic<int64_t> next(0);
+    const int64_t blocks = (job->lanes + LANES - 1) / LANES;
+    const int64_t threads = job->threads < blocks ? job->threads : blocks;
+    std::vector<std::thread> others;
+    for (int64_t i = 1; i < threads; ++i) others.emplace_back([&] { work(*job, next); });
+    work(*job, next);
+    for (auto &other : others) other.join();
+}

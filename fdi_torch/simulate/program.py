@@ -1,0 +1,279 @@
+"""A plant's simulation as sections of one graph: what to compute before, in and after each step, and at each sample.
+
+With `columns` of theta to differentiate by, each section also has the rows of its Jacobian: what its outputs do when
+its inputs or a parameter change. Rates are differentiated stage by stage, so that a direction costs a few products.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+
+from torch import Tensor
+
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.signals import Clock
+from fdi_torch.simulate.expression import Graph, Varies
+from fdi_torch.simulate.trace import Tracer
+
+Place = tuple[str, int]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One output's change: sum of coefficient x change of an input, plus a coefficient for each column of theta."""
+
+    terms: tuple[tuple[int, Place], ...] = ()
+    theta: Mapping[int, int] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.terms or self.theta)
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where a result goes, the node that computes it, and how it changes."""
+
+    place: Place
+    node: int
+    row: Row = Row()
+
+
+Section = tuple[Output, ...]
+
+
+@dataclass(frozen=True)
+class Program:
+    """The sections; each is a tuple of outputs.
+
+    prepare: level (at t = 0), command_delay, reading_delay. settle_commands, settle_readings: the memories at first.
+    act: action, next_command_memory. stages: stage k's levels and then its rates ('slope'), four of each in turn.
+    advance: level. end: slope at the end of the step. read: reading, next_reading_memory.
+    late_actuators, late_sensors: index of those that can be late, in the order of the delays.
+    """
+
+    graph: Graph
+    tangent: bool
+    columns: int
+    tanks: int
+    actuators: int
+    sensors: int
+    channels: tuple[int, ...]
+    sensor_tanks: tuple[int, ...]
+    command_memory: int
+    reading_memory: int
+    late_actuators: tuple[int, ...]
+    late_sensors: tuple[int, ...]
+    prepare: Section
+    settle_commands: Section
+    act: Section
+    stages: tuple[Section, ...]
+    advance: Section
+    end: Section
+    settle_readings: Section
+    read: Section
+
+    @cached_property
+    def step(self) -> Section:
+        """All that a step computes, in order."""
+        return self.act + tuple(o for stage in self.stages for o in stage) + self.advance
+
+
+@lru_cache(maxsize=64)
+def build_program(network: TankNetwork, names: tuple[str, ...], tangent: bool) -> Program:
+    """The program of a plant whose parameters `names` are columns of theta; `tangent`: with its Jacobian."""
+    return _Builder(network, names, tangent).program()
+
+
+class _Builder:
+    def __init__(self, network: TankNetwork, names: tuple[str, ...], tangent: bool) -> None:
+        self.network, self.tangent = network, tangent
+        self.graph = Graph()
+        self.tracer = Tracer(self.graph)
+        self.theta = [self.graph.input("theta", i, Varies.LANE) for i in range(len(names))]
+        self.values = self._values(names)
+        tensor = self.tracer.tensor
+        resolution = self.graph.input("resolution", 0, Varies.NEVER)
+        self.span = [self.graph.input("clock", i, Varies.STEP) for i in (0, 1)]
+        self.clock = Clock(tensor(self.span[0]), tensor(self.span[1]), tensor(resolution))
+
+    def _values(self, names: tuple[str, ...]) -> dict[str, dict[str, Tensor]]:
+        """What TankNetwork.bind makes, with inputs of the program in place of numbers."""
+        values: dict[str, dict[str, Tensor]] = {}
+        for i, name in enumerate(self.network.constants.names):
+            node = self.theta[names.index(name)] if name in names else self.graph.input("nominal", i, Varies.NEVER)
+            place, _, field_name = name.rpartition(".")
+            values.setdefault(place, {})[field_name] = self.tracer.tensor(node)
+        for name in names:
+            self.network.constants.index(name)
+        return values
+
+    def program(self) -> Program:
+        network = self.network
+        prepare, late_actuators, late_sensors = self._prepare()
+        settle_commands, act = self._commands(late_actuators)
+        stages, advance, end = self._rates(act)
+        settle_readings, read = self._readings()
+        return Program(
+            graph=self.graph,
+            tangent=self.tangent,
+            columns=len(self.theta),
+            tanks=len(network.description.tanks),
+            actuators=len(network.actuators()),
+            sensors=len(network.description.sensors),
+            channels=tuple(channel for _, channel in network.actuators()),
+            sensor_tanks=tuple(network.sensor_tanks()),
+            command_memory=network.command_memory(),
+            reading_memory=network.reading_memory(),
+            late_actuators=late_actuators,
+            late_sensors=late_sensors,
+            prepare=prepare,
+            settle_commands=settle_commands,
+            act=act,
+            stages=stages,
+            advance=advance,
+            end=end,
+            settle_readings=settle_readings,
+            read=read,
+        )
+
+    def _inputs(self, kind: str, count: int) -> list[int]:
+        return [self.graph.input(kind, i, Varies.BOTH) for i in range(count)]
+
+    def _prepare(self) -> tuple[Section, tuple[int, ...], tuple[int, ...]]:
+        with self.tracer:
+            levels = self.network.start_levels(self.values)
+            commands = self.network.command_delays(self.values)
+            readings = self.network.reading_delays(self.values)
+        late = [("level", list(levels)), ("command_delay", list(commands.values()))]
+        late.append(("reading_delay", list(readings.values())))
+        outputs = [o for kind, tensors in late for o in self._outputs(kind, [self.tracer.node(t) for t in tensors], {})]
+        return tuple(outputs), tuple(commands), tuple(readings)
+
+    def _commands(self, late: Sequence[int]) -> tuple[Section, Section]:
+        """The memories at first, then what the actuators do and the memories after it."""
+        graph, network, tensor = self.graph, self.network, self.tracer.tensor
+        late_inputs = self._inputs("late_channel", len(late))
+        channels = [
+            late_inputs[late.index(i)] if i in late else graph.input("channel", channel, Varies.STEP)
+            for i, (_, channel) in enumerate(network.actuators())
+        ]
+        memory = self._inputs("command_memory", network.command_memory())
+        with self.tracer:
+            settled = network.remember_commands([tensor(c) for c in channels], self.clock, self.values)
+            actions, kept = network.commands(
+                [tensor(c) for c in channels], tuple(tensor(m) for m in memory), self.clock, self.values
+            )
+        node = self.tracer.node
+        first, then = [node(s) for s in settled], [node(k) for k in kept]
+        moving = {n: ("late_channel", j) for j, n in enumerate(late_inputs)}
+        settle = self._outputs("command_memory", first, moving)
+        lively = self._lively(memory, first, then, moving, "command_memory")
+        act = self._outputs("action", [node(a) for a in actions], lively)
+        return tuple(settle), (*act, *self._outputs("next_command_memory", then, lively))
+
+    def _rates(self, act: Section) -> tuple[tuple[Section, ...], Section, Section]:
+        """RK4 by the 3/8 rule, in the order of operations of torchdiffeq's `rk4`, and the slopes at the step's end."""
+        graph, network, tensor = self.graph, self.network, self.tracer.tensor
+        actions = [o.node for o in act if o.place[0] == "action"]
+        held = [graph.input("action", a, Varies.BOTH if graph.nodes[n].varies & Varies.LANE else Varies.STEP)
+                for a, n in enumerate(actions)]  # fmt: skip
+        levels = self._inputs("level", len(network.description.tanks))
+        with self.tracer:
+            rates = network.rates([tensor(h) for h in levels], [tensor(a) for a in held], self.clock, self.values)
+        law = [self.tracer.node(r) for r in rates]
+        moving: dict[int, Place] = {o.node: o.place for o in act if o.place[0] == "action" and o.row}
+        stages: list[Section] = []
+        one, eighth, step = graph.literal(1.0), graph.literal(0.125), self.span[1]
+        third = graph.number(1.0 / 3.0)
+        third_step, eighth_step = (graph.apply("mul", step, x) for x in (third, eighth))
+
+        def op(name: str, x: list[int], y: list[int] | int) -> list[int]:
+            other = y if isinstance(y, list) else [y] * len(x)
+            return [graph.apply(name, a, b) for a, b in zip(x, other, strict=True)]
+
+        def follows(i: int, *slopes: tuple[int, int]) -> Row:
+            """How a level within the step changes: with the one at its start, and factor x slope of earlier stages."""
+            if not self.tangent:
+                return Row()
+            of_slopes = [(factor, (f"slope{k}", i)) for factor, k in slopes if stages[k - 1][len(law) + i].row]
+            return Row(((one, ("level", i)), *of_slopes))
+
+        def slopes_at(at: list[int], *slopes: tuple[int, int]) -> list[int]:
+            stage = f"stage{len(stages)}"
+            found = graph.substitute(law, dict(zip(levels + held, at + actions, strict=True)))
+            wanted = moving | {n: (stage, i) for i, n in enumerate(at)}
+            reached = [Output((stage, i), n, follows(i, *slopes)) for i, n in enumerate(at)]
+            stages.append((*reached, *self._outputs(f"slope{len(stages) + 1}", found, wanted)))
+            return found
+
+        def times_step(x: list[int]) -> list[int]:
+            return op("mul", x, step)
+
+        def negative(x: int) -> int:
+            return graph.apply("neg", x)
+
+        k1 = slopes_at(levels)
+        k2 = slopes_at(op("add", levels, op("mul", times_step(k1), third)), (third_step, 1))
+        k3_at = op("add", levels, times_step(op("sub", k2, op("mul", k1, third))))
+        k3 = slopes_at(k3_at, (negative(third_step), 1), (step, 2))
+        k4_at = op("add", levels, times_step(op("add", op("sub", k1, k2), k3)))
+        k4 = slopes_at(k4_at, (step, 1), (negative(step), 2), (step, 3))
+        total = op("add", op("add", k1, op("mul", op("add", k2, k3), graph.literal(3.0))), k4)
+        after = op("add", levels, op("mul", times_step(total), eighth))
+        thrice = graph.apply("mul", eighth_step, graph.literal(3.0))
+        parts = ((eighth_step, 1), (thrice, 2), (thrice, 3), (eighth_step, 4))
+        advance = tuple(Output(("next_level", i), n, follows(i, *parts)) for i, n in enumerate(after))
+        uniform = {h: a for h, a in zip(held, actions, strict=True) if not graph.nodes[a].varies & Varies.LANE}
+        ends = graph.substitute(law, uniform)
+        wanted = {n: ("level", i) for i, n in enumerate(levels)}
+        wanted |= {held[o.place[1]]: o.place for o in act if o.place[0] == "action" and o.row}
+        return tuple(stages), advance, tuple(self._outputs("slope_right", ends, wanted))
+
+    def _readings(self) -> tuple[Section, Section]:
+        network, tensor, node = self.network, self.tracer.tensor, self.tracer.node
+        seen = self._inputs("seen", len(network.description.sensors))
+        memory = self._inputs("reading_memory", network.reading_memory())
+        with self.tracer:
+            settled = network.remember_readings([tensor(s) for s in seen], self.clock, self.values)
+            readings, kept = network.read(
+                [tensor(s) for s in seen], tuple(tensor(m) for m in memory), self.clock, self.values
+            )
+        first, then = [node(s) for s in settled], [node(k) for k in kept]
+        moving = {n: ("seen", i) for i, n in enumerate(seen)}
+        lively = self._lively(memory, first, then, moving, "reading_memory")
+        settle = self._outputs("reading_memory", first, moving)
+        read = self._outputs("reading", [node(r) for r in readings], lively)
+        return tuple(settle), (*read, *self._outputs("next_reading_memory", then, lively))
+
+    def _lively(
+        self, memory: list[int], first: list[int], then: list[int], moving: dict[int, Place], kind: str
+    ) -> dict[int, Place]:
+        """The inputs that can change with theta: those given, and the memories that they or theta reach."""
+        lively = dict(moving)
+        if not self.tangent:
+            return lively
+        settled = self._rows(first, moving)
+        while True:
+            rows = self._rows(then, lively)
+            reached = {memory[i]: (kind, i) for i in range(len(memory)) if rows[i] or settled[i]}
+            if reached.keys() <= lively.keys():
+                return lively
+            lively |= reached
+
+    def _outputs(self, kind: str, nodes: list[int], moving: Mapping[int, Place]) -> list[Output]:
+        rows = self._rows(nodes, moving)
+        return [Output((kind, i), n, row) for i, (n, row) in enumerate(zip(nodes, rows, strict=True))]
+
+    def _rows(self, nodes: list[int], moving: Mapping[int, Place]) -> list[Row]:
+        if not self.tangent:
+            return [Row() for _ in nodes]
+        columns = {n: q for q, n in enumerate(self.theta)}
+        return [
+            Row(
+                tuple((slope, moving[n]) for n, slope in slopes.items() if n in moving),
+                {columns[n]: slope for n, slope in slopes.items() if n in columns and n not in moving},
+            )
+            for slopes in self.graph.partials(nodes, [*moving, *self.theta])
+        ]

@@ -1,0 +1,248 @@
+"""The engine without a compiler: the same traced program, each of its operations run by torch on all lanes.
+
+Slower than the compiled engine and faster than differentiating through torchdiffeq; runs on any of torch's devices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
+from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.expression import Varies
+from fdi_torch.simulate.integrate import hermite
+from fdi_torch.simulate.operations import OPERATIONS
+from fdi_torch.simulate.program import Place, Program, Row, Section, build_program
+
+Change = Tensor | None
+
+
+class TracedEngine:
+    """Readings and their Jacobians (forward mode) of many parameter vectors at once, by fixed-step RK4."""
+
+    name = "traced"
+
+    def __init__(self, network: TankNetwork, space: ParameterSpace, experiment: Experiment, why: str = "") -> None:
+        self.network, self.space, self.experiment, self.why = network, space, experiment, why
+
+    def levels(self, theta: Tensor) -> Tensor:
+        return self._simulate(theta, tangent=False, levels=True)[0]
+
+    def readings(self, theta: Tensor) -> Tensor:
+        return self._simulate(theta, tangent=False)[0]
+
+    def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        readings, jacobian = self._simulate(theta, tangent=True)
+        assert jacobian is not None
+        return readings, jacobian
+
+    def moments(self, theta: Tensor, data: Readings) -> Tensor:
+        expect_problems(theta, data)
+        return moments_of(self.readings(theta), data)
+
+    def gram(self, theta: Tensor, data: Readings) -> Tensor:
+        expect_problems(theta, data)
+        return gram_of(*self.linearise(theta), data)
+
+    def _simulate(self, theta: Tensor, tangent: bool, levels: bool = False) -> tuple[Tensor, Tensor | None]:
+        program = build_program(self.network, self.space.names, tangent)
+        run = _Run(program, self.network, self.experiment, theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1]))
+        rows = [run.levels() if levels else run.read(s) for s in run.samples()]
+        values = torch.stack([torch.stack([v.expand(len(run.lanes)) for v, _ in row], dim=-1) for row in rows], dim=1)
+        values = values.reshape(*theta.shape[:-1], *values.shape[1:])
+        if not tangent:
+            return values, None
+        slopes = torch.stack([torch.stack([run.full(d) for _, d in row], dim=-1) for row in rows], dim=2)
+        return values, slopes.movedim(0, -1).reshape(*values.shape, theta.shape[-1])
+
+
+@dataclass
+class _State:
+    """Values (L,) and changes (P, L) by place; a change of None is zero."""
+
+    values: dict[Place, Tensor] = field(default_factory=dict)
+    changes: dict[Place, Change] = field(default_factory=dict)
+
+    def group(self, kind: str, count: int) -> list[tuple[Tensor, Change]]:
+        return [(self.values[kind, i], self.changes.get((kind, i))) for i in range(count)]
+
+    def put(self, kind: str, values: list[tuple[Tensor, Change]]) -> None:
+        for i, (value, change) in enumerate(values):
+            self.values[kind, i], self.changes[kind, i] = value, change
+
+
+class _Run:
+    """One simulation of lanes (L, P)."""
+
+    def __init__(self, program: Program, network: TankNetwork, experiment: Experiment, lanes: Tensor) -> None:
+        self.program, self.experiment, self.lanes = program, experiment, lanes
+        self.state = _State()
+        self.constants: dict[int, Tensor] = {}
+        self.orders: dict[int, list[int]] = {}
+        self.tables = {
+            "theta": lanes.unbind(-1),
+            "nominal": network.nominal.to(lanes).unbind(),
+            "lifted": lanes.new_tensor(program.graph.lifted).unbind(),
+            "resolution": [experiment.resolution.to(lanes)],
+        }
+        self.history: list[list[tuple[Tensor, Change]]] = []
+
+    def samples(self) -> Iterator[int]:
+        """Runs; at each sample's turn the state holds 'sample' levels and the sample's number is handed out."""
+        e, p, state = self.experiment, self.program, self.state
+        firsts = torch.searchsorted(e.sample_step, torch.arange(len(e.nodes))).tolist()
+        shares = e.sample_share.tolist()
+        self._section(p.prepare)
+        for k in range(len(e.nodes) - 1):
+            self._enter(k)
+            if k == 0:
+                self._section(p.settle_commands)
+            mine = list(range(firsts[k], firsts[k + 1]))
+            for s in [s for s in mine if shares[s] <= 0.0]:
+                state.put("sample", self._levels())
+                yield s
+            self._set_clock(e.nodes[k], e.steps[k])  # reading a sample has set another
+            before = self._levels()
+            self._section(p.step)
+            if any(0.0 < shares[s] < 1.0 for s in mine):
+                self._section(p.end)
+            for s in [s for s in mine if shares[s] > 0.0]:
+                state.put("sample", self._between(before, k, e.sample_share[s]))
+                yield s
+
+    def levels(self) -> list[tuple[Tensor, Change]]:
+        return self.state.group("sample", self.program.tanks)
+
+    def read(self, s: int) -> list[tuple[Tensor, Change]]:
+        p, times = self.program, self.experiment.sample_times
+        interval = times[s] - times[s - 1] if s else times[1] - times[0]
+        self._set_clock(times[s] - interval, interval)
+        seen = self.levels()
+        self.state.put("seen", [seen[tank] for tank in p.sensor_tanks])
+        self._see_late(s)
+        if s == 0:
+            self._section(p.settle_readings)
+        self._section(p.read)
+        return self.state.group("reading", p.sensors)
+
+    def full(self, change: Change) -> Tensor:
+        """(P, L), zeros where nothing changes."""
+        return self.lanes.new_zeros(self.lanes.shape[::-1]) if change is None else change.expand(self.lanes.shape[::-1])
+
+    def _levels(self) -> list[tuple[Tensor, Change]]:
+        return self.state.group("level", self.program.tanks)
+
+    def _set_clock(self, start: Tensor, step: Tensor) -> None:
+        self.state.values["clock", 0], self.state.values["clock", 1] = start.to(self.lanes), step.to(self.lanes)
+
+    def _enter(self, k: int) -> None:
+        """The clock and the channels of step k, late ones looked up."""
+        e = self.experiment
+        start, step = e.nodes[k], e.steps[k]
+        self._set_clock(start, step)
+        for c in range(e.inputs.shape[1]):
+            self.state.values["channel", c] = e.inputs[k, c].to(self.lanes)
+        for j, actuator in enumerate(self.program.late_actuators):
+            self._look_up(j, self.program.channels[actuator], start, step)
+
+    def _look_up(self, j: int, channel: int, start: Tensor, step: Tensor) -> None:
+        signal, delay = self.experiment.signal, self.state.values["command_delay", j]
+        begin = start - delay
+        self.state.values["late_channel", j] = signal.average(start, step, channel, delay)
+        d_delay = self.state.changes.get(("command_delay", j))
+        if d_delay is not None:
+            rise = signal.slope_at(begin + step, channel) - signal.slope_at(begin, channel)
+            self.state.changes["late_channel", j] = -rise / step * d_delay
+
+    def _between(self, before: list[tuple[Tensor, Change]], k: int, share: Tensor) -> list[tuple[Tensor, Change]]:
+        """The levels at a share of step k."""
+        after = self._levels()
+        if share >= 1.0:
+            return after
+        step, tanks = self.experiment.steps[k], self.program.tanks
+        left, right = self.state.group("slope1", tanks), self.state.group("slope_right", tanks)
+        rows = list(zip(before, after, left, right, strict=True))
+        levels = [hermite(h0[0], h1[0], k0[0], k1[0], step, share) for h0, h1, k0, k1 in rows]
+        if not self.program.tangent:
+            return [(level, None) for level in levels]
+        moved = [[self.full(change) for _, change in row] for row in rows]
+        return [(h, hermite(d[0], d[1], d[2], d[3], step, share)) for h, d in zip(levels, moved, strict=True)]
+
+    def _see_late(self, s: int) -> None:
+        """Late sensors see what was, between the samples on a straight line."""
+        late, times, state = self.program.late_sensors, self.experiment.sample_times, self.state
+        self.history.append([(state.values["seen", i], state.changes.get(("seen", i))) for i in late])
+        for j, i in enumerate(late) if s else ():
+            delay = state.values["reading_delay", j].expand(len(self.lanes))
+            wanted = times[s] - torch.clamp(delay, min=0.0)
+            right = torch.searchsorted(times, wanted.contiguous()).clamp(1, s)
+            gap = times[right] - times[right - 1]
+            linear = (wanted - times[right - 1]) / gap
+            share = torch.clamp(linear, min=0.0)
+            past = torch.stack([row[j][0].expand(len(self.lanes)) for row in self.history])
+            first, last = past.gather(0, right[None] - 1)[0], past.gather(0, right[None])[0]
+            state.values["seen", i] = first + share * (last - first)
+            if state.changes:
+                moved = torch.where((linear >= 0) & (delay >= 0), -(last - first) / gap, 0.0)
+                state.changes["seen", i] = self._late_change(j, right, share, moved)
+
+    def _late_change(self, j: int, right: Tensor, share: Tensor, moved: Tensor) -> Tensor:
+        past = torch.stack([self.full(row[j][1]) for row in self.history])
+        index = right.expand(1, *past.shape[1:])
+        first, last = past.gather(0, index - 1)[0], past.gather(0, index)[0]
+        return first + share * (last - first) + moved * self.full(self.state.changes.get(("reading_delay", j)))
+
+    def _section(self, section: Section) -> None:
+        """Computes the outputs and their changes and stores them, `next_` ones under the plain name."""
+        wanted = [o.node for o in section]
+        wanted += [n for o in section for n in [*(c for c, _ in o.row.terms), *o.row.theta.values()]]
+        known = self._evaluate(wanted, id(section))
+        changes: dict[Place, Change] = {}
+        for o in section:
+            changes[o.place] = self._change(o.row, known, changes)
+        for (kind, i), node in ((o.place, o.node) for o in section):
+            place = (kind.removeprefix("next_"), i)
+            self.state.values[place] = known[node]
+            if self.program.tangent:
+                self.state.changes[place] = changes[kind, i]
+
+    def _change(self, row: Row, known: Mapping[int, Tensor], fresh: Mapping[Place, Change]) -> Change:
+        total: Change = None
+        for factor, place in row.terms:
+            change = fresh[place] if place in fresh else self.state.changes.get(place)
+            if change is not None:
+                total = known[factor] * change if total is None else total + known[factor] * change
+        if not row.theta:
+            return total
+        own = self.lanes.new_zeros(self.lanes.shape[::-1])
+        for q, slope in row.theta.items():
+            own[q] = known[slope]
+        return own if total is None else total + own
+
+    def _evaluate(self, wanted: list[int], section: int) -> dict[int, Tensor]:
+        nodes = self.program.graph.nodes
+        if section not in self.orders:
+            self.orders[section] = self.program.graph.reach(wanted)
+        known: dict[int, Tensor] = {}
+        for i in self.orders[section]:
+            if i not in self.constants:
+                value = self._compute(i, known)
+                (known if nodes[i].varies & Varies.STEP else self.constants)[i] = value
+            if i in self.constants:
+                known[i] = self.constants[i]
+        return known
+
+    def _compute(self, i: int, known: Mapping[int, Tensor]) -> Tensor:
+        node = self.program.graph.nodes[i]
+        if node.operation == "literal":
+            return self.lanes.new_tensor(node.value)
+        if node.operation == "input":
+            table = self.tables.get(node.kind)
+            return self.state.values[node.kind, node.index] if table is None else table[node.index]
+        return OPERATIONS[node.operation].torch(*(known[a] for a in node.arguments))
