@@ -54,7 +54,8 @@ class TracedEngine:
         program = build_program(self.network, self.space.names, tangent)
         run = _Run(program, self.network, self.experiment, theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1]))
         rows = [run.levels() if levels else run.read(s) for s in run.samples()]
-        values = torch.stack([torch.stack([v.expand(len(run.lanes)) for v, _ in row], dim=-1) for row in rows], dim=1)
+        full = len(run.lanes)
+        values = torch.stack([torch.stack([v.expand(full) for v, _ in row], dim=-1) for row in rows], dim=1)
         values = values.reshape(*theta.shape[:-1], *values.shape[1:])
         if not tangent:
             return values, None
