@@ -5,19 +5,64 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+from fdi_torch.effects.area_taper import AreaTaper
+from fdi_torch.effects.coefficient_drift import CoefficientDrift
+from fdi_torch.effects.cross_flow import CrossFlow
+from fdi_torch.effects.flow_exponent import FlowExponent
+from fdi_torch.effects.internal_body import InternalBody
+from fdi_torch.effects.laminar_flow import LaminarFlow
 from fdi_torch.effects.leak import Leak
 from fdi_torch.effects.net_outlet import NetOutlet
 from fdi_torch.effects.openness import Openness
+from fdi_torch.effects.outlet_drop import OutletDrop
+from fdi_torch.effects.overflow import Overflow
 from fdi_torch.effects.plugging import Plugging
+from fdi_torch.effects.pump_back_pressure import PumpBackPressure
+from fdi_torch.effects.pump_dead_zone import PumpDeadZone
+from fdi_torch.effects.pump_delay import PumpDelay
+from fdi_torch.effects.pump_gain import PumpGain
+from fdi_torch.effects.pump_lag import PumpLag
+from fdi_torch.effects.pump_saturation import PumpSaturation
+from fdi_torch.effects.sensor_bias import SensorBias
+from fdi_torch.effects.sensor_delay import SensorDelay
+from fdi_torch.effects.sensor_drift import SensorDrift
+from fdi_torch.effects.sensor_gain import SensorGain
+from fdi_torch.effects.sensor_lag import SensorLag
+from fdi_torch.effects.sensor_quantization import SensorQuantization
+from fdi_torch.effects.sensor_saturation import SensorSaturation
+from fdi_torch.effects.unmetered_flow import UnmeteredFlow
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Placement, fits
 from fdi_torch.plant.network import TankNetwork
 
+# Of two effects at one place, the earlier one acts first.
 EFFECTS: tuple[Effect, ...] = (
-    Leak(),
+    PumpGain(),
+    PumpDeadZone(),
+    PumpLag(),
+    PumpDelay(),
+    PumpBackPressure(),
+    PumpSaturation(),
+    LaminarFlow(),
+    FlowExponent(),
+    OutletDrop(),
+    CoefficientDrift(),
     Plugging(),
     NetOutlet(),
     Openness(),
+    CrossFlow(),
+    Leak(),
+    UnmeteredFlow(),
+    Overflow(),
+    AreaTaper(),
+    InternalBody(),
+    SensorBias(),
+    SensorGain(),
+    SensorLag(),
+    SensorDrift(),
+    SensorQuantization(),
+    SensorDelay(),
+    SensorSaturation(),
 )
 
 

@@ -12,14 +12,14 @@ from fdi_torch.plant.effect import Effect, Local, Stage, Values
 class NetOutlet(Effect):
     """The outflow is theta times the outlet's law; nominal 1 (theta_2 of the 2020 paper, eq. 31, as an outflow).
 
-    Plugging b and a floor leak rho k of the same tank act through the same sqrt(2 g h), so that only
-    theta = 1 - b + rho k can be found: below 1 plugging prevails, above 1 the leak.
+    Plugging b and a floor leak rho k of the same tank act through the same sqrt(2 g h), so that only theta = 1 - b +
+    rho k can be found: below 1 plugging prevails, above 1 the leak.
     """
 
     name = "net_outlet"
     stage = Stage.FLOW
     places = ("outlet",)
-    mistaken_for = ("plugging", "leak at the floor of the same tank")
+    mistaken_for = ("plugging", "leak")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("size", "1", 1.0, -1.0, 2.0, meaning="net outflow as a share of the outlet's law"),)

@@ -7,10 +7,12 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.reach import Reach, inside
 
 
 class Plugging(Effect):
-    """The flow falls to (1 - b) of its law from an onset on; negative b: wider than believed (2020 paper, eq. 28).
+    """The flow falls to (1 - b) of its law from an onset on, at once or over a ramp; negative b: wider than believed
+    (2020 paper, eq. 28).
 
     Typical: b of 0.05 to 0.6. Within the tolerance of the discharge coefficient it cannot be told from it.
     """
@@ -18,13 +20,18 @@ class Plugging(Effect):
     name = "plugging"
     stage = Stage.FLOW
     places = ("pipe", "outlet")
-    mistaken_for = ("coefficient_drift", "leak at the floor of the tank before an outlet", "laminar_flow")
+    mistaken_for = ("coefficient_drift", "leak", "laminar_flow", "net_outlet", "openness")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
             Parameter("size", "1", 0.0, -1.0, 1.0, meaning="share of the flow that is lost (b)"),
             Parameter("onset", "s", 0.0, 0.0, meaning="when it begins"),
+            Parameter("ramp", "s", 0.0, 0.0, meaning="how long it takes to come in full"),
         )
 
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        onsets = [{"onset": instant} for instant in inside((0.0, reach.duration), 3)]
+        return [{"size": size} | onset for onset in [{}, *onsets] for size in (0.1, -0.1)]
+
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
-        return flow * (1.0 - p["size"] * local.clock.share_after(p["onset"]))
+        return flow * (1.0 - p["size"] * local.clock.risen(p["onset"], p["ramp"]))

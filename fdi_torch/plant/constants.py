@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Sensor
 
 
 def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
@@ -71,3 +71,26 @@ def inverse_areas(plant: PlantDescription, pipe: Pipe) -> float:
     """1/A of the tanks at both ends, 1/m^2: how fast a flow through the pipe changes the head across it."""
     areas = {tank.name: tank.area for tank in plant.tanks}
     return sum(1.0 / areas[end] for end in (pipe.source, pipe.target) if end in areas)
+
+
+def height_before(plant: PlantDescription, pipe: str) -> float:
+    """Height of the tank that a pipe starts from, m."""
+    source = plant.component(pipe).source  # type: ignore[union-attr]
+    return next(t.height for t in plant.tanks if t.name == source)
+
+
+def flow_scale(plant: PlantDescription, tank: str) -> float:
+    """What runs out of a full tank through its leak reference, m^3/s: a flow to measure others against."""
+    height = next(t.height for t in plant.tanks if t.name == tank)
+    return nominal_capacity(plant, leak_pipe(plant, tank)) * math.sqrt(height)
+
+
+def reading_at(plant: PlantDescription, sensor: Sensor, share: float) -> float:
+    """The reading when the level stands at a share of the tank's height, in the reading's unit."""
+    height = next(t.height for t in plant.tanks if t.name == sensor.tank)
+    return sensor.gain * share * height + sensor.offset
+
+
+def reading_span(plant: PlantDescription, sensor: Sensor) -> float:
+    """By how much the reading changes from floor to rim, without sign."""
+    return abs(reading_at(plant, sensor, 1.0) - sensor.offset)

@@ -6,15 +6,18 @@ An effect overrides the one hook of its stage; every other hook passes its value
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.orifice import signed_root
+from fdi_torch.plant.reach import Reach
 from fdi_torch.plant.signals import Clock
 
 Memory = tuple[Tensor, ...]
@@ -37,8 +40,8 @@ class Local:
 
     level: of the tank (pump: its target; pipe: its source); far_level: at the other end; head: what drives the flow;
     capacity: flow at 1 m of head through the place's orifice (tank: through its leak reference), m^2.5/s;
-    command: of the pump or the valve's opening; root: the regularised signed square root of a head;
-    constants: the component's constants by field name.
+    command: of the pump or the valve's opening; width: the head below which roots are drawn smooth, m;
+    height: of that tank's rim, m; gravity: m/s^2; constants: the component's constants by field name.
     """
 
     clock: Clock
@@ -47,8 +50,18 @@ class Local:
     head: Tensor
     capacity: Tensor
     command: Tensor
-    root: Callable[[Tensor], Tensor]
+    width: Tensor
+    height: Tensor
+    gravity: Tensor
     constants: Values
+
+    def root(self, head: Tensor) -> Tensor:
+        """The signed square root of a head, regularised."""
+        return signed_root(head, self.width)
+
+    def magnitude(self, head: Tensor) -> Tensor:
+        """|head|, rounded off at zero so that it can be divided by: sqrt(x^2 + w^2)."""
+        return torch.sqrt(head * head + self.width * self.width)
 
 
 class Effect:
@@ -56,8 +69,10 @@ class Effect:
 
     name: as in configs and answers. stage: which hook it overrides. places: the kinds of component it can sit at,
     of 'pump', 'pipe', 'outlet', 'valve', 'tank', 'tank_pair', 'sensor'. memory: how many memory states it keeps.
-    smooth: whether the size's gradient at nominal is not zero. mistaken_for: what explains nearly the same data.
-    The first of its parameters is its size: where that is nominal, the effect is not there.
+    smooth: whether the size's gradient at nominal is not zero. mistaken_for: effects that explain nearly the same data.
+    delays, rounds: whether it makes the signal late, or the reading coarse.
+    The first of its parameters is its size: where that is nominal, the effect is not there. The others are its
+    shape: nominal there is a typical value, or one (an onset of 0, a ramp of 0) that keeps the effect simple.
     """
 
     name: ClassVar[str]
@@ -72,6 +87,17 @@ class Effect:
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         """Its parameters at that place, size first, under their own short names; ranges may follow the component."""
         raise NotImplementedError
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        """Where a fit may begin (SI, short names). A start names what is to be fitted; the rest stays nominal.
+
+        Here: a tenth of the size's range in each direction, the shape as it is. Effects with a threshold, which no
+        gradient finds, return a small grid over what the recording reaches.
+        """
+        size, *shape = self.parameters(place, plant)
+        typical = {p.name: p.nominal for p in shape}
+        bounds = [bound for bound in (size.low, size.high) if bound != size.nominal]
+        return [{size.name: size.nominal + 0.1 * (bound - size.nominal)} | typical for bound in bounds]
 
     def delay(self, p: Values) -> Tensor:
         """COMMAND, READING: by how many seconds the signal is late (only where `delays`)."""
@@ -96,6 +122,10 @@ class Effect:
     def inflow(self, local: Local, p: Values) -> Tensor:
         """BALANCE: further net inflow of a tank, m^3/s; at a tank pair 'A-B' what flows from A to B."""
         raise NotImplementedError
+
+    def caught(self, p: Values) -> Mapping[str, Tensor]:
+        """BALANCE at a tank: which share of what it loses other tanks get; the rest leaves the plant."""
+        return {}
 
     def area(self, area: Tensor, local: Local, p: Values) -> Tensor:
         """STORAGE: cross-section at the present level, m^2."""

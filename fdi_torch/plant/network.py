@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +16,7 @@ from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.constants import constant_parameters, inverse_areas, leak_pipe, nominal_capacity
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Memory, Placement, Stage, Values, fits
-from fdi_torch.plant.orifice import orifice_capacity, regular_width, signed_root, weir_flow
+from fdi_torch.plant.orifice import orifice_capacity, regular_width, weir_flow
 from fdi_torch.plant.signals import Clock
 
 PlaceValues = Mapping[str, Mapping[str, Tensor]]
@@ -111,8 +110,12 @@ class TankNetwork(nn.Module):
         for i, pump in enumerate(self.description.pumps):
             own = values[pump.name]
             flow = torch.minimum(torch.clamp(own["gain"] * commands[i], min=0.0), own["max_flow"])
-            level = levels[self._tank_index[pump.target]]
-            local = Local(clock, level, level, level, own["gain"], commands[i], torch.sqrt, own)
+            local = replace(
+                self._tank_local(pump.target, levels, clock, values),
+                capacity=own["gain"],
+                command=commands[i],
+                constants=own,
+            )
             for effect, p in self._effects(pump.name, Stage.FLOW, values):
                 flow = effect.flow(flow, local, p)
             flows.append(flow)
@@ -254,6 +257,8 @@ class TankNetwork(nn.Module):
         local = self._tank_local(ends[0], levels, clock, values, ends[-1])
         flow = placement.effect.inflow(local, values[placement.prefix])
         self._move(net, *((ends[0], ends[1]) if len(ends) == 2 else (OUTSIDE, ends[0])), flow)
+        for tank, share in placement.effect.caught(values[placement.prefix]).items():
+            self._move(net, tank, OUTSIDE, share * flow)
 
     def _pipe_local(self, pipe: Pipe, levels: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Local:
         own = values[pipe.name]
@@ -265,8 +270,19 @@ class TankNetwork(nn.Module):
             far = levels[self._tank_index[pipe.target]]
             wet_far = torch.clamp(far - own["elevation"], min=0.0)
             head = torch.clamp(head, min=0.0) - wet_far if pipe.elevation else level - far
-        capacity = orifice_capacity(own["discharge_coefficient"], own["area"], values[""]["gravity"])
-        return Local(clock, level, far, head, capacity, torch.ones_like(level), self._root(pipe, clock), own)
+        gravity = values[""]["gravity"]
+        return Local(
+            clock,
+            level,
+            far,
+            head,
+            capacity=orifice_capacity(own["discharge_coefficient"], own["area"], gravity),
+            command=torch.ones_like(level),
+            width=self._width(pipe, clock),
+            height=values[pipe.source]["height"],
+            gravity=gravity,
+            constants=own,
+        )
 
     def _tank_local(
         self, name: str, levels: Sequence[Tensor], clock: Clock, values: PlaceValues, far: str | None = None
@@ -274,12 +290,22 @@ class TankNetwork(nn.Module):
         level = levels[self._tank_index[name]]
         far_level = levels[self._tank_index[far or name]]
         own = values[name]
-        root = self._root(leak_pipe(self.description, name), clock)
-        return Local(clock, level, far_level, level, own["leak_capacity"], level, root, own)
+        return Local(
+            clock,
+            level,
+            far_level,
+            head=level,
+            capacity=own["leak_capacity"],
+            command=level,
+            width=self._width(leak_pipe(self.description, name), clock),
+            height=own["height"],
+            gravity=values[""]["gravity"],
+            constants=own,
+        )
 
-    def _root(self, pipe: Pipe, clock: Clock) -> partial[Tensor]:
+    def _width(self, pipe: Pipe, clock: Clock) -> Tensor:
         rate = nominal_capacity(self.description, pipe) * inverse_areas(self.description, pipe)
-        return partial(signed_root, width=regular_width(rate, clock.resolution))
+        return regular_width(rate, clock.resolution)
 
 
 def placed_parameters(placement: Placement, plant: PlantDescription) -> list[Parameter]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -32,6 +33,34 @@ class Clock:
     def share_after(self, instant: Tensor) -> Tensor:
         """The share of the step that lies after `instant`: a switch that no step needs to hit."""
         return torch.clamp((self.end - instant) / self.step, 0.0, 1.0)
+
+    def risen(self, onset: Tensor, ramp: Tensor) -> Tensor:
+        """The mean over the step of a rise from 0 to 1 that begins at `onset` and takes `ramp` seconds, exactly."""
+        return (_rise_integral(self.end - onset, ramp) - _rise_integral(self.start - onset, ramp)) / self.step
+
+    def risen_by_end(self, onset: Tensor, ramp: Tensor) -> Tensor:
+        """The same rise as a sample at the step's end sees it, drawn over one sampling interval where it is abrupt.
+
+        A sample at the onset or later sees an abrupt rise in full, so that an onset of 0 has always been there.
+        """
+        return torch.clamp((self.end - onset + self.step) / (torch.clamp(ramp, min=0.0) + self.step), 0.0, 1.0)
+
+    def decay(self, time_constant: Tensor) -> Tensor:
+        """exp(-step / time constant); exactly 0, with slope 0, where the time constant vanishes beside the step."""
+        ratio = torch.clamp(time_constant / self.step, min=1e-3)
+        return torch.exp(-1.0 / ratio)
+
+    def sine(self, period: Tensor, phase: Tensor) -> Tensor:
+        """The mean of sin(2 pi t / period + phase) over the step."""
+        half = math.pi * self.step / period
+        return torch.sin(2.0 * math.pi * self.middle / period + phase) * torch.sin(half) / half
+
+
+def _rise_integral(since: Tensor, ramp: Tensor) -> Tensor:
+    """The integral of a rise from 0 to 1 within `ramp` (s), up to `since` seconds after it began."""
+    after = torch.clamp(since, min=0.0)
+    rising = torch.minimum(after, ramp)
+    return after - rising + 0.5 * rising * (rising / torch.clamp(ramp, min=1e-9))
 
 
 class CumulativeSignal:

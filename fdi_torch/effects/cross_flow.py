@@ -1,0 +1,42 @@
+"""An unknown path between two tanks."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.reach import Reach, inside
+
+
+class CrossFlow(Effect):
+    """s C sqrt(2 g) sqrt(max(h_1 - z, 0) - max(h_2 - z, 0)) from the first tank to the second, signed: a valve left
+    open, a gap in a wall, a hose.
+
+    size: its capacity as a share of the first tank's leak reference. Typical: 0.02 to 0.5. Between two tanks that a
+    pipe joins it is the same as a wider pipe.
+    """
+
+    name = "cross_flow"
+    stage = Stage.BALANCE
+    places = ("tank_pair",)
+    mistaken_for = ("leak", "plugging", "openness")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        height = min(t.height for t in plant.tanks if t.name in place.split("-"))
+        return (
+            Parameter("size", "1", 0.0, 0.0, 1.0, meaning="capacity as a share of the first tank's reference pipe"),
+            Parameter("height", "m", 0.0, 0.0, 0.95 * height, meaning="height of the path above the floors"),
+        )
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        first, second = (reach.levels[tank] for tank in place.split("-"))
+        heights = inside((min(first[0], second[0]), max(first[1], second[1])), 2)
+        return [{"size": 0.1}, *({"size": 0.1, "height": height} for height in heights)]
+
+    def inflow(self, local: Local, p: Values) -> Tensor:
+        near = torch.clamp(local.level - p["height"], min=0.0)
+        far = torch.clamp(local.far_level - p["height"], min=0.0)
+        return p["size"] * local.capacity * local.root(near - far)

@@ -1,0 +1,63 @@
+"""A tank that overflows below its rim, or through a notch in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription, Tank
+from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.orifice import weir_flow
+from fdi_torch.plant.reach import Reach, inside
+
+
+class Overflow(Effect):
+    """What the plant's weir law gives over a crest at H - b, less what it gives over the rim itself, times the
+    crest's length as a share of the rim's. A share of it may land in other tanks; the rest leaves the plant, or goes
+    where the rim's overflow goes.
+
+    Typical: an overflow pipe 5 to 20 cm below the rim, a crest of 1 to 100 % of it. Below its level nothing shows.
+    """
+
+    name = "overflow"
+    stage = Stage.BALANCE
+    places = ("tank",)
+    smooth = False
+    mistaken_for = ("leak", "sensor_saturation", "pump_saturation")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        tank = plant.component(place)
+        assert isinstance(tank, Tank)
+        into = [
+            Parameter(
+                f"to_{t.name}", "1", float(t.name == tank.overflow_to), 0.0, 1.0, meaning=f"share that {t.name} gets"
+            )
+            for t in plant.tanks
+            if t.name != place
+        ]
+        return (
+            Parameter("below_rim", "m", 0.0, 0.0, 0.95 * tank.height, meaning="how far below the rim it runs over"),
+            Parameter("crest", "1", 1.0, 1e-3, 1.0, meaning="length of the crest as a share of the rim"),
+            *into,
+        )
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        tank = plant.component(place)
+        assert isinstance(tank, Tank)
+        low, high = reach.levels[place]
+        depths = [tank.height - level for level in (*inside((0.5 * (low + high), high), 3), high)]
+        shares = [{}, *({f"to_{t.name}": 0.7} for t in plant.tanks if t.name not in (place, tank.overflow_to))]
+        return [{"below_rim": max(d, 0.0), "crest": 0.1} | share for d in depths for share in shares]
+
+    def inflow(self, local: Local, p: Values) -> Tensor:
+        over_rim = local.level - local.height
+        notch = self._weir(over_rim + p["below_rim"], local) - self._weir(over_rim, local)
+        return -p["crest"] * notch
+
+    def caught(self, p: Values) -> Mapping[str, Tensor]:
+        return {name.removeprefix("to_"): share for name, share in p.items() if name.startswith("to_")}
+
+    def _weir(self, above: Tensor, local: Local) -> Tensor:
+        return weir_flow(above, local.constants["area"], local.gravity, local.clock.resolution)

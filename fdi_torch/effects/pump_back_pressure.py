@@ -1,0 +1,29 @@
+"""A pump that delivers less as its tank fills."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Local, Stage, Values
+
+
+class PumpBackPressure(Effect):
+    """The flow is q (1 - c h / H): a centrifugal pump's curve, linear about its working point (Gülich, 2014,
+    "Centrifugal Pumps", ch. 4), for a pump that feeds its tank from below.
+
+    Typical: c of 0.05 to 0.5 at the rim. While the level hardly moves it is the same as a lower gain.
+    """
+
+    name = "pump_back_pressure"
+    stage = Stage.FLOW
+    places = ("pump",)
+    mistaken_for = ("pump_gain", "leak", "pump_saturation")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (Parameter("loss", "1", 0.0, -0.5, 1.0, meaning="share of the flow that is lost when the tank is full"),)
+
+    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+        return flow * torch.clamp(1.0 - p["loss"] * local.level / local.height, min=0.0)

@@ -1,0 +1,37 @@
+"""A pump that delivers more or less than it is believed to."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.reach import Reach
+
+
+class PumpGain(Effect):
+    """The flow is k times the believed one, from an onset on, at once or rising over a ramp (loss of effectiveness;
+    Zhang and Jiang, 2008, "Bibliographical review on reconfigurable fault-tolerant control systems").
+
+    Typical: k of 0.7 to 1.2. At a command that hardly moves it is the same as an offset, a dead zone or a constant
+    draw.
+    """
+
+    name = "pump_gain"
+    stage = Stage.FLOW
+    places = ("pump",)
+    mistaken_for = ("pump_dead_zone", "pump_back_pressure", "pump_offset", "pump_curve")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (
+            Parameter("factor", "1", 1.0, 0.0, 2.0, meaning="delivered over believed flow"),
+            Parameter("onset", "s", 0.0, 0.0, meaning="when it begins"),
+            Parameter("ramp", "s", 0.0, 0.0, meaning="how long it takes to come in full"),
+        )
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        return [{"factor": 0.9}, {"factor": 1.1}]
+
+    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+        return flow * (1.0 + (p["factor"] - 1.0) * local.clock.risen(p["onset"], p["ramp"]))

@@ -1,0 +1,36 @@
+"""A pump that follows its command with a lag."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.signals import Clock
+
+
+class PumpLag(Effect):
+    """First-order response tau dv/dt = u - v (any textbook on linear systems); exact for a command held over a step,
+    of which the mean is passed on: u + (v_0 - u) (tau/dt) (1 - exp(-dt/tau)).
+
+    Typical: tau of 2 to 30 s. Nearly the same as a delay of tau while tau is short beside the tanks' time constants.
+    """
+
+    name = "pump_lag"
+    stage = Stage.COMMAND
+    places = ("pump",)
+    memory = 1
+    mistaken_for = ("pump_delay", "pump_slew")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (Parameter("time_constant", "s", 0.0, 0.0, 60.0, meaning="time to 63 % of a step"),)
+
+    def remember(self, value: Tensor, p: Values) -> Memory:
+        return (value,)
+
+    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+        gap = memory[0] - value
+        decay = clock.decay(p["time_constant"])
+        mean = value + gap * (p["time_constant"] / clock.step) * (1.0 - decay)
+        return mean, (value + gap * decay,)

@@ -1,0 +1,45 @@
+"""A sensor that reads too much or too little by a constant."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.constants import reading_span
+from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.signals import Clock
+
+
+class SensorBias(Effect):
+    """y + b, from an onset on, at once or rising over a ramp (abrupt and incipient bias; Isermann, 2006, "Fault-
+    Diagnosis Systems", ch. 5).
+
+    Typical: 0.2 to 5 % of the range. From the start on it is the same as another offset of the sensor; with one
+    sensor in a plant at rest, as a leak or plugging.
+    """
+
+    name = "sensor_bias"
+    stage = Stage.READING
+    places = ("sensor",)
+    mistaken_for = ("sensor_gain", "sensor_drift", "outlet_drop")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        sensor = plant.component(place)
+        assert isinstance(sensor, Sensor)
+        reach = 0.5 * reading_span(plant, sensor)
+        return (
+            Parameter("bias", sensor.unit, 0.0, -reach, reach, meaning="what it reads too much"),
+            Parameter("onset", "s", 0.0, 0.0, meaning="when it begins"),
+            Parameter("ramp", "s", 0.0, 0.0, meaning="how long it takes to come in full"),
+        )
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        sensor = plant.component(place)
+        assert isinstance(sensor, Sensor)
+        bias = 0.02 * reading_span(plant, sensor)
+        return [{"bias": bias}, {"bias": -bias}]
+
+    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+        return value + p["bias"] * clock.risen_by_end(p["onset"], p["ramp"]), memory

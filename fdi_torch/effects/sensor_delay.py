@@ -1,0 +1,29 @@
+"""A sensor that reads late."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Stage, Values
+
+
+class SensorDelay(Effect):
+    """y(t) = the reading of the level at t - d, straight between samples: filters, slow buses, stamps made on
+    arrival.
+
+    Typical: d of 1 to 20 s. On levels, which move slowly, nearly the same as a lag of d.
+    """
+
+    name = "sensor_delay"
+    stage = Stage.READING
+    places = ("sensor",)
+    delays = True
+    mistaken_for = ("sensor_lag",)
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (Parameter("delay", "s", 0.0, 0.0, 60.0, meaning="how late it reads"),)
+
+    def delay(self, p: Values) -> Tensor:
+        return p["delay"]

@@ -1,0 +1,36 @@
+"""A sensor whose scale is wrong."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.signals import Clock
+
+
+class SensorGain(Effect):
+    """k y, from an onset on, at once or over a ramp (a span error; Isermann, 2006, "Fault-Diagnosis Systems", ch. 5).
+
+    Typical: k of 0.9 to 1.1. While the level hardly moves it is the same as a bias.
+    """
+
+    name = "sensor_gain"
+    stage = Stage.READING
+    places = ("sensor",)
+    mistaken_for = ("sensor_bias", "sensor_curvature")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (
+            Parameter("factor", "1", 1.0, 0.2, 1.8, meaning="reading over true reading"),
+            Parameter("onset", "s", 0.0, 0.0, meaning="when it begins"),
+            Parameter("ramp", "s", 0.0, 0.0, meaning="how long it takes to come in full"),
+        )
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        return [{"factor": 0.95}, {"factor": 1.05}]
+
+    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+        return value * (1.0 + (p["factor"] - 1.0) * clock.risen_by_end(p["onset"], p["ramp"])), memory

@@ -1,0 +1,46 @@
+"""Water that is drawn or added unseen for a while."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.constants import flow_scale
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.reach import Reach
+
+
+class UnmeteredFlow(Effect):
+    """A constant inflow q (negative: a draw) between an instant and another one; steps need not hit them.
+
+    Typical: 5 to 50 % of a pump's flow over minutes. One that never ends is the same as an offset or dead zone of the
+    tank's pump.
+    """
+
+    name = "unmetered_flow"
+    stage = Stage.BALANCE
+    places = ("tank",)
+    mistaken_for = ("leak", "evaporation", "pump_offset", "pump_dead_zone")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        flow = flow_scale(plant, place)
+        return (
+            Parameter("flow", "m^3/s", 0.0, -flow, flow, meaning="what flows in (negative: what is drawn)"),
+            Parameter("begin", "s", 0.0, 0.0, meaning="when it begins"),
+            Parameter("duration", "s", 600.0, 0.0, meaning="how long it lasts"),
+        )
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        flow = 0.1 * flow_scale(plant, place)
+        shares = [(k / 4, 1 / 4) for k in range(4)] + [(k / 8, 1 / 2) for k in range(5)]
+        return [
+            {"flow": sign * flow, "begin": begin * reach.duration, "duration": lasting * reach.duration}
+            for begin, lasting in shares
+            for sign in (-1.0, 1.0)
+        ]
+
+    def inflow(self, local: Local, p: Values) -> Tensor:
+        begun = local.clock.share_after(p["begin"])
+        ended = local.clock.share_after(p["begin"] + p["duration"])
+        return p["flow"] * (begun - ended)

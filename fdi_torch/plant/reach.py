@@ -1,0 +1,56 @@
+"""What a recording reaches: how long it is, and between what its commands, readings and levels lie."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from fdi_torch.plant.constants import reading_at
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Reach:
+    """duration in s; commands by input channel, readings by sensor, levels (m) by tank: lowest and highest."""
+
+    duration: float
+    commands: Mapping[str, Range]
+    readings: Mapping[str, Range]
+    levels: Mapping[str, Range]
+
+
+def reach_of(recording: Recording, plant: PlantDescription) -> Reach:
+    """Lowest and highest of everything; what was not recorded may have been anywhere from floor to rim."""
+    inputs = dict(zip(recording.input_names, recording.inputs.T, strict=True))
+    outputs = {n: c[m] for n, c, m in zip(recording.output_names, recording.outputs.T, recording.mask.T, strict=True)}
+    readings, levels = {}, {tank.name: (0.0, tank.height) for tank in plant.tanks}
+    for sensor in plant.sensors:
+        seen = outputs.get(sensor.column)
+        if seen is None or len(seen) == 0:
+            whole = reading_at(plant, sensor, 0.0), reading_at(plant, sensor, 1.0)
+            readings[sensor.name] = min(whole), max(whole)
+            continue
+        readings[sensor.name] = _range(seen)
+        ends = sorted((reading - sensor.offset) / sensor.gain for reading in readings[sensor.name])
+        levels[sensor.tank] = max(ends[0], 0.0), max(ends[1], 0.0)
+    return Reach(
+        duration=float(recording.time[-1] - recording.time[0]),
+        commands={c: _range(inputs[c]) for c in plant.channels() if c in inputs},
+        readings=readings,
+        levels=levels,
+    )
+
+
+def inside(reached: Range, count: int) -> list[float]:
+    """`count` values evenly within a range, its ends left out."""
+    low, high = reached
+    return [low + (high - low) * (k + 1) / (count + 1) for k in range(count)]
+
+
+def _range(values: Tensor) -> Range:
+    return float(values.min()), float(values.max())
