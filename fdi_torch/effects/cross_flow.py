@@ -25,18 +25,25 @@ class CrossFlow(Effect):
     mistaken_for = ("leak", "plugging", "openness")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        height = min(t.height for t in plant.tanks if t.name in place.split("-"))
         return (
             Parameter("size", "1", 0.0, 0.0, 1.0, meaning="capacity as a share of the first tank's reference pipe"),
-            Parameter("height", "m", 0.0, 0.0, 0.95 * height, meaning="height of the path above the floors"),
+            Parameter(
+                "height", "m", 0.0, 0.0, _lowest_rim(place, plant), meaning="height of the path above the floors"
+            ),
         )
 
     def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
         first, second = (reach.levels[tank] for tank in place.split("-"))
-        heights = inside((min(first[0], second[0]), max(first[1], second[1])), 2)
+        highest = min(max(first[1], second[1]), _lowest_rim(place, plant))
+        heights = inside((0.0, highest), 2)
         return [{"size": 0.1}, *({"size": 0.1, "height": height} for height in heights)]
 
     def inflow(self, local: Local, p: Values) -> Tensor:
         near = torch.clamp(local.level - p["height"], min=0.0)
         far = torch.clamp(local.far_level - p["height"], min=0.0)
         return p["size"] * local.capacity * local.root(near - far)
+
+
+def _lowest_rim(place: str, plant: PlantDescription) -> float:
+    """The highest that the path can be, m: just below the lower one of both rims."""
+    return 0.95 * min(t.height for t in plant.tanks if t.name in place.split("-"))

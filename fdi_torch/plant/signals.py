@@ -10,6 +10,8 @@ from torch import Tensor
 
 from fdi_torch.recording import Hold
 
+_SAME_INSTANT = 1e-9  # s
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -79,7 +81,8 @@ class CumulativeSignal:
 
     def up_to(self, instant: Tensor, channel: int) -> Tensor:
         """The integral from the first sample to `instant`, any shape."""
-        after = torch.searchsorted(self.time, instant.detach().contiguous(), right=True)
+        # At a switch the slope is the one before it, rounding or not: a delay reaches back, never ahead.
+        after = torch.searchsorted(self.time, instant.detach() - _SAME_INSTANT)
         left = torch.clamp(after - 1, min=0)
         return self.integral[left, channel] + self.slopes[after, channel] * (instant - self.time[left])
 

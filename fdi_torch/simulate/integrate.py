@@ -192,5 +192,5 @@ def late(series: Tensor, times: Tensor, delay: Tensor) -> Tensor:
     right = torch.searchsorted(times, wanted.detach().contiguous()).clamp(1, len(times) - 1)
     left = right - 1
     before, after = series.gather(0, left), series.gather(0, right)
-    share = torch.clamp((wanted - times[left]) / (times[right] - times[left]), min=0.0)
-    return before + share * (after - before)
+    share = (wanted - times[left]) / (times[right] - times[left])
+    return before + torch.where(wanted > times[0], share, 0.0) * (after - before)

@@ -1,0 +1,258 @@
+"""What every effect of the library promises, at every place of two plants. An effect's author writes none of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+
+import pytest
+import torch
+from rigs import blank_recording, three_tank
+from torch import Tensor
+
+from fdi_torch.effects import all_placements, build_network
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.reach import Reach, reach_of
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.integrate import ReferenceEngine
+
+# torch itself scripts a few rules the first time it differentiates forward.
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script:DeprecationWarning")
+
+SAMPLES, SAMPLE = 40, 5.0  # s
+
+
+def valve_plant() -> PlantDescription:
+    """Two tanks with valves, one before an outlet; volts in and out; B catches what A spills."""
+    return PlantDescription(
+        "valves",
+        (Tank("A", 0.015, 0.9, 0.25, overflow_to="B"), Tank("B", 0.012, 0.5, 0.15)),
+        (
+            Pipe("AB", "A", "B", 0.5e-4, 0.6, valve="vAB"),
+            Pipe("OUT", "B", "outside", 0.6e-4, 0.6, elevation=0.01, valve="vOUT"),
+        ),
+        (Pump("P", "A", 1e-4, 1e-5, "u", "m^3/s/V"),),
+        (Sensor("yA", "A", "V", 20.0, 0.3), Sensor("yB", "B", "V", -15.0, 9.0)),
+    )
+
+
+PLANTS = {"three_tank": three_tank((0.3, 0.25, 0.28)), "valves": valve_plant()}
+PLACES = [(name, p.prefix) for name, plant in PLANTS.items() for p in all_placements(plant)]
+everywhere = pytest.mark.parametrize(("plant", "place"), PLACES)
+
+
+def random_inputs(plant: PlantDescription) -> Recording:
+    """Each channel steps every 20 s between a fifth and nine tenths of its full scale."""
+    generator = torch.Generator().manual_seed(7)
+    full = {pump.channel: pump.max_flow / pump.gain for pump in plant.pumps}
+    scale = torch.tensor([full.get(c, 1.0) for c in plant.channels()], dtype=torch.float64)
+    steps = 0.2 + 0.7 * torch.rand(SAMPLES // 4 + 1, len(scale), generator=generator, dtype=torch.float64)
+    time = torch.arange(SAMPLES, dtype=torch.float64) * SAMPLE
+    return blank_recording(plant, scale * steps.repeat_interleave(4, dim=0)[:SAMPLES], time)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A plant with some effects, all of whose parameters are free, and the reference experiment on it."""
+
+    plant: PlantDescription
+    network: TankNetwork
+    space: ParameterSpace
+    engine: ReferenceEngine
+    nominal_reading: Tensor
+    reach: Reach
+
+    def placement(self, prefix: str) -> Placement:
+        return next(p for p in self.network.placements if p.prefix == prefix)
+
+    def size(self, prefix: str) -> str:
+        placement = self.placement(prefix)
+        return f"{prefix}.{placement.effect.parameters(placement.location, self.plant)[0].name}"
+
+    def starts(self, prefix: str) -> list[dict[str, float]]:
+        placement = self.placement(prefix)
+        named = placement.effect.starts(placement.location, self.plant, self.reach)
+        return [{f"{prefix}.{name}": value for name, value in start.items()} for start in named]
+
+
+def rig_of(plant: PlantDescription, placements: tuple[Placement, ...]) -> Rig:
+    network = build_network(plant, placements)
+    prefixes = {p.prefix for p in network.placements}
+    space = ParameterSpace(p for p in network.constants if p.name.rpartition(".")[0] in prefixes)
+    recording = random_inputs(plant)
+    engine = ReferenceEngine(network, space, lay_out(recording, plant.channels(), SAMPLE))
+    reading = engine.readings(space.nominal())
+    return Rig(plant, network, space, engine, reading, reach_of(replace(recording, outputs=reading, mask=None), plant))
+
+
+@cache
+def rig(plant: str) -> Rig:
+    """The plant with the whole library at all its places."""
+    return rig_of(PLANTS[plant], all_placements(PLANTS[plant]))
+
+
+@cache
+def alone(plant: str, prefix: str) -> Rig:
+    return rig_of(PLANTS[plant], (rig(plant).placement(prefix),))
+
+
+@cache
+def first_starts(plant: str) -> dict[str, Tensor]:
+    """Readings at the start, of each effect's own ones, that shows most; computed in one batch with a NaN neighbour."""
+    r = rig(plant)
+    lanes = [(p.prefix, start) for p in r.network.placements for start in r.starts(p.prefix)]
+    thetas = torch.stack([*(r.space.vector(start) for _, start in lanes), torch.full((len(r.space),), math.nan)])
+    readings = r.engine.readings(thetas)
+    assert bool(torch.isnan(readings[-1]).any())
+    best: dict[str, Tensor] = {}
+    for (prefix, _), reading in zip(lanes, readings, strict=False):
+        shown = best.get(prefix, r.nominal_reading)
+        if bool((reading - r.nominal_reading).abs().max() >= (shown - r.nominal_reading).abs().max()):
+            best[prefix] = reading
+    return best
+
+
+@cache
+def slopes(plant: str) -> Tensor:
+    """d reading / d parameter at nominal, (S, sensors, P), in forward mode."""
+    r = rig(plant)
+    return r.engine.linearise(r.space.nominal())[1]
+
+
+@cache
+def bare_reading(plant: str) -> Tensor:
+    return rig_of(PLANTS[plant], ()).nominal_reading
+
+
+@everywhere
+def test_neutral_at_nominal_bit_for_bit(plant: str, place: str) -> None:
+    assert torch.equal(alone(plant, place).nominal_reading, bare_reading(plant))
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_the_whole_library_at_nominal_changes_no_bit(plant: str) -> None:
+    assert torch.equal(rig(plant).nominal_reading, bare_reading(plant))
+
+
+@everywhere
+def test_nothing_there_while_the_size_is_nominal_whatever_the_shape(plant: str, place: str) -> None:
+    r = alone(plant, place)
+    size = r.size(place)
+    theta = r.space.vector({n: v for start in r.starts(place) for n, v in start.items() if n != size})
+    assert torch.equal(r.engine.readings(theta), r.nominal_reading)
+
+
+@everywhere
+def test_starts_lie_in_the_box_and_one_of_them_shows(plant: str, place: str) -> None:
+    r = rig(plant)
+    for start in r.starts(place):
+        assert r.size(place) in start
+        for name, value in start.items():
+            assert r.space[name].low <= value <= r.space[name].high, name
+    shown = (first_starts(plant)[place] - r.nominal_reading).abs().max()
+    assert shown > 0 or r.placement(place).effect.rounds
+    assert bool(torch.isfinite(first_starts(plant)[place]).all())
+
+
+@everywhere
+def test_alone_equals_in_batch_beside_a_lane_of_nan(plant: str, place: str) -> None:
+    r = alone(plant, place)
+    start = r.space.vector(r.starts(place)[-1])
+    batch = torch.stack([torch.full_like(start, math.nan), start, r.space.nominal()])
+    assert torch.equal(r.engine.readings(batch)[1], r.engine.readings(start))
+
+
+@everywhere
+def test_slope_of_the_size_is_finite_and_shows_where_the_effect_is_smooth(plant: str, place: str) -> None:
+    r = rig(plant)
+    slope = slopes(plant)[..., r.space.index(r.size(place))]
+    assert bool(torch.isfinite(slope).all())
+    if r.placement(place).effect.smooth:
+        assert slope.abs().max() > 0
+        assert torch.allclose(slope, one_sided_slope(r, place), atol=1e-2 * float(slope.abs().max()))
+    else:
+        assert slope.abs().max() == 0, "it is smooth after all"
+
+
+def one_sided_slope(r: Rig, place: str) -> Tensor:
+    """From readings with sizes just inside the box: a second opinion on the Jacobian."""
+    size = r.space[r.size(place)]
+    bound = size.high if size.high > size.nominal else size.low
+    step = 1e-5 * (bound - size.nominal)
+    both = torch.stack([r.space.vector({size.name: size.nominal + k * step}) for k in (0, 1)])
+    before, after = r.engine.readings(both)
+    return (after - before) / step
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_slopes_of_shapes_are_finite_at_starts(plant: str) -> None:
+    r = rig(plant)
+    theta = r.space.vector({n: v for p in r.network.placements for n, v in r.starts(p.prefix)[0].items()})
+    assert bool(torch.isfinite(r.engine.linearise(theta)[1]).all())
+
+
+def factor(unit: str, metre: float, second: float) -> float:
+    """How a number in this unit changes when metres and seconds are rescaled; volts stay."""
+    scale, result = {"m": metre, "s": second}, 1.0
+    for sign, part in enumerate(unit.replace("/", "*/").split("*")):
+        base, _, power = part.removeprefix("/").partition("^")
+        result *= scale.get(base, 1.0) ** (float(power or 1) * (-1 if part.startswith("/") else 1))
+        assert sign < 4
+    return result
+
+
+def rescaled(plant: PlantDescription, m: float, s: float) -> PlantDescription:
+    """The same plant in other metres and seconds."""
+    f = lambda unit: factor(unit, m, s)  # noqa: E731
+    return replace(
+        plant,
+        tanks=tuple(
+            replace(t, area=t.area * m**2, height=t.height * m, start_level=(t.start_level or 0.0) * m)
+            for t in plant.tanks
+        ),
+        pipes=tuple(replace(p, area=p.area * m**2, elevation=p.elevation * m) for p in plant.pipes),
+        pumps=tuple(replace(p, max_flow=p.max_flow * f("m^3/s"), gain=p.gain * f(p.gain_unit)) for p in plant.pumps),
+        sensors=tuple(replace(y, gain=y.gain * f(y.unit) / m, offset=y.offset * f(y.unit)) for y in plant.sensors),
+        gravity=plant.gravity * f("m/s^2"),
+    )
+
+
+@cache
+def rescaled_readings(plant: str, m: float, s: float) -> dict[str, Tensor]:
+    """Readings of every effect's last start on the rescaled plant, brought back to the first units."""
+    r = rig(plant)
+    other = rescaled(r.plant, m, s)
+    network = build_network(other, all_placements(other))
+    space = ParameterSpace(network.constants[name] for name in r.space.names)
+    recording = random_inputs(r.plant)
+    channels = torch.tensor([factor(u, m, s) for u in other.channel_units().values()], dtype=torch.float64)
+    recording = replace(recording, time=recording.time * s, inputs=recording.inputs * channels)
+    engine = ReferenceEngine(network, space, lay_out(recording, other.channels(), SAMPLE * s))
+    scale = torch.tensor([factor(p.unit, m, s) for p in r.space], dtype=torch.float64)
+    thetas = torch.stack([r.space.vector(r.starts(p.prefix)[-1]) * scale for p in r.network.placements])
+    back = torch.tensor([factor(y.unit, m, s) for y in other.sensors], dtype=torch.float64)
+    return dict(zip((p.prefix for p in r.network.placements), engine.readings(thetas) / back, strict=True))
+
+
+@everywhere
+def test_declared_units_are_true(plant: str, place: str) -> None:
+    r = rig(plant)
+    expected = alone(plant, place).engine.readings(alone(plant, place).space.vector(r.starts(place)[-1]))
+    for metre, second in ((100.0, 1.0), (1.0, 60.0)):
+        assert torch.allclose(rescaled_readings(plant, metre, second)[place], expected, rtol=1e-5)
+
+
+@everywhere
+def test_a_plant_file_can_have_it(plant: str, place: str) -> None:
+    """As part of the plant's description, with these parameters, it does the same as beside it."""
+    r = alone(plant, place)
+    start = r.starts(place)[-1]
+    location, name = place.split(".")
+    own = {full.rpartition(".")[2]: value for full, value in start.items()}
+    described = replace(r.plant, effects=(PlacedEffect(name, location, own),))
+    assert torch.equal(rig_of(described, ()).nominal_reading, r.engine.readings(r.space.vector(start)))
