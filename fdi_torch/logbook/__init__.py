@@ -1,29 +1,44 @@
 """Logs of runs in MCAP: written, read, repaired, inspected, compared and replayed. The only importer of mcap."""
 
+from fdi_torch.logbook.compare import Comparison, align, compare
 from fdi_torch.logbook.errors import LogError
+from fdi_torch.logbook.export import export, export_attachment
 from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.follow import follow
+from fdi_torch.logbook.inspect import Inspection, inspect_log
+from fdi_torch.logbook.payload import unpack
 from fdi_torch.logbook.reader import Message, Run, read_run
 from fdi_torch.logbook.recover import Recovery, recover
+from fdi_torch.logbook.replay import Replay, replay
 from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, own_signals, series
 from fdi_torch.logbook.terminate import Terminated, exit_on_sigterm
 from fdi_torch.logbook.writer import RunLog
 
 __all__ = [
+    "Comparison",
+    "Inspection",
     "LogError",
     "Message",
     "Recovery",
+    "Replay",
     "Run",
     "RunLog",
     "Signals",
     "Terminated",
+    "align",
     "arrays",
+    "compare",
     "content_hash",
     "exit_on_sigterm",
+    "export",
+    "export_attachment",
     "follow",
+    "inspect_log",
     "mapped_signals",
     "own_signals",
     "read_run",
     "recover",
+    "replay",
     "series",
+    "unpack",
 ]

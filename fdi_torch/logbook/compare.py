@@ -1,0 +1,162 @@
+"""Runs side by side: only what differs in them, whether their results agree, their curves over a common axis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from fdi_torch.logbook.fingerprint import content_hash
+from fdi_torch.logbook.reader import Run, read_run
+from fdi_torch.logbook.signals import series
+
+SECTIONS = ("run", "config", "seeds", "data", "env", "git", "status", "result")
+_WALL = {"run": ("started", "run_id", "parent_run_id"), "status": ("ended", "wall_seconds")}
+# The number that says which event a message is; topics not named here align by plant time.
+AXES = {
+    "/estimator/de/generation": "generation",
+    "/estimator/refine/iteration": "iteration",
+    "/study/trial": "trial",
+}
+
+
+@dataclass(frozen=True)
+class Result:
+    """One estimated parameter in all runs; NaN where a run lacks it.
+
+    p_value: of values this far apart if all runs estimate one truth with independent errors,
+    Cochran's Q = sum w (x - mean)^2, w = 1 / std^2, against chi^2; for two runs Q = z^2. NaN where no two have errors.
+    """
+
+    name: str
+    unit: str
+    values: tuple[float, ...]
+    std: tuple[float, ...]
+    p_value: float
+
+    @property
+    def agree(self) -> bool | None:
+        """At 95 %; None where it cannot be said."""
+        return None if math.isnan(self.p_value) else self.p_value >= 0.05
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """labels: one a run. differences: section -> key -> one text a run, "" where a run lacks it.
+
+    same_content: do all logs say the same, message by message? same_data: did all read the same data? Then their
+    errors are not independent, and `agree` says only whether methods differ by less than the noise lets them.
+    """
+
+    labels: tuple[str, ...]
+    differences: dict[str, dict[str, tuple[str, ...]]]
+    results: tuple[Result, ...]
+    same_content: bool
+    same_data: bool
+
+    def rows(self) -> list[list[str]]:
+        """The whole comparison as a table with a header, for CSV."""
+        table = [["section", "key", *self.labels, "unit", "p_value"]]
+        for section, entries in self.differences.items():
+            table += [[section, key, *texts, "", ""] for key, texts in entries.items()]
+        for result in self.results:
+            p_value = "" if math.isnan(result.p_value) else repr(result.p_value)
+            table.append(["estimate", result.name, *map(repr, result.values), result.unit, p_value])
+            table.append(["std", result.name, *map(repr, result.std), result.unit, ""])
+        return table
+
+
+def compare(paths: Sequence[str | Path]) -> Comparison:
+    """Compare any number of logs. Raises LogError where one cannot be read, ValueError for fewer than two."""
+    if len(paths) < 2:
+        raise ValueError(f"expected at least two logs to compare, got {len(paths)}; name more")
+    runs = [read_run(path) for path in paths]
+    return Comparison(
+        labels_of([run.path for run in runs]),
+        {section: found for section in SECTIONS if (found := _differing(runs, section))},
+        _results(runs),
+        len({content_hash(run.messages()) for run in runs}) == 1,
+        len({tuple(sorted(_hashes(run).items())) for run in runs}) == 1 and bool(_hashes(runs[0])),
+    )
+
+
+def align(
+    paths: Sequence[str | Path], topic: str, field: str, where: Mapping[str, float] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """One field of all runs over a common axis: axis (K,), values (runs, K), NaN where a run has no such event.
+
+    The axis is the generation, the iteration, the trial, or plant time in s; never wall time. where: keep messages
+    whose numbers equal these, such as {"problem": 0}. Of several messages at one place the last counts.
+    """
+    axis_field, where = AXES.get(topic, "t"), where or {}
+    columns = []
+    for path in paths:
+        table = series(read_run(path), topic, [axis_field, field, *where])
+        kept = np.all([table[name] == value for name, value in where.items()], axis=0) & np.isfinite(table[axis_field])
+        columns.append(dict(zip(table[axis_field][kept].tolist(), table[field][kept].tolist(), strict=True)))
+    axis = np.array(sorted(set().union(*columns)))
+    return axis, np.array([[column.get(place, np.nan) for place in axis.tolist()] for column in columns])
+
+
+def labels_of(paths: Sequence[Path]) -> tuple[str, ...]:
+    """The shortest ends of the paths that tell the runs apart."""
+    for depth in range(1, max(len(path.resolve().parts) for path in paths)):
+        ends = ["/".join(path.resolve().parts[-depth:]).removesuffix(".mcap") for path in paths]
+        if len(set(ends)) == len(ends):
+            return tuple(ends)
+    return tuple(f"{path.stem}#{number}" for number, path in enumerate(paths, 1))
+
+
+def chi2_p_value(values: Sequence[float], std: Sequence[float]) -> float:
+    """Cochran's Q test of one common value; NaN for fewer than two values with positive errors."""
+    x, s = np.asarray(values, dtype=np.float64), np.asarray(std, dtype=np.float64)
+    usable = np.isfinite(x) & np.isfinite(s) & (s > 0)
+    x, s = x[usable], s[usable]
+    if len(x) < 2:
+        return float("nan")
+    weights = s**-2.0
+    q = float(np.sum(weights * (x - np.sum(weights * x) / np.sum(weights)) ** 2))
+    half = torch.tensor([(len(x) - 1) / 2, q / 2], dtype=torch.float64)
+    return float(torch.special.gammaincc(half[0], half[1]))
+
+
+def _differing(runs: Sequence[Run], section: str) -> dict[str, tuple[str, ...]]:
+    records = [run.metadata.get(f"fdi_torch.{section}", {}) for run in runs]
+    keys = dict.fromkeys(key for record in records for key in record if key not in _WALL.get(section, ()))
+    table = {key: tuple(record.get(key, "") for record in records) for key in keys}
+    return {key: texts for key, texts in table.items() if len(set(texts)) > 1}
+
+
+def _hashes(run: Run) -> dict[str, str]:
+    return {key: text for key, text in run.metadata.get("fdi_torch.data", {}).items() if key.endswith("sha256")}
+
+
+def _results(runs: Sequence[Run]) -> tuple[Result, ...]:
+    estimates = [_estimates(run) for run in runs]
+    names = dict.fromkeys(name for found in estimates for name in found)
+    return tuple(_result(name, [found.get(name, _NOTHING) for found in estimates]) for name in names)
+
+
+def _result(name: str, found: Sequence[tuple[float, float, str]]) -> Result:
+    values, std, units = zip(*found, strict=True)
+    return Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, std))
+
+
+_NOTHING = (float("nan"), float("nan"), "")
+
+
+def _estimates(run: Run) -> dict[str, tuple[float, float, str]]:
+    """Parameter -> (value, standard error, unit), of the last estimate of each problem."""
+    found: dict[str, tuple[float, float, str]] = {}
+    for message in run.messages(["/estimate/final"]):
+        payload = message.payload
+        prefix = f"{payload['problem']}:" if payload.get("problem") else ""
+        names, values, std = payload["names"], payload["values"], payload["std"]
+        units = payload.get("units") or [""] * len(names)
+        for name, value, error, unit in zip(names, values, std, units, strict=True):
+            found[prefix + name] = (float(value), float(error), unit)
+    return found

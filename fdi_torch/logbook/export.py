@@ -1,0 +1,137 @@
+"""A topic or an attachment taken out of a log, for other tools."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import orjson
+
+from fdi_torch.logbook.errors import LogError, log_error
+from fdi_torch.logbook.reader import Message, Run
+
+_UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+def export(run: Run, topic: str, form: str, stream: BinaryIO) -> int:
+    """Write a topic's messages as "csv", "ndjson" or "npz" to an open binary file; returns their number.
+
+    csv: one row a message, units in the header (`h1_m`, `Q1_m3_s`), lists as JSON. ndjson: messages as they are.
+    npz: one array a field of numbers or text. Raises LogError where the topic has no messages.
+    """
+    if form not in _FORMS:
+        raise ValueError(f"expected one of the formats {', '.join(_FORMS)}, got {form}")
+    count = _FORMS[form](run, topic, stream)
+    if not count:
+        known = ", ".join(sorted({message.topic for message in run.messages()})) or "(none)"
+        raise LogError(f"{run.path}: expected one of the topics {known}, got {topic}")
+    return count
+
+
+def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
+    """Write an attachment into `folder`, never outside it and never over a file. Returns where it is."""
+    content = run.attachment(name)
+    target = Path(folder) / safe_name(name)
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        if target.exists():
+            raise LogError(f"{target}: exists already; choose another folder, or delete it")
+        with open(target, "xb") as file:
+            file.write(content)
+    except LogError:
+        raise
+    except OSError as error:
+        raise log_error(target, error) from error
+    return target
+
+
+def safe_name(name: str) -> str:
+    """A file name made of the last part of `name` and of harmless characters only."""
+    last = re.split(r"[/\\]", name)[-1]
+    return _UNSAFE.sub("_", last).lstrip(".")[:100] or "attachment"
+
+
+def _csv(run: Run, topic: str, stream: BinaryIO) -> int:
+    columns, units = _columns(run, topic)
+    text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
+    table = csv.writer(text)
+    table.writerow([_header(name, units.get(name, "")) for name in columns])
+    count = 0
+    for payload in _payloads(run, topic):
+        count += 1
+        table.writerow([_cell(payload.get(name)) for name in columns])
+    text.detach()
+    return count
+
+
+def _ndjson(run: Run, topic: str, stream: BinaryIO) -> int:
+    count = 0
+    for message in run.messages([topic]):
+        count += 1
+        stream.write(orjson.dumps(_loaded(run, message), option=orjson.OPT_APPEND_NEWLINE))
+    return count
+
+
+def _npz(run: Run, topic: str, stream: BinaryIO) -> int:
+    columns, _ = _columns(run, topic)
+    payloads = list(_payloads(run, topic))
+    found = {name: _array([payload.get(name) for payload in payloads]) for name in columns}
+    kept = {name: array for name, array in found.items() if array is not None}
+    if payloads:
+        np.savez_compressed(stream, **kept)  # type: ignore[arg-type]
+    return len(payloads)
+
+
+_FORMS: dict[str, Callable[[Run, str, BinaryIO], int]] = {"csv": _csv, "ndjson": _ndjson, "npz": _npz}
+
+
+def _columns(run: Run, topic: str) -> tuple[list[str], dict[str, str]]:
+    """Fields of a topic's messages, `t` first, and their units."""
+    names: dict[str, None] = {}
+    units: dict[str, str] = {}
+    for message in run.messages([topic]):
+        names.update(dict.fromkeys(message.payload))
+        units.update((k.removeprefix("unit."), v) for k, v in message.channel.metadata if k.startswith("unit."))
+    return sorted(names, key=lambda name: name != "t"), units
+
+
+def _payloads(run: Run, topic: str) -> Iterator[dict[str, Any]]:
+    return (message.payload for message in run.messages([topic]))
+
+
+def _loaded(run: Run, message: Message) -> Any:
+    """The JSON as it stands, with its list of non-finite numbers."""
+    if message.channel.encoding != "json":
+        raise LogError(f"{run.path}: {message.topic} is in {message.channel.encoding}, only json can be exported")
+    try:
+        return orjson.loads(message.data)
+    except ValueError as error:
+        raise LogError(f"{run.path}: a message on {message.topic} is no JSON ({error})") from error
+
+
+def _header(name: str, unit: str) -> str:
+    suffix = unit.replace("^", "").replace("/", "_")
+    return f"{name}_{suffix}" if suffix not in ("", "1") else name
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return repr(value) if math.isfinite(value) else str(value)
+    return value if isinstance(value, str) else orjson.dumps(value).decode()
+
+
+def _array(values: list[Any]) -> np.ndarray | None:
+    """Numbers with NaN where one is missing, or texts; None where they are neither."""
+    if all(isinstance(value, int | float | None) for value in values):
+        return np.array([np.nan if value is None else float(value) for value in values])
+    if all(isinstance(value, str | None) for value in values):
+        return np.array([value or "" for value in values])
+    return None
