@@ -52,7 +52,7 @@ class Messages:
             raise ValueError(f"{topic}: expected a finite time, got {t}; give the plant's time in s")
         if wall:
             message[WALL] = self.wall()
-        self._latest = t
+        self._latest = max(self._latest, t)
         channel = self._channel(topic, fields, message, {**units_of(units), **(about or {})})
         self.put(channel, t, self._next(topic), orjson.dumps(message))
 
@@ -108,7 +108,7 @@ class Messages:
             for t, messages in zip(clock, zip(*encoded, strict=True), strict=True):
                 for (topic, *_), payload in zip(signals, messages, strict=True):
                     self.put(self._described[topic][1], t, self._next(topic), payload)
-        self._latest = float(time[-1]) if len(time) else self._latest
+        self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
 
     def sample(self, topic: str, t: float, values: Named, units: Mapping[str, str] | None = None) -> None:
         """One sample of a signal that arrives bit by bit, such as "/plant/output" or "/plant/truth"."""

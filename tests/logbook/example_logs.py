@@ -44,7 +44,8 @@ def write_everything(log: RunLog, samples: int = 50) -> None:
         hold="linear",
     )
     log.sample("/plant/truth", 0.0, {"T1.leak.size": 0.1}, {"T1.leak.size": "1"})
-    log.residual(1.0, {"h1": 1e-3}, {"h1": 4.2}, {"h1": 5.0}, {"h1": "m"})
+    levels = ("h1", "h2", "h3")
+    log.residual(1.0, dict.fromkeys(levels, 1e-3), dict.fromkeys(levels, 4.2), {"h1": 5.0}, dict.fromkeys(levels, "m"))
     log.alarm(2.0, "raised", "h1", "h1 left its band", value=6.1, threshold=5.0, onset=1.5)
     for generation in range(3):
         log.generation(generation, 1.0 / (generation + 1), {"T1.leak.size": 0.1}, mean_cost=np.inf, evaluations=50)

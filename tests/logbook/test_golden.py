@@ -1,0 +1,75 @@
+"""Logs of every format version stay readable, and the layout for viewers names what the logs hold."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+
+from fdi_torch.logbook import arrays, content_hash, inspect_log, own_signals, read_run, series, unpack
+from fdi_torch.logbook.schemas import TOPICS
+
+TESTS = Path(__file__).parents[1]
+FORMAT_1 = TESTS / "data/log_format_1.mcap"
+FILE_SHA256 = "a3de1a9c2dc88e21bb76cccbf913e53bc97940ad099ddd1ef2a8894b0a6f6687"
+CONTENT_HASH = "091835383d95f91e15527ac9b2043511a0fdd05585a89bec5194d7ab317aa312"
+LAYOUT = TESTS.parent / "docs/fdi_torch.foxglove-layout.json"
+
+
+def test_format_1_is_the_file_it_was() -> None:
+    assert hashlib.sha256(FORMAT_1.read_bytes()).hexdigest() == FILE_SHA256
+    assert content_hash(read_run(FORMAT_1).messages()) == CONTENT_HASH
+
+
+def test_format_1_means_what_it_meant() -> None:
+    found = inspect_log(FORMAT_1)
+    assert found.health.sound and found.messages == 115 and set(found.topics) == set(TOPICS)
+    assert found.about["run"]["format"] == "1" and found.about["seeds"] == {"noise": "7"}
+    run = read_run(FORMAT_1)
+    signals = own_signals(run)
+    assert signals.output_names == ("h1", "h2", "h3") and signals.input_units == ("m^3/s", "m^3/s")
+    assert signals.outputs[0].tolist() == [0.5012573022109339, 0.49867895136708695, 0.5064042265044328]
+    assert np.argwhere(~signals.mask).tolist() == [[3, 1], [5, 0]] and np.isnan(signals.outputs[3, 1])
+    assert series(run, "/estimator/de/generation")["best_cost"].tolist() == [1.0, 0.5, 1 / 3]
+    (population,) = run.messages(["/estimator/de/population"])
+    np.testing.assert_array_equal(unpack(population.payload)["cost"], [1, np.nan, 2, np.inf])
+    (estimate,) = run.messages(["/estimate/final"])
+    np.testing.assert_array_equal(estimate.payload["std"], [0.01, np.inf])
+    (verdict,) = run.messages(["/gap/verdict"])
+    assert orjson.loads(verdict.payload["answer"])["closure"]["closed_ci95"] == [0.99, 1.0]
+    np.testing.assert_array_equal(arrays(run)["covariance"], np.eye(2))
+
+
+def test_the_layout_shows_what_is_in_a_log() -> None:
+    layout = json.loads(LAYOUT.read_text())
+    fields: dict[str, set[str]] = {}
+    for message in read_run(FORMAT_1).messages():
+        fields.setdefault(message.topic, set()).update(orjson.loads(message.channel.schema_data)["properties"])
+    shown = list(_topic_paths(layout["configById"]))
+    assert len(shown) > 20
+    for path in shown:
+        topic, _, name = path.partition(".")
+        assert topic in fields and (not name or name in fields[topic]), path
+
+
+def test_the_layout_places_every_panel_once() -> None:
+    layout = json.loads(LAYOUT.read_text())
+    tabs = layout["configById"]["Tab!fdi"]["tabs"]
+    placed = re.findall(r'"(\w+!\w+)"', json.dumps([layout["layout"], *(tab["layout"] for tab in tabs)]))
+    assert sorted(placed) == sorted(layout["configById"])
+
+
+def _topic_paths(node: Any) -> Any:
+    """Every text that begins like a topic."""
+    if isinstance(node, dict):
+        node = list(node.values())
+    if isinstance(node, list):
+        for part in node:
+            yield from _topic_paths(part)
+    elif isinstance(node, str) and node.startswith("/"):
+        yield node
