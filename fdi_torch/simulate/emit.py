@@ -7,7 +7,7 @@ a step for all lanes; the rest stands in loops over lanes that a compiler turns 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 from fdi_torch.simulate.expression import Varies
@@ -107,12 +107,17 @@ class _Writer:
         moving = [o for o in section if o.row]
         if not moving:
             return []
-        lines = [f"        const real {d_name(o.place)} = {self._change(o, body)};" for o in moving]
+        here = {o.place for o in moving}
+        lines = [f"        const real {d_name(o.place)} = {self._change(o, body, here)};" for o in moving]
         lines += [f"        {d_store(o.place)} = {d_name(o.place)};" for o in moving if d_store(o.place)]
         return ["    for (int p = 0; p < COLUMNS; ++p) EACH_LANE {", *lines, "    }"]
 
-    def _change(self, output: Output, body: _Body) -> str:
-        terms = [product(body.text(slope), d_text(place)) for slope, place in output.row.terms]
+    def _change(self, output: Output, body: _Body, here: Collection[Place]) -> str:
+        """The row as a C expression. here: what is computed in the same loop; the rest is stored."""
+        terms = [
+            product(body.text(slope), d_name(place) if place in here else d_store(place))
+            for slope, place in output.row.terms
+        ]
         if output.row.theta:
             terms.append(f"b.row[{self.rows[output.place][0]}][p][l]")
         return " + ".join(terms)
@@ -255,10 +260,3 @@ def d_store(place: Place) -> str:
 
 def d_name(place: Place) -> str:
     return f"d_{place[0]}_{place[1]}"
-
-
-def d_text(place: Place) -> str:
-    """The change of an input: computed above in the same section, or stored."""
-    kind, i = place
-    local = kind.startswith("stage") or (kind.startswith("slope") and kind != "slope_right")
-    return d_name(place) if local else f"b.d_{kind}[p][{i}][l]"

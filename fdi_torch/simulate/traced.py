@@ -52,7 +52,9 @@ class TracedEngine:
 
     def _simulate(self, theta: Tensor, tangent: bool, levels: bool = False) -> tuple[Tensor, Tensor | None]:
         program = build_program(self.network, self.space.names, tangent)
-        run = _Run(program, self.network, self.experiment, theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1]))
+        run = _Run(
+            program, self.network, self.experiment, theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
+        )
         rows = [run.levels() if levels else run.read(s) for s in run.samples()]
         full = len(run.lanes)
         values = torch.stack([torch.stack([v.expand(full) for v, _ in row], dim=-1) for row in rows], dim=1)
