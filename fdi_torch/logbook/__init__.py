@@ -10,6 +10,7 @@ from fdi_torch.logbook.payload import unpack
 from fdi_torch.logbook.reader import Message, Run, read_run
 from fdi_torch.logbook.recover import Recovery, recover
 from fdi_torch.logbook.replay import Replay, replay
+from fdi_torch.logbook.resume import last_state, set_aside, unfinished
 from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, own_signals, series
 from fdi_torch.logbook.terminate import Terminated, exit_on_sigterm
 from fdi_torch.logbook.writer import RunLog
@@ -34,11 +35,14 @@ __all__ = [
     "export_attachment",
     "follow",
     "inspect_log",
+    "last_state",
     "mapped_signals",
     "own_signals",
     "read_run",
     "recover",
     "replay",
     "series",
+    "set_aside",
+    "unfinished",
     "unpack",
 ]

@@ -14,7 +14,7 @@ import orjson
 
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, plain
-from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, json_schema, topic_definition
+from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, Topic, json_schema, named_kinds, topic_definition
 
 Named = Mapping[str, Any]
 _RESERVED = ("t", NON_FINITE, WALL, "masked")
@@ -45,7 +45,10 @@ class Messages:
         about: Mapping[str, str] | None = None,
         wall: bool = False,
     ) -> None:
-        """One message. units: of named numbers; about: further metadata of the channel, heard at its first message."""
+        """One message. units: of named numbers; about: further metadata of the channel, heard at its first message.
+
+        A field of value None is left out. Raises ValueError for a time that is not finite and for names taken already.
+        """
         t = self._latest if t is None else float(t)
         message = plain({"t": t, **fields})
         if "t" not in message:
@@ -110,28 +113,34 @@ class Messages:
                     self.put(self._described[topic][1], t, self._next(topic), payload)
         self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
 
+    def follow_on(self, channel: Channel, sequence: int, t: float) -> None:
+        """Number and describe what comes as if the message (channel, sequence, t) had just been written."""
+        if self._described.get(channel.topic, (None, None))[1] != channel:
+            properties = orjson.loads(channel.schema_data)["properties"]
+            self._described[channel.topic] = (frozenset(properties), channel)
+        self._sequence[channel.topic] = sequence + 1
+        self._latest = max(self._latest, t)
+
     def sample(self, topic: str, t: float, values: Named, units: Mapping[str, str] | None = None) -> None:
         """One sample of a signal that arrives bit by bit, such as "/plant/output" or "/plant/truth"."""
         self.write(topic, values, t, units=units)
 
     def _channel(self, topic: str, fields: Named, message: Named, metadata: Mapping[str, str]) -> Channel:
         """The topic's channel; a new one where the message has fields that it does not describe."""
-        names, channel = self._described.get(topic, (frozenset(), None))
-        if channel is not None and names.issuperset(fields):
+        known, channel = self._described.get(topic, (frozenset(), None))
+        present = {name: message.get(name) for name, value in fields.items() if value is not None}
+        if channel is not None and known.issuperset(present):
             return channel
         definition = topic_definition(topic)
-        previous = dict(channel.metadata) if channel else {}
-        new = {name: _kind(message.get(name)) for name in fields if name not in definition.fields}
-        if new and not definition.named and not topic.endswith("/population"):
-            raise ValueError(f"{topic}: expected only {', '.join(definition.fields)}, got {', '.join(new)}")
-        named: dict[str, Kind] = dict.fromkeys(sorted(names - definition.fields.keys() - new.keys()), "number")
-        named.update(new)
+        named = named_kinds(definition, channel.schema_data) if channel else {}
+        named.update({name: _kind(value) for name, value in present.items() if name not in definition.fields})
+        _check_names(topic, definition, named)
         units = {f"unit.{name}": unit for name, (_, unit, _) in definition.fields.items() if unit}
+        previous = dict(channel.metadata) if channel else {}
         pairs = {"schema_version": FORMAT_VERSION, "unit.t": "s", **units, **previous, **metadata}
-        channel = Channel(
-            topic, "json", definition.schema, "jsonschema", json_schema(definition, named), tuple(pairs.items())
-        )
-        self._described[topic] = (names | frozenset(fields) | frozenset(definition.fields), channel)
+        schema = json_schema(definition, named)
+        channel = Channel(topic, "json", definition.schema, "jsonschema", schema, tuple(pairs.items()))
+        self._described[topic] = (frozenset({"t", *definition.fields, *named}), channel)
         return channel
 
     def _next(self, topic: str) -> int:
@@ -158,9 +167,8 @@ def units_of(units: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def _row(keys: Sequence[str], row: Sequence[float], uncounted: np.ndarray) -> dict[str, Any]:
-    masked = (
-        [name for name, hidden in zip(keys[1:], uncounted.ravel(), strict=True) if hidden] if uncounted.size else []
-    )
+    hidden = zip(keys[1:], uncounted.ravel(), strict=True) if uncounted.size else ()
+    masked = [name for name, is_hidden in hidden if is_hidden]
     return plain({**dict(zip(keys, row, strict=True)), "masked": masked or None})
 
 
@@ -172,11 +180,19 @@ def _check_signal(topic: str, values: np.ndarray, names: Sequence[str], samples:
             raise ValueError(f"{topic}: expected a name other than {', '.join(_RESERVED)}, got {name}; rename it")
 
 
+def _check_names(topic: str, definition: Topic, named: Mapping[str, Kind]) -> None:
+    if named and not definition.named:
+        raise ValueError(f"{topic}: expected only {', '.join(definition.fields)}, got {', '.join(named)}")
+    for name in named:
+        if name in (NON_FINITE, WALL):
+            raise ValueError(f"{topic}: expected a name other than {NON_FINITE} and {WALL}, got {name}; rename it")
+
+
 def _kind(value: Any) -> Kind:
-    """JSON kind of a plain value; a number that was left out as non-finite is a number."""
+    """JSON kind of a plain value; None stands for a number that was left out as non-finite."""
     if isinstance(value, list):
         first = value[0] if value else 0.0
         return "texts" if isinstance(first, str) else "integers" if type(first) is int else "numbers"
     if isinstance(value, bool):
         return "boolean"
-    return "text" if isinstance(value, str) else "integer" if isinstance(value, int) else "number"
+    return "text" if isinstance(value, str) else "number"

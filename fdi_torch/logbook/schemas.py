@@ -84,6 +84,7 @@ TOPICS: dict[str, Topic] = {
         "fdi_torch.population",
         "state of the search: arrays as base64 of little-endian bytes, each with *_shape and *_dtype",
         {**_EVENT, "generation": ("integer", "", "0 is the first population")},
+        named=True,
     ),
     "/estimator/refine/iteration": Topic(
         "fdi_torch.refine_iteration",
@@ -217,6 +218,14 @@ def json_schema(definition: Topic, named: Mapping[str, Kind]) -> bytes:
         "required": ["t"],
     }
     return orjson.dumps(schema)
+
+
+def named_kinds(definition: Topic, schema: bytes) -> dict[str, Kind]:
+    """Fields that a topic's schema has beyond the topic's own, and their kinds: what `json_schema` was given."""
+    own = {"t", "non_finite", "wall", *definition.fields}
+    kinds = {orjson.dumps(told): kind for kind, told in _JSON.items()}
+    properties = orjson.loads(schema)["properties"]
+    return {name: kinds[orjson.dumps(part)] for name, part in properties.items() if name not in own}
 
 
 def viewer_problems(schema: Any, place: str = "schema") -> list[str]:

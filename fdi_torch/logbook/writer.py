@@ -13,7 +13,7 @@ import io
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -28,6 +28,7 @@ from fdi_torch.logbook.copying import copy_log
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.payload import as_array, plain
 from fdi_torch.logbook.provenance import environment, git_state
+from fdi_torch.logbook.reader import Message
 from fdi_torch.logbook.schemas import FORMAT_VERSION
 from fdi_torch.logbook.sink import Sink, log_time_of
 from fdi_torch.logbook.terminate import Terminated
@@ -149,6 +150,19 @@ class RunLog(Topics):
         with self._lock:
             self._open_sink().message(channel, log_time, log_time, sequence, payload)
             self._note_progress(waiting=True)
+
+    def carry_over(self, messages: Iterable[Message]) -> int:
+        """Messages of an earlier log of the same run, as they were; what is logged next follows them. Their number."""
+        count = 0
+        for message in messages:
+            self.follow_on(message.channel, message.sequence, message.t)
+            with self._lock:
+                self._open_sink().message(
+                    message.channel, message.log_time, message.publish_time, message.sequence, message.data
+                )
+                self._note_progress(waiting=True)
+            count += 1
+        return count
 
     def wall(self) -> dict[str, int]:
         """Wall time for a message's field `wall`."""

@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import orjson
 import pytest
 from example_logs import FIXED, FROZEN, VERDICT, write_everything, write_finished
 from mcap.reader import make_reader
@@ -93,19 +94,26 @@ def test_wall_time_stands_only_where_it_is_asked_for(tmp_path: Path) -> None:
 
 
 def test_the_whole_verdict_is_kept(finished: Path) -> None:
-    import orjson
-
     (message,) = read_run(finished).messages(["/gap/verdict"])
     payload = message.payload
     assert orjson.loads(payload["answer"]) == VERDICT
     assert payload["causes"] == ["pump_lag@Q1"] and payload["closed"] == 0.998
 
 
+def test_the_kind_of_a_field_outlives_further_fields(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "a.mcap", "monitor", **FIXED) as log:
+        log.alarm(0.0, "raised", "h1", cause="leak", sizes=[1.0], sure=True, count=2)
+        log.alarm(0.0, "raised", "h1", size=float("nan"))
+    schema = orjson.loads(list(read_run(tmp_path / "a.mcap").messages())[1].channel.schema_data)["properties"]
+    kinds = {name: schema[name]["type"] for name in ("cause", "sizes", "sure", "count", "size")}
+    assert kinds == {"cause": "string", "sizes": "array", "sure": "boolean", "count": "number", "size": "number"}
+
+
 def test_further_fields_get_a_described_channel(tmp_path: Path) -> None:
     with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
         log.residual(0.0, {"h1": 1.0})
         log.residual(1.0, {"h1": 1.0}, {"h1": 2.0})
-        log.residual(2.0, {"h1": 1.0})
+        log.residual(2.0, {"h1": 1.0, "absent": None})
     channels = [message.channel for message in read_run(tmp_path / "a.mcap").messages()]
     assert b"h1_statistic" not in channels[0].schema_data
     assert b"h1_statistic" in channels[1].schema_data
@@ -157,6 +165,9 @@ def test_misuse_is_told(tmp_path: Path) -> None:
             log.samples("/plant/output", np.arange(2.0), np.zeros((2, 1)), ["t"], ["m"])
         with pytest.raises(ValueError, match="expected finite times"):
             log.samples("/plant/output", np.array([0.0, np.nan]), np.zeros((2, 1)), ["h1"], ["m"])
+        for name in ("wall", "non_finite"):
+            with pytest.raises(ValueError, match=f"expected a name other than non_finite and wall, got {name}"):
+                log.trial(0, {name: 1.0})
         with pytest.raises(ValueError, match="/log: expected only timestamp"):
             log.write("/log", {"shout": 1.0})
 
@@ -350,3 +361,21 @@ def test_a_million_samples_in_little_memory_and_few_bytes(tmp_path: Path) -> Non
     with RunLog(tmp_path / "a.mcap", "simulate", **FIXED) as log:
         log.recording(time_s, inputs, outputs, ["a", "b"], ["x", "y", "z"], ["1"] * 2, ["m"] * 3)
     assert (tmp_path / "a.mcap").stat().st_size / (2 * samples) < 80
+
+
+def test_without_room_to_join_the_chunks_the_log_still_gets_its_name(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap.partial.joined").write_bytes(b"in the way")
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
+        log.say("first")
+        log.flush()
+        log.say("second")
+    run = read_run(tmp_path / "a.mcap")
+    assert run.complete and [message.payload["message"] for message in run.messages()] == ["first", "second"]
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_a_log_whose_name_was_taken_meanwhile_is_kept_under_its_partial_name(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="it is a folder"), RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
+        log.say("hello")
+        (tmp_path / "a.mcap").mkdir()
+    assert read_run(tmp_path / "a.mcap.partial").complete
