@@ -255,3 +255,23 @@ def _channels(table: np.ndarray, positions: list[int], bounds: Sequence[_Bound])
         channels[:, i] = source * np.float64(bound.factor)
     channels[~np.isfinite(channels)] = np.nan
     return channels
+
+
+def write_csv(recording: Recording, path: Path) -> Path:
+    """The recording as CSV whose headers need no mapping: t_s, Q1_cm3_s, h1_cm ... Masked readings are left empty."""
+    units = [_FILE_UNITS.get(unit, unit) for unit in (*recording.input_units, *recording.output_units)]
+    names = (*recording.input_names, *recording.output_names)
+    si_units = (*recording.input_units, *recording.output_units)
+    factors = [unit_factor(si, unit) for si, unit in zip(si_units, units, strict=True)]
+    readings = torch.where(recording.mask, recording.outputs, torch.nan)
+    table = torch.cat([recording.inputs, readings], dim=1).numpy() * np.asarray(factors)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8", newline="") as handle:
+        handle.write(",".join(["t_s", *(f"{n}_{u}" for n, u in zip(names, units, strict=True))]) + "\n")
+        for t, row in zip(recording.time.tolist(), table, strict=True):
+            cells = ("" if np.isnan(value) else f"{value:.12g}" for value in row.tolist())
+            handle.write(f"{t:.12g}," + ",".join(cells) + "\n")
+    return path
+
+
+_FILE_UNITS = {"m": "cm", "m^3/s": "cm3_s", "1": "pct"}

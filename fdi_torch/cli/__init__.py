@@ -18,6 +18,8 @@ from typing import NoReturn
 DONE, MISUSE, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 130
 
 COMMANDS = {
+    "train": "estimate the faults in a recording, and log how",
+    "simulate": "write a recording from a plant, inputs, faults and noise",
     "check": "examine a plant and a recording before any fit",
 }
 

@@ -158,9 +158,9 @@ class TankNetwork(nn.Module):
         for placement in self.placements:
             if placement.effect.stage is Stage.BALANCE:
                 self._move_by_effect(net, placement, levels, clock, values)
-        for tank, level in zip(self.description.tanks, levels, strict=True):
+        for tank, level, inflow in zip(self.description.tanks, levels, tuple(net), strict=True):
             own = values[tank.name]
-            spill = weir_flow(level - own["height"], own["area"], values[""]["gravity"], clock.resolution)
+            spill = weir_flow(level - own["height"], inflow, own["area"], values[""]["gravity"], clock.resolution)
             self._move(net, tank.name, tank.overflow_to, spill)
         return net
 

@@ -1,0 +1,29 @@
+"""Write the recording that `simulate:` of a run file describes: plant, inputs, faults and noise, as CSV with units."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from fdi_torch.cli.options import add_config, add_run, overrides
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.run import load_run
+from fdi_torch.recording_csv import write_csv
+from fdi_torch.train import free_path, simulate
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_config(parser)
+    add_run(parser)
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    job = load_run(arguments.config, overrides(arguments))
+    with screen.progress(job.name) as advance:
+        advance(0.0, "integrating")
+        recording = simulate(job)
+        path = write_csv(recording, free_path(Path(job.config.output.folder), job.name, "csv"))
+        advance(1.0, "done")
+    screen.say(f"{len(recording)} samples, {float(recording.time[-1]):g} s: {path}")
+    screen.result({"format": "fdi_torch.simulate/1", "recording": str(path), "samples": len(recording)})
+    return 0

@@ -1,0 +1,158 @@
+"""What is to be fitted: a plant, its recordings and the parameters in question, as problems at any step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import build_network, placements_for
+from fdi_torch.estimate.objectives import Objective, Problem, Term
+from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.plant.description import PlantDescription, Tank
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.choose import make_engine
+from fdi_torch.simulate.engine import Engine, Readings
+from fdi_torch.simulate.equilibrium import equilibrium
+from fdi_torch.simulate.experiment import lay_out
+
+StartLevel = Literal["equilibrium", "free"] | float
+StartLevels = StartLevel | Mapping[str, StartLevel]
+EngineKind = Literal["auto", "reference", "compiled"]
+
+# A start level that is estimated is searched this share of its tank's height about the first readings.
+START_SEARCH_SHARE = 0.05
+FIRST_READINGS = 5
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """One set of parameters common to several recordings, beside the start levels of each.
+
+    space: all that is estimated, common ones first; the start levels of recording k > 0 bear a suffix '@k'.
+    networks, own_spaces: the plant of each recording with its nominal start levels, and what is estimated there.
+    columns: which columns of theta each recording takes.
+    """
+
+    space: ParameterSpace
+    recordings: tuple[Recording, ...]
+    networks: tuple[TankNetwork, ...]
+    own_spaces: tuple[ParameterSpace, ...]
+    columns: tuple[Tensor, ...]
+    engine: EngineKind = "auto"
+
+    @property
+    def plant(self) -> PlantDescription:
+        return self.networks[0].description
+
+    def engines(self, step: float) -> list[Engine]:
+        """An engine for each recording, in steps no longer than `step` s."""
+        return [
+            make_engine(network, own, lay_out(recording, self.plant.channels(), step), self.engine)
+            for network, own, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True)
+        ]
+
+    def problem(self, step: float, objective: Objective = "likelihood", noise_std: Tensor | None = None) -> Problem:
+        terms = [
+            Term(engine, readings_of(recording, self.plant), columns)
+            for engine, recording, columns in zip(self.engines(step), self.recordings, self.columns, strict=True)
+        ]
+        return Problem(self.space, terms, objective, noise_std)
+
+
+def set_up(
+    plant: PlantDescription,
+    recordings: Sequence[Recording],
+    parameters: Iterable[str | Parameter],
+    start: StartLevels | Sequence[StartLevels] = "free",
+    engine: EngineKind = "auto",
+) -> Fitting:
+    """The fitting of `parameters` ('T1.leak.size', or a Parameter with its own range) to recordings.
+
+    start: 'equilibrium' (the plant file's level, or rest under the first inputs), 'free' (estimated) or a level in m,
+    for all tanks or by tank, and for all recordings or one for each.
+    Raises ValueError for an unknown parameter or a channel that is not recorded.
+    """
+    wanted = list(parameters)
+    names = [p if isinstance(p, str) else p.name for p in wanted]
+    placements = placements_for(names)
+    reference = build_network(plant, placements)
+    common = [reference.constants[p] if isinstance(p, str) else p for p in wanted]
+    networks, own_spaces, columns, joint = [], [], [], list(common)
+    starts = start if isinstance(start, Sequence) and not isinstance(start, str) else [start] * len(recordings)
+    for k, (recording, chosen) in enumerate(zip(recordings, starts, strict=True)):
+        levels, free = start_levels(plant, reference, recording, chosen)
+        tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(plant.tanks, levels, strict=True))
+        networks.append(build_network(replace(plant, tanks=tanks), placements))
+        own_spaces.append(ParameterSpace([*common, *free]))
+        columns.append(torch.tensor([*range(len(common)), *range(len(joint), len(joint) + len(free))]))
+        joint += [replace(p, name=p.name if k == 0 else f"{p.name}@{k}") for p in free]
+    return Fitting(
+        ParameterSpace(joint), tuple(recordings), tuple(networks), tuple(own_spaces), tuple(columns), engine
+    )
+
+
+def start_levels(
+    plant: PlantDescription, network: TankNetwork, recording: Recording, wanted: StartLevels
+) -> tuple[Tensor, list[Parameter]]:
+    """Start levels (tanks,) in m, and those of them that are to be estimated, with the range to search."""
+    by_tank = wanted if isinstance(wanted, Mapping) else {tank.name: wanted for tank in plant.tanks}
+    unknown = set(by_tank) - {tank.name for tank in plant.tanks}
+    if unknown:
+        raise ValueError(f"start levels: expected tanks of plant {plant.name}, got {', '.join(sorted(unknown))}")
+    rest = None
+    levels, free = [], []
+    for i, tank in enumerate(plant.tanks):
+        choice = by_tank.get(tank.name, "free")
+        if choice == "free":
+            parameter = _free_start(plant, tank, recording)
+            levels.append(parameter.nominal)
+            free.append(parameter)
+        elif choice == "equilibrium" and tank.start_level is None:
+            if rest is None:
+                rest = equilibrium(network, _first_inputs(plant, recording))
+            levels.append(float(rest[i]))
+        else:
+            levels.append(float(tank.start_level or 0.0) if isinstance(choice, str) else choice)
+    return torch.tensor(levels, dtype=torch.float64), free
+
+
+def _first_inputs(plant: PlantDescription, recording: Recording) -> Tensor:
+    columns = [recording.input_names.index(c) for c in plant.channels() if c in recording.input_names]
+    return recording.inputs[0, columns]
+
+
+def _free_start(plant: PlantDescription, tank: Tank, recording: Recording) -> Parameter:
+    seen = first_level(plant, tank.name, recording)
+    level = min(max(0.5 * tank.height if seen is None else seen, 0.0), tank.height)
+    reach = tank.height if seen is None else START_SEARCH_SHARE * tank.height
+    low, high = max(0.0, level - reach), min(tank.height, level + reach)
+    return Parameter(f"{tank.name}.start_level", "m", level, low, high, meaning=f"level of {tank.name} at t = 0")
+
+
+def first_level(plant: PlantDescription, tank: str, recording: Recording) -> float | None:
+    """The level that the first few readings of a tank's sensor show, m; None where no sensor sees it."""
+    for sensor in plant.sensors:
+        if sensor.tank == tank and sensor.column in recording.output_names:
+            column = recording.output_names.index(sensor.column)
+            valid = recording.outputs[:, column][recording.mask[:, column]][:FIRST_READINGS]
+            if len(valid):
+                return (float(valid.median()) - sensor.offset) / sensor.gain
+    return None
+
+
+def readings_of(recording: Recording, plant: PlantDescription) -> Readings:
+    """The recording's outputs in the order of the plant's sensors, with weight 0 where masked."""
+    columns = []
+    for sensor in plant.sensors:
+        if sensor.column not in recording.output_names:
+            known = ", ".join(recording.output_names) or "none"
+            raise ValueError(f"{recording.source}: expected readings of sensor '{sensor.column}', got {known}")
+        columns.append(recording.output_names.index(sensor.column))
+    mask = recording.mask[:, columns]
+    values = torch.where(mask, recording.outputs[:, columns], torch.zeros_like(recording.outputs[:, columns]))
+    return Readings(values, mask.to(values.dtype))

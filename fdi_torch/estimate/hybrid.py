@@ -1,0 +1,225 @@
+"""The pipeline: a global search on coarse steps, refinement on fine ones, standard errors converged in the step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.diagnosis import Diagnosis, diagnose, sample_noise
+from fdi_torch.estimate.evolution import EvolutionResult, EvolutionSettings, Search, evolve
+from fdi_torch.estimate.fitting import Fitting, readings_of
+from fdi_torch.estimate.objectives import Objective, Problem
+from fdi_torch.estimate.refine import Progress, RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.refined import Refined
+from fdi_torch.estimate.uncertainty import Estimate, make_estimate
+from fdi_torch.simulate.steps import choose_step, probe_points
+
+# Finer steps than this change no standard error that a recording could support.
+FINEST_STEP = 0.01
+
+
+@dataclass(frozen=True)
+class HybridSettings:
+    """How to estimate.
+
+    objectives: the one searched on and the one refined on. steps in s; None: chosen by measured error.
+    search_tolerance, refine_tolerance: that error, as a share of a channel's spread over the box of parameters.
+    starts: how many of the search's best, mutually distant members are refined. std_tolerance: standard errors change
+    by less than this share when the step is halved.
+    """
+
+    objectives: tuple[Objective, Objective] = ("correlation", "likelihood")
+    search: EvolutionSettings = field(default_factory=EvolutionSettings)
+    method: str = "lm"
+    refine: RefineSettings = field(default_factory=RefineSettings)
+    search_step: float | None = None
+    refine_step: float | None = None
+    search_tolerance: float = 3e-3
+    refine_tolerance: float = 1e-5
+    starts: int = 3
+    std_tolerance: float = 5e-3
+    confidence: float = 0.95
+
+
+@dataclass(frozen=True)
+class HybridResult:
+    """The estimate and how it was reached. predicted: readings (S, C) of each recording at the estimate, SI."""
+
+    estimate: Estimate
+    diagnosis: Diagnosis
+    search: EvolutionResult
+    refinement: Refined
+    correlation: Tensor
+    predicted: tuple[Tensor, ...]
+    steps: tuple[float, float]
+    engine: str
+
+
+def estimate(
+    fitting: Fitting,
+    settings: HybridSettings | None = None,
+    seed: int = 0,
+    on_generation: Callable[[Search], None] | None = None,
+    on_iteration: Callable[[Progress], None] | None = None,
+) -> HybridResult:
+    """Which parameters explain the recordings best, and how surely. Repeats bit for bit for a seed."""
+    settings = settings or HybridSettings()
+    low, high = search_box(fitting)
+    coarse, fine = pick_steps(fitting, settings, low, high)
+    found = search(fitting.problem(coarse, settings.objectives[0]), low, high, settings, seed, on_generation)
+    starts = distant_members(found, low, high, settings.starts)
+    refinement, fine = refine_to_convergence(fitting, settings, starts, low, high, fine, on_iteration)
+    return conclude(fitting, settings, found, refinement, (coarse, fine))
+
+
+def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
+    """low, high (P,): the parameters' ranges, or four standard deviations of a prior where that is tighter."""
+    space = fitting.space
+    nominal, reach = space.nominal(), 4.0 * space.std()
+    low, high = torch.maximum(space.low(), nominal - reach), torch.minimum(space.high(), nominal + reach)
+    for p, a, b in zip(space, low.tolist(), high.tolist(), strict=True):
+        if not (torch.isfinite(torch.tensor([a, b])).all() and a < b):
+            raise ValueError(f"{p.name}: expected a finite range to search, got [{a:g}, {b:g}] {p.unit}; give low and high")
+    return low, high
+
+
+def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Tensor) -> tuple[float, float]:
+    """The steps of search and refinement: those asked for, or the longest whose error over the box is small enough."""
+    points = probe_points(low, high)
+    spans = [float(r.time[-1] - r.time[0]) for r in fitting.recordings]
+    longest = max(min(spans) / 20.0, 1e-6)
+    shortest = min(range(len(spans)), key=spans.__getitem__)
+
+    def engine_at(step: float):  # type: ignore[no-untyped-def]
+        own = fitting.engines(step)
+        return own[shortest]
+
+    columns = fitting.columns[shortest]
+    own_points = points[:, columns]
+    coarse = settings.search_step
+    readings = engine_at(min(longest, 5.0)).readings(own_points)
+    spread = readings.flatten(0, 1).std(dim=0).clamp(min=1e-12)
+    if coarse is None:
+        coarse = choose_step(engine_at, own_points, settings.search_tolerance * spread, longest, quantile=0.9)
+    fine = settings.refine_step
+    if fine is None:
+        fine = choose_step(engine_at, own_points, settings.refine_tolerance * spread, coarse, quantile=0.9)
+    return coarse, fine
+
+
+def search(
+    problem: Problem,
+    low: Tensor,
+    high: Tensor,
+    settings: HybridSettings,
+    seed: int,
+    on_generation: Callable[[Search], None] | None,
+) -> EvolutionResult:
+    return evolve(
+        problem.cost, low.unsqueeze(0), high.unsqueeze(0), settings.search, seeds=seed, on_generation=on_generation
+    )
+
+
+def distant_members(found: EvolutionResult, low: Tensor, high: Tensor, count: int) -> Tensor:
+    """The best member, and further ones (K, P) that are a twentieth of the box away from every better one taken."""
+    population = found.population[0]
+    members = population[torch.isfinite(found.cost[0]) & torch.isfinite(population).all(-1)]
+    taken = [found.best[0]]
+    for member in members:
+        if len(taken) == count:
+            break
+        apart = [float(((member - t) / (high - low)).abs().max()) > 0.05 for t in taken]
+        if all(apart):
+            taken.append(member)
+    return torch.stack(taken)
+
+
+def refine_to_convergence(
+    fitting: Fitting,
+    settings: HybridSettings,
+    starts: Tensor,
+    low: Tensor,
+    high: Tensor,
+    step: float,
+    on_iteration: Callable[[Progress], None] | None,
+) -> tuple[Refined, float]:
+    """Refines from every start, takes the best, and halves the step until standard errors and values stand still."""
+
+    def run(theta: Tensor, at: float) -> Refined:
+        linearise = fitting.problem(at, settings.objectives[1]).linearise
+        return best_of(levenberg_marquardt(linearise, theta, low, high, settings.refine, on_iteration))
+
+    refinement = run(starts, step)
+    while settings.refine_step is None and step > 2.0 * FINEST_STEP:
+        finer = run(refinement.theta, 0.5 * step)
+        coarse_std = information_std(fitting.problem(step, "likelihood"), refinement.theta)
+        fine_std = information_std(fitting.problem(0.5 * step, "likelihood"), finer.theta)
+        known = torch.isfinite(coarse_std) & torch.isfinite(fine_std)
+        change = ((fine_std - coarse_std).abs() / fine_std)[known]
+        move = ((finer.theta - refinement.theta).abs()[0] / fine_std)[known]
+        refinement, step = finer, 0.5 * step
+        if not bool((change > settings.std_tolerance).any() or (move > 0.05).any()):
+            break
+    return refinement, step
+
+
+def best_of(refined: Refined) -> Refined:
+    """The member (1, P) of lowest cost of a flat batch; a cost that is no number never wins."""
+    cost = torch.where(torch.isfinite(refined.cost), refined.cost, torch.inf)
+    best = cost.argmin().reshape(1)
+    return Refined(**{name: None if v is None else v[best] for name, v in vars(refined).items()})  # type: ignore[arg-type]
+
+
+def information_std(problem: Problem, theta: Tensor) -> Tensor:
+    """Standard errors (P,) from the curvature at theta (1, P); infinite where nothing determines a parameter."""
+    curvature = problem.linearise(theta, torch.zeros(1, dtype=torch.int64)).curvature[0]
+    return make_estimate(problem.space, theta[0], curvature).std
+
+
+def conclude(
+    fitting: Fitting,
+    settings: HybridSettings,
+    found: EvolutionResult,
+    refinement: Refined,
+    steps: tuple[float, float],
+) -> HybridResult:
+    """Estimate, diagnosis and goodness of fit at the refined optimum."""
+    theta = refinement.theta
+    lanes = torch.zeros(1, dtype=torch.int64)
+    problem = fitting.problem(steps[1], "likelihood")
+    noise = problem.noise(theta, lanes)
+    curvature = problem.linearise(theta, lanes).curvature[0]
+    predicted, ratios = [], []
+    for term, recording, level in zip(problem.terms, fitting.recordings, noise, strict=True):
+        predicted.append(term.engine.readings(term.theta(theta))[0])
+        data = readings_of(recording, fitting.plant)
+        own = sample_noise(data.values, data.weight)
+        ratios.append(float((level[0] / own.clamp(min=1e-12)).max()))
+    result = make_estimate(
+        fitting.space,
+        theta[0],
+        curvature,
+        status=refinement.statuses()[0],
+        noise_std=noise[0][0],
+        reached={"search": found.reasons()[0], "refinement": refinement.statuses()[0], "steps_s": list(steps)},
+    )
+    first = problem.terms[0]
+    levels = first.engine.levels(first.theta(theta))[0].mean(dim=0)
+    channels = [fitting.recordings[0].input_names.index(c) for c in fitting.plant.channels()]
+    means = fitting.recordings[0].inputs[:, channels].mean(dim=0)
+    diagnosis = diagnose(
+        fitting.networks[0], fitting.space, theta[0], result.std, levels, means, max(ratios), settings.confidence
+    )
+    return HybridResult(
+        estimate=result,
+        diagnosis=diagnosis,
+        search=found,
+        refinement=refinement,
+        correlation=fitting.problem(steps[1], "likelihood").correlations(theta.unsqueeze(1), lanes)[0, 0],
+        predicted=tuple(predicted),
+        steps=steps,
+        engine=problem.terms[0].engine.name,
+    )

@@ -1,0 +1,55 @@
+"""Simulated recordings: a plant run tightly under planned inputs, and read with noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.effect import Stage
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.integrate import ReferenceEngine
+
+# Roots and rims are drawn as for steps of a hundredth of a second: far sharper than any estimator's.
+RESOLUTION = 0.01
+LONGEST_STEP = 1.0
+TOLERANCE = 1e-10  # relative; a hundredth of it in m
+
+
+def clean_readings(network: TankNetwork, planned: Recording, values: Mapping[str, float]) -> Tensor:
+    """Noise-free readings (T, N) with some constants changed by name, by an adaptive solver at 1e-10."""
+    space = ParameterSpace(network.constants[name] for name in values)
+    theta = torch.tensor([[float(value) for value in values.values()]], dtype=planned.time.dtype)
+    experiment = lay_out(planned, network.description.channels(), LONGEST_STEP)
+    sharp = replace(experiment, resolution=theta.new_tensor(RESOLUTION))
+    engine = ReferenceEngine(network, space, sharp, method="dopri5", rtol=TOLERANCE, atol=0.01 * TOLERANCE)
+    return engine.readings(theta)[0]
+
+
+def with_noise(
+    planned: Recording, clean: Tensor, std: Tensor, generator: torch.Generator, network: TankNetwork
+) -> Recording:
+    """The recording that sensors with white noise of standard deviation std (N,) make of clean readings (T, N).
+
+    A sensor that rounds does so after the noise, in steps of its nominal size.
+    """
+    noise = torch.randn(clean.shape, generator=generator, dtype=clean.dtype) * std
+    return replace(planned, outputs=rounded(clean + noise, network), mask=torch.isfinite(clean), source="simulated")
+
+
+def rounded(readings: Tensor, network: TankNetwork) -> Tensor:
+    """Readings (T, N) in the steps that the plant's rounding sensors have."""
+    values = network.bind(ParameterSpace(), readings.new_zeros(0))
+    columns = list(readings.unbind(-1))
+    for placement in network.placements:
+        if placement.effect.stage is Stage.READING and placement.effect.rounds:
+            i = [sensor.name for sensor in network.description.sensors].index(placement.location)
+            width = placement.effect.resolution(values[placement.prefix])
+            if float(width) > 0.0:
+                columns[i] = torch.round(columns[i] / width) * width
+    return torch.stack(columns, dim=-1)

@@ -1,0 +1,38 @@
+"""How long a step may be: chosen by measured error, not by the sampling time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from fdi_torch.simulate.engine import Engine
+
+LADDER = (20.0, 10.0, 5.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
+PROBES = 64
+
+
+def probe_points(low: Tensor, high: Tensor, count: int = PROBES) -> Tensor:
+    """Points (count, P) spread evenly over a box (P,) by a scrambled Sobol sequence of fixed seed."""
+    if low.numel() == 0:
+        return low.new_zeros(1, 0)
+    unit = torch.quasirandom.SobolEngine(low.numel(), scramble=True, seed=0).draw(count, dtype=torch.float64)
+    return low + (high - low) * unit.to(low)
+
+
+def choose_step(
+    engine_at: Callable[[float], Engine], points: Tensor, tolerance: Tensor, longest: float, quantile: float = 1.0
+) -> float:
+    """The longest step (s) of the ladder at which readings of `points` (N, P) are right to `tolerance` (C,).
+
+    Right: they differ from those at a quarter of the step by no more, at that quantile of the points. The step is
+    never longer than `longest`; the shortest of the ladder is returned where none suffices.
+    """
+    ladder = [step for step in LADDER if step <= longest] or [longest]
+    for step in ladder[:-1]:
+        error = (engine_at(step).readings(points) - engine_at(step / 4.0).readings(points)).abs().amax(dim=1)
+        worst = torch.nan_to_num(error / tolerance, nan=torch.inf).amax(dim=1)
+        if float(worst.quantile(quantile)) <= 1.0:
+            return step
+    return ladder[-1]
