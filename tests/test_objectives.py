@@ -45,7 +45,9 @@ def space(std: float = float("inf")) -> ParameterSpace:
     return ParameterSpace([Parameter("a", "1", 1.0, 0.0, 3.0, std), Parameter("b", "1", 0.5, 0.0, 3.0)])
 
 
-def problem(objective: str, noise: float = 0.02, std: float = float("inf"), known: bool = False, samples: int = 40) -> Problem:
+def problem(
+    objective: str, noise: float = 0.02, std: float = float("inf"), known: bool = False, samples: int = 40
+) -> Problem:
     engine = Decay(samples)
     generator = torch.Generator().manual_seed(0)
     values = engine.readings(torch.tensor([1.3, 0.8], dtype=torch.float64))

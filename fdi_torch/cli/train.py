@@ -13,7 +13,7 @@ from fdi_torch.cli.options import add_config, add_run, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.run import load_run
 from fdi_torch.parameters import display_unit
-from fdi_torch.train import TrainResult, train
+from fdi_torch.main_job import TrainResult, train
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -53,11 +53,10 @@ class Overflow(Effect):
 
     def inflow(self, local: Local, p: Values) -> Tensor:
         over_rim = local.level - local.height
-        notch = self._weir(over_rim + p["below_rim"], local) - self._weir(over_rim, local)
-        return -p["crest"] * notch
+        return self._weir(over_rim, local, p["crest"]) - self._weir(over_rim + p["below_rim"], local, p["crest"])
 
     def caught(self, p: Values) -> Mapping[str, Tensor]:
         return {name.removeprefix("to_"): share for name, share in p.items() if name.startswith("to_")}
 
-    def _weir(self, above: Tensor, local: Local) -> Tensor:
-        return weir_flow(above, local.constants["area"], local.gravity, local.clock.resolution)
+    def _weir(self, above: Tensor, local: Local, crest: Tensor) -> Tensor:
+        return weir_flow(above, 0.0, local.constants["area"], local.gravity, local.clock.resolution, crest)

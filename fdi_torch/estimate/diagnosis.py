@@ -1,5 +1,4 @@
-"""From an estimate to words: which faults are present, how large as a flow and as a hole, and whether the model explains
-the recording at all."""
+"""From an estimate to words: which faults are present, how large, and whether the model explains the recording."""
 
 from __future__ import annotations
 
@@ -115,9 +114,7 @@ def fault_flow(
     theta = value[own]
     without = theta.clone()
     without[own.index(which)] = space.parameters[which].nominal
-    volumes = [
-        torch.stack(_inflows(network, part, candidate, levels, channels)) for candidate in (theta, without)
-    ]
+    volumes = [torch.stack(_inflows(network, part, candidate, levels, channels)) for candidate in (theta, without)]
     change = (volumes[0] - volumes[1]).abs()
     flow = float(change.max())
     head = float(levels[int(change.argmax())])

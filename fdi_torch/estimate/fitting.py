@@ -91,9 +91,7 @@ def set_up(
         own_spaces.append(ParameterSpace([*common, *free]))
         columns.append(torch.tensor([*range(len(common)), *range(len(joint), len(joint) + len(free))]))
         joint += [replace(p, name=p.name if k == 0 else f"{p.name}@{k}") for p in free]
-    return Fitting(
-        ParameterSpace(joint), tuple(recordings), tuple(networks), tuple(own_spaces), tuple(columns), engine
-    )
+    return Fitting(ParameterSpace(joint), tuple(recordings), tuple(networks), tuple(own_spaces), tuple(columns), engine)
 
 
 def start_levels(

@@ -82,7 +82,9 @@ def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
     low, high = torch.maximum(space.low(), nominal - reach), torch.minimum(space.high(), nominal + reach)
     for p, a, b in zip(space, low.tolist(), high.tolist(), strict=True):
         if not (torch.isfinite(torch.tensor([a, b])).all() and a < b):
-            raise ValueError(f"{p.name}: expected a finite range to search, got [{a:g}, {b:g}] {p.unit}; give low and high")
+            raise ValueError(
+                f"{p.name}: expected a finite range to search, got [{a:g}, {b:g}] {p.unit}; give low and high"
+            )
     return low, high
 
 

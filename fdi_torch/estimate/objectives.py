@@ -171,7 +171,7 @@ def correlation_loss(sums: Tensor, data: Readings) -> Tensor:
 
 
 def correlation_expansion(gram: Tensor, data: Readings) -> Linearisation:
-    """Gauss-Newton expansion of the sum of 1 - rho = |z - f|^2 / 2, z and f the readings and predictions at unit norm."""
+    """Gauss-Newton expansion of the sum of 1 - rho = |z - f|^2 / 2; z, f: readings and predictions at unit norm."""
     count = data.weight.sum(-2).expand(gram.shape[:-2])
     centred = gram - gram[..., :, -1:] * gram[..., -1:, :] / count[..., None, None]
     jj, jr, jy = centred[..., :-3, :-3], centred[..., :-3, -3], centred[..., :-3, -2]

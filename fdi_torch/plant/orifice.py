@@ -37,8 +37,15 @@ def orifice_capacity(discharge_coefficient: Tensor, area: Tensor, gravity: Tenso
     return discharge_coefficient * area * torch.sqrt(2.0 * gravity)
 
 
-def weir_flow(excess: Tensor, inflow: Tensor, tank_area: Tensor, gravity: Tensor, resolution: Tensor) -> Tensor:
-    """What runs over the rim of a round tank at `excess` m above it while `inflow` m^3/s comes in, m^3/s.
+def weir_flow(
+    excess: Tensor,
+    inflow: Tensor | float,
+    tank_area: Tensor,
+    gravity: Tensor,
+    resolution: Tensor,
+    share: Tensor | float = 1.0,
+) -> Tensor:
+    """What runs over a `share` of the rim of a round tank at `excess` m above it while `inflow` m^3/s comes in, m^3/s.
 
     Sharp-crested weir as long as the rim: w(x) = (2/3) C sqrt(2 g) 2 sqrt(pi A) x^(3/2). It is far faster than the
     tank: where w'(x) r / A is too large for a step of r = `resolution` s, it is taken linearly implicitly for the
@@ -46,7 +53,7 @@ def weir_flow(excess: Tensor, inflow: Tensor, tank_area: Tensor, gravity: Tensor
     """
     above = torch.clamp(excess, min=0.0)
     crest = 2.0 * torch.sqrt(math.pi * tank_area)
-    root = torch.sqrt(above + _DRY) - _DRY**0.5
-    strength = (2.0 / 3.0) * WEIR_COEFFICIENT * torch.sqrt(2.0 * gravity) * crest
+    root = above / torch.sqrt(above + _DRY)
+    strength = (2.0 / 3.0) * WEIR_COEFFICIENT * torch.sqrt(2.0 * gravity) * crest * share
     stiffness = torch.clamp(1.5 * strength * root * resolution / tank_area - STABLE_SPILL_TIMES_STEP, min=0.0)
     return torch.clamp((strength * above * root + stiffness * inflow) / (1.0 + stiffness), min=0.0)

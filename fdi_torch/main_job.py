@@ -1,0 +1,233 @@
+"""The main job: from a run file to a diagnosed fault, logged. `fdi train` calls it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+
+import torch
+
+from fdi_torch.config.estimation import EstimationConfig, estimated_space, parameter_values, placements_of
+from fdi_torch.config.recordings import LoadedRecording, load_recordings
+from fdi_torch.config.run import Run
+from fdi_torch.config.simulation import noise_std, planned_recording
+from fdi_torch.effects import build_network
+from fdi_torch.estimate.evolution import Search
+from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
+from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate
+from fdi_torch.estimate.refine import Progress, RefineSettings
+from fdi_torch.logbook import RunLog
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.recording import Recording
+from fdi_torch.report.fit_figure import fit_figure, save
+from fdi_torch.simulate.record import clean_readings, with_noise
+
+Tell = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """result: the estimate and its diagnosis. truth: the simulated values by name, empty for real data."""
+
+    result: HybridResult
+    fitting: Fitting
+    truth: dict[str, float]
+    log: Path
+    pictures: tuple[Path, ...]
+
+
+def train(run: Run, tell: Tell | None = None) -> TrainResult:
+    """Loads or simulates, estimates, diagnoses, logs and draws what a run file asks for.
+
+    tell(share, text) is called as work goes on. What was computed before an error or Ctrl-C stays readable in the log.
+    """
+    tell = tell or (lambda share, text: None)
+    tell(0.0, "reading" if run.config.recordings else "simulating the recording")
+    loaded = recordings_of(run)
+    fitting = fitting_of(run, loaded)
+    settings = hybrid_settings(run.config.estimate)
+    truth = simulated_truth(run)
+    path = free_path(Path(run.config.output.folder), run.name)
+    sources = [{"path": part.recording.source, "sha256": part.recording.sha256} for part in loaded]
+    with RunLog(path, "train", config_text=run.text, seeds={"seed": run.config.seed}, data=sources) as log:
+        log_recordings(log, loaded, truth)
+        watch = Watch(log, fitting.space, settings, tell)
+        result = estimate(fitting, settings, run.config.seed, watch.generation, watch.iteration)
+        log_result(log, result, fitting.space)
+        pictures = draw(run, fitting, result, path)
+    tell(1.0, "done")
+    return TrainResult(result, fitting, truth, path, pictures)
+
+
+def recordings_of(run: Run) -> list[LoadedRecording]:
+    """The recordings that a run file names, or the one that it asks to simulate."""
+    if run.config.simulate is None:
+        return load_recordings(run.config.recordings, run.plant, run.base)
+    return [LoadedRecording(simulate(run), run.config.simulate.start_levels)]
+
+
+def simulate(run: Run) -> Recording:
+    """The recording that `simulate:` of a run file describes, with its faults and its noise; repeats for a seed."""
+    config = run.config.simulate
+    if config is None:
+        raise ValueError(f"{run.source}: expected simulate, got none; say what is to be simulated")
+    planned = planned_recording(config, run.plant)
+    placements = placements_of(config.faults, run.plant)
+    network = build_network(run.plant, placements)
+    levels, _ = start_levels(run.plant, network, planned, config.start_levels)
+    tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(run.plant.tanks, levels, strict=True))
+    network = build_network(replace(run.plant, tanks=tanks), placements)
+    clean = clean_readings(network, planned, parameter_values(config.faults, network.constants, run.plant))
+    seed = run.config.seed if config.seed is None else config.seed
+    generator = torch.Generator().manual_seed(seed)
+    return with_noise(planned, clean, noise_std(config.noise, run.plant, clean), generator, network)
+
+
+def simulated_truth(run: Run) -> dict[str, float]:
+    """The faults that were simulated, SI by full name; empty for real data."""
+    if run.config.simulate is None:
+        return {}
+    network = build_network(run.plant, placements_of(run.config.simulate.faults, run.plant))
+    return parameter_values(run.config.simulate.faults, network.constants, run.plant)
+
+
+def fitting_of(run: Run, loaded: Sequence[LoadedRecording]) -> Fitting:
+    """What the run file asks to estimate, on its recordings."""
+    config = run.config.estimate
+    if not config.parameters:
+        raise ValueError(
+            f"{run.source}: estimate.parameters: expected at least one, got none; name some, as in T1.leak"
+        )
+    network = build_network(run.plant, placements_of([p.name for p in config.parameters], run.plant))
+    space = estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
+    recordings = [part.recording for part in loaded]
+    expect_enough_samples(recordings, space)
+    return set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
+
+
+def expect_enough_samples(recordings: Sequence[Recording], space: ParameterSpace) -> None:
+    """Raises ValueError where there are fewer readings than parameters."""
+    readings = sum(int(r.mask.sum()) for r in recordings)
+    if readings <= len(space):
+        source = recordings[0].source
+        raise ValueError(
+            f"{source}: expected more readings than parameters, got {readings} readings for {len(space)} parameters; "
+            "take a longer stretch or fewer parameters"
+        )
+
+
+def hybrid_settings(config: EstimationConfig) -> HybridSettings:
+    """The run file's settings in the estimator's own form."""
+    steps = [None if step == "auto" else float(step) for step in (config.step.search, config.step.refine)]
+    return HybridSettings(
+        objectives=(config.objective.search, config.objective.refine),
+        search=config.search,
+        method=config.refine.method,
+        refine=RefineSettings(iterations=config.refine.iterations),
+        search_step=steps[0],
+        refine_step=steps[1],
+        confidence=config.confidence,
+    )
+
+
+class Watch:
+    """Logs each generation and iteration as it comes, and tells how far the work is."""
+
+    def __init__(self, log: RunLog, space: ParameterSpace, settings: HybridSettings, tell: Tell) -> None:
+        self.log, self.space, self.settings, self.tell = log, space, settings, tell
+        self.iterations = 0
+
+    def generation(self, search: Search) -> None:
+        state = search.state
+        best = dict(zip(self.space.names, state.population[0, 0].tolist(), strict=True))
+        cost = float(state.cost[0, 0])
+        self.log.generation(
+            state.generation,
+            cost,
+            best,
+            mean_cost=float(state.cost[0].mean()),
+            evaluations=state.evaluations,
+            units={p.name: p.unit for p in self.space},
+        )
+        self.log.population(state.generation, search.to_dict())
+        share = 0.05 + 0.8 * state.evaluations / self.settings.search.evaluations
+        self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {cost:.3g}")
+
+    def iteration(self, progress: Progress) -> None:
+        self.iterations += 1
+        for k, lane in enumerate(progress.lanes.tolist()):
+            values = dict(zip(self.space.names, progress.theta[k].tolist(), strict=True))
+            self.log.iteration(
+                progress.iteration,
+                float(progress.cost[k]),
+                values,
+                damping=float(progress.damping[k]),
+                accepted=bool(progress.accepted[k]),
+                problem=lane,
+                t=float(self.iterations),
+                units={p.name: p.unit for p in self.space},
+            )
+        self.tell(0.9, f"refinement: iteration {progress.iteration}, cost {float(progress.cost.min()):.6g}")
+
+
+def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[str, float]) -> None:
+    """Inputs and outputs of every recording, and what was simulated; then to disk."""
+    for k, part in enumerate(loaded):
+        r = part.recording
+        log.recording(
+            r.time,
+            r.inputs,
+            r.outputs,
+            r.input_names,
+            r.output_names,
+            r.input_units,
+            r.output_units,
+            mask=r.mask,
+            hold=r.hold,
+            group="" if len(loaded) == 1 else str(k + 1),
+        )
+    if truth:
+        log.write("/plant/truth", truth, 0.0)
+    log.flush()
+
+
+def log_result(log: RunLog, result: HybridResult, space: ParameterSpace) -> None:
+    """The final estimate and every finding of the diagnosis."""
+    final = result.estimate
+    log.estimate(
+        final.names,
+        final.value,
+        final.std,
+        final.covariance,
+        final.status,
+        units=final.units,
+        at_bound=tuple(final.at_bounds),
+        unidentifiable=final.undetermined,
+    )
+    for fault in result.diagnosis.faults:
+        location, _, effect = fault.name.partition(".")
+        log.fault(effect, location, fault.present, size=fault.value, size_std=fault.std, unit=fault.unit)
+    log.result(final.to_dict() | {"kind": result.diagnosis.kind, "explained": result.diagnosis.explained})
+    if final.status != "converged":
+        log.set_status("not_converged", final.status)
+
+
+def draw(run: Run, fitting: Fitting, result: HybridResult, log: Path) -> tuple[Path, ...]:
+    """One picture a recording, beside the log."""
+    paths = []
+    for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
+        suffix = "" if len(fitting.recordings) == 1 else f"_{k + 1}"
+        figure = fit_figure(recording, predicted, f"{run.name}: {result.diagnosis.kind}")
+        paths.append(save(figure, log.with_name(f"{log.stem}{suffix}.png")))
+    return tuple(paths)
+
+
+def free_path(folder: Path, name: str, ending: str = "mcap") -> Path:
+    """NAME.mcap in the folder, or NAME_2.mcap, NAME_3.mcap ... where that is taken."""
+    for k in count(1):
+        path = folder / (f"{name}.{ending}" if k == 1 else f"{name}_{k}.{ending}")
+        if not path.exists() and not path.with_name(path.name + ".partial").exists():
+            return path
+    raise AssertionError("unreachable")
