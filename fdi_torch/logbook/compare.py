@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.reader import Run, read_run
@@ -120,8 +119,14 @@ def chi2_p_value(values: Sequence[float], std: Sequence[float]) -> float:
         return float("nan")
     weights = s**-2.0
     q = float(np.sum(weights * (x - np.sum(weights * x) / np.sum(weights)) ** 2))
-    half = torch.tensor([(len(x) - 1) / 2, q / 2], dtype=torch.float64)
-    return float(torch.special.gammaincc(half[0], half[1]))
+    return _chi2_tail(q / 2, len(x) - 1)
+
+
+def _chi2_tail(half: float, degrees: int) -> float:
+    """P(chi^2 > 2 half), the finite sum for whole degrees of freedom (Abramowitz and Stegun 1964, 26.4.4-26.4.5)."""
+    odd = degrees % 2
+    terms = (half ** (i + odd / 2) / math.gamma(i + 1 + odd / 2) for i in range(degrees // 2))
+    return (math.erfc(math.sqrt(half)) if odd else 0.0) + math.exp(-half) * sum(terms)
 
 
 def _differing(runs: Sequence[Run], section: str) -> dict[str, tuple[str, ...]]:

@@ -49,6 +49,8 @@ class Messages:
 
         A field of value None is left out. Raises ValueError for a time that is not finite and for names taken already.
         """
+        if "t" in fields:
+            raise ValueError(f"{topic}: expected the time as argument, got it among the fields; remove it there")
         t = self._latest if t is None else float(t)
         message = plain({"t": t, **fields})
         if "t" not in message:

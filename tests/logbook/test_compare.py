@@ -55,6 +55,13 @@ def test_results_agree_within_their_errors(tmp_path: Path, other: float, agree: 
     assert ["std", "leak", "0.01", "0.01", "1", ""] in found.rows()
 
 
+@pytest.mark.parametrize("runs", [2, 3, 4, 7, 12])
+def test_the_p_value_is_that_of_chi_squared(runs: int) -> None:
+    values, std = np.random.default_rng(runs).normal(1, 2, runs), np.linspace(1, 3, runs)
+    q = np.sum((values - np.average(values, weights=std**-2)) ** 2 / std**2)
+    assert chi2_p_value(values, std) == pytest.approx(stats.chi2.sf(q, runs - 1), rel=1e-12)
+
+
 def test_the_test_of_agreement_holds_its_level() -> None:
     rng = np.random.default_rng(0)
     std = np.array([0.1, 0.5, 2.0])
