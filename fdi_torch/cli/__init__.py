@@ -21,6 +21,7 @@ COMMANDS = {
     "train": "estimate the faults in a recording, and log how",
     "simulate": "write a recording from a plant, inputs, faults and noise",
     "check": "examine a plant and a recording before any fit",
+    "report": "make one HTML page of one or more logs",
 }
 
 

@@ -21,14 +21,19 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file. Raises ConfigError where there is no file, no YAML or no mapping."""
     if not path.is_file():
         raise ConfigError([f"{path}: expected a YAML file, got none there; check the path"])
+    return parse_yaml(path.read_bytes(), str(path))
+
+
+def parse_yaml(text: bytes, source: str) -> dict[str, Any]:
+    """The mapping in YAML text of plain values. Raises ConfigError, naming `source`, where it is none."""
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        data = yaml.safe_load(text.decode("utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         where = getattr(error, "problem_mark", None)
         line = f"line {where.line + 1}: " if where else ""
-        raise ConfigError([f"{path}: {line}expected YAML, got {getattr(error, 'problem', None) or error}"]) from error
+        raise ConfigError([f"{source}: {line}expected YAML, got {getattr(error, 'problem', None) or error}"]) from error
     if not isinstance(data, dict):
-        raise ConfigError([f"{path}: expected keys and values, got {type(data).__name__}"])
+        raise ConfigError([f"{source}: expected keys and values, got {type(data).__name__}"])
     return data
 
 

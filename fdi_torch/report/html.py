@@ -1,0 +1,66 @@
+"""HTML in which everything is escaped unless it was built here: a tank named `<script>` is a tank named so."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Sequence
+from typing import Any
+
+MOST_ROWS = 300
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff\u202a-\u202e\u2066-\u2069]")
+
+
+class Markup(str):
+    """HTML that may stand on a page as it is."""
+
+    __slots__ = ()
+
+
+def clean(text: Any) -> str:
+    """Text without characters that control terminals, files or the direction of writing."""
+    return _CONTROL.sub("\N{REPLACEMENT CHARACTER}", str(text))
+
+
+def short(text: Any, most: int = 40) -> str:
+    """Clean text of a limited length, for figures."""
+    text = clean(text).replace("\n", " ")
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def escape(content: Any) -> Markup:
+    """Text as HTML; markup stays what it is."""
+    return content if isinstance(content, Markup) else Markup(html.escape(clean(content)))
+
+
+def tag(name: str, *content: Any, **attributes: str) -> Markup:
+    """An element; `class_` and `for_` name attributes that Python does not allow."""
+    written = "".join(f' {key.rstrip("_").replace("_", "-")}="{escape(value)}"' for key, value in attributes.items())
+    return Markup(f"<{name}{written}>{''.join(escape(part) for part in content)}</{name}>")
+
+
+def join(parts: Sequence[Any], between: str = "") -> Markup:
+    return Markup(escape(between).join(escape(part) for part in parts))
+
+
+def table(header: Sequence[Any], rows: Sequence[Sequence[Any]], left: int = 1) -> Markup:
+    """Rows under a header, the first `left` columns flush left; very long tables are cut, and say so."""
+    sides = ["l" if i < left else "r" for i in range(len(header))]
+    head = tag("tr", *(tag("th", name, class_=side) for name, side in zip(header, sides, strict=True)))
+    shown = [
+        tag("tr", *(tag("td", cell, class_=side) for cell, side in zip(row, sides, strict=True)))
+        for row in rows[:MOST_ROWS]
+    ]
+    cut = [] if len(rows) <= MOST_ROWS else [tag("p", f"and {len(rows) - MOST_ROWS} rows more", class_="note")]
+    return join([tag("div", tag("table", tag("thead", head), tag("tbody", *shown)), class_="scroll"), *cut])
+
+
+def pairs(entries: Sequence[tuple[Any, Any]]) -> Markup:
+    """Names and values, one pair a line."""
+    rows = (tag("div", tag("dt", name), tag("dd", value)) for name, value in entries[:MOST_ROWS])
+    return tag("dl", *rows)
+
+
+def folded(summary: str, *content: Any) -> Markup:
+    """Content that opens on request; printed pages show it open."""
+    return tag("details", tag("summary", summary), *content)

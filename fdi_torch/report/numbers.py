@@ -1,0 +1,55 @@
+"""Numbers and units as people read them."""
+
+from __future__ import annotations
+
+import math
+
+from fdi_torch.parameters import display_unit
+
+_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+
+
+def shown_unit(si_unit: str) -> tuple[str, float]:
+    """'m^3/s' -> ('cm³/s', 1e6): the unit on an axis and how many of it one SI unit is; unknown units stay."""
+    try:
+        unit, scale = display_unit(si_unit)
+    except ValueError:
+        unit, scale = si_unit, 1.0
+    return raised(unit), scale
+
+
+def raised(unit: str) -> str:
+    """'cm^3/s' -> 'cm³/s'."""
+    head, *rest = unit.split("^")
+    for part in rest:
+        digits = len(part) - len(part.lstrip("0123456789-"))
+        head += part[:digits].translate(_RAISED) + part[digits:]
+    return head
+
+
+def axis(name: str, unit: str) -> str:
+    """'level, cm': what stands on an axis."""
+    return f"{name}, {unit}" if unit else name
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number with some significant digits; a dash where there is none."""
+    if not math.isfinite(value):
+        return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
+    return _minus(f"{value:.{digits}g}")
+
+
+def with_error(value: float, std: float) -> str:
+    """'0.3000 ± 0.0020': the error with two digits, the value as far as the error lets one read it."""
+    if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
+        return number(value)
+    digits = min(max(1 - math.floor(math.log10(std)), 0), 12)
+    return _minus(f"{value:.{digits}f} ± {std:.{digits}f}") if abs(value) < 1e9 else f"{number(value)} ± {std:.2g}"
+
+
+def percent(share: float) -> str:
+    return f"{100.0 * share:.3g} %" if math.isfinite(share) else "–"
+
+
+def _minus(text: str) -> str:
+    return text.replace("-", "−")

@@ -1,0 +1,36 @@
+"""Optional arrays of a log's `results.npz` that the page draws. All SI; sensors in the order of `/plant/output`.
+
+| array | shape | what it is |
+|---|---|---|
+| `predicted` | (T, N) | readings at the estimate, at the samples of the recording |
+| `predicted_K` | (T, N) | the same for the K-th of several recordings, from 1 |
+| `nominal`, `recalibrated`, `augmented`, `ceiling` | (T, N) | readings that each model of a gap diagnosis predicts |
+| `holdout_time` | (S,) | clock of the hold-out in s |
+| `holdout_read` | (S, N) | its readings, NaN where one does not count |
+| `holdout_nominal`, `holdout_recalibrated`, `holdout_augmented`, `holdout_ceiling` | (S, N) | its predictions |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
+
+# Models of a gap diagnosis: array -> what the page calls it, and its colour.
+MODELS = {
+    "nominal": ("as believed", SOFT),
+    "recalibrated": ("recalibrated", OTHER),
+    "augmented": ("with the cause", MODEL),
+    "ceiling": ("free-form", MARK),
+}
+
+
+def predicted(arrays: Mapping[str, np.ndarray], number: int, several: bool, shape: Sequence[int]) -> np.ndarray | None:
+    """Readings of the recording with this number (from 0) at the estimate; None where there are none."""
+    for name in (f"predicted_{number + 1}", *(() if several else ("predicted", "augmented"))):
+        found = arrays.get(name)
+        if found is not None and found.dtype.kind == "f" and found.shape == tuple(shape):
+            return found
+    return None

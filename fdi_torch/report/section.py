@@ -1,0 +1,55 @@
+"""A section of the page: a title over words, tables and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from fdi_torch.report.html import Markup, clean, escape, join, tag
+from fdi_torch.report.material import Material
+from fdi_torch.report.style import inline_svg
+
+
+@dataclass(frozen=True)
+class Picture:
+    """name: of its file, without ending. caption: what one sees, in words; also read aloud. wide: takes a whole row."""
+
+    name: str
+    figure: Figure
+    caption: str = ""
+    wide: bool = False
+
+
+@dataclass(frozen=True)
+class Section:
+    """blocks: markup, text (a paragraph), or a list of pictures set side by side."""
+
+    title: str
+    blocks: Sequence[Markup | str | Sequence[Picture]]
+
+    @property
+    def pictures(self) -> list[Picture]:
+        return [picture for block in self.blocks if not isinstance(block, str) for picture in block]
+
+
+Maker = Callable[[Material], "Section | None"]
+
+
+def section_html(section: Section, prefix: str) -> Markup:
+    """prefix: makes the ids of this run's pictures unique on the page."""
+    blocks = []
+    for block in section.blocks:
+        if isinstance(block, str):
+            blocks.append(block if isinstance(block, Markup) else tag("p", block))
+        else:
+            blocks.append(tag("div", *(_figure(picture, prefix) for picture in block), class_="grid"))
+    return tag("section", tag("h3", section.title), join(blocks))
+
+
+def _figure(picture: Picture, prefix: str) -> Markup:
+    described = escape(clean(picture.caption or picture.name))
+    svg = Markup(inline_svg(picture.figure, f"{prefix}{picture.name}", described))
+    caption = [tag("figcaption", picture.caption)] if picture.caption else []
+    return tag("figure", svg, *caption, class_="wide" if picture.wide else "panel")

@@ -1,0 +1,21 @@
+"""The sections of the page, in their order. Each makes itself from what the log holds, or is left out."""
+
+from fdi_torch.report.section import Maker
+from fdi_torch.report.sections.estimate import estimate_section, posterior_section
+from fdi_torch.report.sections.origin import configuration_section, health_section, provenance_section
+from fdi_torch.report.sections.rig import rig_section
+from fdi_torch.report.sections.search import refinement_section, search_section
+from fdi_torch.report.sections.signals import fit_section, inputs_section
+
+SECTIONS: tuple[Maker, ...] = (
+    rig_section,
+    estimate_section,
+    fit_section,
+    inputs_section,
+    posterior_section,
+    search_section,
+    refinement_section,
+    configuration_section,
+    provenance_section,
+    health_section,
+)

@@ -1,0 +1,115 @@
+"""The estimate: its table, what is present, and its uncertainty."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from fdi_torch.report.findings import findings
+from fdi_torch.report.html import table, tag
+from fdi_torch.report.material import Material, Payload
+from fdi_torch.report.numbers import number, shown_unit, with_error
+from fdi_torch.report.panels import ellipse_panel
+from fdi_torch.report.section import Picture, Section
+
+MOST_ELLIPSES = 6
+
+
+def estimate_section(material: Material) -> Section | None:
+    """Values with standard errors and 95 % intervals, beside what was simulated where it was."""
+    final = last_estimate(material)
+    if final is None:
+        return None
+    rows = [_row(material, final, i) for i in range(len(final["names"]))]
+    header = ["parameter", "unit", "estimate", "95 % interval"]
+    header += ["simulated"] if material.truth else []
+    header += ["finding"] if material.of("/diagnosis/fault") else []
+    notes = [str(note) for note in final.get("unidentifiable") or ()]
+    notes += [f"{name} lies at the edge of its range" for name in final.get("at_bound") or ()]
+    listed = [tag("ul", *(tag("li", note) for note in notes))] if notes else []
+    return Section("Estimate", [table(header, rows, left=2), *_water(material), *listed])
+
+
+def posterior_section(material: Material) -> Section | None:
+    """Ellipses of the pairs that depend on each other most, and the correlation of all."""
+    final = last_estimate(material)
+    if final is None or len(final["names"]) < 2:
+        return None
+    names, covariance = final["names"], covariance_of(final)
+    if covariance is None:
+        return None
+    std = np.sqrt(np.diag(covariance))
+    known = [i for i in range(len(names)) if np.isfinite(std[i]) and std[i] > 0]
+    correlation = covariance / np.outer(std, std)
+    ranked = sorted(combinations(known, 2), key=lambda pair: -abs(correlation[pair]))[:MOST_ELLIPSES]
+    pictures = [_ellipse(material, final, covariance, pair, k) for k, pair in enumerate(ranked)]
+    words = "Regions that hold 50 % and 95 % of the probability, the most correlated pairs first."
+    words += " The green cross is what was simulated." if material.truth else ""
+    rows = [[names[i], *(f"{correlation[i, j]:.2f}" for j in known)] for i in known]
+    grid = table(["correlation", *(str(names[j]) for j in known)], rows)
+    return Section("Uncertainty", [words, pictures, grid]) if pictures else None
+
+
+def last_estimate(material: Material) -> Payload | None:
+    """The last final estimate, of the first problem where several were estimated."""
+    finals = [m for m in material.of("/estimate/final") if not m.get("problem")]
+    return finals[-1] if finals else None
+
+
+def covariance_of(final: Payload) -> np.ndarray | None:
+    """(P, P); None where the message has none of that size."""
+    flat, count = np.asarray(final.get("covariance", ()), dtype=float), len(final["names"])
+    return flat.reshape(count, count) if flat.size == count * count else None
+
+
+def _row(material: Material, final: Payload, i: int) -> list[Any]:
+    name = str(final["names"][i])
+    unit, scale = shown_unit(final["units"][i] if final.get("units") else "")
+    value, std = scale * float(final["values"][i]), scale * float(final["std"][i])
+    reach = 1.96 * std
+    digits = 4 if not np.isfinite(reach) else max(3, min(9, 2 + _decades(value, reach)))
+    interval = f"{number(value - reach, digits)} … {number(value + reach, digits)}" if np.isfinite(reach) else "–"
+    cells: list[Any] = [name, unit or "1", with_error(value, std), interval]
+    if material.truth:
+        cells.append(number(scale * material.truth[name]) if name in material.truth else "")
+    if material.of("/diagnosis/fault"):
+        cells.append(_finding(material, name))
+    return cells
+
+
+def _decades(value: float, reach: float) -> int:
+    return int(np.ceil(np.log10(max(abs(value) / reach, 1.0)))) if reach > 0 else 4
+
+
+def _finding(material: Material, name: str) -> Any:
+    for finding in findings(material):
+        if name in (f"{finding.location}.{finding.effect}", f"{finding.location}.{finding.effect}.size"):
+            return tag("span", "present", class_="bad") if finding.present else "not found"
+    return ""
+
+
+def _water(material: Material) -> list[Any]:
+    """Sizes as flows and as holes, where the log says them."""
+    lines = []
+    for finding in findings(material):
+        if finding.present and np.isfinite(finding.flow):
+            text = f"{finding.words} moves {number(1e6 * finding.flow, 3)} cm³/s"
+            if np.isfinite(finding.hole):
+                text += f", as a sharp-edged hole of {number(1e3 * finding.hole, 3)} mm would"
+            lines.append(tag("li", text))
+    return [tag("ul", *lines)] if lines else []
+
+
+def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: tuple[int, int], k: int) -> Picture:
+    i, j = pair
+    units, scales = zip(*(shown_unit(final["units"][n] if final.get("units") else "") for n in pair), strict=True)
+    names = (str(final["names"][i]), str(final["names"][j]))
+    scale = np.array(scales)
+    centre = scale * np.array([final["values"][i], final["values"][j]], dtype=float)
+    part = covariance[np.ix_(pair, pair)] * np.outer(scale, scale)
+    known = all(name in material.truth for name in names)
+    truth = (scales[0] * material.truth[names[0]], scales[1] * material.truth[names[1]]) if known else None
+    rho = part[0, 1] / np.sqrt(part[0, 0] * part[1, 1])
+    return Picture(f"ellipse_{k + 1}", ellipse_panel(names, units, centre, part, truth), f"correlation {rho:.2f}")

@@ -1,0 +1,61 @@
+"""The rig with the diagnosis on it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.report.findings import findings
+from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import number, shown_unit
+from fdi_torch.report.schematic import Overlay, schematic
+from fdi_torch.report.section import Picture, Section
+
+
+def rig_section(material: Material) -> Section | None:
+    """The schematic: last levels read, what was found where, the gap's share as strength of colour."""
+    plant = material.plant
+    if plant is None:
+        return None
+    overlay = Overlay(last_levels(material, plant), marks_of(material), heat_of(material))
+    parts = ["Levels are the last ones read."] if overlay.levels else []
+    parts += ["Orange: what was found."] if overlay.marks else []
+    parts += ["Strength of colour: share of the gap that this component alone can close."] if overlay.heat else []
+    caption = " ".join([f"{plant.name}, not to scale.", *parts])
+    return Section("The rig", [[Picture("rig", schematic(plant, overlay), caption, wide=True)]])
+
+
+def last_levels(material: Material, plant: PlantDescription) -> dict[str, float]:
+    """Tank -> level in m, from the last reading that counts."""
+    levels: dict[str, float] = {}
+    if not material.groups:
+        return levels
+    recording = material.recordings[0]
+    for sensor in plant.sensors:
+        if sensor.column not in recording.output_names:
+            continue
+        i = recording.output_names.index(sensor.column)
+        counted = np.flatnonzero(recording.mask[:, i])
+        if len(counted):
+            levels[sensor.tank] = (float(recording.outputs[counted[-1], i]) - sensor.offset) / sensor.gain
+    return levels
+
+
+def marks_of(material: Material) -> dict[str, list[str]]:
+    """Location -> what was found there, in a few words."""
+    marks: dict[str, list[str]] = {}
+    for finding in findings(material):
+        if finding.present:
+            unit, scale = shown_unit(finding.unit)
+            size = "" if math.isnan(finding.size) else f" {number(scale * finding.size, 3)} {unit}".rstrip()
+            marks.setdefault(finding.location, []).append(f"{finding.effect.replace('_', ' ')}{size}")
+    return marks
+
+
+def heat_of(material: Material) -> dict[str, float]:
+    """Location -> share of the gap."""
+    where = {str(message["location"]): float(message["share"]) for message in material.of("/gap/where")}
+    where |= {str(place["location"]): float(place["share"]) for place in material.answer.get("where", [])}
+    return {location: min(max(share, 0.0), 1.0) for location, share in where.items() if math.isfinite(share)}

@@ -1,0 +1,128 @@
+"""The visual language of all figures: three colours that also the colour-blind tell apart, units on every axis, labels
+above the data; as SVG whose colours follow the page's light or dark theme.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+# What was read is grey, what a model says is blue, what deviates is orange, a second model or the truth is green
+# (after Okabe & Ito 2008, darkened until text in them has a contrast of 4.5 on white).
+INK, SOFT, FAINT = "#1f2933", "#67727e", "#d3d9e0"
+MODEL, MARK, OTHER = "#0b6cab", "#b84a00", "#0b7558"
+PAPER = "#fefefe"
+
+_VARIABLES = {INK: "ink", SOFT: "soft", FAINT: "faint", MODEL: "model", MARK: "mark", OTHER: "other", PAPER: "paper"}
+_SETTINGS: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "fdi_torch",
+    "text.parse_math": False,
+    "font.size": 10.0,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.edgecolor": SOFT,
+    "axes.labelcolor": SOFT,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-4, 5),
+    "grid.color": FAINT,
+    "grid.linewidth": 0.5,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "xtick.labelsize": 9.0,
+    "ytick.labelsize": 9.0,
+    "text.color": INK,
+    "lines.linewidth": 1.5,
+    "figure.facecolor": PAPER,
+    "axes.facecolor": "none",
+    "savefig.facecolor": PAPER,
+}
+WIDTH, HEIGHT = 4.4, 2.7
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Figures made and saved inside have the house style; a glyph that the font lacks is no reason to speak."""
+    with matplotlib.rc_context(_SETTINGS), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*missing from.*font")
+        yield
+
+
+def panel(title: str, x_label: str, y_label: str, width: float = WIDTH, height: float = HEIGHT) -> tuple[Figure, Axes]:
+    """One small figure with one pair of axes, for a phone and side by side on a desk. width, height in inches."""
+    with styled():
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots()
+        axes.set_title(title)
+        axes.set_xlabel(x_label)
+        axes.set_ylabel(y_label)
+    return figure, axes
+
+
+def label_lines(axes: Axes) -> None:
+    """Names of the lines above the plot, each in its line's colour; no box hides data."""
+    with styled():
+        axes.legend(
+            loc="lower right",
+            bbox_to_anchor=(1.02, 0.97),
+            ncols=4,
+            frameon=False,
+            labelcolor="linecolor",
+            handlelength=1.0,
+            handletextpad=0.4,
+            columnspacing=0.9,
+            borderaxespad=0.0,
+            fontsize=9.0,
+        )
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Writes the picture as PNG or SVG, by the path's ending; equal figures give equal files."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
+    with styled():
+        figure.savefig(path, dpi=160, metadata=metadata)
+    return path
+
+
+def inline_svg(figure: Figure, name: str, description: str) -> str:
+    """The figure as an element of a page: colours are the page's variables, ids are unique below `name`."""
+    text = io.StringIO()
+    with styled():
+        figure.savefig(text, format="svg", metadata={"Date": None}, transparent=True)
+    svg = text.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
+    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', rf'\1 role="img" aria-label="{description}"', svg, count=1)
+    svg = re.sub(r"(font(?:-family)?:[^;\"]*?)'DejaVu Sans'(, [^;\"]*)?", r"\1system-ui, sans-serif", svg)
+    for colour, variable in _VARIABLES.items():
+        svg = svg.replace(colour, f"var(--{variable})")
+    return _own_ids(svg, name)
+
+
+def _own_ids(svg: str, name: str) -> str:
+    """Ids that something refers to begin with `name`; the others go."""
+    used = set(re.findall(r'(?:url\(#|href="#)([^")]+)', svg))
+
+    def renamed(match: re.Match[str]) -> str:
+        return f' id="{name}-{match[1]}"' if match[1] in used else ""
+
+    svg = re.sub(r'\sid="([^"]+)"', renamed, svg)
+    return re.sub(r'(url\(#|href="#)', rf"\g<1>{name}-", svg)

@@ -1,0 +1,57 @@
+"""How the page looks: one column of cards, light or dark as the reader's system is, and on paper."""
+
+STYLESHEET = """
+:root { color-scheme: light dark; --ink: #1f2933;
+  --soft: #5b6672; --faint: #d3d9e0; --paper: #ffffff; --ground: #f3f5f7;
+  --model: #0b6cab; --mark: #b84a00; --other: #0b7558; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e4e9ee; --soft: #a3aeba; --faint: #3a444f; --paper: #1a2027;
+  --ground: #11151a; --model: #63b3ed; --mark: #ff9a5a; --other: #4cc9a0; } }
+* { box-sizing: border-box; }
+html { -webkit-text-size-adjust: 100%; }
+body { margin: 0; background: var(--ground); color: var(--ink);
+  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", sans-serif; overflow-wrap: anywhere; }
+main { max-width: 1180px; margin: 0 auto; padding: 1.5rem 1rem 3rem; }
+h1 { font-size: 1.05rem; font-weight: 600; color: var(--soft); margin: 0 0 .5rem; }
+h2 { font-size: 1.55rem; line-height: 1.25; margin: .2rem 0 .4rem; text-wrap: balance; }
+h3 { font-size: 1.1rem; margin: 0 0 .6rem; }
+p { margin: .4rem 0; max-width: 72ch; }
+a { color: var(--model); }
+article + article { margin-top: 3rem; }
+section { background: var(--paper); border: 1px solid var(--faint); border-radius: 10px; padding: 1rem 1.1rem;
+  margin: 1rem 0; }
+.grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 330px), 1fr)); gap: .8rem 1.2rem;
+  align-items: start; margin: .6rem 0; }
+figure { margin: 0; min-width: 0; }
+figure.wide { grid-column: 1 / -1; max-width: 44rem; }
+figure svg { display: block; width: 100%; height: auto; }
+figcaption { font-size: .85rem; color: var(--soft); }
+.note, .meta { color: var(--soft); font-size: .9rem; }
+.lead { font-size: 1.05rem; }
+.bad { color: var(--mark); font-weight: 600; }
+.good { color: var(--other); font-weight: 600; }
+.scroll { overflow-x: auto; max-width: 100%; }
+table { border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }
+th, td { padding: .28rem .9rem .28rem 0; text-align: right; vertical-align: top; border-bottom: 1px solid var(--faint);
+  overflow-wrap: normal; }
+th { color: var(--soft); font-weight: 600; white-space: nowrap; }
+td.r { white-space: nowrap; }
+th.l, td.l { text-align: left; }
+dl { margin: .3rem 0; font-size: .92rem; }
+dl div { display: grid; grid-template-columns: minmax(6rem, 13rem) 1fr; gap: .8rem; padding: .18rem 0;
+  border-bottom: 1px solid var(--faint); }
+dt { color: var(--soft); }
+dd { margin: 0; min-width: 0; }
+pre { font: .82rem/1.45 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; white-space: pre-wrap;
+  margin: .5rem 0; }
+summary { cursor: pointer; color: var(--model); padding: .2rem 0; }
+ul { margin: .3rem 0; padding-left: 1.2rem; }
+@media (max-width: 480px) { main { padding: 1rem .6rem 2rem; } section { padding: .8rem .7rem; border-radius: 8px; }
+  dl div { grid-template-columns: 1fr; gap: 0; } h2 { font-size: 1.3rem; }
+  table { font-size: .8rem; } th, td { padding-right: .55rem; } }
+@media print { :root { color-scheme: light; --ink: #000000; --soft: #444444; --faint: #bbbbbb; --paper: #ffffff;
+  --ground: #ffffff; --model: #0b6cab; --mark: #b84a00; --other: #0b7558; }
+  body { font-size: 10.5pt; } main { padding: 0; max-width: none; } section { border: 0; padding: 0; margin: 1rem 0; }
+  figure, tr, dl div { break-inside: avoid; } h3 { break-after: avoid; }
+  .grid { grid-template-columns: repeat(2, 1fr); } .scroll { overflow: visible; }
+  details::details-content { content-visibility: visible; display: block; } }
+"""

@@ -1,0 +1,84 @@
+"""The answer of a run in words, before any picture."""
+
+from __future__ import annotations
+
+from fdi_torch.report.findings import Finding, findings
+from fdi_torch.report.material import Material
+
+KINDS = {
+    "train": "Fault diagnosis",
+    "simulate": "Simulation",
+    "monitor": "Monitoring",
+    "study": "Study",
+    "gap": "Sim-to-real gap",
+    "challenge": "Withheld check",
+}
+
+
+def kind_words(material: Material) -> str:
+    return KINDS.get(material.kind, material.kind or "Recording")
+
+
+def headline(material: Material) -> str:
+    """The verdict; how the run ended where it has none."""
+    for words in (gap_words(material), fault_words(findings(material)), alarm_words(material), study_words(material)):
+        if words:
+            return words
+    return material.about("status").get("status", "did not end").replace("_", " ").capitalize()
+
+
+def fault_words(found: list[Finding]) -> str:
+    if not found:
+        return ""
+    present = [f.words for f in found if f.present]
+    if not present:
+        return "No fault found"
+    return f"{'Fault' if len(present) == 1 else f'{len(present)} faults'}: {_listed(present)}"
+
+
+def gap_words(material: Material) -> str:
+    answer = material.answer
+    causes = _listed([f"{c['effect']} at {c['location']}".replace("_", " ") for c in answer.get("causes", [])])
+    places = _listed([str(place["location"]) for place in answer.get("where", [])[:1]])
+    standing = len(answer.get("ambiguity_set", []))
+    return {
+        "no_gap": "No gap beyond noise and tolerances",
+        "named": f"The gap comes from {causes}",
+        "ambiguous": f"A gap that {standing} explanations share; the best is {causes}",
+        "unknown": f"A gap at {places or 'an unknown place'} that no known effect explains",
+    }.get(str(answer.get("verdict", "")), "")
+
+
+def alarm_words(material: Material) -> str:
+    if not material.counts.get("/observer/residual"):
+        return ""
+    alarms = [m for m in material.of("/observer/alarm") if m.get("event") == "raised"]
+    if not alarms:
+        return "No alarm"
+    channels = _listed(list(dict.fromkeys(str(m.get("channel", "")) for m in alarms)))
+    return f"{len(alarms)} alarm{'s' if len(alarms) > 1 else ''}: {channels}"
+
+
+def study_words(material: Material) -> str:
+    trials, groups = material.counts.get("/study/trial", 0), len(material.of("/study/summary"))
+    if not trials and not groups:
+        return ""
+    return f"{trials} trials" + (f" in {groups} settings" if groups else "")
+
+
+def how_it_ended(material: Material) -> list[str]:
+    """When, how long and how the run ended, one sentence each."""
+    status, run = material.about("status"), material.about("run")
+    ended = status.get("status", "no end in the log").replace("_", " ")
+    reason = f" ({status['reason']})" if status.get("reason") else ""
+    parts = [f"{ended}{reason}"]
+    parts += [f"started {run['started'][:19].replace('T', ' ')} UTC"] if run.get("started") else []
+    parts += [f"took {status['wall_seconds']} s"] if status.get("wall_seconds") else []
+    sentences = [" · ".join(parts)]
+    if material.about("result").get("explained") == "false":
+        sentences.append("This model does not explain the recording: residuals are larger than the sensors' noise.")
+    return sentences
+
+
+def _listed(items: list[str]) -> str:
+    return ", ".join(items[:-1]) + " and " + items[-1] if len(items) > 1 else "".join(items)

@@ -1,0 +1,52 @@
+"""Numbers as people read them; long signals that keep their look."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fdi_torch.report.curves import held_steps, thinned
+from fdi_torch.report.html import MOST_ROWS, short, table, tag
+from fdi_torch.report.numbers import number, percent, raised, shown_unit, with_error
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "shown"),
+    [
+        (0.30043, 0.00197, "0.3004 ± 0.0020"),
+        (-12.3456, 0.5, "−12.35 ± 0.50"),
+        (1234.5, 99.0, "1234 ± 99"),
+        (0.3, float("inf"), "0.3"),
+        (0.3, float("nan"), "0.3"),
+    ],
+)
+def test_the_error_says_how_many_digits_count(value: float, std: float, shown: str) -> None:
+    assert with_error(value, std) == shown
+
+
+def test_units_and_odd_numbers() -> None:
+    assert shown_unit("m^3/s") == ("cm³/s", pytest.approx(1e6))
+    assert shown_unit("bananas") == ("bananas", 1.0)
+    assert raised("m^-2 s^10") == "m⁻² s¹⁰"
+    assert [number(v) for v in (float("nan"), float("inf"), -1.5)] == ["–", "∞", "−1.5"]
+    assert percent(0.1234) == "12.3 %"
+
+
+def test_a_spike_and_a_hole_survive_thinning() -> None:
+    time, values = np.arange(1e5), np.zeros(100_000)
+    values[54_321], values[20_000:30_000] = 7.0, np.nan
+    x, y = thinned(time, values)
+    assert len(x) <= 800 and np.all(np.diff(x) > 0)
+    assert np.nanmax(y) == 7.0 and x[np.nanargmax(y)] == 54_321
+    assert np.isnan(y[(x > 21_000) & (x < 29_000)]).all()
+
+
+def test_held_signals_keep_their_corners() -> None:
+    x, y = held_steps(np.arange(6.0), np.array([1.0, 1, 2, 2, 2, 2]))
+    assert x.tolist() == [0, 2, 5] and y.tolist() == [1, 2, 2]
+
+
+def test_text_is_escaped_once_and_tables_say_what_they_leave_out() -> None:
+    assert tag("p", "<b>", tag("i", "&"), title='"') == '<p title="&quot;">&lt;b&gt;<i>&amp;</i></p>'
+    assert "and 5 rows more" in table(["a"], [["x"]] * (MOST_ROWS + 5))
+    assert short("a" * 50, 10) == "a" * 9 + "…"

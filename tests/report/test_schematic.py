@@ -1,0 +1,53 @@
+"""Any rig can be drawn: every tank has a place of its own, below what pours into it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fdi_torch.config import load_plant
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.report.layout import tank_places
+from fdi_torch.report.schematic import Overlay, schematic
+from fdi_torch.report.style import inline_svg
+
+PLANTS = sorted(p.stem for p in (Path(__file__).parents[2] / "configs" / "plants").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_every_component_of_every_shipped_plant_is_named(name: str) -> None:
+    plant = load_plant(name)
+    svg = inline_svg(schematic(plant), "rig", "the rig")
+    assert all(f">{component.name}<" in svg for component in plant.components())
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_what_pours_stands_above_what_catches_it(name: str) -> None:
+    plant = load_plant(name)
+    places = tank_places(plant)
+    assert len(set(places.values())) == len(plant.tanks)
+    for pipe in plant.pipes:
+        if pipe.target != OUTSIDE:
+            assert (places[pipe.target][0] > places[pipe.source][0]) == pipe.free_fall
+
+
+def test_a_chain_is_drawn_in_its_order() -> None:
+    columns = {name: column for name, (_, column) in tank_places(load_plant("three_tank")).items()}
+    assert columns == {"T1": 0, "T3": 1, "T2": 2}
+
+
+def test_circles_of_pipes_and_of_falls_are_drawn_too() -> None:
+    tanks = tuple(Tank(n, 0.01, 1.0) for n in "ABCD")
+    ring = [Pipe(a + b, a, b, 1e-5, 0.6) for a, b in ("AB", "BC", "CD", "DA", "AC")]
+    falls = [Pipe("f" + a + b, a, b, 1e-5, 0.6, free_fall=True, valve="v") for a, b in ("AB", "BA")]
+    plant = PlantDescription("ring", tanks, (*ring, *falls), (Pump("p", "A", 1e-4),), (Sensor("s", "A"),))
+    assert len(set(tank_places(plant).values())) == 4
+    assert ">fBA<" in inline_svg(schematic(plant), "rig", "")
+
+
+def test_guilty_components_and_shares_stand_on_the_drawing() -> None:
+    overlay = Overlay({"T1": 0.5}, {"Q1": ["pump lag 8 s"], "T1-T2": ["cross flow"]}, {"P13": 0.62})
+    svg = inline_svg(schematic(load_plant("three_tank"), overlay), "rig", "")
+    assert all(f">{words}<" in svg for words in ("50.0 cm", "pump lag 8 s", "cross flow", "62 % of the gap"))
+    assert svg.count("var(--mark)") > inline_svg(schematic(load_plant("three_tank")), "rig", "").count("var(--mark)")
