@@ -34,6 +34,6 @@ def test_standard_errors_are_at_the_bound(fault: tuple[float, ...]) -> None:
     recording.outputs.copy_(clean)
     recording.mask.fill_(True)
     fitting = set_up(plant, [recording], PAPER_PARAMETERS, "equilibrium")
-    std = 1e6 * information_std(fitting.problem(STEP, "likelihood", noise), theta)
+    std = 1e6 * information_std(fitting.problem(STEP).at_noise([noise]), theta)
     # The printed bounds are whole numbers, converged to half a per cent.
     assert torch.allclose(std, torch.tensor(BOUNDS[fault], dtype=torch.float64), rtol=0.01, atol=0.5)

@@ -56,7 +56,7 @@ def problem(
     weight[3:7, 0] = 0.0
     values[3:7, 0] = float("nan")
     level = torch.tensor([0.02, 0.03], dtype=torch.float64) if known else None
-    return Problem(space(std), [Term(engine, Readings(values, weight))], objective, level)  # type: ignore[arg-type]
+    return Problem(space(std), [Term(engine, Readings(values, weight), noise_std=level)], objective)  # type: ignore[arg-type]
 
 
 THETA = torch.tensor([[[1.1, 0.6], [2.0, 1.5], [1.3, 0.8]]], dtype=torch.float64)

@@ -59,7 +59,10 @@ def show(done: TrainResult, screen: Screen) -> None:
 def in_words(done: TrainResult) -> list[str]:
     """What the diagnosis says, one sentence a line."""
     diagnosis, final = done.result.diagnosis, done.result.estimate
-    lines = [f"{diagnosis.kind}: " + (", ".join(f.name for f in diagnosis.present) or "all suspects are at nominal")]
+    lines = []
+    if diagnosis.faults:
+        found = ", ".join(f.name for f in diagnosis.present) or "every suspect is nominal as far as can be told"
+        lines.append(f"{diagnosis.kind}: {found}")
     for fault in diagnosis.present:
         parts = [f"{fault.value:.4g} instead of {fault.nominal:g}"]
         if fault.flow is not None:
@@ -67,7 +70,7 @@ def in_words(done: TrainResult) -> list[str]:
         if fault.hole is not None:
             parts.append(f"as a sharp-edged hole of {1e3 * fault.hole:.3g} mm")
         lines.append(f"- {fault.name}: " + ", ".join(parts))
-    lines += [f"- {name} lies at the edge of its range" for name in final.at_bounds]
+    lines += [f"- {name} lies at the {end} end of its range" for name, end in final.at_bounds.items()]
     lines += [f"- {sentence}" for sentence in final.undetermined]
     if not diagnosis.explained:
         ratio = diagnosis.unexplained_ratio

@@ -152,3 +152,17 @@ def sample_noise(values: Tensor, weight: Tensor) -> Tensor:
         for c in range(values.shape[1])
     ]
     return torch.stack(levels)
+
+
+def lasting(residual: Tensor, weight: Tensor) -> Tensor:
+    """For how many samples a residual lasts, (C,): (1 + a) / (1 - a), a its lag-1 correlation; 1 where it is white.
+
+    Slow parameters see noise of that many times the variance (AR(1) spectrum at frequency zero; Box & Jenkins 1970).
+    residual, weight: (S, C). A correlation within three standard errors of zero counts as none.
+    """
+    pairs = weight[1:] * weight[:-1]
+    square = (weight * residual**2).sum(0) / weight.sum(0).clamp(min=1.0)
+    count = pairs.sum(0).clamp(min=1.0)
+    a = (pairs * residual[1:] * residual[:-1]).sum(0) / count / square.clamp(min=1e-300)
+    a = torch.where(a > 3.0 / torch.sqrt(count), a, torch.zeros_like(a)).clamp(max=1.0 - 20.0 / (count + 20.0))
+    return (1.0 + a) / (1.0 - a)

@@ -56,12 +56,12 @@ class Fitting:
             for network, own, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True)
         ]
 
-    def problem(self, step: float, objective: Objective = "likelihood", noise_std: Tensor | None = None) -> Problem:
+    def problem(self, step: float, objective: Objective = "likelihood") -> Problem:
         terms = [
             Term(engine, readings_of(recording, self.plant), columns)
             for engine, recording, columns in zip(self.engines(step), self.recordings, self.columns, strict=True)
         ]
-        return Problem(self.space, terms, objective, noise_std)
+        return Problem(self.space, terms, objective)
 
 
 def set_up(

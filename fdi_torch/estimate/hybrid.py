@@ -8,15 +8,17 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.diagnosis import Diagnosis, diagnose, sample_noise
+from fdi_torch.estimate.diagnosis import Diagnosis, diagnose, lasting, sample_noise
 from fdi_torch.estimate.evolution import EvolutionResult, EvolutionSettings, Search, evolve
-from fdi_torch.estimate.fitting import Fitting, readings_of
+from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.objectives import Objective, Problem
 from fdi_torch.estimate.refine import Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.uncertainty import Estimate, make_estimate
 from fdi_torch.simulate.steps import choose_step, probe_points
 
+# A refinement that stopped at the last digits of its cost is converged when this few standard errors are left to go.
+LEFT_TO_GO = 0.1
 # Finer steps than this change no standard error that a recording could support.
 FINEST_STEP = 0.01
 
@@ -175,6 +177,13 @@ def best_of(refined: Refined) -> Refined:
     return Refined(**{name: None if v is None else v[best] for name, v in vars(refined).items()})  # type: ignore[arg-type]
 
 
+def status_of(refinement: Refined) -> str:
+    """The status of one member; 'converged' too where only rounding kept it from going the last bit."""
+    status = refinement.statuses()[0]
+    near = float(refinement.promised[0]) < 0.5 * LEFT_TO_GO**2
+    return "converged" if status == "stalled" and near else status
+
+
 def information_std(problem: Problem, theta: Tensor) -> Tensor:
     """Standard errors (P,) from the curvature at theta (1, P); infinite where nothing determines a parameter."""
     curvature = problem.linearise(theta, torch.zeros(1, dtype=torch.int64)).curvature[0]
@@ -193,18 +202,18 @@ def conclude(
     lanes = torch.zeros(1, dtype=torch.int64)
     problem = fitting.problem(steps[1], "likelihood")
     noise = problem.noise(theta, lanes)
-    curvature = problem.linearise(theta, lanes).curvature[0]
-    predicted, ratios = [], []
-    for term, recording, level in zip(problem.terms, fitting.recordings, noise, strict=True):
+    predicted, ratios, slow_noise = [], [], []
+    for term, level in zip(problem.terms, noise, strict=True):
         predicted.append(term.engine.readings(term.theta(theta))[0])
-        data = readings_of(recording, fitting.plant)
-        own = sample_noise(data.values, data.weight)
+        own = sample_noise(term.data.known, term.data.weight)
         ratios.append(float((level[0] / own.clamp(min=1e-12)).max()))
+        slow_noise.append(level[0] * torch.sqrt(lasting(term.data.known - predicted[-1], term.data.weight)))
+    curvature = problem.at_noise(slow_noise).linearise(theta, lanes).curvature[0]
     result = make_estimate(
         fitting.space,
         theta[0],
         curvature,
-        status=refinement.statuses()[0],
+        status=status_of(refinement),
         noise_std=noise[0][0],
         reached={"search": found.reasons()[0], "refinement": refinement.statuses()[0], "steps_s": list(steps)},
     )

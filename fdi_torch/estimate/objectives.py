@@ -6,7 +6,7 @@ Both are taken from the engines' sums over samples, so no trajectory is kept.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -25,11 +25,13 @@ ROUNDING_SHARE = 1e-9
 
 @dataclass(frozen=True)
 class Term:
-    """One recording: the engine under its inputs, what was read, and which columns of theta the engine takes."""
+    """One recording: the engine under its inputs, what was read, which columns of theta the engine takes, and the
+    noise's standard deviation where it is known."""
 
     engine: Engine
     data: Readings
     columns: Tensor | None = None
+    noise_std: Tensor | None = None
 
     def theta(self, theta: Tensor) -> Tensor:
         return theta if self.columns is None else theta[..., self.columns]
@@ -39,8 +41,8 @@ class Problem:
     """The cost of parameter vectors, in the two forms that search and refinement ask for.
 
     objective 'correlation': sum over channels of 1 - rho, which is (13), (18) of the 2020 paper as a minimum.
-    objective 'likelihood': the negative log-likelihood of Gaussian noise. noise_std (C,) or (problems, C), in the
-    readings' units: where it is not given, each channel's noise level is unknown and is profiled out.
+    objective 'likelihood': the negative log-likelihood of Gaussian noise. A term's noise_std (C,) or (problems, C), in
+    the readings' units: where it is not given, each channel's noise level is unknown and is profiled out.
     Finite standard deviations of the space are Gaussian priors about its nominal values.
     """
 
@@ -49,16 +51,20 @@ class Problem:
         space: ParameterSpace,
         terms: Sequence[Term],
         objective: Objective = "likelihood",
-        noise_std: Tensor | None = None,
     ) -> None:
         if objective not in OBJECTIVES:
             raise ValueError(f"expected an objective of {', '.join(OBJECTIVES)}, got '{objective}'")
         if not terms:
             raise ValueError("expected at least one recording, got none")
-        self.space, self.terms, self.objective, self.noise_std = space, tuple(terms), objective, noise_std
+        self.space, self.terms, self.objective = space, tuple(terms), objective
         if objective == "correlation":
             for term in self.terms:
                 _expect_variation(term.data)
+
+    def at_noise(self, levels: Sequence[Tensor]) -> Problem:
+        """The likelihood of the same recordings at known noise levels, one (C,) for each."""
+        known = [replace(term, noise_std=level) for term, level in zip(self.terms, levels, strict=True)]
+        return Problem(self.space, known, "likelihood")
 
     def cost(self, theta: Tensor, lanes: Tensor) -> Tensor:
         """theta (L, N, P) of the problems `lanes` (L,) -> cost (L, N)."""
@@ -69,7 +75,7 @@ class Problem:
             if self.objective == "correlation":
                 total = total + correlation_loss(sums, data).sum(-1)
             else:
-                total = total + self._deviance(sums[..., 1], data, lanes).sum(-1)
+                total = total + deviance(sums[..., 1], data, known_noise(term, lanes)).sum(-1)
         return total
 
     def correlations(self, theta: Tensor, lanes: Tensor) -> Tensor:
@@ -91,7 +97,7 @@ class Problem:
             if self.objective == "correlation":
                 parts = correlation_expansion(gram, data)
             else:
-                parts = self._likelihood_expansion(gram, data, lanes)
+                parts = likelihood_expansion(gram, data, known_noise(term, lanes))
             cost = cost + parts.cost
             columns = torch.arange(own.shape[-1], device=theta.device) if term.columns is None else term.columns
             gradient = gradient.index_add(1, columns, parts.gradient)
@@ -109,27 +115,6 @@ class Problem:
             spent = theta.shape[-1] / squares.shape[-1] / len(self.terms)
             levels.append(torch.sqrt(squares / (data.weight.sum(-2) - spent).clamp(min=1.0)))
         return levels
-
-    def _deviance(self, squares: Tensor, data: Readings, lanes: Tensor) -> Tensor:
-        """Each channel's negative log-likelihood, (L, N, C); constants dropped."""
-        count = _per_lane(data.weight.sum(-2), squares)
-        if self.noise_std is not None:
-            return 0.5 * squares / _per_lane(self._known_noise(lanes), squares) ** 2
-        return 0.5 * count * torch.log(squares / count.clamp(min=1.0) + _per_lane(_floor(data), squares))
-
-    def _likelihood_expansion(self, gram: Tensor, data: Readings, lanes: Tensor) -> Linearisation:
-        squares = gram[..., -3, -3]
-        cost = self._deviance(squares.unsqueeze(1), data, lanes).squeeze(1).sum(-1)
-        if self.noise_std is not None:
-            variance = (self._known_noise(lanes) ** 2).expand_as(squares)
-        else:
-            variance = squares / data.weight.sum(-2).clamp(min=1.0) + _floor(data)
-        scaled = gram / variance[..., None, None]
-        return Linearisation(cost, -scaled[..., :-3, -3].sum(1), scaled[..., :-3, :-3].sum(1))
-
-    def _known_noise(self, lanes: Tensor) -> Tensor:
-        assert self.noise_std is not None
-        return self.noise_std[lanes] if self.noise_std.dim() == 2 else self.noise_std
 
     def _precision(self, theta: Tensor) -> Tensor:
         return self.space.std(theta) ** -2
@@ -150,6 +135,30 @@ def of_lanes(data: Readings, lanes: Tensor) -> Readings:
 def spread_of(data: Readings) -> Tensor:
     """Weighted sum of squares of each channel about its mean, (C,) or (L, C)."""
     return (data.weight * (data.known - data.centre.unsqueeze(-2)) ** 2).sum(-2)
+
+
+def known_noise(term: Term, lanes: Tensor) -> Tensor | None:
+    """The noise levels of some problems, (C,) or (L, C); None where they are unknown."""
+    std = term.noise_std
+    return std if std is None or std.dim() == 1 else std[lanes]
+
+
+def deviance(squares: Tensor, data: Readings, noise_std: Tensor | None) -> Tensor:
+    """Each channel's negative log-likelihood, (L, N, C), from its sum of squares; constants dropped."""
+    if noise_std is not None:
+        return 0.5 * squares / _per_lane(noise_std, squares) ** 2
+    count = _per_lane(data.weight.sum(-2), squares)
+    return 0.5 * count * torch.log(squares / count.clamp(min=1.0) + _per_lane(_floor(data), squares))
+
+
+def likelihood_expansion(gram: Tensor, data: Readings, noise_std: Tensor | None) -> Linearisation:
+    """Gauss-Newton expansion of the negative log-likelihood, from the sums of products (L, C, P+3, P+3)."""
+    squares = gram[..., -3, -3]
+    cost = deviance(squares.unsqueeze(1), data, noise_std).squeeze(1).sum(-1)
+    unknown = squares / data.weight.sum(-2).clamp(min=1.0) + _floor(data)
+    variance = unknown if noise_std is None else (noise_std**2).expand_as(squares)
+    scaled = gram / variance[..., None, None]
+    return Linearisation(cost, -scaled[..., :-3, -3].sum(1), scaled[..., :-3, :-3].sum(1))
 
 
 def correlation_loss(sums: Tensor, data: Readings) -> Tensor:
