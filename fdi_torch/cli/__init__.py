@@ -22,6 +22,7 @@ COMMANDS = {
     "simulate": "write a recording from a plant, inputs, faults and noise",
     "check": "examine a plant and a recording before any fit",
     "report": "make one HTML page of one or more logs",
+    "gap": "where a plant file falls short of a recording, by which effect, and how far the gap closes",
 }
 
 

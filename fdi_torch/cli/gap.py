@@ -1,0 +1,75 @@
+"""Where a plant file falls short of a recording, which unmodelled effect causes it, and how far the gap then closes."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from fdi_torch.cli import DONE
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.plant import load_plant
+from fdi_torch.config.recordings import RecordingConfig, read_recording
+from fdi_torch.gap.answer import Answer
+from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.parameters import display_unit
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
+    parser.add_argument("--recording", metavar="FILE", required=True, help="CSV or MCAP file to diagnose")
+    parser.add_argument("--holdout", metavar="FILE", help="another recording of the same rig, for closure only")
+    parser.add_argument(
+        "--library", metavar="EFFECT,...", help="effects to search (EFFECT@PLACE for one place), or all"
+    )
+    parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="effects to deny the diagnosis")
+    parser.add_argument("--out", metavar="DIR", default="logs", help="folder for the answer")
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    torch.set_num_threads(1)  # arrays of this size lose more by sharing work than they gain
+    plant = load_plant(arguments.plant)
+    recording = read_recording(RecordingConfig(file=arguments.recording), plant, Path.cwd())
+    holdout = read_recording(RecordingConfig(file=arguments.holdout), plant, Path.cwd()) if arguments.holdout else None
+    settings = Settings(
+        library=tuple(arguments.library.split(",")) if arguments.library else None,
+        leave_out=tuple(name for name in arguments.leave_out.split(",") if name),
+    )
+    with screen.progress("gap") as advance:
+        answer = diagnose(plant, recording, holdout, settings, advance)
+    show(answer, screen)
+    screen.result(answer.to_dict())
+    return DONE
+
+
+def show(answer: Answer, screen: Screen) -> None:
+    """The verdict in words, causes with units, rivals, closure."""
+    screen.say(
+        f"verdict: {answer.verdict.replace('_', ' ')} (chance of such a gain by noise alone {answer.p_value:.1g})"
+    )
+    rows = []
+    for cause in answer.causes:
+        for name, amount in cause.parameters.items():
+            unit, scale = display_unit(amount.unit)
+            rows.append(
+                [cause.effect, cause.location, name, f"{scale * amount.value:.4g}", f"{scale * amount.std:.2g}", unit]
+            )
+    if rows:
+        screen.table("causes", ("effect", "at", "parameter", "value", "std error", "unit"), rows, left=3)
+    screen.table("where", ("place", "share of the gap"), [[p, f"{100 * s:.1f} %"] for p, s in answer.where[:5]])
+    names = [[_words(e.causes, e.unknown_at), f"{100 * e.probability:.2f} %"] for e in answer.posterior[:5]]
+    screen.table("explanations", ("causes", "probability"), names)
+    if answer.closure:
+        c = answer.closure
+        parts = ", ".join(f"{n} {c[n]:.4g}" for n in ("nominal", "recalibrated", "augmented", "noise_floor"))
+        closed = "undefined" if c["closed"] is None else f"{100 * c['closed']:.1f} %"
+        screen.say(f"hold-out, free-run RMSE in {c['unit']}: {parts}; gap closed: {closed}")
+    for remark in answer.remarks:
+        screen.say(f"- {remark}")
+
+
+def _words(causes: tuple[tuple[str, str], ...], unknown_at: str | None) -> str:
+    if unknown_at:
+        return f"something unknown at {unknown_at}"
+    return " and ".join(f"{effect} at {place}" for effect, place in causes) or "nothing beyond tolerances"

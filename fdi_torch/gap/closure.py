@@ -1,0 +1,100 @@
+"""How far the gap shrinks on data not used for any fit: free runs of the hold-out, with and without the effects.
+
+    closed = 1 - (augmented^2 - floor^2) / (recalibrated^2 - floor^2), in mean squares
+
+Constants and effects come from the recording; of the hold-out only the start levels are fitted, to its first samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject
+from fdi_torch.gap.floor import Noise, estimate_noise
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.simulate.collocation import Collocation
+
+START_SAMPLES = 120
+BLOCKS, DRAWS = 24, 400
+DEFINED = 5.0  # standard errors that a gap has to measure before a share of it means anything
+
+
+@dataclass(frozen=True)
+class Closure:
+    """Free-run RMSE on the hold-out, in the unit shown; closed is None where the gap is too small to be shared out."""
+
+    unit: str
+    per_sensor: dict[str, dict[str, float]]
+    pooled: dict[str, float]
+    closed: float | None
+    closed_ci95: tuple[float, float] | None
+    residuals: dict[str, Tensor]
+
+
+def closure(
+    subject: Subject, noise: Noise, fits: Mapping[str, Fit | None], best: str, scale: float, unit: str
+) -> Closure:
+    """fits: by the names of the answer ('nominal' has None); best: whose residual shows the hold-out's noise."""
+    residuals = {name: free_run(subject, noise, fit) for name, fit in fits.items()}
+    floor = estimate_noise(residuals[best], subject.mask).std
+    mask = subject.mask
+    squares = {name: torch.where(mask, r * r, 0.0) for name, r in residuals.items()}
+    count = mask.sum(dim=0)
+    names = [s.name for s in subject.plant.sensors]
+    each = {name: torch.sqrt(s.sum(dim=0) / count) for name, s in squares.items()} | {"noise_floor": floor}
+    pooled = {name: float(torch.sqrt((v * v * count).sum() / count.sum())) * scale for name, v in each.items()}
+    sensors = {s: {name: float(v[i]) * scale for name, v in each.items()} for i, s in enumerate(names)}
+    closed, interval = _closed(squares["recalibrated"], squares["augmented"], mask, floor)
+    return Closure(unit, sensors, pooled, closed, interval, residuals)
+
+
+def free_run(subject: Subject, noise: Noise, fit: Fit | None) -> Tensor:
+    """Residual (S, C) of a run with constants as fitted (or as believed) and start levels from the first samples."""
+    candidate = fit.candidate if fit else Candidate()
+    free = [n for n in fit.space.names if n.count(".") == 2] if fit else []
+    fitter = Fitter(replace(subject, mask=_first(subject.mask)), noise)
+    network = fitter.engine(candidate, free).network
+    if fit:
+        for name, value in fit.values.items():
+            network.nominal[network.constants.index(name)] = value
+    starts = [f"{t.name}.start_level" for t in subject.plant.tanks]
+    engine = Collocation(network, ParameterSpace(network.constants[n] for n in starts), subject.experiment)
+    theta = engine.space.vector(fitter.first_levels()).unsqueeze(0)
+    levels = engine.settle(theta, engine.constant_guess(theta)).levels
+    theta, _, near = fitter.descend(engine, theta, levels, 5)
+    return subject.readings - engine.settle(theta, near.levels).readings[0]
+
+
+def _first(mask: Tensor) -> Tensor:
+    early = mask.clone()
+    early[START_SAMPLES:] = False
+    return early
+
+
+def _closed(
+    recalibrated: Tensor, augmented: Tensor, mask: Tensor, floor: Tensor
+) -> tuple[float | None, tuple[float, float] | None]:
+    """The share closed and its 95 % interval over blocks of time; None where the gap is under 5 standard errors."""
+    noise = floor**2 * mask
+    gap = _blocks(recalibrated - noise)
+    left = _blocks(augmented - noise)
+    total = float(gap.sum())
+    error = float(gap.std()) * math.sqrt(len(gap))
+    floor_error = 2.0 * float((floor**2 * mask.sum(dim=0)).sum()) * math.sqrt(2.0 / float(mask.sum()))
+    if total < DEFINED * min(error, max(floor_error, 1e-300)) or total < DEFINED * floor_error:
+        return None, None
+    generator = torch.Generator().manual_seed(0)
+    pick = torch.randint(len(gap), (DRAWS, len(gap)), generator=generator)
+    drawn = 1.0 - left[pick].sum(dim=1) / gap[pick].sum(dim=1)
+    low, high = torch.quantile(drawn, torch.tensor([0.025, 0.975], dtype=drawn.dtype)).tolist()
+    return 1.0 - float(left.sum()) / total, (low, high)
+
+
+def _blocks(x: Tensor) -> Tensor:
+    """(S, C) -> sums over blocks of time."""
+    return torch.stack([b.sum() for b in torch.tensor_split(x.sum(dim=1), BLOCKS)])

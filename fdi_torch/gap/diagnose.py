@@ -1,0 +1,250 @@
+"""The gap diagnosis: noise floor, recalibration, where, which, and how far the gap closes on data not used."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import effect
+from fdi_torch.gap.answer import Amount, Answer, Cause, CauseName, Explanation, Verdict
+from fdi_torch.gap.closure import Closure, closure
+from fdi_torch.gap.evidence import LOG_PRIOR_EFFECT, log_evidence, posterior, temperature
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject, subject_of
+from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step
+from fdi_torch.gap.freeform import free_forms
+from fdi_torch.gap.library import canonical, library_of, possible_places, twins
+from fdi_torch.gap.screening import options_of
+from fdi_torch.gap.where import Suspect, refit, suspects
+from fdi_torch.gap.which import Search, search
+from fdi_torch.parameters import display_unit
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.reach import reach_of
+from fdi_torch.recording import Recording
+
+CONTENT = 0.95
+REFITS = 3
+LOG_PRIOR_UNKNOWN = math.log(0.01)  # odds of an effect outside the library, before the data
+Tell = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """library, leave_out: as in `library_of`. step: of the simulation, s; None for the sampling interval."""
+
+    library: tuple[str, ...] | None = None
+    leave_out: tuple[str, ...] = ()
+    step: float | None = None
+
+
+def diagnose(
+    plant: PlantDescription,
+    recording: Recording,
+    holdout: Recording | None = None,
+    settings: Settings = Settings(),
+    tell: Tell = lambda share, text: None,
+) -> Answer:
+    """What keeps the plant file from explaining the recording; the hold-out only measures how far the gap closes."""
+    library = library_of(plant, settings.library, settings.leave_out)
+    believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    subject = subject_of(plant, believed, recording, settings.step or _interval(recording))
+    tell(0.05, "noise floor and recalibration")
+    fitter, null, lattice = _recalibrated(subject)
+    reach = reach_of(recording, plant)
+    tell(0.2, "which effect")
+    options = options_of([p for p in library if not p.effect.rounds], fitter, reach)
+    found = search(fitter, null, options)
+    tell(0.6, "where")
+    heat = temperature(null.cost - found.best.cost)
+    forms = free_forms(plant, reach, possible_places(plant))
+    places = suspects(fitter, null, forms, reach, heat)
+    refits = [refit(fitter, null, forms[s.location]) for s in places[:REFITS]] if _gap(subject, null) > 100.0 else []
+    rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
+    rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]
+    weighed = _weighed(fitter, found, refits, len(library), plant)
+    tell(0.8, "hold-out")
+    return _answer(fitter, found, places, weighed, rounded, lattice, holdout, settings)
+
+
+def _interval(recording: Recording) -> float:
+    return float(torch.median(torch.diff(recording.time)))
+
+
+def _gap(subject: Subject, null: Fit) -> float:
+    return null.cost - float(subject.mask.sum())
+
+
+def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
+    """The noise of each channel, the recalibrated plant under it, and the step of each rounded channel."""
+    channels = len(subject.plant.sensors)
+    spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+    first = Fitter(subject, Noise(1e-2 * spread, torch.zeros(channels, dtype=spread.dtype)))
+    null = first.fit(Candidate())
+    residual = subject.readings - null.near.readings[0]
+    noise = estimate_noise(residual, subject.mask)
+    values = [subject.readings[subject.mask[:, c], c] for c in range(channels)]
+    lattice = [lattice_step(v, float(noise.std[c])) for c, v in enumerate(values)]
+    noise = estimate_noise(residual, subject.mask, [step > 0.0 for step in lattice])
+    fitter = Fitter(subject, noise)
+    return fitter, fitter.fit(Candidate(), null), lattice
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """Explanations with their probabilities, likeliest first; fit: the best one of each."""
+
+    explanations: tuple[Explanation, ...]
+    fits: tuple[Fit, ...]
+
+
+def _weighed(fitter: Fitter, found: Search, refits: Sequence[Fit], choices: int, plant: PlantDescription) -> Weighed:
+    ceiling = min([found.best.cost, *(f.cost for f in refits)])
+    heat = temperature(found.null.cost - ceiling)
+    scores: dict[tuple[str | None, frozenset[CauseName]], tuple[float, Fit]] = {}
+    for fit in found.fits:
+        key = (None, frozenset(canonical(c, plant) for c in fit.key))
+        score = log_evidence(fitter, fit, heat, choices)
+        if key not in scores or score > scores[key][0]:
+            scores[key] = (score, fit)
+    for fit in refits:
+        place = fit.candidate.placements[0].location
+        extra = LOG_PRIOR_UNKNOWN - len(fit.key) * LOG_PRIOR_EFFECT + math.lgamma(len(fit.key) + 1)
+        count = len(possible_places(plant))
+        score = log_evidence(fitter, fit, heat, 1) + extra - math.log(count)
+        scores[(place, frozenset())] = (score, fit)
+    ranked = sorted(scores.items(), key=lambda item: -item[1][0])
+    weights = posterior([score for _, (score, _) in ranked])
+    explanations = tuple(
+        Explanation(_ordered(fit) if place is None else (), weight, place)
+        for ((place, _), (_, fit)), weight in zip(ranked, weights, strict=True)
+    )
+    return Weighed(explanations, tuple(fit for _, (_, fit) in ranked))
+
+
+def _ordered(fit: Fit) -> tuple[CauseName, ...]:
+    return tuple((p.effect.name, p.location) for p in fit.candidate.placements)
+
+
+def _answer(
+    fitter: Fitter,
+    found: Search,
+    places: Sequence[Suspect],
+    weighed: Weighed,
+    rounded: Sequence[CauseName],
+    lattice: Sequence[float],
+    holdout: Recording | None,
+    settings: Settings,
+) -> Answer:
+    subject, plant = fitter.subject, fitter.subject.plant
+    standing = _content(weighed.explanations)
+    best, fit = weighed.explanations[0], weighed.fits[0]
+    library_fit = next(
+        (f for e, f in zip(weighed.explanations, weighed.fits, strict=True) if e.unknown_at is None), fit
+    )
+    unknown = sum(e.probability for e in weighed.explanations if e.unknown_at) > 0.5
+    verdict: Verdict = "unknown" if unknown else _verdict([e for e in standing if e.unknown_at is None], rounded)
+    causes = () if verdict in ("no_gap", "unknown") else _causes(fitter, library_fit, rounded, lattice)
+    sets = [(*e.causes, *rounded) for e in standing if e.unknown_at is None] if causes else []
+    gap = max(_gap(subject, found.null), 1.0)
+    where = [(s.location, min(max(s.closes / gap, 0.0), 1.0)) for s in places]
+    if unknown:
+        first = next(e.unknown_at for e in weighed.explanations if e.unknown_at)
+        where = sorted(where, key=lambda w: w[0] != first)
+    return Answer(
+        verdict=verdict,
+        p_value=_p_value(found, rounded),
+        where=where,
+        causes=causes,
+        ambiguity_set=sets,
+        posterior=[
+            Explanation((*e.causes, *rounded) if not e.unknown_at else (), e.probability, e.unknown_at)
+            for e in weighed.explanations[:12]
+        ],
+        closure=_closure(fitter, found, library_fit if not unknown else fit, holdout, settings, unknown),
+        noise=_noise(fitter, lattice),
+    )
+
+
+def _content(explanations: Sequence[Explanation]) -> list[Explanation]:
+    """The fewest explanations that hold 95 % together."""
+    kept, held = [], 0.0
+    for explanation in explanations:
+        kept.append(explanation)
+        held += explanation.probability
+        if held >= CONTENT:
+            break
+    return kept
+
+
+def _verdict(standing: Sequence[Explanation], rounded: Sequence[CauseName]) -> Verdict:
+    if not standing[0].causes and not rounded:
+        return "no_gap"
+    return "named" if len(standing) == 1 else "ambiguous"
+
+
+def _causes(fitter: Fitter, fit: Fit, rounded: Sequence[CauseName], lattice: Sequence[float]) -> tuple[Cause, ...]:
+    plant, stds = fitter.subject.plant, _standard_errors(fitter, fit)
+    causes = []
+    for p in fit.candidate.placements:
+        amounts = {}
+        for name, value in fit.effect_values.items():
+            if name.rpartition(".")[0] == p.prefix:
+                amounts[name.rpartition(".")[2]] = Amount(value, stds[name], fit.space[name].unit)
+        causes.append(Cause(p.effect.name, p.location, amounts, twins((p.effect.name, p.location), plant)))
+    steps = {s.name: (step, s.unit) for s, step in zip(plant.sensors, lattice, strict=True)}
+    for name, place in rounded:
+        causes.append(Cause(name, place, {"step": Amount(steps[place][0], 0.0, steps[place][1])}))
+    return tuple(causes)
+
+
+def _standard_errors(fitter: Fitter, fit: Fit) -> dict[str, float]:
+    scale = fitter.box(fit.space)[2]
+    curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.near, scale)[2][0]
+    variance = torch.diagonal(torch.linalg.pinv(curvature, hermitian=True))
+    return dict(zip(fit.space.names, (torch.sqrt(variance.clamp(min=0.0)) * scale).tolist(), strict=True))
+
+
+def _p_value(found: Search, rounded: Sequence[CauseName]) -> float:
+    """Chance that noise alone lets some option of the library gain as much (Bonferroni over the options)."""
+    if rounded:
+        return 0.0
+    screen = found.screens[found.null.key]
+    gain = max(
+        float(screen.gain.max()),
+        found.null.cost - min((f.cost for f in found.fits if len(f.key) == 1), default=found.null.cost),
+    )
+    return min(1.0, len(screen.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))
+
+
+def _closure(
+    fitter: Fitter, found: Search, best: Fit, holdout: Recording | None, settings: Settings, unknown: bool
+) -> Mapping[str, Any]:
+    if holdout is None:
+        return {}
+    subject = subject_of(fitter.subject.plant, fitter.subject.believed, holdout, settings.step or _interval(holdout))
+    unit, scale = display_unit(subject.plant.sensors[0].unit)
+    fits: dict[str, Fit | None] = {"nominal": None, "recalibrated": found.null, "augmented": best}
+    done: Closure = closure(subject, fitter.noise, fits, "augmented", scale, unit)
+    return {
+        "metric": "free-run RMSE on the hold-out, per sensor and pooled, in the sensor's unit",
+        "unit": done.unit,
+        **done.pooled,
+        "per_sensor": done.per_sensor,
+        "closed": done.closed,
+        "closed_ci95": done.closed_ci95,
+        "with": "a free discrepancy" if unknown else "the causes named",
+    }
+
+
+def _noise(fitter: Fitter, lattice: Sequence[float]) -> Mapping[str, Any]:
+    sensors = fitter.subject.plant.sensors
+    std: Tensor = fitter.noise.std
+    return {
+        s.name: {"std": float(std[i]), "ar1": float(fitter.noise.ar[i]), "rounded_to": lattice[i], "unit": s.unit}
+        for i, s in enumerate(sensors)
+    }

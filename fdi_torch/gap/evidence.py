@@ -1,0 +1,66 @@
+"""How well an explanation stands among others: Laplace's evidence, tempered by what its equations may get wrong.
+
+    log E = -J / (2 T) - log det(H / T) / 2 + sum of the log prior densities of the effects' parameters
+
+J is the fit's chi-square with the tolerances' share, H its curvature. No library has the true equations: an effect with
+a slightly other formula leaves a share of the gap that grows with the gap, so T = 1 + G / 4000 for a gap of G
+chi-square units: every further thousandth of the gap left open costs two nats, however many samples there are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.fitting import Fit, Fitter
+
+MISMATCH = 4000.0
+LOG_PRIOR_EFFECT = math.log(0.1)  # odds of one more thing being wrong, before the data
+
+
+def temperature(gap: float) -> float:
+    """gap: chi-square between the recalibrated plant and the best explanation."""
+    return 1.0 + max(gap, 0.0) / MISMATCH
+
+
+def log_evidence(fitter: Fitter, fit: Fit, heat: float, choices: int) -> float:
+    """choices: how many effects at places the library holds; each further effect is one of them."""
+    space = fit.space
+    scale = fitter.box(space)[2]
+    curvature = fitter.normal(space, fit.theta.unsqueeze(0), fit.near, scale)[2][0]
+    pull = torch.nan_to_num(scale / space.std(fit.theta), posinf=0.0)
+    # What a tolerance says is no data and stays as it is.
+    hessian = (curvature - torch.diag(pull**2)) / heat + torch.diag(pull**2)
+    cost = (fit.cost - _prior_cost(fit)) / heat + _prior_cost(fit)
+    widths = torch.tensor([_log_width(fitter, fit, i) for i in range(len(space))], dtype=torch.float64)
+    occam = -0.5 * _log_det(hessian) + float((torch.log(scale) - widths).sum())
+    causes = len(fit.key)
+    return -0.5 * cost + occam + causes * (LOG_PRIOR_EFFECT - math.log(choices)) - math.lgamma(causes + 1)
+
+
+def _prior_cost(fit: Fit) -> float:
+    off = (fit.theta - fit.space.nominal(fit.theta)) / fit.space.std(fit.theta)
+    return float((off * off).sum())
+
+
+def _log_width(fitter: Fitter, fit: Fit, i: int) -> float:
+    """Log of the width of a parameter's prior over sqrt(2 pi), in its unit."""
+    p = fit.space.parameters[i]
+    if math.isfinite(p.std):
+        return math.log(p.std)
+    low, high, _ = fitter.box(fit.space)
+    width = float(high[i] - low[i])
+    return math.log(width if math.isfinite(width) else 1.0) - 0.5 * math.log(2.0 * math.pi)
+
+
+def _log_det(h: Tensor) -> float:
+    """Of a curvature in units of each parameter's range; what the data do not show counts as known to 1 range."""
+    return float(torch.log(torch.clamp(torch.linalg.eigvalsh(h), min=1.0)).sum())
+
+
+def posterior(log_weights: Sequence[float]) -> list[float]:
+    weights = torch.softmax(torch.tensor(log_weights, dtype=torch.float64), dim=0)
+    return [float(w) for w in weights]

@@ -1,0 +1,253 @@
+"""Fits of one model, from many starts at once, to one recording: Levenberg-Marquardt on whole trajectories."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import EFFECTS
+from fdi_torch.gap.floor import Noise
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.experiment import Experiment, lay_out
+
+ROUNDS = 14
+SETTLED = 0.05  # chi-square units; smaller gains decide nothing
+PATIENCE, ENOUGH = 2, 5.0  # a start is given up that gains less than a fifth of its arrears after two rounds
+Key = frozenset[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is diagnosed: a plant (with the effects it is believed to have) and one recording of it."""
+
+    plant: PlantDescription
+    believed: tuple[Placement, ...]
+    recording: Recording
+    experiment: Experiment
+    readings: Tensor
+    mask: Tensor
+
+    @cached_property
+    def nuisance(self) -> tuple[str, ...]:
+        """Calibration constants with a tolerance, and start levels: refitted with every candidate."""
+        constants = TankNetwork(self.plant, ()).constants
+        tolerated = [p.name for p in constants if math.isfinite(p.std)]
+        return (*tolerated, *(f"{t.name}.start_level" for t in self.plant.tanks))
+
+
+def subject_of(plant: PlantDescription, believed: Sequence[Placement], recording: Recording, step: float) -> Subject:
+    """Lays a recording out; its sensors in the plant's order. Raises ValueError where one is missing."""
+    names = [s.column for s in plant.sensors]
+    missing = [n for n in names if n not in recording.output_names]
+    if missing:
+        known = ", ".join(recording.output_names) or "none"
+        raise ValueError(f"{recording.source}: expected a sensor '{missing[0]}', got {known}; map the column to it")
+    order = [recording.output_names.index(n) for n in names]
+    experiment = lay_out(recording, plant.channels(), step)
+    return Subject(plant, tuple(believed), recording, experiment, recording.outputs[:, order], recording.mask[:, order])
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Effects at places; free: which of their parameters are fitted, and from where ('Q1.pump_lag.time_constant')."""
+
+    placements: tuple[Placement, ...] = ()
+    starts: tuple[Mapping[str, float], ...] = ({},)
+
+    @property
+    def key(self) -> Key:
+        return frozenset((p.effect.name, p.location) for p in self.placements)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The best fit of a candidate: parameters by name, cost (chi-square with priors) and its neighbourhood."""
+
+    candidate: Candidate
+    space: ParameterSpace
+    theta: Tensor
+    cost: float
+    near: Linearised
+
+    @property
+    def values(self) -> dict[str, float]:
+        return dict(zip(self.space.names, self.theta.tolist(), strict=True))
+
+    @property
+    def effect_values(self) -> dict[str, float]:
+        return {n: v for n, v in self.values.items() if n.count(".") == 2}
+
+    @property
+    def key(self) -> Key:
+        return self.candidate.key
+
+
+class Fitter:
+    """Fits candidates to one subject under one noise."""
+
+    def __init__(self, subject: Subject, noise: Noise) -> None:
+        self.subject, self.noise = subject, noise
+        self._engines: dict[tuple[str, ...], Collocation] = {}
+
+    def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation:
+        """The plant with the candidate's effects; its space holds the nuisances and what is free."""
+        known = {p.prefix for p in candidate.placements}
+        believed = [p for p in self.subject.believed if p.prefix not in known]
+        network = TankNetwork(self.subject.plant, _in_library_order([*believed, *candidate.placements]))
+        names = [*self.subject.nuisance, *free]
+        return Collocation(network, ParameterSpace(network.constants[n] for n in names), self.subject.experiment)
+
+    def fit(
+        self, candidate: Candidate, base: Fit | None = None, rounds: int = ROUNDS, target: float = -math.inf
+    ) -> Fit:
+        """The best of the candidate's starts; nuisances and trajectory begin where `base` found them.
+
+        target: the cost to compete with; starts that come near it too slowly are given up.
+        """
+        by_free: dict[tuple[str, ...], list[Mapping[str, float]]] = {}
+        for start in candidate.starts:
+            by_free.setdefault(tuple(sorted(start)), []).append(start)
+        fits = [self._fit(candidate, free, starts, base, rounds, target) for free, starts in by_free.items()]
+        return min(fits, key=lambda f: f.cost)
+
+    def _fit(
+        self,
+        candidate: Candidate,
+        free: tuple[str, ...],
+        starts: Sequence[Mapping[str, float]],
+        base: Fit | None,
+        rounds: int,
+        target: float,
+    ) -> Fit:
+        engine = self.engine(candidate, free)
+        theta, levels = self._begin(engine, starts, base)
+        theta, cost, near = self.descend(engine, theta, levels, rounds, target)
+        best = int(torch.nan_to_num(cost, nan=torch.inf).argmin())
+        return Fit(candidate, engine.space, theta[best], float(cost[best]), near.lanes(torch.tensor([best])))
+
+    def _begin(
+        self, engine: Collocation, starts: Sequence[Mapping[str, float]], base: Fit | None
+    ) -> tuple[Tensor, Tensor]:
+        known = base.values if base else self.first_levels()
+        rows = [engine.space.vector({n: v for n, v in {**known, **s}.items() if n in engine.space}) for s in starts]
+        theta = torch.stack(rows)
+        if base is None:
+            guess = engine.constant_guess(theta)
+            return theta, engine.settle(theta, guess).levels
+        return theta, base.near.levels.expand(len(starts), -1, -1)
+
+    def first_levels(self) -> dict[str, float]:
+        """Start levels from the mean of the first few readings."""
+        found = {}
+        for i, sensor in enumerate(self.subject.plant.sensors):
+            seen = self.subject.readings[:5, i][self.subject.mask[:5, i]]
+            if len(seen):
+                found[f"{sensor.tank}.start_level"] = max(float(seen.mean() - sensor.offset) / sensor.gain, 0.0)
+        return found
+
+    def descend(
+        self, engine: Collocation, theta: Tensor, levels: Tensor, rounds: int, target: float = -math.inf
+    ) -> tuple[Tensor, Tensor, Linearised]:
+        """theta (L, P), levels (L, K+1, n) -> where Levenberg-Marquardt ends, its cost (L,) and neighbourhood."""
+        low, high, scale = self.box(engine.space)
+        near = engine.linearise(theta, levels)
+        near = engine.linearise(theta, near.levels)
+        cost, gradient, curvature = self.normal(engine.space, theta, near, scale)
+        damping = torch.full_like(cost, 1e-3)
+        active = torch.isfinite(cost)
+        for turn in range(rounds):
+            lanes = active.nonzero().flatten()
+            if not len(lanes):
+                break
+            step = _bounded_step(gradient[lanes], curvature[lanes], damping[lanes], theta[lanes], low, high, scale)
+            moved = torch.minimum(torch.maximum(theta[lanes] + step, low), high)
+            moves = (moved - theta[lanes]).unsqueeze(1).unsqueeze(1)
+            guess = near.levels[lanes] + (near.slopes[lanes] * moves).sum(-1)
+            tried = engine.linearise(moved, guess)
+            new_cost, new_gradient, new_curvature = self.normal(engine.space, moved, tried, scale)
+            better = new_cost < cost[lanes]
+            gain = torch.where(better, cost[lanes] - new_cost, torch.zeros_like(new_cost))
+            take = lanes[better]
+            theta, cost = theta.index_copy(0, take, moved[better]), cost.index_copy(0, take, new_cost[better])
+            gradient = gradient.index_copy(0, take, new_gradient[better])
+            curvature = curvature.index_copy(0, take, new_curvature[better])
+            near = _replaced(near, take, tried.lanes(better))
+            damping[lanes] = torch.where(better, damping[lanes] * 0.2, damping[lanes] * 10.0).clamp(1e-9, 1e8)
+            behind = cost[lanes] - max(target, float(cost.min()) if len(cost) > 1 else target)
+            hopeless = (turn >= PATIENCE) & (ENOUGH * gain < behind) & (behind > 30.0)
+            done = (better & (gain < SETTLED)) | (damping[lanes] > 1e4) | hopeless
+            active[lanes[done]] = False
+        return theta, cost, near
+
+    def normal(
+        self, space: ParameterSpace, theta: Tensor, near: Linearised, scale: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost (L,), half its gradient (L, P) and curvature (L, P, P), in scaled parameters."""
+        residual, jacobian = self.white(near)
+        pull = 1.0 / space.std(theta)
+        off = (theta - space.nominal(theta)) * pull
+        j = (jacobian * scale).flatten(1, 2)
+        r = residual.flatten(1)
+        cost = (r * r).sum(-1) + (off * off).sum(-1)
+        gradient = torch.einsum("lsp,ls->lp", j, r) - off * pull * scale
+        curvature = torch.einsum("lsp,lsq->lpq", j, j) + torch.diag_embed((pull * scale) ** 2).expand(
+            len(theta), -1, -1
+        )
+        return cost, gradient, curvature
+
+    def white(self, near: Linearised) -> tuple[Tensor, Tensor]:
+        """Whitened residual (L, S, C) and Jacobian (L, S, C, P)."""
+        subject = self.subject
+        residual = self.noise.whiten(subject.readings - near.readings, subject.mask)
+        return residual, self.noise.whiten(near.jacobian, subject.mask)
+
+    def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]:
+        """Bounds, and the scale on which each parameter varies."""
+        duration = float(self.subject.experiment.nodes[-1])
+        low, high, scale = [], [], []
+        for p in space:
+            timed = p.unit == "s"
+            top = min(p.high, duration) if timed else p.high
+            low.append(p.low)
+            high.append(max(top, p.nominal))
+            finite = math.isfinite(p.std)
+            span = top - p.low
+            scale.append(p.std if finite else 0.1 * (span if math.isfinite(span) else max(abs(p.nominal), 1.0)))
+        return tuple(torch.tensor(x, dtype=torch.float64) for x in (low, high, scale))  # type: ignore[return-value]
+
+
+def _bounded_step(
+    gradient: Tensor, curvature: Tensor, damping: Tensor, theta: Tensor, low: Tensor, high: Tensor, scale: Tensor
+) -> Tensor:
+    """The damped step; parameters that a bound stops are left out of it, once more after a first look."""
+    stuck = ((theta <= low) & (gradient < 0)) | ((theta >= high) & (gradient > 0))
+    for _ in range(2):
+        free = (~stuck).to(theta.dtype)
+        h = curvature * free.unsqueeze(-1) * free.unsqueeze(-2)
+        diagonal = torch.diagonal(h, dim1=-2, dim2=-1)
+        added = damping.unsqueeze(-1) * diagonal + (1.0 - free) + 1e-9 * diagonal.amax(-1, keepdim=True) + 1e-12
+        step = torch.linalg.solve(h + torch.diag_embed(added), (gradient * free).unsqueeze(-1)).squeeze(-1) * scale
+        step = torch.nan_to_num(step, nan=0.0, posinf=0.0, neginf=0.0)
+        # A bound that is overshot from where the parameter already lies on it holds the parameter there.
+        stuck = stuck | ((theta + step <= low) & (theta <= low)) | ((theta + step >= high) & (theta >= high))
+    return step
+
+
+def _replaced(near: Linearised, lanes: Tensor, new: Linearised) -> Linearised:
+    fields = {name: getattr(near, name).index_copy(0, lanes, getattr(new, name)) for name in near.__dataclass_fields__}
+    return replace(near, **fields)
+
+
+def _in_library_order(placements: Sequence[Placement]) -> list[Placement]:
+    order = {e.name: i for i, e in enumerate(EFFECTS)}
+    return sorted(placements, key=lambda p: order.get(p.effect.name, len(order)))

@@ -1,0 +1,129 @@
+"""The noise floor: level and AR(1) colour of each channel's noise from the fast part of its residuals, and lattices.
+
+What a model gets wrong is slow beside the sampling, noise is not: the spectrum of an AR(1) noise,
+
+    S(w) = s^2 / |1 - a exp(-i w)|^2,
+
+is fitted to the periodogram above a corner frequency only (Whittle, 1953), so that a gap does not pass for colour.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+FAST_PERIOD = 30.0  # samples; slower parts of a residual may be the model's
+
+
+@dataclass(frozen=True)
+class Noise:
+    """innovation (C,): standard deviation of what is new in each sample, in the reading's unit; ar (C,)."""
+
+    innovation: Tensor
+    ar: Tensor
+
+    @property
+    def std(self) -> Tensor:
+        return self.innovation / torch.sqrt(1.0 - self.ar**2)
+
+    @property
+    def effective_share(self) -> Tensor:
+        """(C,): how many independent samples one sample is worth for a slow quantity."""
+        return (1.0 - self.ar) / (1.0 + self.ar)
+
+    def whiten(self, x: Tensor, mask: Tensor) -> Tensor:
+        """x (*lanes, S, C) or (*lanes, S, C, P), mask (S, C) -> independent samples of unit variance; masked are 0.
+
+        x_k - a x_{k-1}; the first sample, and one after a masked one, is scaled by sqrt(1 - a^2) instead.
+        """
+        extra = x.dim() - mask.dim() - 1 if x.shape[-2:] != mask.shape else 0
+        ar, innovation, keep = self.ar, self.innovation, mask
+        if x.shape[-2:] != mask.shape:
+            ar, innovation, keep = ar.unsqueeze(-1), innovation.unsqueeze(-1), mask.unsqueeze(-1)
+            extra = 1
+        time = -2 - extra
+        x = torch.where(keep, x, torch.zeros_like(x))
+        before = torch.roll(x, 1, time)
+        follows = mask & torch.roll(mask, 1, 0)
+        follows[0] = False
+        if extra:
+            follows = follows.unsqueeze(-1)
+        fresh = torch.sqrt(1.0 - ar**2)
+        white = torch.where(follows, x - ar * before, fresh * x)
+        return torch.where(keep, white / innovation, torch.zeros_like(x))
+
+
+def estimate_noise(residual: Tensor, mask: Tensor, rounded: Sequence[bool] = ()) -> Noise:
+    """residual (S, C), mask (S, C) -> level and colour of each channel's noise.
+
+    One colour for all channels: they are read by one system. rounded (C,): channels that have no say in it, for
+    what rounding adds has a colour of its own.
+    """
+    spectra = [_fast_spectrum(residual[mask[:, c], c]) for c in range(residual.shape[1])]
+    say = [not r for r in rounded] if rounded and not all(rounded) else [True] * len(spectra)
+    likelihoods = torch.stack([_likelihood(*s) for s in spectra])
+    common = _chosen(likelihoods[torch.tensor(say)].sum(dim=0), int(mask.sum()))
+    chosen = [common if ours else _chosen(likelihoods[c], int(mask[:, c].sum())) for c, ours in enumerate(say)]
+    level = torch.stack([_levels(*s)[i] for s, i in zip(spectra, chosen, strict=True)])
+    return Noise(
+        torch.sqrt(torch.clamp(level, min=torch.finfo(level.dtype).tiny)), _COLOURS.to(level)[torch.tensor(chosen)]
+    )
+
+
+_COLOURS = torch.cat([torch.linspace(-0.5, 0.9, 281), torch.linspace(0.901, 0.98, 80)])
+_WHITE = int(_COLOURS.abs().argmin())
+
+
+def _fast_spectrum(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Tapered periodogram of x (S,) above the corner frequency, and the cosine of each frequency."""
+    count = len(x)
+    taper = torch.hann_window(count, periodic=False, dtype=x.dtype)
+    power = torch.fft.rfft((x - x.mean()) * taper).abs() ** 2 / (taper**2).sum()
+    frequency = torch.arange(len(power), dtype=x.dtype) / count
+    fast = frequency > 1.0 / FAST_PERIOD
+    return power[fast], torch.cos(2 * math.pi * frequency[fast])
+
+
+def _shape(cosine: Tensor) -> Tensor:
+    a = _COLOURS.to(cosine).unsqueeze(1)
+    return 1.0 / (1.0 - 2.0 * a * cosine + a * a)
+
+
+def _levels(power: Tensor, cosine: Tensor) -> Tensor:
+    """Innovation variance for each colour."""
+    return (power / _shape(cosine)).mean(dim=1)
+
+
+def _likelihood(power: Tensor, cosine: Tensor) -> Tensor:
+    """Twice the negative log-likelihood for each colour; the taper leaves one frequency in 1.94 independent."""
+    level = torch.log(torch.clamp(_levels(power, cosine), min=torch.finfo(power.dtype).tiny))
+    return 2.0 * (level + torch.log(_shape(cosine)).mean(dim=1)) * len(power) / 1.94
+
+
+def _chosen(likelihood: Tensor, count: int) -> int:
+    """The likeliest colour; white unless colour earns what the BIC asks for one parameter."""
+    best = int(likelihood.argmin())
+    return best if float(likelihood[_WHITE] - likelihood[best]) > math.log(count) else _WHITE
+
+
+def lattice_step(values: Tensor, noise: float) -> float:
+    """The distance between the values that a rounded channel takes, or 0 where it is finer than a tenth of the noise.
+
+    values (S,). A lattice: all gaps between distinct values are multiples of the least one.
+    """
+    distinct = torch.unique(values)
+    if len(distinct) < 3:
+        return 0.0
+    gaps = torch.diff(distinct)
+    merged = gaps[gaps > 1e-9 * float(distinct.abs().max())]
+    if len(merged) < 2:
+        return 0.0
+    step = float(merged.min())
+    step = float(merged[merged < 1.5 * step].mean())
+    multiples = merged / step
+    on_lattice = bool(((multiples - multiples.round()).abs() < 0.02 * multiples.round()).all())
+    return step if on_lattice and step > 0.1 * noise and len(distinct) < 0.5 * len(values) else 0.0

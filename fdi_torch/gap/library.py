@@ -1,0 +1,86 @@
+"""Which effects a gap diagnosis can name, and which of them are one and the same thing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from fdi_torch.effects import EFFECTS, effect
+from fdi_torch.gap.answer import CauseName
+from fdi_torch.plant.description import OUTSIDE, PlantDescription
+from fdi_torch.plant.effect import Placement, fits
+
+# The protocol's vocabulary. Further effects of the library are searched when they are named.
+STANDARD = (
+    "pump_gain",
+    "pump_dead_zone",
+    "pump_saturation",
+    "pump_lag",
+    "pump_delay",
+    "pump_back_pressure",
+    "laminar_flow",
+    "flow_exponent",
+    "outlet_drop",
+    "coefficient_drift",
+    "plugging",
+    "cross_flow",
+    "leak",
+    "unmetered_flow",
+    "area_taper",
+    "internal_body",
+    "overflow",
+    "sensor_bias",
+    "sensor_gain",
+    "sensor_lag",
+    "sensor_drift",
+    "sensor_quantization",
+    "sensor_delay",
+    "sensor_saturation",
+)
+
+
+def library_of(
+    plant: PlantDescription, names: Sequence[str] | None = None, leave_out: Iterable[str] = ()
+) -> tuple[Placement, ...]:
+    """Every named effect ('all' for the whole library; 'pump_lag@Q1' for one place only) where it can sit and is not
+    the same as another one there. Raises ValueError for an effect or a place that does not exist.
+    """
+    wanted = STANDARD if names is None else tuple(e.name for e in EFFECTS) if tuple(names) == ("all",) else names
+    left_out = {effect(name).name for name in leave_out}
+    found: dict[str, Placement] = {}
+    for entry in wanted:
+        name, _, at = entry.partition("@")
+        if name in left_out:
+            continue
+        places = [at] if at else [p for p in possible_places(plant) if fits(effect(name), plant, p)]
+        for place in places:
+            if not fits(effect(name), plant, place):
+                kinds = " or ".join(effect(name).places)
+                raise ValueError(f"library: {entry}: expected a place of kind {kinds}, got {place}")
+            found[f"{place}.{name}"] = Placement(effect(name), place)
+    if not found:
+        raise ValueError("library: expected at least one effect that fits the plant, got none; name some")
+    return tuple(found.values())
+
+
+def possible_places(plant: PlantDescription) -> tuple[str, ...]:
+    """All components, and the pairs of tanks that no pipe joins: beside a pipe another path is a wider pipe."""
+    joined = [{p.source, p.target} for p in plant.pipes]
+    pairs = {f"{a}-{b}" for a, b in plant.tank_pairs() if {a, b} in joined}
+    return tuple(place for place in plant.locations() if place not in pairs)
+
+
+def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:
+    """One name for what is one thing: an outlet at its tank's floor that is wider or narrower, and a leak of the tank."""
+    name, place = cause
+    for pipe in plant.pipes:
+        to_outside = pipe.target == OUTSIDE and pipe.elevation == 0.0
+        if to_outside and name == "plugging" and place == pipe.name:
+            return "leak", pipe.source
+    return cause
+
+
+def twins(cause: CauseName, plant: PlantDescription) -> tuple[CauseName, ...]:
+    """Other names of the same thing."""
+    name, place = canonical(cause, plant)
+    others = [("plugging", p.name) for p in plant.pipes if canonical(("plugging", p.name), plant) == (name, place)]
+    return tuple(c for c in dict.fromkeys([(name, place), *others]) if c != cause) if others else ()

@@ -1,0 +1,117 @@
+"""Which effects: screening, refits of singles, and of combinations one effect at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Key
+from fdi_torch.gap.screening import Option, Screen, screen
+
+SINGLES, STARTS = 14, 2
+PARENTS, PARTNERS = 3, 5
+DEEPEST = 4
+PROMISE = 10.0  # chi-square units that an effect has to promise, to first order, to be fitted
+PROMISED_SHARE = 1e-3  # the same as a share of the gap, beside other effects
+
+
+@dataclass(frozen=True)
+class Search:
+    """All fits made, best first; screens by the key of the fit they were made about."""
+
+    null: Fit
+    fits: tuple[Fit, ...]
+    screens: dict[Key, Screen]
+
+    @property
+    def best(self) -> Fit:
+        return self.fits[0]
+
+
+def search(fitter: Fitter, null: Fit, options: Sequence[Option]) -> Search:
+    """Fits singles, then pairs and more about the best ones, while another effect promises something."""
+    fits: dict[Key, Fit] = {null.key: null}
+    screens = {null.key: screen(fitter, null, options)}
+    for candidate in _further(null, screens[null.key], SINGLES, PROMISE):
+        _keep(fits, fitter.fit(candidate, null, target=_best(fits)))
+    for depth in range(2, DEEPEST + 1):
+        before = len(fits)
+        worth = max(PROMISE, PROMISED_SHARE * (null.cost - _best(fits)))
+        for parent in _parents(fits.values(), depth - 1, PARENTS if depth == 2 else 2):
+            screens[parent.key] = screen(fitter, parent, _beside(parent, options))
+            for candidate in _further(parent, screens[parent.key], PARTNERS if depth == 2 else 3, worth):
+                if candidate.key not in fits:
+                    _keep(fits, fitter.fit(candidate, parent, target=_best(fits)))
+        if depth == 2 and len(fits) > before:
+            for candidate in _pairs(screens[null.key], 3):
+                if candidate.key not in fits:
+                    _keep(fits, fitter.fit(candidate, null, target=_best(fits)))
+        if len(fits) == before:
+            break
+    return Search(null, tuple(sorted(fits.values(), key=lambda f: f.cost)), screens)
+
+
+def _best(fits: dict[Key, Fit]) -> float:
+    return min(f.cost for f in fits.values())
+
+
+def _keep(fits: dict[Key, Fit], fit: Fit) -> None:
+    if fit.key not in fits or fit.cost < fits[fit.key].cost:
+        fits[fit.key] = fit
+
+
+def _parents(fits: Iterable[Fit], effects: int, count: int) -> list[Fit]:
+    return sorted((f for f in fits if len(f.key) == effects), key=lambda f: f.cost)[:count]
+
+
+def _beside(fit: Fit, options: Sequence[Option]) -> list[Option]:
+    return [o for o in options if o.cause not in fit.key]
+
+
+def _further(fit: Fit, found: Screen, count: int, worth: float) -> list[Candidate]:
+    """The fit with one more effect: the `count` causes that promise most, each from its best starts."""
+    by_cause: dict[tuple[str, str], list[int]] = {}
+    for i in torch.argsort(found.gain, descending=True).tolist():
+        if float(found.gain[i]) > worth:
+            by_cause.setdefault(found.options[i].cause, []).append(i)
+    chosen = list(by_cause.values())[:count]
+    return [_with(fit, [found.options[i] for i in group[:STARTS]], found, group) for group in chosen]
+
+
+def _with(fit: Fit, options: Sequence[Option], found: Screen, group: Sequence[int]) -> Candidate:
+    """Each start once with the size that the screen suggests, the rest where the fit has it."""
+    starts = [fit.effect_values | sized(o, float(found.size[i])) for o, i in zip(options, group, strict=False)]
+    return Candidate((*fit.candidate.placements, options[0].placement), tuple(starts))
+
+
+def sized(option: Option, factor: float) -> dict[str, float]:
+    """The start with its size multiplied, within reason: a secant holds near where it was taken."""
+    name = next(iter(option.start))
+    size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
+    factor = min(max(factor, 0.1), 4.0)
+    value = size.nominal + factor * (option.start[name] - size.nominal)
+    return {**option.start, name: min(max(value, size.low), size.high)}
+
+
+def _pairs(found: Screen, count: int) -> list[Candidate]:
+    """The pairs that promise most together, of causes that alone may promise little."""
+    gain = found.pair_gain()
+    best: dict[Key, tuple[int, int]] = {}
+    order = torch.argsort(gain.flatten(), descending=True)[:400].tolist()
+    for flat in order:
+        i, j = divmod(flat, gain.shape[1])
+        a, b = found.options[i], found.options[j]
+        if a.cause != b.cause:
+            best.setdefault(frozenset((a.cause, b.cause)), (i, j))
+    return [
+        Candidate((found.options[i].placement, found.options[j].placement), (_both(found, i, j),))
+        for i, j in list(best.values())[:count]
+    ]
+
+
+def _both(found: Screen, i: int, j: int) -> dict[str, float]:
+    pick = torch.tensor([i, j])
+    sizes = torch.linalg.lstsq(found.gram[pick][:, pick], found.score[pick].unsqueeze(1)).solution.flatten().tolist()
+    return sized(found.options[i], sizes[0]) | sized(found.options[j], sizes[1])
