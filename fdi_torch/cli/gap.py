@@ -20,9 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
     parser.add_argument("--recording", metavar="FILE", required=True, help="CSV or MCAP file to diagnose")
     parser.add_argument("--holdout", metavar="FILE", help="another recording of the same rig, for closure only")
-    parser.add_argument(
-        "--library", metavar="EFFECT,...", help="effects to search (EFFECT@PLACE for one place), or all"
-    )
+    parser.add_argument("--library", metavar="EFFECT,...", help="effects to search (EFFECT@PLACE for one), or all")
     parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="effects to deny the diagnosis")
     parser.add_argument("--out", metavar="DIR", default="logs", help="folder for the answer")
 
@@ -45,9 +43,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def show(answer: Answer, screen: Screen) -> None:
     """The verdict in words, causes with units, rivals, closure."""
-    screen.say(
-        f"verdict: {answer.verdict.replace('_', ' ')} (chance of such a gain by noise alone {answer.p_value:.1g})"
-    )
+    verdict = answer.verdict.replace("_", " ")
+    screen.say(f"verdict: {verdict} (chance of such a gain by noise alone {answer.p_value:.1g})")
     rows = []
     for cause in answer.causes:
         for name, amount in cause.parameters.items():

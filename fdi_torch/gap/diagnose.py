@@ -140,17 +140,14 @@ def _answer(
     holdout: Recording | None,
     settings: Settings,
 ) -> Answer:
-    subject, plant = fitter.subject, fitter.subject.plant
     standing = _content(weighed.explanations)
-    best, fit = weighed.explanations[0], weighed.fits[0]
-    library_fit = next(
-        (f for e, f in zip(weighed.explanations, weighed.fits, strict=True) if e.unknown_at is None), fit
-    )
+    explanations, fit = weighed.explanations, weighed.fits[0]
+    library_fit = next(f for e, f in zip(explanations, weighed.fits, strict=True) if e.unknown_at is None)
     unknown = sum(e.probability for e in weighed.explanations if e.unknown_at) > 0.5
     verdict: Verdict = "unknown" if unknown else _verdict([e for e in standing if e.unknown_at is None], rounded)
     causes = () if verdict in ("no_gap", "unknown") else _causes(fitter, library_fit, rounded, lattice)
     sets = [(*e.causes, *rounded) for e in standing if e.unknown_at is None] if causes else []
-    gap = max(_gap(subject, found.null), 1.0)
+    gap = max(_gap(fitter.subject, found.null), 1.0)
     where = [(s.location, min(max(s.closes / gap, 0.0), 1.0)) for s in places]
     if unknown:
         first = next(e.unknown_at for e in weighed.explanations if e.unknown_at)
@@ -162,8 +159,8 @@ def _answer(
         causes=causes,
         ambiguity_set=sets,
         posterior=[
-            Explanation((*e.causes, *rounded) if not e.unknown_at else (), e.probability, e.unknown_at)
-            for e in weighed.explanations[:12]
+            Explanation(() if e.unknown_at else (*e.causes, *rounded), e.probability, e.unknown_at)
+            for e in explanations[:12]
         ],
         closure=_closure(fitter, found, library_fit if not unknown else fit, holdout, settings, unknown),
         noise=_noise(fitter, lattice),
@@ -214,10 +211,8 @@ def _p_value(found: Search, rounded: Sequence[CauseName]) -> float:
     if rounded:
         return 0.0
     screen = found.screens[found.null.key]
-    gain = max(
-        float(screen.gain.max()),
-        found.null.cost - min((f.cost for f in found.fits if len(f.key) == 1), default=found.null.cost),
-    )
+    singles = [f.cost for f in found.fits if len(f.key) == 1]
+    gain = max(float(screen.gain.max()), found.null.cost - min(singles, default=found.null.cost))
     return min(1.0, len(screen.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))
 
 

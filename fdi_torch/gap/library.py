@@ -70,7 +70,7 @@ def possible_places(plant: PlantDescription) -> tuple[str, ...]:
 
 
 def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:
-    """One name for what is one thing: an outlet at its tank's floor that is wider or narrower, and a leak of the tank."""
+    """One name for what is one thing: an outlet at its tank's floor wider or narrower, and a leak of the tank."""
     name, place = cause
     for pipe in plant.pipes:
         to_outside = pipe.target == OUTSIDE and pipe.elevation == 0.0

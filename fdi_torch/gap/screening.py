@@ -54,7 +54,7 @@ class Screen:
 
     @property
     def gain(self) -> Tensor:
-        """(M,): chi-square closed by each alone; 0 where only the opposite effect would help, or the effect is unseen."""
+        """(M,): chi-square closed by each alone; 0 where only the opposite would help, or nothing is seen."""
         strength = torch.diagonal(self.gram)
         return torch.where((self.score > 0) & (strength > 1e-6), self.score**2 / strength.clamp(min=1e-300), 0.0)
 

@@ -87,7 +87,9 @@ def _with(fit: Fit, options: Sequence[Option], found: Screen, group: Sequence[in
 
 
 def sized(option: Option, factor: float) -> dict[str, float]:
-    """The start with its size multiplied, within reason: a secant holds near where it was taken."""
+    """The start with its size multiplied, within reason; a threshold stays where it was tried."""
+    if not option.placement.effect.smooth:
+        return dict(option.start)
     name = next(iter(option.start))
     size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
     factor = min(max(factor, 0.1), 4.0)

@@ -106,7 +106,7 @@ class Collocation:
         return start.unsqueeze(1).expand(-1, len(self.experiment.nodes), -1).clone()
 
     def read_along(self, levels: Tensor, along: Tensor, theta: Tensor) -> Tensor:
-        """How readings (L, S, C, M) change where levels (L, K+1, tanks) move `along` (L, K+1, tanks, M); theta (L, P)."""
+        """How readings (L, S, C, M) change where levels (L, K+1, tanks) move `along` (L, K+1, tanks, M)."""
         count = along.shape[-1]
         with forward_ad.dual_level():
             paths = levels.expand(count, *levels.shape).contiguous()

@@ -40,7 +40,7 @@ def _in_blocks(x: Tensor, blocks: int, length: int, filler: Tensor) -> Tensor:
 
 def _side_by_side(a: Tensor, b: Tensor) -> list[Tensor]:
     """Within each block: [x from zero | product of A] after each of its steps."""
-    n, m = b.shape[-2:]
+    m = b.shape[-1]
     state = torch.cat([b[:, :, 0], a[:, :, 0]], dim=-1)
     found = [state]
     for k in range(1, a.shape[2]):
