@@ -16,7 +16,7 @@ from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
-from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate
+from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
 from fdi_torch.estimate.refine import Progress, RefineSettings
 from fdi_torch.logbook import RunLog
 from fdi_torch.parameters import ParameterSpace
@@ -44,9 +44,10 @@ def train(run: Run, tell: Tell | None = None) -> TrainResult:
     tell(share, text) is called as work goes on. What was computed before an error or Ctrl-C stays readable in the log.
     """
     tell = tell or (lambda share, text: None)
+    space = wanted_space(run)
     tell(0.0, "reading" if run.config.recordings else "simulating the recording")
     loaded = recordings_of(run)
-    fitting = fitting_of(run, loaded)
+    fitting = fitting_of(run, space, loaded)
     settings = hybrid_settings(run.config.estimate)
     truth = simulated_truth(run)
     path = free_path(Path(run.config.output.folder), run.name)
@@ -54,7 +55,7 @@ def train(run: Run, tell: Tell | None = None) -> TrainResult:
     with RunLog(path, "train", config_text=run.text, seeds={"seed": run.config.seed}, data=sources) as log:
         log_recordings(log, loaded, truth)
         watch = Watch(log, fitting.space, settings, tell)
-        result = estimate(fitting, settings, run.config.seed, watch.generation, watch.iteration)
+        result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration)
         log_result(log, result, fitting.space)
         pictures = draw(run, fitting, result, path)
     tell(1.0, "done")
@@ -65,10 +66,10 @@ def recordings_of(run: Run) -> list[LoadedRecording]:
     """The recordings that a run file names, or the one that it asks to simulate."""
     if run.config.simulate is None:
         return load_recordings(run.config.recordings, run.plant, run.base)
-    return [LoadedRecording(simulate(run), run.config.simulate.start_levels)]
+    return [LoadedRecording(simulate_recording(run), run.config.simulate.start_levels)]
 
 
-def simulate(run: Run) -> Recording:
+def simulate_recording(run: Run) -> Recording:
     """The recording that `simulate:` of a run file describes, with its faults and its noise; repeats for a seed."""
     config = run.config.simulate
     if config is None:
@@ -93,15 +94,19 @@ def simulated_truth(run: Run) -> dict[str, float]:
     return parameter_values(run.config.simulate.faults, network.constants, run.plant)
 
 
-def fitting_of(run: Run, loaded: Sequence[LoadedRecording]) -> Fitting:
-    """What the run file asks to estimate, on its recordings."""
+def wanted_space(run: Run) -> ParameterSpace:
+    """The parameters that the run file asks for, and the constants to calibrate beside them."""
     config = run.config.estimate
     if not config.parameters:
         raise ValueError(
             f"{run.source}: estimate.parameters: expected at least one, got none; name some, as in T1.leak"
         )
     network = build_network(run.plant, placements_of([p.name for p in config.parameters], run.plant))
-    space = estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
+    return estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
+
+
+def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording]) -> Fitting:
+    """These parameters on these recordings."""
     recordings = [part.recording for part in loaded]
     expect_enough_samples(recordings, space)
     return set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)

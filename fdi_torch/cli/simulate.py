@@ -8,7 +8,7 @@ from pathlib import Path
 from fdi_torch.cli.options import add_config, add_run, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.run import load_run
-from fdi_torch.main_job import free_path, simulate
+from fdi_torch.main_job import free_path, simulate_recording
 from fdi_torch.recording_csv import write_csv
 
 
@@ -21,7 +21,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     job = load_run(arguments.config, overrides(arguments))
     with screen.progress(job.name) as advance:
         advance(0.0, "integrating")
-        recording = simulate(job)
+        recording = simulate_recording(job)
         path = write_csv(recording, free_path(Path(job.config.output.folder), job.name, "csv"))
         advance(1.0, "done")
     screen.say(f"{len(recording)} samples, {float(recording.time[-1]):g} s: {path}")

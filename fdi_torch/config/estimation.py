@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 
 from fdi_torch.config.problems import ConfigError, unknown
 from fdi_torch.config.strict import Amount, Share, Strict, quantity
-from fdi_torch.effects import EFFECTS, effect, placements_for
+from fdi_torch.effects import EFFECTS, all_placements, effect, placements_for
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
@@ -114,7 +114,7 @@ def _chosen(config: ParameterConfig, index: int, constants: ParameterSpace, plan
     place = f"estimate.parameters.{index}"
     name = full_name(config.name, plant)
     if name not in constants:
-        raise ConfigError([f"{place}: {_unknown_parameter(name, constants)}"])
+        raise ConfigError([f"{place}: {_unknown_parameter(name, constants, plant)}"])
     unit = constants[name].unit
     try:
         given = {field: getattr(config, field) for field in ("nominal", "low", "high", "std")}
@@ -133,14 +133,16 @@ def _calibrated(
     for pattern in config.calibrate:
         matched = [name for name in constants.names if fnmatchcase(name, pattern)]
         if not matched:
-            raise ConfigError([f"estimate.calibrate: {_unknown_parameter(pattern, constants)}"])
+            raise ConfigError([f"estimate.calibrate: {_unknown_parameter(pattern, constants, plant)}"])
         names += [name for name in matched if name not in names]
     return names
 
 
-def _unknown_parameter(name: str, constants: ParameterSpace) -> str:
-    sentence = unknown("a parameter of the plant or its faults", name, constants.names)
-    return sentence.replace(f" ({', '.join(constants.names)})", "")
+def _unknown_parameter(name: str, constants: ParameterSpace, plant: PlantDescription) -> str:
+    faults = [p.prefix for p in all_placements(plant)]
+    candidates = (*constants.names, *faults)
+    sentence = unknown("a parameter of the plant or its faults", name, candidates)
+    return sentence.replace(f" ({', '.join(candidates)})", "")
 
 
 def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant: PlantDescription) -> dict[str, float]:
@@ -149,7 +151,7 @@ def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant
     for given, value in values.items():
         name = full_name(given, plant)
         if name not in constants:
-            raise ConfigError([f"simulate.faults: {_unknown_parameter(name, constants)}"])
+            raise ConfigError([f"simulate.faults: {_unknown_parameter(name, constants, plant)}"])
         try:
             si[name] = quantity(value, constants[name].unit)
         except ValueError as error:

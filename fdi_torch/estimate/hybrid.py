@@ -60,7 +60,7 @@ class HybridResult:
     engine: str
 
 
-def estimate(
+def estimate_parameters(
     fitting: Fitting,
     settings: HybridSettings | None = None,
     seed: int = 0,

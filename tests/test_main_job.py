@@ -1,0 +1,124 @@
+"""The main job from a run file to log, picture and words."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from fdi_torch.cli import DONE, MISUSE, main
+from fdi_torch.config.run import Run, load_run
+from fdi_torch.logbook import content_hash, read_run
+from fdi_torch.main_job import train
+
+QUICK = ("simulate.duration=400 s", "estimate.search.evaluations=1500", "estimate.step.refine=0.5 s")
+
+
+def quick_run(folder: Path, *changes: str) -> Run:
+    return load_run(None, [*QUICK, f"output.folder={folder}", *changes])
+
+
+def test_the_built_in_fault_is_found(tmp_path: Path) -> None:
+    done = train(quick_run(tmp_path))
+    truth = torch.tensor([done.truth[p.name] for p in done.fitting.space], dtype=torch.float64)
+    error = (done.result.estimate.value - truth).abs() / done.result.estimate.std
+    assert bool((error < 4.0).all())
+    assert {f.name for f in done.result.diagnosis.present} >= {"T1.leak.size", "T3.leak.size", "OUT2.net_outlet.size"}
+    assert done.result.diagnosis.explained
+    assert all(picture.stat().st_size > 10_000 for picture in done.pictures)
+
+
+def test_the_log_tells_how_it_was_found(tmp_path: Path) -> None:
+    done = train(quick_run(tmp_path))
+    run = read_run(done.log)
+    topics = {m.topic for m in run.messages()}
+    assert {"/plant/input", "/plant/output", "/plant/truth", "/estimate/final", "/diagnosis/fault"} <= topics
+    assert {"/estimator/de/generation", "/estimator/de/population", "/estimator/refine/iteration"} <= topics
+    final = next(iter(run.messages(["/estimate/final"]))).payload
+    assert final["values"] == done.result.estimate.value.tolist()
+    assert run.config_text == done_text(done.log)
+
+
+def done_text(log: Path) -> str:
+    return load_run(None, [*QUICK, f"output.folder={log.parent}"]).text
+
+
+def test_it_repeats_bit_for_bit(tmp_path: Path) -> None:
+    one, two = (train(quick_run(tmp_path)) for _ in range(2))
+    assert one.log != two.log
+    assert torch.equal(one.result.estimate.value, two.result.estimate.value)
+    assert content_hash(read_run(one.log).messages()) == content_hash(read_run(two.log).messages())
+
+
+def test_a_model_without_the_fault_does_not_explain_it(tmp_path: Path) -> None:
+    done = train(quick_run(tmp_path, "estimate.parameters=[P32.openness]"))
+    assert not done.result.diagnosis.explained
+
+
+def test_interrupted_it_keeps_what_it_has(tmp_path: Path) -> None:
+    def stop(share: float, text: str) -> None:
+        if "generation 4" in text:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(quick_run(tmp_path), stop)
+    run = read_run(tmp_path / "default.mcap")
+    assert run.complete
+    assert run.metadata["fdi_torch.status"]["status"] == "interrupted"
+    assert [m.payload["generation"] for m in run.messages(["/estimator/de/generation"])][-1] == 4
+
+
+def test_the_command_prints_json_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    changes = [word for change in QUICK for word in ("--set", change)]
+    assert main(["train", "--json", "--quiet", "--out", str(tmp_path), *changes]) == DONE
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["format"] == "fdi_torch.train/1"
+    assert Path(answer["log"]).is_file()
+
+
+def test_the_command_prints_a_table_with_units(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    changes = [word for change in QUICK for word in ("--set", change)]
+    assert main(["train", "--out", str(tmp_path), *changes]) == DONE
+    shown = capsys.readouterr()
+    assert "T1.leak.size" in shown.out and "cm^3/s at the mean levels" in shown.out and "log: " in shown.out
+    assert "default 100% done" in shown.err
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ("simulate.duration=1 s", "expected more readings than parameters, got 6 readings for 8 parameters"),
+        ("estimate.parameters=[]", "estimate.parameters: expected at least one, got none"),
+        ("estimate.parameters=[T1.leek]", "the nearest is 'T1.leak'"),
+    ],
+)
+def test_misuse_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str], change: str, sentence: str) -> None:
+    changes = ["--set", change, "--set", "simulate.start_levels={T1: 50 cm, T2: 40 cm, T3: 45 cm}"]
+    if "duration" in change:
+        more = "[T1.leak, T2.leak, T3.leak, P13.openness, P32.openness, OUT2.net_outlet, T1.area, T2.area]"
+        changes += ["--set", f"estimate.parameters={more}"]
+    assert main(["train", "--out", str(tmp_path), "--quiet", *changes]) == MISUSE
+    complaint = capsys.readouterr().err
+    assert sentence in complaint and "Traceback" not in complaint
+
+
+def test_an_unwritable_folder_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    assert main(["train", "--quiet", "--out", str(blocked)]) == MISUSE
+    assert str(blocked) in capsys.readouterr().err
+
+
+def test_simulate_writes_a_recording_that_train_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "--quiet", "--out", str(tmp_path), "--set", "simulate.duration=400 s"]) == DONE
+    assert "401 samples" in capsys.readouterr().out
+    text = (
+        "plant: three_tank\nrecordings: [{file: default.csv, start_levels: equilibrium}]\n"
+        "estimate: {parameters: [T1.leak, OUT2.net_outlet, T3.leak, P13.openness, P32.openness], calibrate: []}\n"
+    )
+    (tmp_path / "own.yaml").write_text(text)
+    changes = [f"output.folder={tmp_path}", *QUICK[1:]]
+    done = train(load_run(tmp_path / "own.yaml", changes))
+    assert float(done.result.estimate.value[0]) == pytest.approx(0.3, abs=0.02)

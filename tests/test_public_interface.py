@@ -1,0 +1,45 @@
+"""Every public name is there, and the package loads without torch."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+import fdi_torch
+
+
+@pytest.mark.parametrize("name", fdi_torch.__all__)
+def test_public_names_are_there(name: str) -> None:
+    assert getattr(fdi_torch, name).__name__ == name if name != "EFFECTS" else len(fdi_torch.EFFECTS) > 20
+
+
+def test_an_unknown_name_is_refused() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
+        _ = fdi_torch.nonsense
+
+
+def test_loading_the_package_does_not_load_torch() -> None:
+    code = "import sys, fdi_torch; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_tensors_in_tensors_out() -> None:
+    plant = fdi_torch.load_plant("three_tank")
+    rest = fdi_torch.equilibrium(fdi_torch.build_network(plant), torch.tensor([50e-6, 50e-6], dtype=torch.float64))
+    time = torch.arange(601, dtype=torch.float64)
+    inputs = torch.full((601, 2), 50e-6, dtype=torch.float64)
+    names = ("T1.leak.size", "P13.plugging.size")
+    blank = fdi_torch.Recording(
+        time, inputs, torch.full((601, 3), torch.nan), ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3
+    )
+    fitting = fdi_torch.set_up(plant, [blank], names, "equilibrium")
+    engine = fitting.engines(1.0)[0]
+    truth = torch.tensor([[0.2, 0.3]], dtype=torch.float64)
+    readings = engine.readings(truth)[0]
+    assert torch.allclose(readings[0], rest, atol=1e-6)
+    seen = fdi_torch.Recording(time, inputs, readings, ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
+    found = fdi_torch.estimate_parameters(fdi_torch.set_up(plant, [seen], names, "equilibrium"))
+    assert torch.allclose(found.estimate.value, truth[0], atol=1e-4)
