@@ -10,7 +10,7 @@ from matplotlib.ticker import NullFormatter
 
 from fdi_torch.report.curves import thinned
 from fdi_torch.report.html import short
-from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT, label_lines, panel
+from fdi_torch.report.style import INK, MARK, MODEL, OTHER, SOFT, label_lines, panel
 
 Line = tuple[str, np.ndarray, np.ndarray, str]  # name, x, y, colour
 
@@ -67,7 +67,7 @@ def bar_panel(
     axes.barh(rows, lengths, height=0.66, color=[MARK if s else MODEL for s in strong])
     reach = max(float(lengths.max(initial=0.0)), 1e-300)
     for row, length, text in zip(rows, lengths, texts, strict=True):
-        axes.text(length + 0.02 * reach, row, text, va="center", fontsize=9.0)
+        axes.text(length + 0.02 * reach, row, text, va="center", fontsize=9.0, color=INK)
     axes.set_xlim(0.0, 1.28 * reach)
     axes.set_yticks(rows, [short(name, 26) for name in names])
     axes.invert_yaxis()

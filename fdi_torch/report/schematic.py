@@ -48,8 +48,9 @@ class _Drawing:
         self.crossings = 0
         rows = 1 + max(row for row, _ in self.places.values())
         columns = 1 + max(column for _, column in self.places.values())
-        left, right = -0.85, (columns - 1) * COLUMN + 1.05
-        bottom, top = -(rows - 1) * ROW - 1.15, TALL + 1.2
+        left, right = -0.95, (columns - 1) * COLUMN + 1.1
+        words = 0.2 * max((len(self.said(name)) for name in plant.locations()), default=0)
+        bottom, top = -(rows - 1) * ROW - 0.85 - words, TALL + 1.05 + words
         self.figure = Figure(figsize=((right - left) * INCH, (top - bottom) * INCH))
         FigureCanvasAgg(self.figure)
         self.axes: Axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -79,14 +80,17 @@ class _Drawing:
     def colour(self, name: str, plain: str = INK) -> str:
         return MARK if name in self.overlay.marks else plain
 
+    def said(self, name: str) -> list[str]:
+        """What the diagnosis says of a component."""
+        share = self.overlay.heat.get(name, 0.0)
+        marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
+        return [*marks, f"{100 * share:.0f} %"] if share >= 0.005 else marks
+
     def words(self, name: str, point: Point, ha: str, va: str) -> None:
         """A component's name, and below it in colour what is wrong with it."""
         x, y = point
-        marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
-        if name in self.overlay.heat and self.overlay.heat[name] >= 0.005:
-            marks.append(f"{100 * self.overlay.heat[name]:.0f} % of the gap")
         step = 0.2 if va == "top" else -0.2
-        lines = [(short(name, 16), SOFT, "normal"), *((text, MARK, "bold") for text in marks)]
+        lines = [(short(name, 16), SOFT, "normal"), *((text, MARK, "bold") for text in self.said(name))]
         for k, (text, colour, weight) in enumerate(lines if va == "top" else reversed(lines)):
             self.axes.text(x, y - k * step, text, ha=ha, va=va, color=colour, weight=weight, fontsize=9.0, zorder=6)
 
@@ -112,7 +116,10 @@ class _Drawing:
             water = Rectangle((x - 0.5, y), 1.0, height, facecolor=MODEL, alpha=0.22, edgecolor="none", zorder=3)
             self.axes.add_patch(water)
             self.axes.plot([x - 0.5, x + 0.5], [y + height] * 2, color=MODEL, lw=1.2, zorder=4)
-            self.axes.text(x, y + 0.2, f"{100 * level:.1f} cm", ha="center", color=MODEL, fontsize=9.0, zorder=6)
+            above = 0.05 if height < 0.3 else -0.24
+            self.axes.text(
+                x, y + height + above, f"{100 * level:.1f} cm", ha="center", color=MODEL, fontsize=9.0, zorder=6
+            )
         walls = [(x - 0.5, y + TALL), (x - 0.5, y), (x + 0.5, y), (x + 0.5, y + TALL)]
         self.axes.plot(*np.array(walls).T, color=self.colour(tank.name), lw=2.0, zorder=5, solid_joinstyle="miter")
         self.words(tank.name, (x, y + TALL - 0.08), "center", "top")

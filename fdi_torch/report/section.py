@@ -11,6 +11,8 @@ from fdi_torch.report.html import Markup, clean, escape, join, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.style import inline_svg
 
+REM_PER_INCH = 7.6  # of a wide picture on a wide page; its letters are then as large as the text's
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -52,4 +54,7 @@ def _figure(picture: Picture, prefix: str) -> Markup:
     described = escape(clean(picture.caption or picture.name))
     svg = Markup(inline_svg(picture.figure, f"{prefix}{picture.name}", described))
     caption = [tag("figcaption", picture.caption)] if picture.caption else []
-    return tag("figure", svg, *caption, class_="wide" if picture.wide else "panel")
+    if not picture.wide:
+        return tag("figure", svg, *caption)
+    width = f"max-width: {REM_PER_INCH * picture.figure.get_figwidth():.1f}rem"
+    return tag("figure", svg, *caption, class_="wide", style=width)

@@ -22,7 +22,7 @@ section { background: var(--paper); border: 1px solid var(--faint); border-radiu
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 330px), 1fr)); gap: .8rem 1.2rem;
   align-items: start; margin: .6rem 0; }
 figure { margin: 0; min-width: 0; }
-figure.wide { grid-column: 1 / -1; max-width: 44rem; }
+figure.wide { grid-column: 1 / -1; }
 figure svg { display: block; width: 100%; height: auto; }
 figcaption { font-size: .85rem; color: var(--soft); }
 .note, .meta { color: var(--soft); font-size: .9rem; }

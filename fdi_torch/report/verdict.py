@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fdi_torch.report.findings import Finding, findings
 from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import number
 
 KINDS = {
     "train": "Fault diagnosis",
@@ -52,11 +53,12 @@ def gap_words(material: Material) -> str:
 def alarm_words(material: Material) -> str:
     if not material.counts.get("/observer/residual"):
         return ""
-    alarms = [m for m in material.of("/observer/alarm") if m.get("event") == "raised"]
+    alarms = [m for m in material.of("/observer/alarm") if m.get("event") in ("alarm", "raised")]
     if not alarms:
         return "No alarm"
-    channels = _listed(list(dict.fromkeys(str(m.get("channel", "")) for m in alarms)))
-    return f"{len(alarms)} alarm{'s' if len(alarms) > 1 else ''}: {channels}"
+    channels = _listed(list(dict.fromkeys(str(m["channel"]) for m in alarms if m.get("channel"))))
+    first = f"the first at {number(float(alarms[0]['t']), 6)} s"
+    return f"{len(alarms)} alarm{'s' if len(alarms) > 1 else ''}, {first}{': ' + channels if channels else ''}"
 
 
 def study_words(material: Material) -> str:

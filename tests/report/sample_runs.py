@@ -47,3 +47,100 @@ def write_train(path: Path, name: str = "T1.leak.size", predicted: bool = True) 
 
 def material_of(path: Path, plant: Any = None) -> Material:
     return gather(read_run(path, salvage=True), plant)
+
+
+def write_gap(path: Path) -> Path:
+    """A named gap with everything in it that the page can draw."""
+    rng = np.random.default_rng(1)
+    time = np.arange(1800.0)
+    inputs = np.stack([4e-5 + 3e-5 * (np.sin(time / 130) > 0), 4e-5 + 3e-5 * (np.sin(time / 210) > 0)], 1)
+    augmented = 0.3 + np.stack([0.1 * np.sin(time / 130 - k) for k in range(3)], 1)
+    recalibrated = augmented + 0.01 * np.diff(inputs, axis=0, prepend=inputs[:1]).cumsum(0)[:, :1] / 3e-5
+    read = augmented + 1e-3 * rng.standard_normal(augmented.shape)
+    half = slice(0, 900)
+    with RunLog(path, "gap", config_text="plant: three_tank\n", **FIXED) as log:
+        log.recording(time, inputs, read, ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
+        for place in GAP_ANSWER["where"]:
+            log.gap_where(place["location"], place["share"], 1e-9)
+        log.gap_verdict(GAP_ANSWER)
+        log.result_arrays(
+            recalibrated=recalibrated,
+            augmented=augmented,
+            holdout_time=time[half],
+            holdout_read=read[half],
+            holdout_recalibrated=recalibrated[half],
+            holdout_augmented=augmented[half],
+        )
+    return path
+
+
+_LAG, _DELAY = {"effect": "pump_lag", "location": "Q1"}, {"effect": "pump_delay", "location": "Q1"}
+GAP_ANSWER: dict[str, Any] = {
+    "format": "fdi_torch.gap/1",
+    "verdict": "named",
+    "alarm": {"p_value": 1e-9},
+    "where": [
+        {"location": name, "share": share}
+        for name, share in (("Q1", 0.91), ("T1", 0.42), ("P13", 0.3), ("h1", 0.11), ("Q2", 0.02), ("T1-T2", 0.01))
+    ],
+    "causes": [{**_LAG, "parameters": {"time_constant": {"value": 8.1, "std": 0.2, "unit": "s"}}, "same_as": [_DELAY]}],
+    "ambiguity_set": [[_LAG], [_DELAY]],
+    "posterior": [
+        {"causes": [_LAG], "probability": 0.9},
+        {"causes": [_DELAY], "probability": 0.08},
+        {"causes": [], "probability": 0.02, "unknown_at": "Q1"},
+    ],
+    "closure": {
+        "unit": "cm",
+        "nominal": 1.9,
+        "recalibrated": 0.8,
+        "augmented": 0.101,
+        "ceiling": 0.1,
+        "noise_floor": 0.1,
+        "closed": 0.998,
+        "closed_ci95": [0.99, 1.0],
+        "per_sensor": {"h1": {"nominal": 2.0, "recalibrated": 0.9, "augmented": 0.1}},
+    },
+    "shape": {
+        "location": "Q1",
+        "variable": "command",
+        "variable_unit": "m^3/s",
+        "values": [1e-5, 2e-5, 4e-5, 8e-5],
+        "discrepancy": [-1e-6, -2e-6, 1e-6, 3e-6],
+        "discrepancy_unit": "m^3/s",
+        "std": [5e-7] * 4,
+    },
+    "next_input": {
+        "time": [0.0, 100.0, 200.0],
+        "inputs": [{"channel": "Q1", "unit": "m^3/s", "values": [2e-5, 8e-5, 2e-5]}],
+        "text": "Steps of Q1 part lag from delay within 60 samples.",
+    },
+    "remarks": ["Two input steps can never separate lag from delay."],
+    "impostors": {"rate": 0.04, "of": "60 simulated rivals"},
+}
+
+
+def write_monitor(path: Path) -> Path:
+    """Residuals with thresholds, an alarm and its isolation."""
+    time = np.arange(0.0, 600.0, 2.0)
+    rng = np.random.default_rng(2)
+    with RunLog(path, "monitor", config_text="plant: three_tank\n", **FIXED) as log:
+        for t in time:
+            r = {f"h{k}": 1e-3 * rng.standard_normal() + (0.006 if t > 400 else 0.0) for k in (1, 2, 3)}
+            log.residual(t, r, {"all": 3.0 + 40.0 * (t > 400)}, {"all": 16.0}, dict.fromkeys(r, "m"))
+        log.alarm(408.0, "alarm", "h1", "the residual leaves its fault-free range", onset=400.0)
+        log.alarm(468.0, "isolated", "T1.leak", "leak at T1: 0.2 ± 0.01", onset=401.0)
+        log.fault("leak", "T1", True, size=0.2, size_std=0.01, unit="1")
+    return path
+
+
+def write_study(path: Path) -> Path:
+    """Two settings of twenty trials."""
+    rng = np.random.default_rng(3)
+    with RunLog(path, "study", **FIXED) as log:
+        for k, (group, spread) in enumerate((("SNR 50", 1e-3), ("SNR 30", 1e-2))):
+            for n in range(20):
+                numbers = {"error": float(spread * rng.standard_normal()), "free": [0.1, 0.2]}
+                log.trial(20 * k + n, numbers, group=group, seed=n, status="converged" if n else "stalled")
+            log.summary(group, 20, {"rmse": spread, "bound": [1e-3, 2e-3]})
+    return path

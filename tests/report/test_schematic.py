@@ -49,5 +49,5 @@ def test_circles_of_pipes_and_of_falls_are_drawn_too() -> None:
 def test_guilty_components_and_shares_stand_on_the_drawing() -> None:
     overlay = Overlay({"T1": 0.5}, {"Q1": ["pump lag 8 s"], "T1-T2": ["cross flow"]}, {"P13": 0.62})
     svg = inline_svg(schematic(load_plant("three_tank"), overlay), "rig", "")
-    assert all(f">{words}<" in svg for words in ("50.0 cm", "pump lag 8 s", "cross flow", "62 % of the gap"))
+    assert all(f">{words}<" in svg for words in ("50.0 cm", "pump lag 8 s", "cross flow", "62 %"))
     assert svg.count("var(--mark)") > inline_svg(schematic(load_plant("three_tank")), "rig", "").count("var(--mark)")

@@ -1,15 +1,36 @@
 """The sections of the page, in their order. Each makes itself from what the log holds, or is left out."""
 
 from fdi_torch.report.section import Maker
+from fdi_torch.report.sections.before_after import holdout_section, profile_section
 from fdi_torch.report.sections.estimate import estimate_section, posterior_section
+from fdi_torch.report.sections.gap import (
+    causes_section,
+    closure_section,
+    next_input_section,
+    shape_section,
+    where_section,
+)
+from fdi_torch.report.sections.monitor import event_section, residual_section
 from fdi_torch.report.sections.origin import configuration_section, health_section, provenance_section
 from fdi_torch.report.sections.rig import rig_section
 from fdi_torch.report.sections.search import refinement_section, search_section
 from fdi_torch.report.sections.signals import fit_section, inputs_section
+from fdi_torch.report.sections.study import summary_section, trials_section
 
 SECTIONS: tuple[Maker, ...] = (
     rig_section,
+    causes_section,
+    where_section,
+    closure_section,
+    holdout_section,
+    shape_section,
+    profile_section,
+    next_input_section,
     estimate_section,
+    event_section,
+    residual_section,
+    summary_section,
+    trials_section,
     fit_section,
     inputs_section,
     posterior_section,

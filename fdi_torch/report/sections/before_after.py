@@ -1,0 +1,124 @@
+"""The gap before and after its cause was added: on the hold-out, and by time, level, input and direction of flow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from fdi_torch.logbook import Signals
+from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import axis, shown_unit
+from fdi_torch.report.panels import Line, line_panel
+from fdi_torch.report.predictions import MODELS
+from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.style import SOFT
+
+BINS = 24
+
+
+def holdout_section(material: Material) -> Section | None:
+    """What is left of the hold-out's readings by each model, sensor by sensor."""
+    time, read = material.arrays.get("holdout_time"), material.arrays.get("holdout_read")
+    if time is None or read is None or not material.recordings:
+        return None
+    recording = material.recordings[0]
+    pictures = []
+    for i, name in enumerate(recording.output_names):
+        unit, scale = shown_unit(recording.output_units[i])
+        lines: list[Line] = []
+        for model in ("recalibrated", "augmented"):
+            said = material.arrays.get(f"holdout_{model}")
+            if said is not None:
+                words, colour = MODELS[model]
+                lines.append((words, time, scale * (read[:, i] - said[:, i]), colour))
+        if lines:
+            figure = line_panel(f"{name}, hold-out", "time, s", axis("read − model", unit), lines)
+            pictures.append(Picture(f"holdout_{i + 1}", figure))
+    return (
+        Section("Before and after", ["What each model leaves on data not used for fitting.", pictures])
+        if pictures
+        else None
+    )
+
+
+def profile_section(material: Material) -> Section | None:
+    """Size of the residual, in units of the sensors' noise, over everything it may depend on."""
+    if not material.recordings:
+        return None
+    recording = material.recordings[0]
+    left = {
+        m: residual for m in ("recalibrated", "augmented") if (residual := _excess(material, recording, m)) is not None
+    }
+    if not left:
+        return None
+    pictures = []
+    for k, (title, label, variable) in enumerate(_variables(material, recording)):
+        lines: list[Line] = [(MODELS[m][0], *_binned(variable, size), MODELS[m][1]) for m, size in left.items()]
+        figure = line_panel(title, label, "residual, × noise", lines)
+        figure.axes[0].axhline(1.0, color=SOFT, lw=0.8, ls=":")
+        figure.axes[0].set_ylim(bottom=0.0)
+        pictures.append(Picture(f"gap_by_{k + 1}", figure))
+    words = "Root mean square residual of all sensors, each divided by its noise; at 1 nothing but noise is left."
+    return Section("What the gap depends on", [words, pictures])
+
+
+def _excess(material: Material, recording: Signals, model: str) -> np.ndarray | None:
+    """Squared residual over squared noise, mean of the sensors (T,)."""
+    said = material.arrays.get(model)
+    if said is None or said.shape != recording.outputs.shape:
+        return None
+    read = np.where(recording.mask, recording.outputs, np.nan)
+    ratio = ((read - said) / sample_noise(read)) ** 2
+    counted = np.isfinite(ratio)
+    return np.where(counted, ratio, 0.0).sum(1) / np.maximum(counted.sum(1), 1)
+
+
+def sample_noise(read: np.ndarray) -> np.ndarray:
+    """Noise (N,) of readings (T, N) from their second differences, by the median (Hall, Kay & Titterington 1990)."""
+    second = np.abs(np.diff(read, 2, axis=0)) / np.sqrt(6.0)
+    found = [
+        np.median(column[np.isfinite(column)]) / 0.6745 if np.isfinite(column).any() else 0.0 for column in second.T
+    ]
+    return np.maximum(np.array(found), 1e-12)
+
+
+def _variables(material: Material, recording: Signals) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Title, axis label and values (T,) of everything the gap may depend on."""
+    yield "By time", "time, s", recording.time
+    for i, name in enumerate(recording.output_names):
+        unit, scale = shown_unit(recording.output_units[i])
+        yield f"By {name}", axis(f"{name} read", unit), scale * recording.outputs[:, i]
+    for i, name in enumerate(recording.input_names):
+        unit, scale = shown_unit(recording.input_units[i])
+        yield f"By {name}", axis(f"{name} commanded", unit), scale * recording.inputs[:, i]
+    for name, head in _heads(material, recording):
+        yield f"By the flow in {name}", "head along the pipe, cm", 100.0 * head
+
+
+def _heads(material: Material, recording: Signals) -> Iterator[tuple[str, np.ndarray]]:
+    """Level difference in m over each pipe between two tanks that both have a sensor."""
+    if material.plant is None:
+        return
+    levels = {}
+    for sensor in material.plant.sensors:
+        if sensor.column in recording.output_names:
+            read = recording.outputs[:, recording.output_names.index(sensor.column)]
+            levels[sensor.tank] = (read - sensor.offset) / sensor.gain
+    for pipe in material.plant.pipes:
+        if pipe.source in levels and pipe.target in levels and not pipe.free_fall:
+            yield pipe.name, levels[pipe.source] - levels[pipe.target]
+
+
+def _binned(variable: np.ndarray, squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Root mean of `squares` for each value of the variable where those are few, or in bins of equal counts."""
+    usable = np.isfinite(variable) & np.isfinite(squares)
+    variable, squares = variable[usable], squares[usable]
+    values, which = np.unique(variable, return_inverse=True)
+    if len(values) > BINS:
+        edges = np.quantile(variable, np.linspace(0.0, 1.0, BINS + 1)[1:-1])
+        which = np.searchsorted(edges, variable)
+    count = np.maximum(np.bincount(which, minlength=1), 1)
+    x, y = (np.bincount(which, weights=w) / count for w in (variable, squares))
+    kept = np.bincount(which, minlength=1) > 0
+    return x[kept], np.sqrt(y[kept])

@@ -1,0 +1,99 @@
+"""A study: its settings summed up, and its trials."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from fdi_torch.report.html import folded, short, table
+from fdi_torch.report.material import Material, Payload
+from fdi_torch.report.numbers import axis, number, percent, shown_unit
+from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.style import MODEL, SOFT, panel
+
+TRIAL, SUMMARY = "/study/trial", "/study/summary"
+MOST_PANELS, MOST_GROUPS = 9, 40
+_OWN = ("t", "trial", "trials", "group", "seed", "status")
+
+
+def summary_section(material: Material) -> Section | None:
+    """One row a setting."""
+    settings = material.of(SUMMARY)
+    if not settings:
+        return None
+    names = list(dict.fromkeys(k for m in settings for k, v in m.items() if k not in _OWN and _shown(v) is not None))
+    header = ["setting", "trials", *(axis(name, shown_unit(material.unit(SUMMARY, name))[0]) for name in names)]
+    rows = [[str(m.get("group", "")), str(m.get("trials", "")), *_cells(material, m, names)] for m in settings]
+    return Section("Settings", [table(header, rows)])
+
+
+def trials_section(material: Material) -> Section | None:
+    """How often trials ended in which way, and every number of theirs by setting: each trial, and the median."""
+    trials = material.of(TRIAL)
+    if not trials:
+        return None
+    groups = list(dict.fromkeys(str(m.get("group", "")) for m in trials))[:MOST_GROUPS]
+    statuses = list(dict.fromkeys(str(m.get("status", "")) for m in trials))[:6]
+    rows = []
+    for group in groups:
+        own = [m for m in trials if str(m.get("group", "")) == group]
+        ends = [sum(str(m.get("status", "")) == status for m in own) / len(own) for status in statuses]
+        rows.append([group, str(len(own)), *(percent(share) for share in ends)])
+    names = dict.fromkeys(k for m in trials for k, v in m.items() if k not in _OWN and isinstance(v, float))
+    pictures = []
+    for k, name in enumerate(list(names)[:MOST_PANELS]):
+        unit, scale = shown_unit(material.unit(TRIAL, name))
+        figure = group_panel(name, axis(name, unit), groups, [scale * _column(trials, g, name) for g in groups])
+        pictures.append(Picture(f"trials_{k + 1}", figure))
+    ended = table(["setting", "trials", *(status or "ended" for status in statuses)], rows)
+    blocks: list[Any] = [folded("How the trials ended", ended)]
+    blocks += [pictures] if pictures else []
+    return Section("Trials", blocks)
+
+
+def group_panel(title: str, label: str, groups: Sequence[str], values: Sequence[np.ndarray]) -> Figure:
+    """Points of every group beside each other, spread sideways so that they can be told apart; the median as a bar."""
+    figure, axes = panel(short(title), "", short(label))
+    for k, points in enumerate(values):
+        points = points[np.isfinite(points)][:2000]
+        spread = 0.3 * (np.modf(np.arange(len(points)) * 0.6180339887)[0] - 0.5)
+        axes.plot(k + spread, points, ".", color=SOFT, ms=2.5, alpha=0.7)
+        if len(points):
+            axes.plot([k - 0.25, k + 0.25], [np.median(points)] * 2, color=MODEL, lw=2.0)
+    turned = max((len(g) for g in groups), default=0) * len(groups) > 36
+    axes.set_xticks(
+        range(len(groups)),
+        [short(g, 18) for g in groups],
+        rotation=45 if turned else 0,
+        ha="right" if turned else "center",
+    )
+    return figure
+
+
+def _column(trials: Sequence[Payload], group: str, name: str) -> np.ndarray:
+    own = (m.get(name) for m in trials if str(m.get("group", "")) == group)
+    return np.array([float(v) for v in own if isinstance(v, int | float)])
+
+
+def _cells(material: Material, message: Payload, names: Sequence[str]) -> list[str]:
+    cells = []
+    for name in names:
+        value = message.get(name)
+        scale = shown_unit(material.unit(SUMMARY, name))[1]
+        number_like = isinstance(value, int | float) and not isinstance(value, bool)
+        cells.append(number(scale * float(value), 4) if number_like else _shown(value) or "")  # type: ignore[arg-type]
+    return cells
+
+
+def _shown(value: Any) -> str | None:
+    """Numbers, texts and short lists of them as text; None for what no table can hold."""
+    if isinstance(value, bool | str):
+        return str(value)
+    if isinstance(value, int | float):
+        return number(float(value))
+    if isinstance(value, list) and len(value) <= 8:
+        return ", ".join(number(float(v), 3) if isinstance(v, int | float) else str(v) for v in value)
+    return None

@@ -1,0 +1,101 @@
+"""One frame for every kind of run: each page says and draws what that kind of log holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sample_runs import GAP_ANSWER, material_of, write_gap, write_monitor, write_study
+
+from fdi_torch.config import load_plant
+from fdi_torch.logbook import RunLog
+from fdi_torch.report.page import RunReport, page, report_of
+from fdi_torch.report.sections.before_after import sample_noise
+from fdi_torch.report.verdict import headline
+
+
+def report(write: Callable[[Path], Path], folder: Path) -> RunReport:
+    return report_of(material_of(write(folder / "run.mcap"), load_plant("three_tank")))
+
+
+def titles(made: RunReport) -> list[str]:
+    return [section.title for section in made.sections]
+
+
+def names(made: RunReport) -> set[str]:
+    return {picture.name for picture in made.pictures}
+
+
+def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> None:
+    made = report(write_gap, tmp_path)
+    text = page([made])
+    assert headline(made.material) == "The gap comes from pump lag at Q1"
+    assert titles(made)[:8] == [
+        "The rig",
+        "What causes it",
+        "Where the gap lies",
+        "How far it closes",
+        "Before and after",
+        "The discrepancy",
+        "What the gap depends on",
+        "What to run next",
+    ]
+    assert {
+        "gap_where",
+        "gap_posterior",
+        "gap_closure",
+        "holdout_3",
+        "gap_shape",
+        "gap_by_8",
+        "gap_next_input_1",
+    } <= names(made)
+    assert "99.8 % of the gap is closed on data not used for fitting (95 % interval 99 % to 100 %)." in text
+    assert "8.10 ± 0.20" in text and "pump lag at Q1 is the same as pump delay at Q1." in text
+    assert ">91 %<" in text and "cannot be shown" not in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"verdict": "no_gap", "causes": []}, "No gap beyond noise and tolerances"),
+        ({"verdict": "ambiguous"}, "A gap that 2 explanations share; the best is pump lag at Q1"),
+        ({"verdict": "unknown", "causes": []}, "A gap at Q1 that no known effect explains"),
+    ],
+)
+def test_every_verdict_has_its_words(changes: dict[str, Any], words: str, tmp_path: Path) -> None:
+    with RunLog(tmp_path / "run.mcap", "gap", env={}, git={}) as log:
+        log.gap_verdict({**GAP_ANSWER, **changes, "closure": {**GAP_ANSWER["closure"], "closed": None}})
+    made = report_of(material_of(tmp_path / "run.mcap"))
+    assert headline(made.material) == words
+    assert "is undefined: it is too small against its own standard error" in page([made])
+
+
+def test_noise_is_seen_through_a_moving_signal() -> None:
+    time = np.arange(5000.0)
+    noise = np.random.default_rng(0).standard_normal((5000, 2)) * (1e-3, 5e-3)
+    assert sample_noise(np.sin(time / 50)[:, None] + noise) == pytest.approx([1e-3, 5e-3], rel=0.05)
+
+
+def test_a_monitor_page_shows_residuals_thresholds_and_events(tmp_path: Path) -> None:
+    made = report(write_monitor, tmp_path)
+    assert headline(made.material) == "Fault: leak at T1"
+    assert titles(made)[1:3] == ["Events", "Residuals"]
+    assert {"observer_residual_3", "observer_statistic_1"} <= names(made)
+    assert "the residual leaves its fault-free range" in page([made])
+
+
+def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
+    made = report(write_study, tmp_path)
+    assert headline(made.material) == "40 trials in 2 settings"
+    assert titles(made)[1:3] == ["Settings", "Trials"]
+    assert "trials_1" in names(made) and "0.001, 0.002" in page([made])
+
+
+def test_several_runs_share_a_page(tmp_path: Path) -> None:
+    text = page(
+        [report_of(material_of(write(tmp_path / f"{write.__name__}.mcap"))) for write in (write_gap, write_study)]
+    )
+    assert text.count("<article>") == 2
