@@ -11,18 +11,18 @@ import torch
 from rigs import blank_recording, three_tank
 from torch import Tensor
 
-from fdi_torch.effects import all_placements, build_network
+from fdi_torch.effects import EFFECTS, all_placements, build_network, effect
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.reach import Reach, reach_of
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.build import BuildError
+from fdi_torch.simulate.choose import make_engine
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.integrate import ReferenceEngine
-
-# torch itself scripts a few rules the first time it differentiates forward.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script:DeprecationWarning")
+from fdi_torch.simulate.traced import TracedEngine
 
 SAMPLES, SAMPLE = 40, 5.0  # s
 
@@ -121,7 +121,21 @@ def first_starts(plant: str) -> dict[str, Tensor]:
 def slopes(plant: str) -> Tensor:
     """d reading / d parameter at nominal, (S, sensors, P), in forward mode."""
     r = rig(plant)
-    return r.engine.linearise(r.space.nominal())[1]
+    return traced(r).linearise(r.space.nominal())[1]
+
+
+def traced(r: Rig) -> TracedEngine:
+    """Forward derivatives of the same equations, at a fraction of the time."""
+    return TracedEngine(r.network, r.space, r.engine.experiment)
+
+
+@cache
+def compiled_starts(plant: str) -> tuple[Tensor, Tensor]:
+    """Readings at every effect's last start by the compiled engine and by the reference engine, (N, S, sensors)."""
+    r = rig(plant)
+    thetas = torch.stack([r.space.vector(r.starts(p.prefix)[-1]) for p in r.network.placements])
+    engine = make_engine(r.network, r.space, r.engine.experiment, "compiled")
+    return engine.readings(thetas), r.engine.readings(thetas)
 
 
 @cache
@@ -193,7 +207,29 @@ def one_sided_slope(r: Rig, place: str) -> Tensor:
 def test_slopes_of_shapes_are_finite_at_starts(plant: str) -> None:
     r = rig(plant)
     theta = r.space.vector({n: v for p in r.network.placements for n, v in r.starts(p.prefix)[0].items()})
-    assert bool(torch.isfinite(r.engine.linearise(theta)[1]).all())
+    assert bool(torch.isfinite(traced(r).linearise(theta)[1]).all())
+
+
+@everywhere
+def test_the_compiled_engine_gives_the_same_numbers(plant: str, place: str) -> None:
+    try:
+        compiled, reference = compiled_starts(plant)
+    except BuildError as error:
+        pytest.skip(str(error))
+    lane = [p.prefix for p in rig(plant).network.placements].index(place)
+    assert torch.allclose(compiled[lane], reference[lane], rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plant", PLANTS)
+def test_the_compiled_engine_gives_the_same_slopes(plant: str) -> None:
+    r = rig(plant)
+    try:
+        engine = make_engine(r.network, r.space, r.engine.experiment, "compiled")
+    except BuildError as error:
+        pytest.skip(str(error))
+    expected = slopes(plant)
+    assert torch.allclose(engine.linearise(r.space.nominal())[1], expected, rtol=1e-9, atol=1e-9)
 
 
 def factor(unit: str, metre: float, second: float) -> float:
@@ -256,3 +292,12 @@ def test_a_plant_file_can_have_it(plant: str, place: str) -> None:
     own = {full.rpartition(".")[2]: value for full, value in start.items()}
     described = replace(r.plant, effects=(PlacedEffect(name, location, own),))
     assert torch.equal(rig_of(described, ()).nominal_reading, r.engine.readings(r.space.vector(start)))
+
+
+def test_names_are_unique_and_twins_are_known() -> None:
+    names = [e.name for e in EFFECTS]
+    assert len(set(names)) == len(names)
+    for e in EFFECTS:
+        assert e.mistaken_for, f"{e.name} says nothing of what it is mistaken for"
+        for other in e.mistaken_for:
+            assert other != e.name and effect(other).name == other

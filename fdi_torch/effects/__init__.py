@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+from fdi_torch.effects.actuator_slew import ActuatorSlew
+from fdi_torch.effects.actuator_stuck import ActuatorStuck
 from fdi_torch.effects.area_taper import AreaTaper
 from fdi_torch.effects.coefficient_drift import CoefficientDrift
 from fdi_torch.effects.cross_flow import CrossFlow
+from fdi_torch.effects.evaporation import Evaporation
 from fdi_torch.effects.flow_exponent import FlowExponent
 from fdi_torch.effects.internal_body import InternalBody
 from fdi_torch.effects.laminar_flow import LaminarFlow
@@ -18,30 +21,53 @@ from fdi_torch.effects.outlet_drop import OutletDrop
 from fdi_torch.effects.overflow import Overflow
 from fdi_torch.effects.plugging import Plugging
 from fdi_torch.effects.pump_back_pressure import PumpBackPressure
+from fdi_torch.effects.pump_curve import PumpCurve
+from fdi_torch.effects.pump_cut_out import PumpCutOut
 from fdi_torch.effects.pump_dead_zone import PumpDeadZone
 from fdi_torch.effects.pump_delay import PumpDelay
 from fdi_torch.effects.pump_gain import PumpGain
 from fdi_torch.effects.pump_lag import PumpLag
+from fdi_torch.effects.pump_offset import PumpOffset
+from fdi_torch.effects.pump_oscillation import PumpOscillation
 from fdi_torch.effects.pump_saturation import PumpSaturation
 from fdi_torch.effects.sensor_bias import SensorBias
+from fdi_torch.effects.sensor_curvature import SensorCurvature
 from fdi_torch.effects.sensor_delay import SensorDelay
 from fdi_torch.effects.sensor_drift import SensorDrift
+from fdi_torch.effects.sensor_floor import SensorFloor
 from fdi_torch.effects.sensor_gain import SensorGain
+from fdi_torch.effects.sensor_hysteresis import SensorHysteresis
 from fdi_torch.effects.sensor_lag import SensorLag
+from fdi_torch.effects.sensor_oscillation import SensorOscillation
 from fdi_torch.effects.sensor_quantization import SensorQuantization
 from fdi_torch.effects.sensor_saturation import SensorSaturation
+from fdi_torch.effects.sensor_stuck import SensorStuck
 from fdi_torch.effects.unmetered_flow import UnmeteredFlow
+from fdi_torch.effects.valve_characteristic import ValveCharacteristic
+from fdi_torch.effects.valve_dead_zone import ValveDeadZone
+from fdi_torch.effects.valve_lag import ValveLag
+from fdi_torch.effects.valve_leak import ValveLeak
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Placement, fits
 from fdi_torch.plant.network import TankNetwork
 
 # Of two effects at one place, the earlier one acts first.
 EFFECTS: tuple[Effect, ...] = (
-    PumpGain(),
-    PumpDeadZone(),
+    ActuatorStuck(),
+    ActuatorSlew(),
     PumpLag(),
     PumpDelay(),
+    PumpDeadZone(),
+    ValveLag(),
+    ValveDeadZone(),
+    ValveCharacteristic(),
+    ValveLeak(),
+    PumpGain(),
+    PumpCurve(),
     PumpBackPressure(),
+    PumpOscillation(),
+    PumpOffset(),
+    PumpCutOut(),
     PumpSaturation(),
     LaminarFlow(),
     FlowExponent(),
@@ -53,16 +79,22 @@ EFFECTS: tuple[Effect, ...] = (
     CrossFlow(),
     Leak(),
     UnmeteredFlow(),
+    Evaporation(),
     Overflow(),
     AreaTaper(),
     InternalBody(),
-    SensorBias(),
-    SensorGain(),
     SensorLag(),
-    SensorDrift(),
-    SensorQuantization(),
     SensorDelay(),
+    SensorHysteresis(),
+    SensorCurvature(),
+    SensorGain(),
+    SensorBias(),
+    SensorDrift(),
+    SensorOscillation(),
+    SensorStuck(),
+    SensorFloor(),
     SensorSaturation(),
+    SensorQuantization(),
 )
 
 

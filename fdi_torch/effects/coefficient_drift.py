@@ -19,7 +19,7 @@ class CoefficientDrift(Effect):
     name = "coefficient_drift"
     stage = Stage.FLOW
     places = ("pipe", "outlet")
-    mistaken_for = ("plugging", "sensor_drift", "leak")
+    mistaken_for = ("unmetered_flow", "plugging", "sensor_drift", "flow_exponent")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("rate", "1/s", 0.0, -3e-4, 3e-4, meaning="share of the flow gained each second"),)

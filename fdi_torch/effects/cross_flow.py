@@ -22,7 +22,7 @@ class CrossFlow(Effect):
     name = "cross_flow"
     stage = Stage.BALANCE
     places = ("tank_pair",)
-    mistaken_for = ("leak", "plugging", "openness")
+    mistaken_for = ("plugging", "laminar_flow", "leak", "valve_leak", "openness")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (

@@ -22,7 +22,7 @@ class FlowExponent(Effect):
     name = "flow_exponent"
     stage = Stage.FLOW
     places = ("pipe", "outlet")
-    mistaken_for = ("laminar_flow", "outlet_drop")
+    mistaken_for = ("laminar_flow", "outlet_drop", "evaporation", "pump_offset", "sensor_bias")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("excess", "1", 0.0, -0.4, 0.6, meaning="exponent of the head less 1/2"),)

@@ -21,7 +21,7 @@ class LaminarFlow(Effect):
     name = "laminar_flow"
     stage = Stage.FLOW
     places = ("pipe", "outlet")
-    mistaken_for = ("flow_exponent", "outlet_drop", "plugging")
+    mistaken_for = ("flow_exponent", "outlet_drop", "sensor_bias", "cross_flow", "plugging")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         high = 0.3 * height_before(plant, place)

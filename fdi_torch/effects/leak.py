@@ -22,7 +22,7 @@ class Leak(Effect):
     name = "leak"
     stage = Stage.BALANCE
     places = ("tank",)
-    mistaken_for = ("plugging", "net_outlet", "unmetered_flow", "cross_flow", "overflow", "evaporation")
+    mistaken_for = ("plugging", "net_outlet", "valve_leak", "unmetered_flow", "cross_flow", "overflow", "evaporation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         tank = plant.component(place)

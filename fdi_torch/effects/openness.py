@@ -18,7 +18,7 @@ class Openness(Effect):
     name = "openness"
     stage = Stage.FLOW
     places = ("pipe",)
-    mistaken_for = ("plugging",)
+    mistaken_for = ("plugging", "cross_flow")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("size", "1", 1.0, 0.0, 1.0, meaning="share of the nominal flow that passes (1 - b)"),)

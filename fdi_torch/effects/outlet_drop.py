@@ -20,7 +20,7 @@ class OutletDrop(Effect):
     name = "outlet_drop"
     stage = Stage.FLOW
     places = ("outlet",)
-    mistaken_for = ("flow_exponent", "laminar_flow", "sensor_bias")
+    mistaken_for = ("laminar_flow", "flow_exponent", "evaporation", "pump_offset", "sensor_bias")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         far = 0.3 * height_before(plant, place)

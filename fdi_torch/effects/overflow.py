@@ -25,7 +25,7 @@ class Overflow(Effect):
     stage = Stage.BALANCE
     places = ("tank",)
     smooth = False
-    mistaken_for = ("leak", "sensor_saturation", "pump_saturation")
+    mistaken_for = ("pump_cut_out", "sensor_saturation", "leak", "pump_saturation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         tank = plant.component(place)

@@ -20,7 +20,7 @@ class Plugging(Effect):
     name = "plugging"
     stage = Stage.FLOW
     places = ("pipe", "outlet")
-    mistaken_for = ("coefficient_drift", "leak", "laminar_flow", "net_outlet", "openness")
+    mistaken_for = ("openness", "net_outlet", "coefficient_drift", "leak", "cross_flow", "laminar_flow")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (

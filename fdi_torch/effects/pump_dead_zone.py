@@ -23,7 +23,7 @@ class PumpDeadZone(Effect):
     name = "pump_dead_zone"
     stage = Stage.COMMAND
     places = ("pump",)
-    mistaken_for = ("pump_gain", "pump_offset", "unmetered_flow", "evaporation")
+    mistaken_for = ("pump_offset", "evaporation", "unmetered_flow", "pump_gain", "pump_curve", "flow_exponent")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         pump = plant.component(place)

@@ -20,7 +20,7 @@ class PumpDelay(Effect):
     stage = Stage.COMMAND
     places = ("pump",)
     delays = True
-    mistaken_for = ("pump_lag", "pump_slew")
+    mistaken_for = ("pump_lag", "actuator_slew", "sensor_delay", "sensor_lag")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("delay", "s", 0.0, 0.0, 60.0, meaning="how late the pump acts"),)

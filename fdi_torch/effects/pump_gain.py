@@ -21,7 +21,14 @@ class PumpGain(Effect):
     name = "pump_gain"
     stage = Stage.FLOW
     places = ("pump",)
-    mistaken_for = ("pump_dead_zone", "pump_back_pressure", "pump_offset", "pump_curve")
+    mistaken_for = (
+        "actuator_stuck",
+        "pump_saturation",
+        "pump_back_pressure",
+        "pump_dead_zone",
+        "pump_offset",
+        "pump_curve",
+    )
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (

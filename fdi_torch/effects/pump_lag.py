@@ -21,7 +21,7 @@ class PumpLag(Effect):
     stage = Stage.COMMAND
     places = ("pump",)
     memory = 1
-    mistaken_for = ("pump_delay", "pump_slew")
+    mistaken_for = ("pump_delay", "actuator_slew", "sensor_lag", "sensor_delay")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("time_constant", "s", 0.0, 0.0, 60.0, meaning="time to 63 % of a step"),)

@@ -21,7 +21,7 @@ class PumpSaturation(Effect):
     stage = Stage.FLOW
     places = ("pump",)
     smooth = False
-    mistaken_for = ("pump_curve", "pump_gain", "pump_back_pressure")
+    mistaken_for = ("pump_gain", "actuator_stuck", "pump_curve", "pump_back_pressure", "pump_cut_out")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         pump = plant.component(place)

@@ -23,7 +23,7 @@ class SensorBias(Effect):
     name = "sensor_bias"
     stage = Stage.READING
     places = ("sensor",)
-    mistaken_for = ("sensor_gain", "sensor_drift", "outlet_drop")
+    mistaken_for = ("sensor_gain", "laminar_flow", "flow_exponent", "outlet_drop", "sensor_drift")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         sensor = plant.component(place)

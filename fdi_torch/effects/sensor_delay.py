@@ -20,7 +20,7 @@ class SensorDelay(Effect):
     stage = Stage.READING
     places = ("sensor",)
     delays = True
-    mistaken_for = ("sensor_lag",)
+    mistaken_for = ("sensor_lag", "pump_delay", "sensor_hysteresis")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("delay", "s", 0.0, 0.0, 60.0, meaning="how late it reads"),)

@@ -20,7 +20,7 @@ class SensorDrift(Effect):
     name = "sensor_drift"
     stage = Stage.READING
     places = ("sensor",)
-    mistaken_for = ("sensor_bias", "coefficient_drift")
+    mistaken_for = ("sensor_bias", "coefficient_drift", "sensor_curvature")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         sensor = plant.component(place)

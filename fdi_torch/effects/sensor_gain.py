@@ -20,7 +20,7 @@ class SensorGain(Effect):
     name = "sensor_gain"
     stage = Stage.READING
     places = ("sensor",)
-    mistaken_for = ("sensor_bias", "sensor_curvature")
+    mistaken_for = ("sensor_curvature", "sensor_bias", "sensor_stuck", "laminar_flow")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (

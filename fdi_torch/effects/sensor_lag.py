@@ -21,7 +21,7 @@ class SensorLag(Effect):
     stage = Stage.READING
     places = ("sensor",)
     memory = 2
-    mistaken_for = ("sensor_delay",)
+    mistaken_for = ("sensor_delay", "pump_lag", "sensor_hysteresis")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("time_constant", "s", 0.0, 0.0, 60.0, meaning="time to 63 % of a step"),)

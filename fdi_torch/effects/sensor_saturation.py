@@ -24,7 +24,7 @@ class SensorSaturation(Effect):
     stage = Stage.READING
     places = ("sensor",)
     smooth = False
-    mistaken_for = ("overflow", "sensor_curvature")
+    mistaken_for = ("overflow", "pump_cut_out", "sensor_curvature")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         sensor = plant.component(place)

@@ -21,7 +21,7 @@ class UnmeteredFlow(Effect):
     name = "unmetered_flow"
     stage = Stage.BALANCE
     places = ("tank",)
-    mistaken_for = ("leak", "evaporation", "pump_offset", "pump_dead_zone")
+    mistaken_for = ("leak", "evaporation", "pump_offset", "pump_dead_zone", "coefficient_drift")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         flow = flow_scale(plant, place)

@@ -79,6 +79,12 @@ def height_before(plant: PlantDescription, pipe: str) -> float:
     return next(t.height for t in plant.tanks if t.name == source)
 
 
+def target_height(plant: PlantDescription, pump: str) -> float:
+    """Height of the tank that a pump feeds, m."""
+    target = plant.component(pump).target  # type: ignore[union-attr]
+    return next(t.height for t in plant.tanks if t.name == target)
+
+
 def flow_scale(plant: PlantDescription, tank: str) -> float:
     """What runs out of a full tank through its leak reference, m^3/s: a flow to measure others against."""
     height = next(t.height for t in plant.tanks if t.name == tank)

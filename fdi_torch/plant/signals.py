@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fdi_torch.recording import Hold
 
-_SAME_INSTANT = 1e-9  # s
+SAME_INSTANT = 1e-9  # s; closer than this, two instants differ by rounding only
 
 
 @dataclass(frozen=True)
@@ -81,16 +81,19 @@ class CumulativeSignal:
 
     def up_to(self, instant: Tensor, channel: int) -> Tensor:
         """The integral from the first sample to `instant`, any shape."""
-        # At a switch the slope is the one before it, rounding or not: a delay reaches back, never ahead.
-        after = torch.searchsorted(self.time, instant.detach() - _SAME_INSTANT)
+        after = self._interval(instant)
         left = torch.clamp(after - 1, min=0)
         return self.integral[left, channel] + self.slopes[after, channel] * (instant - self.time[left])
 
     def slope_at(self, instant: Tensor, channel: int) -> Tensor:
-        """The slope of the integral just after `instant`: the signal's mean between the samples around it."""
-        return self.slopes[torch.searchsorted(self.time, instant.detach().contiguous(), right=True), channel]
+        """The slope of the integral up to `instant`: the signal's mean between the samples around it."""
+        return self.slopes[self._interval(instant), channel]
 
     def average(self, start: Tensor, step: Tensor, channel: int, delay: Tensor | float = 0.0) -> Tensor:
         """The mean over [start - delay, start + step - delay]; shapes broadcast."""
         begin = start - delay
         return (self.up_to(begin + step, channel) - self.up_to(begin, channel)) / step
+
+    def _interval(self, instant: Tensor) -> Tensor:
+        """Which slope holds up to `instant`; at a switch the one before it: a delay reaches back, never ahead."""
+        return torch.searchsorted(self.time, instant.detach() - SAME_INSTANT)

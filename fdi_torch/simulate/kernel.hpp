@@ -62,6 +62,9 @@ struct Block {
 
 //@SECTIONS@
 
+// As in plant/signals.py: at a switch the slope is the one before it, since a delay reaches back.
+static const real SAME_INSTANT = 1e-9;
+
 // The mean of a held or linear signal over [start - delay, start - delay + span], exactly.
 static void look_up_late_channels(const Job &job, Block &b, real start, real span) {
     const int64_t n = job.signal_samples;
@@ -70,8 +73,8 @@ static void look_up_late_channels(const Job &job, Block &b, real start, real spa
         for (int l = 0; l < LANES; ++l) {
             const real from = start - b.command_delay[j][l], to = from + span;
             int64_t &i = b.begin[j][l], &k = b.end[j][l];
-            while (i < n && job.signal_times[i] <= from) ++i;
-            while (k < n && job.signal_times[k] <= to) ++k;
+            while (i < n && job.signal_times[i] < from - SAME_INSTANT) ++i;
+            while (k < n && job.signal_times[k] < to - SAME_INSTANT) ++k;
             const int64_t left = i > 0 ? i - 1 : 0, right = k > 0 ? k - 1 : 0;
             const real slope_from = job.signal_slopes[i * CHANNELS + c], slope_to = job.signal_slopes[k * CHANNELS + c];
             const real before = job.signal_integral[left * CHANNELS + c] + slope_from * (from - job.signal_times[left]);
@@ -107,7 +110,7 @@ static void look_up_late_levels(const Job &job, Block &b, int64_t s) {
             const real rise = history[right][l] - history[left][l];
             b.seen[i][l] = history[left][l] + share * rise;
 #if TANGENT
-            const real slope = linear >= 0 && delay >= 0 ? -rise / gap : 0;
+            const real slope = linear > 0 && delay >= 0 ? -rise / gap : 0;
             for (int p = 0; p < COLUMNS; ++p) {
                 const real *past = b.d_history.data() + ((p * LATE_SENSORS + j) * job.samples) * LANES + l;
                 const real first = past[left * LANES];

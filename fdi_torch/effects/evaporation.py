@@ -1,0 +1,36 @@
+"""Water that evaporates."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Local, Stage, Values
+
+
+class Evaporation(Effect):
+    """The tank loses r A whatever its level, A its believed cross-section.
+
+    Typical: r of 0.05 to 0.5 mm/h (1e-8 to 1e-7 m/s); hot or blown surfaces more. The same as a constant draw that
+    never ends, and as a dead zone of the tank's pump.
+    """
+
+    name = "evaporation"
+    stage = Stage.BALANCE
+    places = ("tank",)
+    mistaken_for = (
+        "pump_offset",
+        "pump_dead_zone",
+        "unmetered_flow",
+        "leak",
+        "flow_exponent",
+        "outlet_drop",
+        "laminar_flow",
+    )
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (Parameter("rate", "m/s", 0.0, 0.0, 2e-5, meaning="fall of the level in a still tank"),)
+
+    def inflow(self, local: Local, p: Values) -> Tensor:
+        return -p["rate"] * local.constants["area"]

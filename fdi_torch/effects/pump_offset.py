@@ -1,0 +1,32 @@
+"""A pump whose delivery is shifted by a constant flow."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription, Pump
+from fdi_torch.plant.effect import Effect, Local, Stage, Values
+
+
+class PumpOffset(Effect):
+    """q + c, never below zero: a siphon, a bypass, a command whose zero is wrong.
+
+    Typical: 1 to 10 % of the full flow, either sign. Negative, it is the same as a dead zone while the pump runs;
+    either way the same as a constant inflow that never ends.
+    """
+
+    name = "pump_offset"
+    stage = Stage.FLOW
+    places = ("pump",)
+    mistaken_for = ("pump_dead_zone", "evaporation", "unmetered_flow", "pump_gain", "pump_curve", "flow_exponent")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        pump = plant.component(place)
+        assert isinstance(pump, Pump)
+        far = 0.5 * pump.max_flow
+        return (Parameter("offset", "m^3/s", 0.0, -far, far, meaning="flow beside the commanded one"),)
+
+    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+        return torch.clamp(flow + p["offset"], min=0.0)

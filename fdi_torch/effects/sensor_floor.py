@@ -1,0 +1,41 @@
+"""A sensor that cannot read below some level."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.constants import reading_at
+from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.reach import Reach, inside
+from fdi_torch.plant.signals import Clock
+
+
+class SensorFloor(Effect):
+    """max(y, y_min), before noise: a sensor mounted above the floor, dry below its own height; nominal is far below
+    anything that the tank can hold, where it changes nothing.
+
+    Typical: 1 to 10 % of the range. Above it nothing shows.
+    """
+
+    name = "sensor_floor"
+    stage = Stage.READING
+    places = ("sensor",)
+    smooth = False
+    mistaken_for = ("sensor_bias", "outlet_drop", "sensor_curvature")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        sensor = plant.component(place)
+        assert isinstance(sensor, Sensor)
+        bottom = min(reading_at(plant, sensor, share) for share in (-1.0, 2.0))
+        high = max(reading_at(plant, sensor, share) for share in (0.0, 1.0))
+        return (Parameter("limit", sensor.unit, bottom, bottom, high, meaning="the least it reads"),)
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        low, high = reach.readings[place]
+        return [{"limit": limit} for limit in inside((low, 0.5 * (low + high)), 5)]
+
+    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+        return torch.maximum(value, p["limit"]), memory

@@ -1,0 +1,48 @@
+"""A sensor on whose reading a sine is superimposed."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.constants import reading_span
+from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.signals import Clock
+
+
+class SensorOscillation(Effect):
+    """y + a sin(2 pi t / T + phi): waves on the surface, hum, a beat with the sampling (Isermann, 2006, "Fault-
+    Diagnosis Systems", ch. 5).
+
+    Typical: a of 0.2 to 2 % of the range. Faster than two samples it looks slower than it is.
+    """
+
+    name = "sensor_oscillation"
+    stage = Stage.READING
+    places = ("sensor",)
+    mistaken_for = ("pump_oscillation", "sensor_bias")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        sensor = plant.component(place)
+        assert isinstance(sensor, Sensor)
+        high = 0.3 * reading_span(plant, sensor)
+        return (
+            Parameter("amplitude", sensor.unit, 0.0, 0.0, high, meaning="half the swing"),
+            Parameter("period", "s", 60.0, 2.0, 3600.0, meaning="of the swing"),
+            Parameter("phase", "1", 0.0, -math.pi, math.pi, meaning="of the swing at t = 0, in radians"),
+        )
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        sensor = plant.component(place)
+        assert isinstance(sensor, Sensor)
+        amplitude = 0.01 * reading_span(plant, sensor)
+        periods = (5.0, 10.0, 30.0, 60.0, 120.0, 300.0)
+        return [{"amplitude": amplitude, "period": t, "phase": phase} for t in periods for phase in (-1.5, 1.5)]
+
+    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+        return value + p["amplitude"] * torch.sin(2.0 * math.pi * clock.end / p["period"] + p["phase"]), memory

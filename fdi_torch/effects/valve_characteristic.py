@@ -1,0 +1,34 @@
+"""A valve whose passage is a power of its opening."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.signals import Clock
+
+LEAST_OPENING = 1e-6
+
+
+class ValveCharacteristic(Effect):
+    """The opening o acts as o^(1 + c): linear at c = 0, quick opening below, like an equal-percentage valve above
+    (IEC 60534-2-1 on inherent flow characteristics). Closed and fully open nothing changes.
+
+    Typical: c of -0.4 to 2. At one opening it is the same as plugging; together with a dead zone it is what ball
+    valves do.
+    """
+
+    name = "valve_characteristic"
+    stage = Stage.COMMAND
+    places = ("valve",)
+    mistaken_for = ("valve_dead_zone", "valve_leak", "actuator_stuck", "plugging")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (Parameter("bend", "1", 0.0, -0.8, 4.0, meaning="exponent of the opening less 1"),)
+
+    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+        opening = torch.clamp(value, 0.0, 1.0)
+        return opening * torch.exp(p["bend"] * torch.log(torch.clamp(opening, min=LEAST_OPENING))), memory

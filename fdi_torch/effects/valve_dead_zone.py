@@ -1,0 +1,34 @@
+"""A valve that is still closed at small openings."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.signals import Clock
+
+
+class ValveDeadZone(Effect):
+    """The opening o acts as max(o - d, 0) / (1 - d): ball and gate valves pass nothing over the first part of their
+    stroke.
+
+    Typical: d of 0.05 to 0.4. At one opening it is the same as plugging.
+    """
+
+    name = "valve_dead_zone"
+    stage = Stage.COMMAND
+    places = ("valve",)
+    mistaken_for = ("valve_leak", "actuator_stuck", "valve_characteristic", "plugging")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (Parameter("dead_zone", "1", 0.0, 0.0, 0.9, meaning="opening at which it begins to pass"),)
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        return [{"dead_zone": opening} for opening in (0.05, 0.15, 0.3, 0.5)]
+
+    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+        return torch.clamp(value - p["dead_zone"], min=0.0) / (1.0 - p["dead_zone"]), memory

@@ -1,0 +1,28 @@
+"""A valve that does not close."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.signals import Clock
+
+
+class ValveLeak(Effect):
+    """The opening o acts as o + s (1 - o): worn seats, dirt, a position sensor that reads closed too early.
+
+    Typical: s of 0.005 to 0.1. At one opening it is the same as a wider pipe.
+    """
+
+    name = "valve_leak"
+    stage = Stage.COMMAND
+    places = ("valve",)
+    mistaken_for = ("valve_dead_zone", "actuator_stuck", "valve_characteristic", "leak", "cross_flow", "plugging")
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return (Parameter("size", "1", 0.0, 0.0, 1.0, meaning="what it passes when closed, as a share of fully open"),)
+
+    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+        return value + p["size"] * (1.0 - value), memory
