@@ -64,8 +64,6 @@ class Rig:
     network: TankNetwork
     space: ParameterSpace
     engine: ReferenceEngine
-    nominal_reading: Tensor
-    reach: Reach
 
     def placement(self, prefix: str) -> Placement:
         return next(p for p in self.network.placements if p.prefix == prefix)
@@ -76,7 +74,7 @@ class Rig:
 
     def starts(self, prefix: str) -> list[dict[str, float]]:
         placement = self.placement(prefix)
-        named = placement.effect.starts(placement.location, self.plant, self.reach)
+        named = placement.effect.starts(placement.location, self.plant, bare_reach(self.plant.name))
         return [{f"{prefix}.{name}": value for name, value in start.items()} for start in named]
 
 
@@ -84,10 +82,14 @@ def rig_of(plant: PlantDescription, placements: tuple[Placement, ...]) -> Rig:
     network = build_network(plant, placements)
     prefixes = {p.prefix for p in network.placements}
     space = ParameterSpace(p for p in network.constants if p.name.rpartition(".")[0] in prefixes)
-    recording = random_inputs(plant)
-    engine = ReferenceEngine(network, space, lay_out(recording, plant.channels(), SAMPLE))
-    reading = engine.readings(space.nominal())
-    return Rig(plant, network, space, engine, reading, reach_of(replace(recording, outputs=reading, mask=None), plant))
+    engine = ReferenceEngine(network, space, lay_out(random_inputs(plant), plant.channels(), SAMPLE))
+    return Rig(plant, network, space, engine)
+
+
+def experiment_on(plant: PlantDescription) -> Tensor:
+    """Readings (S, sensors) of the plant as its description has it."""
+    r = rig_of(plant, ())
+    return r.engine.readings(r.space.nominal())
 
 
 @cache
@@ -96,9 +98,28 @@ def rig(plant: str) -> Rig:
     return rig_of(PLANTS[plant], all_placements(PLANTS[plant]))
 
 
+@dataclass(frozen=True)
+class Alone:
+    """Readings of a plant with one effect. started: at its last start, by itself and in a batch beside a lane of NaN.
+
+    nominal, shaped: in the same batch, at nominal and with the start's shape but a size at nominal.
+    """
+
+    rig: Rig
+    started: Tensor
+    started_in_batch: Tensor
+    nominal: Tensor
+    shaped: Tensor
+
+
 @cache
-def alone(plant: str, prefix: str) -> Rig:
-    return rig_of(PLANTS[plant], (rig(plant).placement(prefix),))
+def alone(plant: str, prefix: str) -> Alone:
+    r = rig_of(PLANTS[plant], (rig(plant).placement(prefix),))
+    starts = rig(plant).starts(prefix)
+    start, nominal = r.space.vector(starts[-1]), r.space.nominal()
+    shape = r.space.vector({n: v for one in starts for n, v in one.items() if n != r.size(prefix)})
+    batch = r.engine.readings(torch.stack([torch.full_like(start, math.nan), start, nominal, shape]))
+    return Alone(r, r.engine.readings(start), batch[1], batch[2], batch[3])
 
 
 @cache
@@ -111,8 +132,8 @@ def first_starts(plant: str) -> dict[str, Tensor]:
     assert bool(torch.isnan(readings[-1]).any())
     best: dict[str, Tensor] = {}
     for (prefix, _), reading in zip(lanes, readings, strict=False):
-        shown = best.get(prefix, r.nominal_reading)
-        if bool((reading - r.nominal_reading).abs().max() >= (shown - r.nominal_reading).abs().max()):
+        shown = best.get(prefix, bare_reading(plant))
+        if bool((reading - bare_reading(plant)).abs().max() >= (shown - bare_reading(plant)).abs().max()):
             best[prefix] = reading
     return best
 
@@ -140,25 +161,30 @@ def compiled_starts(plant: str) -> tuple[Tensor, Tensor]:
 
 @cache
 def bare_reading(plant: str) -> Tensor:
-    return rig_of(PLANTS[plant], ()).nominal_reading
+    """Readings of the plant without any effect."""
+    return experiment_on(PLANTS[plant])
+
+
+@cache
+def bare_reach(plant: str) -> Reach:
+    recording = replace(random_inputs(PLANTS[plant]), outputs=bare_reading(plant), mask=None)
+    return reach_of(recording, PLANTS[plant])
 
 
 @everywhere
 def test_neutral_at_nominal_bit_for_bit(plant: str, place: str) -> None:
-    assert torch.equal(alone(plant, place).nominal_reading, bare_reading(plant))
+    assert torch.equal(alone(plant, place).nominal, bare_reading(plant))
 
 
 @pytest.mark.parametrize("plant", PLANTS)
 def test_the_whole_library_at_nominal_changes_no_bit(plant: str) -> None:
-    assert torch.equal(rig(plant).nominal_reading, bare_reading(plant))
+    r = rig(plant)
+    assert torch.equal(r.engine.readings(r.space.nominal()), bare_reading(plant))
 
 
 @everywhere
 def test_nothing_there_while_the_size_is_nominal_whatever_the_shape(plant: str, place: str) -> None:
-    r = alone(plant, place)
-    size = r.size(place)
-    theta = r.space.vector({n: v for start in r.starts(place) for n, v in start.items() if n != size})
-    assert torch.equal(r.engine.readings(theta), r.nominal_reading)
+    assert torch.equal(alone(plant, place).shaped, bare_reading(plant))
 
 
 @everywhere
@@ -168,17 +194,14 @@ def test_starts_lie_in_the_box_and_one_of_them_shows(plant: str, place: str) -> 
         assert r.size(place) in start
         for name, value in start.items():
             assert r.space[name].low <= value <= r.space[name].high, name
-    shown = (first_starts(plant)[place] - r.nominal_reading).abs().max()
+    shown = (first_starts(plant)[place] - bare_reading(plant)).abs().max()
     assert shown > 0 or r.placement(place).effect.rounds
     assert bool(torch.isfinite(first_starts(plant)[place]).all())
 
 
 @everywhere
 def test_alone_equals_in_batch_beside_a_lane_of_nan(plant: str, place: str) -> None:
-    r = alone(plant, place)
-    start = r.space.vector(r.starts(place)[-1])
-    batch = torch.stack([torch.full_like(start, math.nan), start, r.space.nominal()])
-    assert torch.equal(r.engine.readings(batch)[1], r.engine.readings(start))
+    assert torch.equal(alone(plant, place).started_in_batch, alone(plant, place).started)
 
 
 @everywhere
@@ -188,19 +211,20 @@ def test_slope_of_the_size_is_finite_and_shows_where_the_effect_is_smooth(plant:
     assert bool(torch.isfinite(slope).all())
     if r.placement(place).effect.smooth:
         assert slope.abs().max() > 0
-        assert torch.allclose(slope, one_sided_slope(r, place), atol=1e-2 * float(slope.abs().max()))
+        assert torch.allclose(slope, one_sided_slopes(plant)[place], atol=1e-2 * float(slope.abs().max()))
     else:
         assert slope.abs().max() == 0, "it is smooth after all"
 
 
-def one_sided_slope(r: Rig, place: str) -> Tensor:
+@cache
+def one_sided_slopes(plant: str) -> dict[str, Tensor]:
     """From readings with sizes just inside the box: a second opinion on the Jacobian."""
-    size = r.space[r.size(place)]
-    bound = size.high if size.high > size.nominal else size.low
-    step = 1e-5 * (bound - size.nominal)
-    both = torch.stack([r.space.vector({size.name: size.nominal + k * step}) for k in (0, 1)])
-    before, after = r.engine.readings(both)
-    return (after - before) / step
+    r = rig(plant)
+    sizes = [r.space[r.size(p.prefix)] for p in r.network.placements]
+    steps = [1e-5 * ((z.high if z.high > z.nominal else z.low) - z.nominal) for z in sizes]
+    lanes = [r.space.vector({z.name: z.nominal + step}) for z, step in zip(sizes, steps, strict=True)]
+    changes = r.engine.readings(torch.stack(lanes)) - bare_reading(plant)
+    return {p.prefix: c / step for p, c, step in zip(r.network.placements, changes, steps, strict=True)}
 
 
 @pytest.mark.parametrize("plant", PLANTS)
@@ -277,21 +301,17 @@ def rescaled_readings(plant: str, m: float, s: float) -> dict[str, Tensor]:
 
 @everywhere
 def test_declared_units_are_true(plant: str, place: str) -> None:
-    r = rig(plant)
-    expected = alone(plant, place).engine.readings(alone(plant, place).space.vector(r.starts(place)[-1]))
     for metre, second in ((100.0, 1.0), (1.0, 60.0)):
-        assert torch.allclose(rescaled_readings(plant, metre, second)[place], expected, rtol=1e-5)
+        assert torch.allclose(rescaled_readings(plant, metre, second)[place], alone(plant, place).started, rtol=1e-5)
 
 
 @everywhere
 def test_a_plant_file_can_have_it(plant: str, place: str) -> None:
     """As part of the plant's description, with these parameters, it does the same as beside it."""
-    r = alone(plant, place)
-    start = r.starts(place)[-1]
     location, name = place.split(".")
-    own = {full.rpartition(".")[2]: value for full, value in start.items()}
-    described = replace(r.plant, effects=(PlacedEffect(name, location, own),))
-    assert torch.equal(rig_of(described, ()).nominal_reading, r.engine.readings(r.space.vector(start)))
+    own = {full.rpartition(".")[2]: value for full, value in rig(plant).starts(place)[-1].items()}
+    described = replace(PLANTS[plant], effects=(PlacedEffect(name, location, own),))
+    assert torch.equal(experiment_on(described), alone(plant, place).started)
 
 
 def test_names_are_unique_and_twins_are_known() -> None:

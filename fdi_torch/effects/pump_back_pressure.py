@@ -20,7 +20,7 @@ class PumpBackPressure(Effect):
     name = "pump_back_pressure"
     stage = Stage.FLOW
     places = ("pump",)
-    mistaken_for = ("pump_gain", "pump_saturation", "flow_exponent", "leak")
+    mistaken_for = ("pump_gain", "actuator_stuck", "pump_saturation", "flow_exponent", "leak")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("loss", "1", 0.0, -0.5, 1.0, meaning="share of the flow that is lost when the tank is full"),)

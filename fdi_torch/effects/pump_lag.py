@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from torch import Tensor
 
 from fdi_torch.parameters import Parameter
@@ -21,7 +23,7 @@ class PumpLag(Effect):
     stage = Stage.COMMAND
     places = ("pump",)
     memory = 1
-    mistaken_for = ("pump_delay", "actuator_slew", "sensor_lag", "sensor_delay")
+    mistaken_for: ClassVar[tuple[str, ...]] = ("pump_delay", "actuator_slew", "sensor_lag", "sensor_delay")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("time_constant", "s", 0.0, 0.0, 60.0, meaning="time to 63 % of a step"),)

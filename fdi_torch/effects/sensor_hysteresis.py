@@ -36,6 +36,6 @@ class SensorHysteresis(Effect):
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
         behind = memory[0] - value
-        # Two branches rather than a clamp: at a play of 0 both ends of a clamp meet and its slopes cancel.
-        kept = torch.where(behind > 0.0, torch.minimum(behind, p["play"]), torch.maximum(behind, -p["play"]))
+        # Not a clamp between -play and play: at a play of 0 its ends meet and their slopes cancel.
+        kept = torch.sign(behind) * torch.minimum(torch.abs(behind), p["play"])
         return value + kept, (value + kept,)
