@@ -70,24 +70,36 @@ class Observer:
         return PlantState(levels, state.commands, state.readings), residual
 
     def run(self, samples: Samples, levels: Tensor | None = None) -> Observation:
-        """Along whole recordings. levels: at the start, where known."""
+        """Along whole recordings. levels: before the first correction, where known."""
         state = self.start(samples, levels)
         state = replace(state, levels=state.levels.expand(*self._lanes(samples), -1))
+        times = samples.time.tolist()
+        state, residual = self.correct(state, samples.readings[..., 0, :], 0, times[0], times[1] - times[0])
+        rest = self.resume(samples, state, 1)
+        return Observation(
+            samples.time,
+            torch.cat([state.levels.unsqueeze(-2), rest.levels], dim=-2),
+            torch.cat([residual.unsqueeze(-2), rest.residual], dim=-2),
+            torch.cat([self.gain.inflation_at(0).unsqueeze(-2), rest.inflation], dim=-2),
+        )
+
+    def resume(self, samples: Samples, state: PlantState, number: int) -> Observation:
+        """From the state after the first sample's correction: what is seen at the others. number: samples seen so far."""
         move = self.stepper.recorded(state.levels, samples.input_at(0), self.values)
         times = samples.time.tolist()
         seen, residuals, inflation = [], [], []
-        for k in range(len(samples)):
-            span = times[k] - times[k - 1] if k else times[1] - times[0]
-            if k:
-                state = self.stepper.advance(
-                    state, partial(samples.input_at, k - 1), times[k - 1], span, self.values, move
-                )
-            state, residual = self.correct(state, samples.readings[..., k, :], k, times[k], span)
+        for k in range(1, len(samples)):
+            span = times[k] - times[k - 1]
+            inputs = partial(samples.input_at, k - 1)
+            state = self.stepper.advance(state, inputs, times[k - 1], span, self.values, move)
+            count = number + k - 1
+            state, residual = self.correct(state, samples.readings[..., k, :], count, times[k], span)
             seen.append(state.levels)
             residuals.append(residual)
-            inflation.append(self.gain.inflation_at(k))
-        stacked = torch.stack(inflation, dim=-2)
-        return Observation(samples.time, torch.stack(seen, dim=-2), torch.stack(residuals, dim=-2), stacked)
+            inflation.append(self.gain.inflation_at(count))
+        return Observation(
+            samples.time[1:], torch.stack(seen, -2), torch.stack(residuals, -2), torch.stack(inflation, -2)
+        )
 
     def check_stable(self, samples: Samples, seen: Observation) -> float:
         """The largest spectral radius of the error's transition at the levels visited.

@@ -65,16 +65,13 @@ class Stepper:
         move: Move | None = None,
     ) -> PlantState:
         """The state `span` s later. inputs: share (0..1) of the span -> (*batch, channels). move: from `recorded`."""
-        count = max(math.ceil(span / self.longest - 1e-9), 1)
-        step = span / count
-        for i in range(count):
-            share, start = (i + 0.5) / count, begin + i * step
+        for start, step, share in substeps(begin, span, self.longest):
             if move is not None:
                 times = state.levels.new_tensor([start, step])
                 state = replace(state, levels=move(state.levels, inputs(share), times))
                 continue
             clock = self._clock(state.levels, start, step, step)
-            levels, memory = self._move(state.levels, inputs(share), state.commands, clock, values)
+            levels, memory = self.move(state.levels, inputs(share), state.commands, clock, values)
             state = replace(state, levels=levels, commands=memory)
         return state
 
@@ -88,7 +85,7 @@ class Stepper:
 
         def move(x: Tensor, u: Tensor, times: Tensor) -> Tensor:
             clock = Clock(times[0], times[1], times[1])
-            return self._move(x, u, (), clock, values)[0]
+            return self.move(x, u, (), clock, values)[0]
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch announces a successor of its tracer; it does not do this job yet
@@ -101,9 +98,10 @@ class Stepper:
         readings, memory = self.network.read(self._seen(state.levels), state.readings, clock, values)
         return torch.stack(torch.broadcast_tensors(*readings), dim=-1), replace(state, readings=memory)
 
-    def _move(
+    def move(
         self, levels: Tensor, inputs: Tensor, memory: Memory, clock: Clock, values: PlaceValues
     ) -> tuple[Tensor, Memory]:
+        """One integration step: levels and what the actuators remember."""
         actual, memory = self.network.commands(self._channels(inputs), memory, clock, values)
         return self._runge_kutta(levels, actual, clock, values), memory
 
@@ -129,6 +127,13 @@ class Stepper:
     @staticmethod
     def _clock(like: Tensor, start: float, step: float, resolution: float) -> Clock:
         return Clock(like.new_tensor(start), like.new_tensor(step), like.new_tensor(resolution))
+
+
+def substeps(begin: float, span: float, longest: float) -> list[tuple[float, float, float]]:
+    """Start (s), length (s) and middle (as a share of the span) of the equal steps that fill a span."""
+    count = max(math.ceil(span / longest - 1e-9), 1)
+    step = span / count
+    return [(begin + i * step, step, (i + 0.5) / count) for i in range(count)]
 
 
 def slopes(function: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
