@@ -69,9 +69,7 @@ class ChangedObserver:
         white[:, : self.whitening.order] = 0.0
         return torch.nan_to_num(white, nan=0.0)
 
-    def follow(
-        self, samples: Samples, levels: Tensor, believed: Tensor, changes: Changes
-    ) -> tuple[Tensor, Tensor]:
+    def follow(self, samples: Samples, levels: Tensor, believed: Tensor, changes: Changes) -> tuple[Tensor, Tensor]:
         """Corrected levels (L, S, tanks) and innovations (L, S, sensors) along one recording."""
         theta = changes.theta
         times, last = samples.time.tolist(), float(samples.time[-1])
@@ -117,9 +115,7 @@ class ChangedObserver:
         if key in self._recorded:
             return self._recorded[key]
 
-        def step(
-            x: Tensor, u: Tensor, clock: Tensor, now: Tensor, y: Tensor, moves: Tensor
-        ) -> tuple[Tensor, Tensor]:
+        def step(x: Tensor, u: Tensor, clock: Tensor, now: Tensor, y: Tensor, moves: Tensor) -> tuple[Tensor, Tensor]:
             values = self.network.bind(self.space, now)
             moved = self.stepper.move(x, u, (), Clock(clock[0], clock[1], clock[1]), values)[0]
             x = x + moves * (moved - x)

@@ -84,7 +84,7 @@ class Observer:
         )
 
     def resume(self, samples: Samples, state: PlantState, number: int) -> Observation:
-        """From the state after the first sample's correction: what is seen at the others. number: samples seen so far."""
+        """From the state after the first sample: what is seen at the others. number: samples seen so far."""
         move = self.stepper.recorded(state.levels, samples.input_at(0), self.values)
         times = samples.time.tolist()
         seen, residuals, inflation = [], [], []

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fdi_torch.monitor.change import ChangedObserver, Changes
 from fdi_torch.monitor.detection import NEVER, Detector
-from fdi_torch.monitor.events import Event
+from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.isolation import Finding, isolate, refit
 from fdi_torch.monitor.noise import Noise
 from fdi_torch.monitor.observer import Observer, first_levels
@@ -206,7 +206,7 @@ class Monitor:
         return self._believe(state, change), events
 
     def _revise(
-        self, state: MonitorState, change: Change, now: float, kind: str, only: tuple[Finding, ...] = ()
+        self, state: MonitorState, change: Change, now: float, kind: Kind, only: tuple[Finding, ...] = ()
     ) -> tuple[MonitorState, list[Event]]:
         """The last change estimated again from all that has come since; `only`: of the same kind as before."""
         start = max(change.finding.onset - self.settings.lookback, float(state.samples.time[0]))
@@ -282,28 +282,24 @@ class Monitor:
         nominal = self.space.parameters[column].nominal
         return abs(float(finding.value[column]) - nominal) <= 3.0 * float(finding.std[column])
 
-    def _tell(self, change: Change, rivals: tuple[str, ...], now: float, kind: str) -> list[Event]:
+    def _tell(self, change: Change, rivals: tuple[str, ...], now: float, kind: Kind) -> list[Event]:
         finding, names = change.finding, self._names(change.finding)
         columns = finding.hypothesis.columns
         back = [c for c in columns if self._is_nominal(finding, c) and not self._was_nominal(change, c)]
         sizes = tuple(float(finding.value[c]) for c in columns)
         stds = tuple(float(finding.std[c]) for c in columns)
         units = tuple(self.space.parameters[c].unit for c in columns)
-        parts = [f"{n} = {v:.4g} ± {s:.2g} {u}".rstrip(" 1") if u == "1" else f"{n} = {v:.4g} ± {s:.2g} {u}"
-                 for n, v, s, u in zip(names, sizes, stds, units, strict=True)]
+        parts = [_amount(*row) for row in zip(names, sizes, stds, units, strict=True)]
         manner = "growing since" if finding.hypothesis.incipient else "since"
         text = f"{', '.join(parts)}, {manner} {finding.onset:.1f} ± {finding.onset_std:.2g} s"
         if rivals:
             text += f"; or {' or '.join(rivals)}"
         if not _fits(finding):
             text += "; does not explain all of the residual"
-        whole = len(back) == len(columns)
-        return [
-            Event(
-                now, "recovered" if whole else kind, text, names, sizes, stds, units, finding.onset,  # type: ignore[arg-type]
-                finding.onset_std, finding.hypothesis.incipient, change.alarm - finding.onset, rivals,
-            )
-        ]  # fmt: skip
+        told: Kind = "recovered" if len(back) == len(columns) else kind
+        onset, incipient = finding.onset, finding.hypothesis.incipient
+        delay = change.alarm - onset
+        return [Event(now, told, text, names, sizes, stds, units, onset, finding.onset_std, incipient, delay, rivals)]
 
     def _was_nominal(self, change: Change, column: int) -> bool:
         return float(change.before[column]) == self.space.parameters[column].nominal
@@ -358,6 +354,10 @@ def _notice(last: float, time: float, usual: float, unknown_since: float | None)
     if time - last > GAP * usual:
         return f"no samples for {time - last:g} s; the observer starts afresh"
     return ""
+
+
+def _amount(name: str, size: float, std: float, unit: str) -> str:
+    return f"{name} = {size:.4g} ± {std:.2g}" + ("" if unit == "1" else f" {unit}")
 
 
 def _fits(finding: Finding) -> bool:

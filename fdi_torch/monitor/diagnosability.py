@@ -1,0 +1,200 @@
+"""What an experiment can tell at all: which faults show, which can be told apart, how small they may be.
+
+Definitions 1 to 3 and Theorem 1 of the 2020 paper, from the sensitivities of the readings to the faults.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from statistics import NormalDist
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import placements_for
+from fdi_torch.estimate.fitting import StartLevels, set_up
+from fdi_torch.estimate.information import certainty
+from fdi_torch.estimate.uncertainty import undetermined_in_words
+from fdi_torch.monitor.structure import structure_of
+from fdi_torch.plant.description import Pipe, PlantDescription, Tank
+from fdi_torch.recording import Recording
+
+# Signatures whose angle's sine is below this are one and the same.
+SAME = 1e-6
+# A fault whose effect on a reading is this share of its largest effect on any does not show there.
+UNSEEN = 1e-9
+STEP = 0.25
+
+
+@dataclass(frozen=True)
+class Diagnosability:
+    """Of faults f (names, in units) by sensors c, for one experiment and noise level.
+
+    shows (F, C): noise standard deviations, summed over samples in squares, that a unit of the fault adds to a sensor.
+    apart (F, F): sine of the angle between two signatures; 0: inseparable. structurally_apart: the same from structure.
+    rank: how many combinations of faults are determined. std (F): Cramer-Rao bound of all together; infinite where
+    not determined. std_by_correlation: with each channel's gain and offset left open, as a correlation leaves them.
+    smallest_detectable (F): found with the wished rates if its time and kind are known. smallest_isolable (F): told
+    from any single other fault. groups: faults that cannot be told apart, and why.
+    """
+
+    faults: tuple[str, ...]
+    units: tuple[str, ...]
+    sensors: tuple[str, ...]
+    shows: tuple[tuple[float, ...], ...]
+    apart: tuple[tuple[float, ...], ...]
+    structurally_apart: tuple[tuple[bool, ...], ...]
+    rank: int
+    std: tuple[float, ...]
+    std_by_correlation: tuple[float, ...]
+    smallest_detectable: tuple[float, ...]
+    smallest_isolable: tuple[float, ...]
+    groups: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values; what is infinite is None."""
+        return {key: _plain(value) for key, value in asdict(self).items()}
+
+
+def diagnosability(
+    plant: PlantDescription,
+    faults: Sequence[str],
+    recording: Recording,
+    noise_std: Tensor,
+    at: dict[str, float] | None = None,
+    calibrate: Sequence[str] = (),
+    start: StartLevels = "equilibrium",
+    false_alarm: float = 0.001,
+    miss: float = 0.05,
+    step: float = STEP,
+) -> Diagnosability:
+    """The report for the inputs and sample times of a recording; its readings are not looked at.
+
+    faults: parameters such as 'T1.leak.size'. noise_std (C,) in the sensors' units. at: values at which to linearise,
+    nominal where not named. calibrate: constants that are uncertain too, by their tolerance. Raises ValueError.
+    """
+    if not faults:
+        raise ValueError("expected at least one fault, got none; name some, such as T1.leak.size")
+    if not (0 < false_alarm < 1 and 0 < miss < 1):
+        raise ValueError(f"expected rates between 0 and 1, got {false_alarm:g} (false alarm) and {miss:g} (miss)")
+    fitting = set_up(plant, [recording], [*faults, *calibrate], start)
+    theta = fitting.space.vector(at or {})
+    readings, slopes = fitting.engines(step)[0].linearise(theta)
+    scaled = slopes / noise_std[:, None]
+    count = len(faults)
+    information = scaled.flatten(0, 1).mT @ scaled.flatten(0, 1) + torch.diag(fitting.space.std(theta) ** -2)
+    blind = without_gain_and_offset(scaled, readings)
+    sure = certainty(information)
+    blind_sure = certainty(blind.flatten(0, 1).mT @ blind.flatten(0, 1) + torch.diag(fitting.space.std(theta) ** -2))
+    own = without_constants(scaled, count, fitting.space.std(theta))
+    apart = sines(own)
+    reach = NormalDist().inv_cdf(1.0 - 0.5 * false_alarm) + NormalDist().inv_cdf(1.0 - miss)
+    length = torch.linalg.vector_norm(own, dim=0)
+    nearest = (apart + torch.eye(count, dtype=apart.dtype)).amin(dim=1) if count > 1 else torch.ones(1)
+    structural = structure_of(plant, placements_for(faults)).isolable()
+    prefixes = [name.rpartition(".")[0] for name in faults]
+    return Diagnosability(
+        faults=tuple(faults),
+        units=tuple(p.unit for p in fitting.space)[:count],
+        sensors=tuple(sensor.name for sensor in plant.sensors),
+        shows=_rows(torch.linalg.vector_norm(scaled[..., :count], dim=0).mT),
+        apart=_rows(apart),
+        structurally_apart=tuple(tuple(structural[f].get(g, False) for g in prefixes) for f in prefixes),
+        rank=int((torch.linalg.svdvals(own / length.clamp(min=1e-300)) > SAME).sum()),
+        std=tuple(sure.std[:count].tolist()),
+        std_by_correlation=tuple(blind_sure.std[:count].tolist()),
+        smallest_detectable=_limits(reach, length, length),
+        smallest_isolable=_limits(reach, length * nearest, length),
+        groups=tuple(_groups(plant, faults, apart)),
+        remarks=tuple(undetermined_in_words(fitting.space.names, sure)) + _remarks(readings, length, faults),
+    )
+
+
+def without_gain_and_offset(slopes: Tensor, readings: Tensor) -> Tensor:
+    """Slopes (S, C, P) less what a channel's gain and offset could imitate: all that a correlation sees (erratum 6)."""
+    projected = []
+    for c in range(readings.shape[1]):
+        basis = torch.stack([torch.ones_like(readings[:, c]), readings[:, c] - readings[:, c].mean()], dim=1)
+        basis = basis / torch.linalg.vector_norm(basis, dim=0).clamp(min=1e-12)
+        q = torch.linalg.qr(basis).Q
+        projected.append(slopes[:, c] - q @ (q.mT @ slopes[:, c]))
+    return torch.stack(projected, dim=1)
+
+
+def without_constants(scaled: Tensor, faults: int, std: Tensor) -> Tensor:
+    """Signatures (K, F) of the faults in noise standard deviations, less what uncertain constants could imitate."""
+    flat = scaled.flatten(0, 1)
+    own, others = flat[:, :faults], flat[:, faults:]
+    if not others.shape[1]:
+        return own
+    # A prior is one more reading of the constant: rows of 1/std that no fault touches.
+    prior = torch.diag(1.0 / std[faults:])
+    others = torch.cat([others, prior])
+    own = torch.cat([own, own.new_zeros(len(prior), faults)])
+    q = torch.linalg.qr(others).Q
+    return own - q @ (q.mT @ own)
+
+
+def sines(signatures: Tensor) -> Tensor:
+    """Sine of the angle between columns of (K, F), (F, F); small angles keep their digits."""
+    length = torch.linalg.vector_norm(signatures, dim=0)
+    unit = signatures / torch.where(length > 0, length, 1.0)
+    rows = []
+    for i in range(unit.shape[1]):
+        along = (unit[:, i : i + 1] * unit).sum(dim=0)
+        rows.append(torch.linalg.vector_norm(unit - unit[:, i : i + 1] * along, dim=0))
+    table = torch.stack(rows)
+    return torch.where(torch.eye(len(table), dtype=torch.bool), torch.zeros_like(table), table)
+
+
+def _groups(plant: PlantDescription, faults: Sequence[str], apart: Tensor) -> list[str]:
+    """Faults with one signature, each group once, with the reason."""
+    left, sentences = list(range(len(faults))), []
+    while left:
+        first, *others = left
+        twins = [j for j in others if float(apart[first, j]) < SAME]
+        left = [j for j in others if j not in twins]
+        if twins:
+            members = [faults[first], *(faults[j] for j in twins)]
+            sentences.append(f"{' and '.join(members)} cannot be told apart: {_reason(plant, members)}")
+    return sentences
+
+
+def _reason(plant: PlantDescription, members: Sequence[str]) -> str:
+    places = dict.fromkeys(name.split(".")[0] for name in members)
+    if len(places) == 1:
+        return f"they are the same change of {next(iter(places))}"
+    components = [plant.component(place) for place in places]
+    sources = {c.source for c in components if isinstance(c, Pipe) and c.is_outlet}
+    tanks = {c.name for c in components if isinstance(c, Tank)}
+    if sources and len(sources | tanks) == 1:
+        return f"they act through the same sqrt(2 g h) of {next(iter(sources))}, so that only their sum is seen"
+    return "their signatures are the same under these inputs; other inputs or sensors may separate them"
+
+
+def _remarks(readings: Tensor, length: Tensor, faults: Sequence[str]) -> tuple[str, ...]:
+    unseen = [name for name, size in zip(faults, length.tolist(), strict=True) if not size > 0]
+    constant = (readings.amax(0) - readings.amin(0) <= UNSEEN * readings.abs().amax(0)).nonzero().flatten().tolist()
+    remarks = [f"{name} does not show in any reading" for name in unseen]
+    if constant:
+        numbers = ", ".join(str(c + 1) for c in constant)
+        remarks.append(f"without a fault reading {numbers} stands still: its correlation is undefined")
+    return tuple(remarks)
+
+
+def _limits(reach: float, length: Tensor, whole: Tensor) -> tuple[float, ...]:
+    seen = length > SAME * whole
+    return tuple(torch.where(seen, reach / torch.where(seen, length, 1.0), torch.inf).tolist())
+
+
+def _rows(table: Tensor) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in table.tolist())
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and value in (float("inf"), float("-inf")) else value

@@ -1,0 +1,136 @@
+"""Diagnosability against the published bound, against structure by another tool, and against what is known by hand."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from fdi_torch.config.plant import load_plant
+from fdi_torch.effects import placements_for
+from fdi_torch.estimate.fitting import set_up
+from fdi_torch.monitor.diagnosability import diagnosability
+from fdi_torch.monitor.structure import Structure, structure_of
+from fdi_torch.recording import Recording
+
+PLANT = load_plant("three_tank")
+PAPER = ["T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size"]
+SINGLES = [f"T{i}.leak.size" for i in (1, 2, 3)] + [f"{pipe}.plugging.size" for pipe in ("P13", "P32", "OUT2")]
+TABLE_3 = dict(zip(PAPER, (0.3, 0.3, 0.5, 0.6, 1.0), strict=True))
+
+
+def steady(samples: int = 1001) -> Recording:
+    time = torch.arange(samples, dtype=torch.float64)
+    flows, readings = time.new_full((samples, 2), 50e-6), time.new_zeros(samples, 3)
+    return Recording(time, flows, readings, ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
+
+
+def millimetre() -> torch.Tensor:
+    return torch.full((3,), 1e-3, dtype=torch.float64)
+
+
+def test_standard_errors_are_the_cramer_rao_bound_of_table_3() -> None:
+    fitting = set_up(PLANT, [steady()], PAPER, "equilibrium")
+    clean = fitting.engines(0.1)[0].readings(fitting.space.vector(TABLE_3))
+    found = diagnosability(PLANT, PAPER, steady(), clean.std(0) * 10**-2.5, at=TABLE_3, step=0.1)
+    # Independent computation: central differences through RK4 at 0.02 s.
+    assert found.std == pytest.approx([203e-6, 174e-6, 268e-6, 539e-6, 744e-6], rel=0.01)
+    assert found.std_by_correlation == pytest.approx([390e-6, 601e-6, 847e-6, 849e-6, 1300e-6], rel=0.01)
+
+
+def test_plugging_of_the_outlet_and_a_leak_of_its_tank_are_one_and_the_reason_is_told() -> None:
+    found = diagnosability(PLANT, SINGLES, steady(), millimetre())
+    assert found.groups == (
+        "T2.leak.size and OUT2.plugging.size cannot be told apart: they act through the same sqrt(2 g h) of T2, "
+        "so that only their sum is seen",
+    )
+    assert found.smallest_isolable[1] == math.inf and found.smallest_isolable[5] == math.inf
+    assert all(math.isfinite(size) for size in found.smallest_detectable)
+
+
+def test_at_rest_three_readings_determine_three_combinations_and_moving_levels_five() -> None:
+    rest = diagnosability(PLANT, PAPER, steady(), millimetre())
+    assert rest.rank == 3 and all(math.isinf(std) for std in rest.std)
+    assert any("correlation is undefined" in remark for remark in rest.remarks)
+    moving = diagnosability(PLANT, PAPER, steady(), millimetre(), at=TABLE_3)
+    assert moving.rank == 5 and all(math.isfinite(std) for std in moving.std)
+
+
+def test_smallest_detectable_size_follows_the_rates_and_the_noise() -> None:
+    loose = diagnosability(PLANT, ["T1.leak.size"], steady(200), millimetre(), false_alarm=0.1, miss=0.5)
+    strict = diagnosability(PLANT, ["T1.leak.size"], steady(200), 2 * millimetre(), false_alarm=0.1, miss=0.5)
+    assert loose.smallest_detectable[0] == pytest.approx(1.6449 * loose.std[0], rel=1e-4)
+    assert strict.smallest_detectable[0] == pytest.approx(2 * loose.smallest_detectable[0], rel=1e-9)
+
+
+def test_uncertain_constants_hide_what_they_imitate() -> None:
+    alone = diagnosability(PLANT, ["P13.plugging.size"], steady(), millimetre())
+    constants = ["P13.discharge_coefficient"]
+    hidden = diagnosability(PLANT, ["P13.plugging.size"], steady(), millimetre(), calibrate=constants)
+    # Plugging is told from the coefficient only by the coefficient's tolerance of 3 %.
+    assert hidden.std[0] == pytest.approx(0.03, rel=0.01) and alone.std[0] < 1e-3
+    reach = hidden.smallest_detectable[0] / alone.smallest_detectable[0]
+    assert reach == pytest.approx(hidden.std[0] / alone.std[0], rel=0.01)
+
+
+def test_a_sensor_that_sees_nothing_of_a_fault_says_so() -> None:
+    found = diagnosability(PLANT, ["h2.sensor_bias.bias"], steady(50), millimetre())
+    assert found.shows[0][0] == 0.0 and found.shows[0][2] == 0.0 and found.shows[0][1] > 0
+    assert found.to_dict()["rank"] == 1
+
+
+def test_misuse_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one fault"):
+        diagnosability(PLANT, [], steady(), millimetre())
+    with pytest.raises(ValueError, match="rates between 0 and 1"):
+        diagnosability(PLANT, SINGLES, steady(), millimetre(), miss=1.0)
+
+
+def test_structure_of_a_chain_by_hand() -> None:
+    # x is read twice: both readings and the law of y are checked by each other, z is nobody's.
+    structure = Structure(
+        {"a": frozenset({"x"}), "b": frozenset({"x"}), "c": frozenset({"z"})},
+        {"fa": frozenset({"a"}), "fb": frozenset({"b"}), "fc": frozenset({"c"})},
+    )
+    assert structure.detectable() == {"fa": True, "fb": True, "fc": False}
+    assert not structure.isolable()["fa"]["fb"]
+
+
+def test_structure_agrees_with_the_fault_diagnosis_toolbox() -> None:
+    toolbox = pytest.importorskip("faultdiagnosistoolbox", reason="faultdiagnosistoolbox is not installed")
+    places = [*placements_for([*SINGLES, "h1.sensor_bias.bias", "h3.sensor_bias.bias", "Q1.pump_gain.factor"])]
+    structure = structure_of(PLANT, places)
+    names = [p.prefix.replace(".", "_") for p in places]
+    model = toolbox.DiagnosisModel(_as_toolbox_model(toolbox, structure, names), name="three tanks")
+    detectable, hidden = model.DetectabilityAnalysis()
+    assert set(detectable) == set(names) and not hidden
+    not_isolable = model.IsolabilityAnalysis()
+    ours = structure.isolable()
+    for i, f in enumerate(places):
+        for j, g in enumerate(places):
+            assert ours[f.prefix][g.prefix] == (not not_isolable[i, j]), (f.prefix, g.prefix)
+
+
+def _as_toolbox_model(toolbox: Any, structure: Structure, names: list[str]) -> dict[str, Any]:
+    """The same equations in the toolbox's own words: faults and readings written into them."""
+    unknowns = sorted({u for row in structure.equations.values() for u in row})
+    written: list[Any] = []
+    readings = []
+    for name, row in structure.equations.items():
+        if name.startswith("derivative"):
+            tank = name.split()[1]
+            written.append(toolbox.DiffConstraint(f"dh_{tank}", f"h_{tank}"))
+            continue
+        upset = [fault for fault, own in zip(names, structure.faults.values(), strict=True) if name in own]
+        known = [f"y_{name.split()[1]}"] if name.startswith("sensor") or name.startswith("law Q") else []
+        readings += known
+        written.append([u.replace(" ", "_") for u in sorted(row)] + upset + known)
+    return {
+        "type": "VarStruc",
+        "x": [u.replace(" ", "_") for u in unknowns],
+        "f": names,
+        "z": readings,
+        "rels": written,
+    }
