@@ -18,13 +18,16 @@ from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
 from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
 from fdi_torch.estimate.refine import Progress, RefineSettings
-from fdi_torch.logbook import RunLog
+from fdi_torch.logbook import Message, RunLog, last_state, unfinished
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure, save
 from fdi_torch.simulate.record import clean_readings, with_noise
 
 Tell = Callable[[float, str], None]
+
+# What a resumed run takes over from the log of the killed one.
+KEPT = ("/plant/input", "/plant/output", "/plant/truth", "/estimator/de/generation", "/estimator/de/population")
 
 
 @dataclass(frozen=True)
@@ -38,10 +41,11 @@ class TrainResult:
     pictures: tuple[Path, ...]
 
 
-def train(run: Run, tell: Tell | None = None) -> TrainResult:
+def train(run: Run, tell: Tell | None = None, resume: bool = False) -> TrainResult:
     """Loads or simulates, estimates, diagnoses, logs and draws what a run file asks for.
 
     tell(share, text) is called as work goes on. What was computed before an error or Ctrl-C stays readable in the log.
+    resume: goes on from the last generation that a killed run of the same file logged, and ends as it would have.
     """
     tell = tell or (lambda share, text: None)
     space = wanted_space(run)
@@ -50,12 +54,15 @@ def train(run: Run, tell: Tell | None = None) -> TrainResult:
     fitting = fitting_of(run, space, loaded)
     settings = hybrid_settings(run.config.estimate)
     truth = simulated_truth(run)
-    path = free_path(Path(run.config.output.folder), run.name)
+    folder = Path(run.config.output.folder)
+    path = killed_path(folder, run.name) if resume else free_path(folder, run.name)
+    before, search = left_behind(path, run) if resume else ((), None)
     sources = [{"path": part.recording.source, "sha256": part.recording.sha256} for part in loaded]
     with RunLog(path, "train", config_text=run.text, seeds={"seed": run.config.seed}, data=sources) as log:
-        log_recordings(log, loaded, truth)
+        if not log.carry_over(before):
+            log_recordings(log, loaded, truth)
         watch = Watch(log, fitting.space, settings, tell)
-        result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration)
+        result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, search)
         log_result(log, result, fitting.space)
         pictures = draw(run, fitting, result, path)
     tell(1.0, "done")
@@ -229,6 +236,31 @@ def draw(run: Run, fitting: Fitting, result: HybridResult, log: Path) -> tuple[P
         figure = fit_figure(recording, predicted, f"{run.name}: {result.diagnosis.kind}")
         paths.append(save(figure, log.with_name(f"{log.stem}{suffix}.png")))
     return tuple(paths)
+
+
+def killed_path(folder: Path, name: str) -> Path:
+    """The newest log of that name that was never finished. Raises ValueError where there is none."""
+    partials = [
+        p
+        for p in folder.glob(f"{name}*.mcap.partial")
+        if p.name.split(".")[0].removeprefix(name).strip("_0123456789") == ""
+    ]
+    if not partials:
+        raise ValueError(f"{folder}: expected an unfinished log {name}.mcap.partial, got none; start without --resume")
+    return max(partials, key=lambda p: p.stat().st_mtime).with_suffix("")
+
+
+def left_behind(path: Path, run: Run) -> tuple[tuple[Message, ...], Search | None]:
+    """What a killed run logged until its last whole generation, and the state of its search there."""
+    before = unfinished(path)
+    if before is None or before.config_text != run.text:
+        raise ValueError(f"{path}.partial: expected the log of this very run, got another; start without --resume")
+    state = last_state(before)
+    if state is None:
+        return (), None
+    generation, arrays = state
+    kept = (m for m in before.messages() if m.topic in KEPT and m.payload.get("generation", 0) <= generation)
+    return tuple(kept), Search.from_dict({name: torch.tensor(array) for name, array in arrays.items()})
 
 
 def free_path(folder: Path, name: str, ending: str = "mcap") -> Path:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -122,3 +125,39 @@ def test_simulate_writes_a_recording_that_train_takes(tmp_path: Path, capsys: py
     changes = [f"output.folder={tmp_path}", *QUICK[1:]]
     done = train(load_run(tmp_path / "own.yaml", changes))
     assert float(done.result.estimate.value[0]) == pytest.approx(0.3, abs=0.02)
+
+
+def killed_in_generation(number: int, run: Run, folder: Path) -> None:
+    """Leaves in the folder what kill -9 leaves: a .partial that was never finished."""
+    done = subprocess.run([sys.executable, "-c", KILLED, run.text, str(number)], check=False, cwd=folder)
+    assert done.returncode == -signal.SIGKILL
+
+
+KILLED = """
+import os, signal, sys, time
+import yaml
+from pathlib import Path
+from fdi_torch.config.run import build_run
+from fdi_torch.main_job import train
+def tell(share, text):
+    if f"generation {sys.argv[2]}," in text:
+        time.sleep(1.2)
+        os.kill(os.getpid(), signal.SIGKILL)
+train(build_run(yaml.safe_load(sys.argv[1]), Path.cwd(), "default.yaml"), tell)
+"""
+
+
+def test_a_killed_run_resumes_to_the_same_end(tmp_path: Path) -> None:
+    straight = train(quick_run(tmp_path / "straight"))
+    run = quick_run(tmp_path / "killed")
+    killed_in_generation(9, run, tmp_path)
+    assert list((tmp_path / "killed").glob("*.partial"))
+    resumed = train(run, resume=True)
+    assert torch.equal(resumed.result.estimate.value, straight.result.estimate.value)
+    assert torch.equal(resumed.result.estimate.covariance, straight.result.estimate.covariance)
+    assert content_hash(read_run(resumed.log).messages()) == content_hash(read_run(straight.log).messages())
+
+
+def test_nothing_to_resume_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"expected an unfinished log default.mcap.partial, got none"):
+        train(quick_run(tmp_path), resume=True)

@@ -19,12 +19,13 @@ from fdi_torch.parameters import display_unit
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     add_run(parser)
+    parser.add_argument("--resume", action="store_true", help="go on where a killed run of the same file stopped")
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     job = load_run(arguments.config, overrides(arguments))
     with screen.progress(job.name) as advance:
-        done = train(job, advance)
+        done = train(job, advance, arguments.resume)
     show(done, screen)
     screen.result(as_json(done))
     return DONE if done.result.estimate.status == "converged" else NOT_CONVERGED

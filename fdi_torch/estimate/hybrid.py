@@ -66,12 +66,16 @@ def estimate_parameters(
     seed: int = 0,
     on_generation: Callable[[Search], None] | None = None,
     on_iteration: Callable[[Progress], None] | None = None,
+    resume: Search | None = None,
 ) -> HybridResult:
-    """Which parameters explain the recordings best, and how surely. Repeats bit for bit for a seed."""
+    """Which parameters explain the recordings best, and how surely. Repeats bit for bit for a seed.
+
+    resume: a state that `on_generation` was given; the search goes on from there to the same end.
+    """
     settings = settings or HybridSettings()
     low, high = search_box(fitting)
     coarse, fine = pick_steps(fitting, settings, low, high)
-    found = search(fitting.problem(coarse, settings.objectives[0]), low, high, settings, seed, on_generation)
+    found = search(fitting.problem(coarse, settings.objectives[0]), low, high, settings, seed, on_generation, resume)
     starts = distant_members(found, low, high, settings.starts)
     refinement, fine = refine_to_convergence(fitting, settings, starts, low, high, fine, on_iteration)
     return conclude(fitting, settings, found, refinement, (coarse, fine))
@@ -121,10 +125,10 @@ def search(
     settings: HybridSettings,
     seed: int,
     on_generation: Callable[[Search], None] | None,
+    resume: Search | None = None,
 ) -> EvolutionResult:
-    return evolve(
-        problem.cost, low.unsqueeze(0), high.unsqueeze(0), settings.search, seeds=seed, on_generation=on_generation
-    )
+    low, high = low.unsqueeze(0), high.unsqueeze(0)
+    return evolve(problem.cost, low, high, settings.search, seed, on_generation=on_generation, resume=resume)
 
 
 def distant_members(found: EvolutionResult, low: Tensor, high: Tensor, count: int) -> Tensor:
