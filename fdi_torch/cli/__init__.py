@@ -23,6 +23,7 @@ COMMANDS = {
     "check": "examine a plant and a recording before any fit",
     "report": "make one HTML page of one or more logs",
     "gap": "where a plant file falls short of a recording, by which effect, and how far the gap closes",
+    "study": "many trials at once: errors against their bounds, coverage, failures",
 }
 
 

@@ -14,6 +14,7 @@ from fdi_torch.config.recordings import StartLevels
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.record import noise_level
 
 
 class InputConfig(Strict):
@@ -94,16 +95,15 @@ def planned_recording(config: SimulationConfig, plant: PlantDescription) -> Reco
 def noise_std(config: NoiseConfig, plant: PlantDescription, clean: Tensor) -> Tensor:
     """Standard deviation (N,) of the noise for noise-free outputs (T, N), in their SI units.
 
-    From the signal-to-noise ratio: sqrt(P 10^(-SNR/10)), P the variance or the mean square of each output.
+    From the signal-to-noise ratio, or as given.
     """
     names = [sensor.column for sensor in plant.sensors]
     std = clean.new_zeros(len(names))
     if config.snr_db is not None:
-        power = clean.var(dim=0, correction=0) if config.definition == "variance" else clean.square().mean(dim=0)
-        if bool((power <= 0).any()):
-            still = names[int((power <= 0).nonzero()[0])]
+        std = noise_level(clean, config.snr_db, config.definition)
+        if bool((std <= 0).any()):
+            still = names[int((std <= 0).nonzero()[0])]
             raise ConfigError([f"simulate.noise.snr_db: expected outputs that vary, got a constant {still}; give std"])
-        std = (power * 10.0 ** (-config.snr_db / 10.0)).sqrt()
     for name, value in config.std.items():
         if name not in names:
             raise ConfigError([f"simulate.noise.std.{name}: {unknown('an output of the plant', name, names)}"])

@@ -31,6 +31,15 @@ def clean_readings(network: TankNetwork, planned: Recording, values: Mapping[str
     return engine.readings(theta)[0]
 
 
+def noise_level(clean: Tensor, snr_db: float, definition: str = "variance") -> Tensor:
+    """Standard deviation (*batch, N) of the noise that makes clean readings (*batch, T, N) have this SNR in dB.
+
+    sqrt(P 10^(-SNR/10)); P is each output's variance, or under 'power' its mean square.
+    """
+    power = clean.var(dim=-2, correction=0) if definition == "variance" else clean.square().mean(dim=-2)
+    return (power * 10.0 ** (-snr_db / 10.0)).sqrt()
+
+
 def with_noise(
     planned: Recording, clean: Tensor, std: Tensor, generator: torch.Generator, network: TankNetwork
 ) -> Recording:

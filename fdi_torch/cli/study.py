@@ -1,0 +1,100 @@
+"""Many trials of one experiment, estimated and summed up: bias, error against the Cramer-Rao bound, coverage, failures.
+
+The trials run in this process or, with --cluster, on a Dask cluster, with the same numbers.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from fdi_torch.cli.options import add_config, add_run, overrides
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.study import load_study
+from fdi_torch.study.isolation import Isolation
+from fdi_torch.study.summary import Ratio, Score, Summary
+from fdi_torch.study_job import StudyResult, run_study
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_config(parser, required=True)
+    add_run(parser)
+    parser.add_argument("--resume", action="store_true", help="go on from what a killed run left in its log")
+    parser.add_argument("--cluster", metavar="local|ADDRESS", help="run on Dask: local, or tcp://host:8786")
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    study = load_study(arguments.config, overrides(arguments))
+    with screen.progress(study.run.name) as advance:
+        advance(0.0, f"{study.plan.trials} trials")
+        result = run_study(study, arguments.resume, arguments.cluster, advance)
+    show(result, screen)
+    screen.result(as_json(result))
+    return 0
+
+
+def show(result: StudyResult, screen: Screen) -> None:
+    """One table a setting, then the isolation of modes, then where the log is."""
+    single = len(result.summaries) <= 10
+    for summary in result.summaries if single else ():
+        screen.table(heading(summary), HEADER, [_row(score) for score in summary.scores], left=2)
+        screen.say(ending(summary))
+        screen.say()
+    if not single:
+        header = ("setting", "trials", "failures", "worst error (share of range)")
+        screen.table("", header, [_short_row(summary) for summary in result.summaries])
+    if result.isolation is not None:
+        screen.say(isolation_in_words(result.isolation))
+    pace = f", {1e3 * result.seconds / result.computed:.0f} ms each" if result.computed else ""
+    screen.say(f"{result.computed} trials in {result.seconds:.0f} s{pace}")
+    for path in (result.log, *result.pictures):
+        screen.say(str(path))
+
+
+HEADER = ("estimator", "parameter", "bias", "RMSE", "/ bound", "95 %", "/ linearised", "95 %", "coverage", "95 %")
+
+
+def _row(score: Score) -> list[str]:
+    ratios = [text for ratio in (score.over_bound, score.over_linearised, score.coverage) for text in _shown(ratio)]
+    bias = f"{score.bias:.2g} ± {1.96 * score.bias_error:.1g}"
+    return [score.estimator, score.parameter.removesuffix(".size"), bias, f"{score.rmse:.3g}", *ratios]
+
+
+def _shown(ratio: Ratio | None) -> tuple[str, str]:
+    return ("", "") if ratio is None else (f"{ratio.value:.3f}", f"{ratio.low:.3f} .. {ratio.high:.3f}")
+
+
+def heading(summary: Summary) -> str:
+    return f"{summary.setting}: {summary.trials} trials, {summary.converged} converged"
+
+
+def ending(summary: Summary) -> str:
+    failed = ", ".join(f"{name} {count}" for name, count in summary.failures.items())
+    text = f"failures: {failed}; sum of correlations {summary.rho.value:.6f}"
+    if summary.undetermined:
+        text += f"; {summary.undetermined} trials whose readings cannot determine every parameter"
+    return text
+
+
+def _short_row(summary: Summary) -> list[str]:
+    name = next(iter(summary.failures))
+    return [summary.setting, str(summary.trials), str(summary.failures[name]), f"{summary.worst[name]:.2g}"]
+
+
+def isolation_in_words(isolation: Isolation) -> str:
+    right = 100.0 * isolation.right / isolation.trials
+    return (
+        f"isolation: {isolation.right} of {isolation.trials} modes right ({right:.1f} %), {isolation.missed} faults "
+        f"missed, {isolation.false} false ones"
+    )
+
+
+def as_json(result: StudyResult) -> dict[str, object]:
+    return {
+        "format": "fdi_torch.study/1",
+        "settings": result.summaries,
+        "isolation": result.isolation,
+        "computed": result.computed,
+        "seconds": result.seconds,
+        "log": str(result.log),
+        "pictures": [str(path) for path in result.pictures],
+    }

@@ -1,0 +1,155 @@
+"""Study files: a run file (often through `extends`) with a `study:` block that says what is varied and how often."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import BeforeValidator, Field, ValidationError
+
+from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
+from fdi_torch.config.files import find_file, read_extended, with_overrides, write_yaml
+from fdi_torch.config.problems import ConfigError, explain, unknown
+from fdi_torch.config.run import Run, build_run
+from fdi_torch.config.simulation import planned_recording
+from fdi_torch.config.strict import Seconds, Share, Strict, quantity
+from fdi_torch.effects import build_network
+from fdi_torch.estimate.evolution_settings import EvolutionSettings
+from fdi_torch.estimate.fitting import Fitting, set_up
+from fdi_torch.estimate.refine import RefineSettings
+from fdi_torch.study.plan import (
+    ESTIMATORS,
+    Estimator,
+    Method,
+    Plan,
+    Setting,
+    fault_modes,
+    fixed_faults,
+    mode_faults,
+    uniform_faults,
+)
+
+
+def _seconds(value: Any) -> Any:
+    return [quantity(v, "s") for v in value] if isinstance(value, list) else value
+
+
+class StudyConfig(Strict):
+    faults: Literal["simulated", "uniform", "modes"] = Field(
+        "simulated", description="those of simulate, or drawn evenly from the box, or every set of faulty parameters"
+    )
+    smallest: Share = Field(0.1, ge=0, lt=1, description="least size of a fault under modes, as a share of its range")
+    snr_db: list[float | None] = Field([None], min_length=1, description="signal-to-noise ratios, dB; null: no noise")
+    trials: int = Field(1000, ge=1, description="in each setting")
+    block: int = Field(100, ge=1, description="trials computed at once")
+    estimators: list[Estimator] = Field(
+        list(ESTIMATORS), min_length=1, description="which are compared; free or boxed stands for the hybrid search"
+    )
+    starts: int = Field(2, ge=1, description="members of the search that are refined")
+    searches: int = Field(3, ge=1, description="at most, for trials whose residuals stay above their noise")
+    search_step: Seconds = Field(5.0, gt=0, description="integration step of the search, s")
+    search_every: int = Field(5, ge=1, description="the search sees every so manieth reading")
+    steps: Annotated[list[float], BeforeValidator(_seconds)] = Field(
+        [1.0, 0.1], min_length=1, description="integration steps of the refinement, coarse to fine, s"
+    )
+    data_step: Seconds = Field(0.01, gt=0, description="integration step of the noise-free readings, s")
+    population: int = Field(40, ge=4, description="of the search")
+    evaluations: int = Field(2000, ge=4, description="of the search, each time")
+    tolerance: float = Field(1e-5, gt=0, description="without noise: a larger error is a failure, share of the range")
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study file understood. text: YAML that gives the same study, plant included."""
+
+    config: StudyConfig
+    run: Run
+    plan: Plan
+    text: str
+
+
+def load_study(path: str | Path, overrides: list[str] | None = None) -> Study:
+    """A study file, some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
+    file = find_file(str(path), Path.cwd())
+    data = with_overrides(read_extended(file), overrides or [])
+    if "study" not in data:
+        raise ConfigError([f"{file}: expected a block study, got none; fdi train estimates a single run"])
+    varied = data.pop("study")
+    run = build_run(data, file.parent, str(file))
+    try:
+        config = StudyConfig.model_validate(varied)
+    except ValidationError as error:
+        raise explain(error, f"{file}: study") from None
+    text = run.text + write_yaml({"study": varied})
+    return Study(config, run, _plan(config, run), text)
+
+
+def _plan(config: StudyConfig, run: Run) -> Plan:
+    fitting = _fitting(run)
+    method = Method(
+        estimators=tuple(config.estimators),
+        objective=run.config.estimate.objective.search,
+        search=EvolutionSettings(population=config.population, evaluations=config.evaluations),
+        search_step=config.search_step,
+        search_every=config.search_every,
+        starts=config.starts,
+        searches=config.searches,
+        steps=tuple(config.steps),
+        refine=RefineSettings(iterations=run.config.estimate.refine.iterations),
+        data_step=config.data_step,
+    )
+    definition = run.config.simulate.noise.definition if run.config.simulate else "variance"
+    settings = tuple(_settings(config, run, fitting))
+    return Plan(fitting, settings, method, run.config.seed, definition, config.block)
+
+
+def _fitting(run: Run) -> Fitting:
+    """Plant, clock, inputs, known start levels and parameters; readings that are all there, of value 0."""
+    simulated, estimate = run.config.simulate, run.config.estimate
+    if simulated is None:
+        raise ConfigError([f"{run.source}: expected simulate, got recordings; a study makes its own readings"])
+    if not estimate.parameters:
+        raise ConfigError([f"{run.source}: estimate.parameters: expected at least one, got none"])
+    network = build_network(run.plant, placements_of([p.name for p in estimate.parameters], run.plant))
+    space = estimated_space(estimate, network.constants, run.plant, real_data=False)
+    unbounded = [p.name for p in space if not (abs(p.low) < torch.inf and abs(p.high) < torch.inf)]
+    if unbounded:
+        raise ConfigError(
+            [f"{run.source}: {unbounded[0]}: expected a finite range to search, got none; give low, high"]
+        )
+    planned = planned_recording(simulated, run.plant)
+    zeros = torch.zeros_like(planned.outputs)
+    planned = replace(planned, outputs=zeros, mask=torch.ones_like(planned.mask))
+    return set_up(run.plant, [planned], space, [simulated.start_levels], run.config.engine)
+
+
+def _settings(config: StudyConfig, run: Run, fitting: Fitting) -> list[Setting]:
+    """Every signal-to-noise ratio with every kind of fault asked for."""
+    space, made = fitting.space, []
+    for snr in config.snr_db:
+        noise = "no noise" if snr is None else f"SNR {snr:g} dB"
+        if config.faults == "simulated":
+            made.append(Setting(noise, fixed_faults(_simulated(run, fitting), config.trials), snr))
+        elif config.faults == "uniform":
+            faults = uniform_faults(space, config.trials, run.config.seed, len(made))
+            made.append(Setting(f"uniform faults, {noise}", faults, snr))
+        else:
+            for mode in fault_modes(space):
+                name = " + ".join(space.names[i].removesuffix(".size") for i in mode)
+                faults = mode_faults(space, mode, config.smallest, config.trials, run.config.seed, len(made))
+                made.append(Setting(f"{name}, {noise}", faults, snr))
+    return made
+
+
+def _simulated(run: Run, fitting: Fitting) -> torch.Tensor:
+    assert run.config.simulate is not None
+    faults = run.config.simulate.faults
+    network = build_network(run.plant, placements_of(faults, run.plant))
+    values = parameter_values(faults, network.constants, run.plant)
+    for name in values:
+        if name not in fitting.space:
+            sentence = unknown("an estimated parameter", name, fitting.space.names)
+            raise ConfigError([f"{run.source}: simulate.faults: {sentence}; estimate it too"])
+    return fitting.space.vector(values)

@@ -1,0 +1,1 @@
+"""Monte Carlo studies: many trials of one experiment, estimated in batches and summed up."""

@@ -1,0 +1,172 @@
+"""What many trials of a setting say of each estimator, with the Monte Carlo error of every statement."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.study.monte_carlo import Trial, is_converged
+from fdi_torch.study.plan import ESTIMATORS, Plan, Setting
+
+# Intervals below are those of 95 %.
+_REACH = NormalDist().inv_cdf(0.975)
+# Further from the truth than this many Cramer-Rao bounds is no noise: stuck elsewhere.
+STUCK = 6.0
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A number with the ends of its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """How one estimator does on one parameter. bias, bias_error, rmse in the parameter's unit.
+
+    over_bound: RMSE over the Cramer-Rao bound; over_linearised: over the RMSE of the linearised efficient estimator on
+    the same draws; coverage: of the stated 95 % intervals. None where there is nothing to compare with.
+    """
+
+    estimator: str
+    parameter: str
+    bias: float
+    bias_error: float
+    rmse: float
+    over_bound: Ratio | None
+    over_linearised: Ratio | None
+    coverage: Ratio | None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """failures: trials of each estimator that ended far from the truth; worst: largest error, share of the range.
+
+    undetermined: trials of which the Fisher information at the truth says beforehand that a parameter cannot be told.
+    """
+
+    setting: str
+    trials: int
+    scores: tuple[Score, ...]
+    failures: Mapping[str, int]
+    worst: Mapping[str, float]
+    converged: int
+    undetermined: int
+    rho: Ratio
+
+    def numbers(self) -> dict[str, float]:
+        """All of it as named numbers."""
+        flat: dict[str, float] = {"converged": self.converged, "undetermined": self.undetermined}
+        flat |= _ends("rho", self.rho)
+        flat |= {f"{name}.failures": count for name, count in self.failures.items()}
+        flat |= {f"{name}.worst": error for name, error in self.worst.items()}
+        for score in self.scores:
+            name = f"{score.estimator}.{score.parameter}"
+            flat |= {f"{name}.{key}": getattr(score, key) for key in ("bias", "bias_error", "rmse")}
+            for key in ("over_bound", "over_linearised", "coverage"):
+                flat |= _ends(f"{name}.{key}", getattr(score, key))
+        return flat
+
+
+def summarise(plan: Plan, setting: Setting, trials: Sequence[Trial], tolerance: float = 1e-5) -> Summary:
+    """The trials of one setting summed up. tolerance: largest error without noise, as a share of the range."""
+    space = plan.fitting.space
+    names: list[str] = [name for name in ESTIMATORS if name in trials[0].numbers]
+    truth = column(trials, "truth")
+    errors = {name: column(trials, name) - truth for name in names}
+    width = space.high() - space.low()
+    return Summary(
+        setting=setting.name,
+        trials=len(trials),
+        scores=tuple(s for name in names for s in _scores(name, errors, trials, space, setting.snr_db is not None)),
+        failures={name: _failures(name, errors[name], trials, setting, tolerance * width) for name in names},
+        worst={name: float((errors[name].abs() / width).max()) for name in names},
+        converged=sum(is_converged(trial.status) for trial in trials),
+        undetermined=int((column(trials, "bound") > width).any(-1).sum()),
+        rho=mean_with_error(column(trials, "rho").sum(-1)),
+    )
+
+
+def column(trials: Sequence[Trial], name: str) -> Tensor:
+    """One array of all trials, (trials, ...)."""
+    return torch.tensor([trial.numbers[name] for trial in trials], dtype=torch.float64)
+
+
+def bound_name(estimator: str) -> str:
+    return "correlation_bound" if estimator == "correlation" else "bound"
+
+
+def _scores(
+    name: str, errors: Mapping[str, Tensor], trials: Sequence[Trial], space: ParameterSpace, noisy: bool
+) -> list[Score]:
+    error, scores = errors[name], []
+    bound = column(trials, "bound")
+    std = column(trials, f"{name}_std") if f"{name}_std" in trials[0].numbers else None
+    compared = noisy and "linearised" in errors and name != "linearised"
+    for i, parameter in enumerate(space.names):
+        own = error[:, i]
+        scores.append(
+            Score(
+                estimator=name,
+                parameter=parameter,
+                bias=float(own.mean()),
+                bias_error=float(own.std() / math.sqrt(len(own))) if len(own) > 1 else math.nan,
+                rmse=float(own.square().mean().sqrt()),
+                over_bound=rms_with_error(own / bound[:, i]) if noisy else None,
+                over_linearised=rms_ratio(own, errors["linearised"][:, i]) if compared else None,
+                coverage=None if std is None or not noisy else covered(own, std[:, i]),
+            )
+        )
+    return scores
+
+
+def _failures(name: str, error: Tensor, trials: Sequence[Trial], setting: Setting, allowed: Tensor) -> int:
+    if setting.snr_db is not None:
+        allowed = STUCK * column(trials, bound_name(name))
+    return int((~(error.abs() <= allowed)).any(-1).sum())
+
+
+def mean_with_error(values: Tensor) -> Ratio:
+    mean = float(values.mean())
+    reach = _REACH * float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else math.inf
+    return Ratio(mean, mean - reach, mean + reach)
+
+
+def rms_with_error(values: Tensor) -> Ratio:
+    """Root mean square of (N,) and its interval, from the spread of the squares."""
+    square = mean_with_error(values.square())
+    return Ratio(math.sqrt(square.value), math.sqrt(max(square.low, 0.0)), math.sqrt(square.high))
+
+
+def rms_ratio(errors: Tensor, others: Tensor) -> Ratio:
+    """Ratio of the root mean squares of paired errors (N,), with the interval that pairing allows (delta method)."""
+    a, b = errors.square(), others.square()
+    ratio = math.sqrt(float(a.mean() / b.mean()))
+    spread = float((a / a.mean() - b / b.mean()).std()) / math.sqrt(len(a)) if len(a) > 1 else math.inf
+    factor = math.exp(0.5 * _REACH * spread)
+    return Ratio(ratio, ratio / factor, ratio * factor)
+
+
+def covered(error: Tensor, std: Tensor) -> Ratio:
+    """The share of 95 % intervals that hold the truth, with its interval (Wilson 1927)."""
+    return share(int((error.abs() <= _REACH * std).sum()), len(error))
+
+
+def share(count: int, trials: int) -> Ratio:
+    p, z2 = count / trials, _REACH * _REACH
+    centre = (p + z2 / (2 * trials)) / (1 + z2 / trials)
+    reach = _REACH * math.sqrt(p * (1 - p) / trials + z2 / (4 * trials * trials)) / (1 + z2 / trials)
+    return Ratio(p, centre - reach, centre + reach)
+
+
+def _ends(name: str, ratio: Ratio | None) -> dict[str, float]:
+    return {} if ratio is None else {name: ratio.value, f"{name}.low": ratio.low, f"{name}.high": ratio.high}

@@ -1,0 +1,89 @@
+"""The readings of a block's trials, and what the best estimators could make of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.batch_algebra import apply
+from fdi_torch.estimate.information import Certainty, certainty
+from fdi_torch.simulate.engine import Engine, Readings
+from fdi_torch.simulate.record import noise_level
+from fdi_torch.study.plan import Block, Plan
+
+# The noise (m) that bounds are stated for where the readings have none.
+NOMINAL_NOISE = 1e-3
+
+
+@dataclass(frozen=True)
+class Trials:
+    """truth (B, P), readings (B, S, C), the noise in them (B, S, C) and its standard deviation (B, C), SI."""
+
+    truth: Tensor
+    readings: Tensor
+    noise: Tensor
+    std: Tensor
+
+
+def make_trials(plan: Plan, block: Block) -> Trials:
+    """Noise-free readings at fine steps, and each trial's own noise."""
+    setting = plan.settings[block.setting]
+    truth = setting.faults[block.first : block.last]
+    clean = plan.fitting.engines(plan.method.data_step)[0].readings(truth)
+    if setting.snr_db is None:
+        none = torch.zeros_like(clean)
+        return Trials(truth, clean, none, torch.full_like(clean[:, 0], NOMINAL_NOISE))
+    std = noise_level(clean, setting.snr_db, plan.snr_definition)
+    noise = plan.noise(block, tuple(clean.shape[1:])) * std[:, None, :]
+    return Trials(truth, clean + noise, noise, std)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What no estimator can beat, at the truth of each trial, (B, P) each.
+
+    bound: the Cramer-Rao bound, start levels and noise level known; infinite where a parameter is not determined.
+    correlation_bound: the same where gain and offset of each channel are unknown, which correlation cannot see.
+    linearised: theta_0 + (J' W J)^-1 J' W noise, the efficient estimator of the linearised model on the same draws.
+    """
+
+    bound: Tensor
+    correlation_bound: Tensor
+    linearised: Tensor
+
+
+def limits(engine: Engine, trials: Trials) -> Limits:
+    predicted = engine.readings(trials.truth)
+    shifted = predicted + trials.noise
+    gram = engine.gram(trials.truth[:, None], Readings(shifted, torch.ones_like(shifted)))[:, 0]
+    weight = (trials.std**-2)[..., None, None]
+    information, score = _summed(weight * gram[..., :-3, :-3]), _summed(weight * gram[..., :-3, -3:-2])[..., 0]
+    sure = certainty(information)
+    return Limits(sure.std, _blind_to_scale(engine, trials, predicted).std, trials.truth + _solved(sure, score))
+
+
+def _blind_to_scale(engine: Engine, trials: Trials, predicted: Tensor) -> Certainty:
+    """What is known once a constant and the prediction itself are projected out of each channel's Jacobian."""
+    gram = engine.gram(trials.truth[:, None], Readings(predicted, torch.ones_like(predicted)))[:, 0]
+    count = gram[..., -1:, -1:]
+    centred = gram - gram[..., :, -1:] * gram[..., -1:, :] / count
+    along, own = centred[..., :-3, -2], centred[..., -2, -2]
+    varies = own > 0
+    share = along / torch.where(varies, own, 1.0)[..., None]
+    left = centred[..., :-3, :-3] - along[..., :, None] * share[..., None, :]
+    return certainty(_summed((trials.std**-2)[..., None, None] * left))
+
+
+def _solved(sure: Certainty, score: Tensor) -> Tensor:
+    """Covariance times score; NaN where the covariance has no number."""
+    return apply(sure.covariance, score)
+
+
+def _summed(per_channel: Tensor) -> Tensor:
+    """(B, C, ...) -> (B, ...), channel by channel, so that the order of the sum is always the same."""
+    total = per_channel[:, 0]
+    for channel in per_channel.unbind(1)[1:]:
+        total = total + channel
+    return total

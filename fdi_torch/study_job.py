@@ -1,0 +1,162 @@
+"""A whole study: trials computed here or on a cluster, logged as they come, resumed, summed up and drawn."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from fdi_torch.config.study import Study
+from fdi_torch.logbook import RunLog, read_run, unfinished
+from fdi_torch.logbook.reader import Run as OldLog
+from fdi_torch.main_job import free_path
+from fdi_torch.report.fit_figure import save
+from fdi_torch.report.study_figures import correlation_figure, error_figure
+from fdi_torch.study.cluster import run_on_cluster
+from fdi_torch.study.isolation import Isolation, isolate
+from fdi_torch.study.monte_carlo import Trial, run_blocks
+from fdi_torch.study.plan import Plan
+from fdi_torch.study.summary import Summary, summarise
+
+Tell = Callable[[float, str], None]
+
+TRIAL = "/study/trial"
+_ENVELOPE = ("t", "trial", "group", "seed", "status")
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """summaries: one a setting. isolation: where faults are drawn by mode. seconds: of this run's own trials."""
+
+    summaries: tuple[Summary, ...]
+    isolation: Isolation | None
+    trials: dict[int, Trial]
+    computed: int
+    seconds: float
+    log: Path
+    pictures: tuple[Path, ...]
+
+
+def run_study(study: Study, resume: bool = False, cluster: str | None = None, tell: Tell | None = None) -> StudyResult:
+    """Computes every trial that the log does not hold yet. tell(share, text) is called after each block.
+
+    cluster: address of a Dask scheduler, or 'local'; None: this process.
+    """
+    tell = tell or (lambda share, text: None)
+    output = study.run.config.output
+    path = Path(output.folder) / f"{study.run.name}.mcap"
+    before = earlier(path, study) if resume else None
+    path = path if resume else free_path(path.parent, study.run.name)
+    with RunLog(path, "study", config_text=study.text, seeds={"seed": study.plan.seed}) as log:
+        trials = carried_over(log, before)
+        found = len(trials)
+        started = time.monotonic()
+        for done in computed(study.plan, trials, cluster):
+            log_trials(log, study.plan, [trial for trial in done if trial.number not in trials])
+            trials |= {trial.number: trial for trial in done if trial.number not in trials}
+            tell(*progress(len(trials), found, study.plan.trials, time.monotonic() - started))
+        seconds = time.monotonic() - started
+        summaries = tuple(summed_up(study, trials))
+        isolation = isolated(study, trials)
+        log_summaries(log, summaries, isolation)
+    pictures = draw(study, trials, path)
+    return StudyResult(summaries, isolation, trials, len(trials) - found, seconds, path, pictures)
+
+
+def earlier(path: Path, study: Study) -> OldLog | None:
+    """What a killed or interrupted run of the same study left, set aside; None where there is nothing.
+
+    Raises ValueError where the study is finished already, or the log is that of another configuration.
+    """
+    partial = path.with_name(path.name + ".partial")
+    known = path if path.exists() else partial if partial.exists() else None
+    if known is None:
+        return None
+    old = read_run(known, salvage=True)
+    if old.config_text != study.text:
+        raise ValueError(f"{known}: expected the log of this configuration, got another's; run without --resume")
+    if path.exists():
+        if old.metadata.get("fdi_torch.status", {}).get("status") == "completed":
+            raise ValueError(f"{path}: expected an unfinished study, got a finished one; there is nothing to resume")
+        os.replace(path, partial)
+    return unfinished(path)
+
+
+def carried_over(log: RunLog, before: OldLog | None) -> dict[int, Trial]:
+    """The trials of an earlier log, each once, copied into this one."""
+    trials: dict[int, Trial] = {}
+    for message in before.messages([TRIAL]) if before else ():
+        fields = message.payload
+        if fields["trial"] not in trials:
+            numbers = {name: value for name, value in fields.items() if name not in _ENVELOPE}
+            trials[fields["trial"]] = Trial(fields["trial"], fields["group"], fields["status"], numbers)
+            log.carry_over([message])
+    return trials
+
+
+def computed(plan: Plan, known: Mapping[int, Trial], cluster: str | None) -> Iterator[list[Trial]]:
+    """Blocks with a trial that is not known yet, as they get done."""
+    blocks = [block for block in plan.blocks() if any(number not in known for number in block.numbers)]
+    return run_blocks(plan, blocks) if cluster is None else run_on_cluster(plan, blocks, cluster)
+
+
+def log_trials(log: RunLog, plan: Plan, trials: list[Trial]) -> None:
+    for trial in trials:
+        log.trial(
+            trial.number, trial.numbers, group=trial.setting, seed=f"{plan.seed}/{trial.number}", status=trial.status
+        )
+    log.flush()
+
+
+def progress(done: int, found: int, total: int, seconds: float) -> tuple[float, str]:
+    """How far, and how long it will take at the pace so far."""
+    left = seconds * (total - done) / max(done - found, 1)
+    return done / total, f"{done} of {total} trials, {left:.0f} s left"
+
+
+def of_setting(plan: Plan, trials: Mapping[int, Trial]) -> Iterator[list[Trial]]:
+    """The trials of each setting in their order."""
+    numbers: dict[int, list[int]] = {}
+    for block in plan.blocks():
+        numbers.setdefault(block.setting, []).extend(block.numbers)
+    for chosen in numbers.values():
+        yield [trials[number] for number in chosen]
+
+
+def summed_up(study: Study, trials: Mapping[int, Trial]) -> Iterator[Summary]:
+    for setting, own in zip(study.plan.settings, of_setting(study.plan, trials), strict=True):
+        yield summarise(study.plan, setting, own, study.config.tolerance)
+
+
+def isolated(study: Study, trials: Mapping[int, Trial]) -> Isolation | None:
+    """Stated against true modes, where the study draws faults by mode and estimates them free of the box."""
+    if study.config.faults != "modes" or "free" not in study.config.estimators:
+        return None
+    ordered = [trials[number] for number in sorted(trials)]
+    return isolate(study.plan.fitting.space, ordered, study.run.config.estimate.confidence)
+
+
+def log_summaries(log: RunLog, summaries: tuple[Summary, ...], isolation: Isolation | None) -> None:
+    for summary in summaries:
+        log.summary(summary.setting, summary.trials, summary.numbers())
+    if isolation is not None:
+        log.result({"isolation": {name: value for name, value in vars(isolation).items() if name != "confusion"}})
+        log.result_arrays(confusion=isolation.confusion)
+
+
+def draw(study: Study, trials: Mapping[int, Trial], log: Path) -> tuple[Path, ...]:
+    """Figure 3 and Table 3 of the 2020 paper as distributions, where the study varies the noise of one fault."""
+    if study.config.faults != "simulated" or None in study.config.snr_db:
+        return ()
+    groups = list(of_setting(study.plan, trials))
+    levels = [float(setting.snr_db or 0.0) for setting in study.plan.settings]
+    figures = {"correlation": correlation_figure(levels, [[t.numbers["rho"] for t in own] for own in groups])}
+    estimator = next((name for name in ("free", "boxed") if name in study.config.estimators), None)
+    if estimator:
+        errors = [[t.numbers[estimator] for t in own] for own in groups]
+        truth = study.plan.settings[0].faults[0]
+        bounds = [own[0].numbers["bound"] for own in groups]
+        figures["estimates"] = error_figure(study.plan.fitting.space, levels, errors, truth, bounds)
+    return tuple(save(figure, log.with_name(f"{log.stem}_{name}.png")) for name, figure in figures.items())

@@ -1,0 +1,58 @@
+"""A study on a cluster: the same trials, also where a worker is lost on the way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from fdi_torch.config.study import load_study
+from fdi_torch.study.cluster import connected, run_on_cluster, run_with
+from fdi_torch.study.monte_carlo import Trial, run_blocks
+from fdi_torch.study.plan import Plan
+
+pytest.importorskip("distributed")
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    changes = ["study.trials=40", "study.block=2", "study.snr_db=[30]", "study.evaluations=600", "study.population=24"]
+    return load_study("configs/studies/table3_noise.yaml", changes).plan
+
+
+def every_trial_once(results: Iterator[list[Trial]]) -> dict[int, Trial]:
+    trials = [trial for block in results for trial in block]
+    found = {trial.number: trial for trial in trials}
+    assert len(found) == len(trials)
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_killing_one_of_two_workers_changes_no_trial(plan: Plan) -> None:
+    alone = every_trial_once(run_blocks(plan, plan.blocks()))
+    with connected("local", workers=2) as client:
+
+        def with_a_murder() -> Iterator[list[Trial]]:
+            for k, block in enumerate(run_with(client, plan, plan.blocks())):
+                if k == 2:
+                    victim = next(iter(client.run(os.getpid).values()))
+                    os.kill(victim, signal.SIGKILL)
+                yield block
+
+        assert every_trial_once(with_a_murder()) == alone
+    assert sorted(alone) == list(range(40))
+
+
+def test_nobody_at_the_address_is_said(plan: Plan) -> None:
+    with pytest.raises(ValueError, match="expected a Dask scheduler at tcp"):
+        next(run_on_cluster(plan, plan.blocks(), "tcp://127.0.0.1:1"))
+
+
+def test_without_dask_it_says_what_to_install(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ValueError, match=r"pip install 'fdi_torch\[cluster\]'"):
+        next(run_on_cluster(plan, plan.blocks(), "local"))
