@@ -41,9 +41,10 @@ def show(done: TrainResult, screen: Screen) -> None:
         value, std = scale * float(final.value[i]), scale * float(final.std[i])
         low, high = value - 1.96 * std, value + 1.96 * std
         numbers = [f"{value:.6g}", f"{std:.2g}", f"{low:.5g} .. {high:.5g}", f"{scale * p.nominal:.5g}"]
-        rows.append([p.name, unit or "1", *numbers, "" if truth is None else f"{scale * truth:.5g}"])
+        simulated = [f"{scale * truth:.5g}" if truth is not None else ""] if done.truth else []
+        rows.append([p.name, unit or "1", *numbers, *simulated])
     header = ("parameter", "unit", "estimate", "std error", "95 % interval", "nominal", "simulated")
-    screen.table("", header, rows, left=2)
+    screen.table("", header if done.truth else header[:-1], rows, left=2)
     screen.say()
     for line in in_words(done):
         screen.say(line)
