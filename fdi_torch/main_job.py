@@ -48,10 +48,11 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False) -> TrainResu
     resume: goes on from the last generation that a killed run of the same file logged, and ends as it would have.
     """
     tell = tell or (lambda share, text: None)
+    device = usable_device(run.config.device)
     space = wanted_space(run)
     tell(0.0, "reading" if run.config.recordings else "simulating the recording")
     loaded = recordings_of(run)
-    fitting = fitting_of(run, space, loaded)
+    fitting = fitting_of(run, space, loaded, device)
     settings = hybrid_settings(run.config.estimate)
     truth = simulated_truth(run)
     folder = Path(run.config.output.folder)
@@ -62,7 +63,8 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False) -> TrainResu
         if not log.carry_over(before):
             log_recordings(log, loaded, truth)
         watch = Watch(log, fitting.space, settings, tell)
-        result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, search)
+        with device:
+            result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, search)
         log_result(log, result, fitting.space)
         pictures = draw(run, fitting, result, path)
     tell(1.0, "done")
@@ -112,11 +114,21 @@ def wanted_space(run: Run) -> ParameterSpace:
     return estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
 
 
-def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording]) -> Fitting:
-    """These parameters on these recordings."""
-    recordings = [part.recording for part in loaded]
+def usable_device(name: str) -> torch.device:
+    """The device of that name. Raises ValueError where this machine or this torch lacks it."""
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"device: expected one that torch can use here, such as cpu, got '{name}'") from error
+    return torch.device(name)
+
+
+def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording], device: torch.device) -> Fitting:
+    """These parameters on these recordings, with all tensors on the device."""
+    recordings = [part.recording.to(device) for part in loaded]
     expect_enough_samples(recordings, space)
-    return set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
+    with device:
+        return set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
 
 
 def expect_enough_samples(recordings: Sequence[Recording], space: ParameterSpace) -> None:

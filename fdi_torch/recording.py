@@ -58,6 +58,11 @@ class Recording:
     def __len__(self) -> int:
         return len(self.time)
 
+    def to(self, device: torch.device) -> Recording:
+        """The same with its tensors on a device."""
+        tensors = {name: getattr(self, name).to(device) for name in ("time", "inputs", "outputs", "mask")}
+        return replace(self, **tensors)
+
     def stretch(self, first: int, last: int) -> Recording:
         """Samples first..last-1, with the same clock."""
         part = slice(first, last)

@@ -93,6 +93,7 @@ def test_the_command_prints_a_table_with_units(tmp_path: Path, capsys: pytest.Ca
     ("change", "sentence"),
     [
         ("simulate.duration=1 s", "expected more readings than parameters, got 6 readings for 8 parameters"),
+        ("device=cuda:99", "device: expected one that torch can use here, such as cpu, got 'cuda:99'"),
         ("estimate.parameters=[]", "estimate.parameters: expected at least one, got none"),
         ("estimate.parameters=[T1.leek]", "the nearest is 'T1.leak'"),
     ],

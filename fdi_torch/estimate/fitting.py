@@ -52,7 +52,13 @@ class Fitting:
     def engines(self, step: float) -> list[Engine]:
         """An engine for each recording, in steps no longer than `step` s."""
         return [
-            make_engine(network, own, lay_out(recording, self.plant.channels(), step), self.engine)
+            make_engine(
+                network,
+                own,
+                lay_out(recording, self.plant.channels(), step),
+                self.engine,
+                device=recording.time.device.type,
+            )
             for network, own, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True)
         ]
 
