@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -58,8 +59,7 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False) -> TrainResu
     folder = Path(run.config.output.folder)
     path = killed_path(folder, run.name) if resume else free_path(folder, run.name)
     before, search = left_behind(path, run) if resume else ((), None)
-    sources = [{"path": part.recording.source, "sha256": part.recording.sha256} for part in loaded]
-    with RunLog(path, "train", config_text=run.text, seeds={"seed": run.config.seed}, data=sources) as log:
+    with RunLog(path, "train", **origin_of(run, loaded)) as log:
         if not log.carry_over(before):
             log_recordings(log, loaded, truth)
         watch = Watch(log, fitting.space, settings, tell)
@@ -69,6 +69,16 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False) -> TrainResu
         pictures = draw(run, fitting, result, path)
     tell(1.0, "done")
     return TrainResult(result, fitting, truth, path, pictures)
+
+
+def origin_of(run: Run, loaded: Sequence[LoadedRecording]) -> dict[str, Any]:
+    """What a log says of where its run comes from."""
+    return {
+        "config_text": run.text,
+        "config": run.resolved,
+        "seeds": {"seed": run.config.seed},
+        "data": [{"path": part.recording.source, "sha256": part.recording.sha256} for part in loaded],
+    }
 
 
 def recordings_of(run: Run) -> list[LoadedRecording]:

@@ -19,7 +19,7 @@ LAYERS = (
     {"estimate", "logbook"},
     {"report", "gap", "study", "monitor"},
     {"config"},
-    {"main_job", "study_job"},
+    {"main_job", "study_job", "replay_job"},
     {"cli", "train", "__main__", "__init__"},
 )
 RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}

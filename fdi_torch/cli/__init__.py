@@ -22,6 +22,10 @@ COMMANDS = {
     "simulate": "write a recording from a plant, inputs, faults and noise",
     "check": "examine a plant and a recording before any fit",
     "report": "make one HTML page of one or more logs",
+    "inspect": "what a log is about, whether it is sound, and its messages for other tools",
+    "replay": "run a logged estimation again and compare, or try what another choice gives",
+    "compare": "what differs between runs, and whether their results agree",
+    "recover": "save what is whole of a broken or unfinished log",
     "gap": "where a plant file falls short of a recording, by which effect, and how far the gap closes",
     "study": "many trials at once: errors against their bounds, coverage, failures",
 }

@@ -6,15 +6,18 @@ The page needs no network and no scripts. It is written beside the (first) log, 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.logged import logged_plant
-from fdi_torch.logbook import Run, read_run
+from fdi_torch.logbook import Run, compare, read_run
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.report.comparison import comparison_section
 from fdi_torch.report.material import gather
-from fdi_torch.report.page import page, report_of, write_pictures
+from fdi_torch.report.page import RunReport, page, report_of, write_pictures
+from fdi_torch.report.section import Section
 from fdi_torch.report.verdict import headline
 
 
@@ -33,7 +36,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             reports.append(report_of(gather(log, plant_of(log, screen))))
             advance((k + 1) / (len(arguments.logs) + 1), log.path.name)
         target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(page(reports), encoding="utf-8", errors="replace")
+        first = [together(reports)] if len(reports) > 1 else []
+        target.write_text(page(reports, first), encoding="utf-8", errors="replace")
         pictures = []
         for k, report in enumerate(reports if arguments.pictures else ()):
             several = f"{k + 1}_" if len(reports) > 1 else ""
@@ -46,6 +50,15 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         screen.say(f"{len(pictures)} pictures: {target.with_suffix('')}")
     screen.result({"format": "fdi_torch.report/1", "page": str(target), "pictures": [str(path) for path in pictures]})
     return DONE
+
+
+def together(reports: Sequence[RunReport]) -> Section:
+    """The comparison of all runs; what stands in its way where they cannot be compared."""
+    runs = [report.material for report in reports]
+    try:
+        return comparison_section(compare([run.run.path for run in runs]), runs)
+    except (ValueError, KeyError, TypeError, IndexError, OSError) as error:
+        return Section("Comparison", [f"These logs cannot be compared: {error}"])
 
 
 def page_path(logs: list[Path], out: str | None) -> Path:

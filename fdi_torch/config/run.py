@@ -54,6 +54,11 @@ class Run:
     text: str
 
     @property
+    def resolved(self) -> dict[str, Any]:
+        """Every value, defaults included, as plain nested values."""
+        return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
+
+    @property
     def name(self) -> str:
         return self.config.output.name or Path(self.source).stem
 

@@ -1,0 +1,97 @@
+"""What a log is about and whether it is sound; any MCAP file will do. With --topic, its messages for other tools."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from fdi_torch.cli import DONE
+from fdi_torch.cli.screen import Screen
+from fdi_torch.logbook import Inspection, export, export_attachment, inspect_log, read_run
+
+MOST_RESULTS = 12
+RECORDS = ("run", "status", "data", "seeds", "git")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", metavar="RUN.mcap", help="a log, ours or any other, whole or not")
+    parser.add_argument("--topic", metavar="T", help="write the messages of this topic instead")
+    parser.add_argument("--format", choices=("csv", "ndjson", "npz"), default="csv", help="in this form (default: csv)")
+    parser.add_argument("--attachment", metavar="NAME", help="write this attachment instead, such as config.yaml")
+    parser.add_argument(
+        "--out", metavar="FILE|DIR", help="file for the messages (default: standard output), folder for an attachment"
+    )
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    if arguments.attachment is not None:
+        path = export_attachment(read_run(arguments.log, salvage=True), arguments.attachment, arguments.out or ".")
+        screen.note(f"attachment: {path}")
+    elif arguments.topic is not None:
+        write_topic(arguments, screen)
+    else:
+        found = inspect_log(arguments.log)
+        show(found, screen)
+        screen.result(as_json(found))
+    return DONE
+
+
+def write_topic(arguments: argparse.Namespace, screen: Screen) -> None:
+    """The messages of a topic, to a new file or to standard output."""
+    log = read_run(arguments.log, salvage=True)
+    if arguments.out is None:
+        count = export(log, arguments.topic, arguments.format, sys.stdout.buffer)
+        sys.stdout.buffer.flush()
+    else:
+        with open(arguments.out, "xb") as file:
+            try:
+                count = export(log, arguments.topic, arguments.format, file)
+            except OSError:
+                Path(arguments.out).unlink()
+                raise
+    screen.note(f"{count} messages of {arguments.topic}: {arguments.out or 'standard output'}")
+
+
+def show(found: Inspection, screen: Screen) -> None:
+    """One screen: what ran, on what, with which result; topics; health."""
+    kind = found.about.get("run", {}).get("kind", "")
+    screen.say(f"{found.path}: {'a log of fdi ' + kind if kind else 'a foreign MCAP file'}, written by {found.library}")
+    for record in RECORDS:
+        values = found.about.get(record, {})
+        if values:
+            screen.say(f"{record:<8}{', '.join(f'{name} {value}' for name, value in values.items() if value)}")
+    results = list(found.about.get("result", {}).items())
+    for name, value in results[:MOST_RESULTS]:
+        screen.say(f"result  {name} {value[:100]}")
+    if len(results) > MOST_RESULTS:
+        screen.say(f"result  and {len(results) - MOST_RESULTS} more")
+    rows = [
+        [info.topic, info.schema, str(info.messages), f"{info.first:.6g}", f"{info.last:.6g}", str(info.size)]
+        for info in found.topics.values()
+    ]
+    screen.say()
+    screen.table("", ("topic", "schema", "messages", "from, s", "to, s", "bytes"), rows, left=2)
+    for item in found.attachments.values():
+        screen.say(f"attachment {item.name}, {item.size} bytes")
+    screen.say()
+    state = "sound: all CRCs, indices and counts agree" if found.health.sound else "not sound"
+    screen.say(f"{found.size} bytes, {found.messages} messages in {found.health.chunks} chunks; {state}")
+    for sentence in (*found.health.problems, found.advice):
+        if sentence:
+            screen.say(f"- {sentence}")
+
+
+def as_json(found: Inspection) -> dict[str, object]:
+    return {
+        "format": "fdi_torch.inspect/1",
+        "path": str(found.path),
+        "size": found.size,
+        "ours": found.ours,
+        "about": found.about,
+        "other_metadata": found.other_metadata,
+        "topics": list(found.topics.values()),
+        "attachments": {name: item.size for name, item in found.attachments.items()},
+        "sound": found.health.sound,
+        "problems": list(found.health.problems),
+    }

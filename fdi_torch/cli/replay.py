@@ -1,0 +1,79 @@
+"""Run an estimation again from its log alone and compare event by event; with --set, try what another choice gives.
+
+Exit code 3 where an event differs by more than the tolerance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+from fdi_torch.cli import DONE
+from fdi_torch.cli import compare as comparing
+from fdi_torch.cli.screen import Screen
+from fdi_torch.logbook import Replay, compare, read_run, replay
+
+DIFFERS = 3
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", metavar="RUN.mcap", help="a log of fdi train")
+    parser.add_argument(
+        "--relative", metavar="R", type=float, default=1e-9, help="tolerance of numbers (default: 1e-9)"
+    )
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="what if: another objective, seed ...; may be repeated",
+    )
+    parser.add_argument("--out", metavar="FILE", help="the new log (with --set: NAME.what_if.mcap; otherwise not kept)")
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    return what_if(arguments, screen) if arguments.set else faithful(arguments, screen)
+
+
+def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
+    """The same again: every event must be the same."""
+    from fdi_torch.replay_job import run_again
+
+    with tempfile.TemporaryDirectory() as folder, screen.progress("replay") as advance:
+        target = Path(arguments.out or Path(folder) / "again.mcap")
+        done = replay(arguments.log, lambda log: run_again(log, target, (), advance), relative=arguments.relative)
+        advance(1.0)
+    for line in in_words(done, arguments.relative):
+        screen.say(line)
+    screen.result({"format": "fdi_torch.replay/1", "replay": done})
+    return DIFFERS if done.outcome == "differs" else DONE
+
+
+def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
+    """The same data with another choice: a new log, compared with the old one."""
+    from fdi_torch.replay_job import run_again
+
+    source = Path(arguments.log)
+    target = Path(arguments.out or source.with_name(f"{source.name.removesuffix('.mcap')}.what_if.mcap"))
+    with screen.progress("replay") as advance:
+        run_again(read_run(source), target, arguments.set, advance)
+        advance(1.0)
+    compared = compare([source, target])
+    comparing.show(compared, screen)
+    screen.say(f"log: {target}")
+    screen.result({"format": "fdi_torch.replay/1", "log": str(target), "comparison": compared})
+    return DONE
+
+
+def in_words(done: Replay, relative: float) -> list[str]:
+    """The outcome, and what differs first."""
+    lines = [f"{done.outcome}: {done.events} events compared, largest relative difference {done.largest:.3g}"]
+    if done.outcome == "within tolerance":
+        lines[0] += f" of {relative:g}"
+    for title, found in (("beyond the tolerance", done.first), ("not bit-equal", done.first_inexact)):
+        if found is not None:
+            where = f"event {found.event}, {found.topic} at {found.place}, {found.field}"
+            lines.append(f"first {title}: {where}: {found.logged} became {found.replayed}")
+    lines += [f"{name} was {then or 'absent'}, is {now or 'absent'}" for name, (then, now) in done.versions.items()]
+    return lines

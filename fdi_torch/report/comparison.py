@@ -1,0 +1,97 @@
+"""Runs side by side on a page: only what differs, whether results agree, convergence and residuals over one another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fdi_torch.logbook import Comparison, align
+from fdi_torch.report.html import folded, table, tag
+from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import axis, number, shown_unit, with_error
+from fdi_torch.report.panels import Line, line_panel
+from fdi_torch.report.predictions import predicted
+from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
+
+COLOURS = (MODEL, MARK, OTHER, SOFT)
+CURVES = {
+    "/estimator/de/generation": ("Search", "generation", "best_cost"),
+    "/estimator/refine/iteration": ("Refinement", "iteration", "cost"),
+}
+
+
+def comparison_section(compared: Comparison, runs: Sequence[Material]) -> Section:
+    """runs: in the order that they were compared in."""
+    blocks: list[Any] = [tag("p", sentence) for sentence in in_words(compared)]
+    if compared.results:
+        header = ["parameter", "unit", *compared.labels, "p", "agree"]
+        blocks.append(table(header, result_rows(compared), left=2))
+    pictures = [*_convergence(compared, runs), *_residuals(compared, runs)]
+    blocks += [pictures] if pictures else []
+    for name, entries in compared.differences.items():
+        rows = [[key, *texts] for key, texts in entries.items()]
+        blocks.append(
+            folded(f"{name}: {len(rows)} differ", table(["key", *compared.labels], rows, len(compared.labels) + 1))
+        )
+    return Section("Comparison", blocks)
+
+
+def in_words(compared: Comparison) -> list[str]:
+    """What the comparison comes to, one sentence each."""
+    if compared.same_content:
+        return ["All logs say the same, message by message."]
+    differing = ", ".join(compared.differences)
+    words = [f"What differs: {differing}." if differing else "Configuration, versions and data are the same."]
+    apart = [result.name for result in compared.results if result.agree is False]
+    if any(result.agree is not None for result in compared.results):
+        words.append(f"At 95 % these differ: {', '.join(apart)}." if apart else "At 95 % the results agree.")
+    if compared.same_data:
+        words.append("All runs read the same data, so their errors are not independent.")
+    return words
+
+
+def result_rows(compared: Comparison) -> list[list[str]]:
+    """Parameter, unit, value with error of each run, p-value, and whether they agree."""
+    verdicts = {True: "yes", False: "no", None: ""}
+    rows = []
+    for result in compared.results:
+        unit, scale = shown_unit(result.unit)
+        values = [with_error(scale * v, scale * s) for v, s in zip(result.values, result.std, strict=True)]
+        rows.append([result.name, unit or "1", *values, number(result.p_value, 2), verdicts[result.agree]])
+    return rows
+
+
+def _convergence(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
+    """One line a run; of several problems or starts the first."""
+    pictures = []
+    for k, (topic, (title, step, field)) in enumerate(CURVES.items()):
+        if sum(bool(run.counts.get(topic)) for run in runs) < 2:
+            continue
+        steps, costs = align([run.run.path for run in runs], topic, field, {"problem": 0})
+        lines: list[Line] = []
+        for label, cost, colour in zip(compared.labels, costs, COLOURS, strict=False):
+            told = np.isfinite(cost)
+            lines.append((label, steps[told], cost[told], colour))
+        pictures.append(Picture(f"compare_cost_{k + 1}", line_panel(title, step, "cost", lines, log=True)))
+    return pictures
+
+
+def _residuals(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
+    """What is left of each sensor's readings, of the runs that tell what they predict."""
+    lines: dict[tuple[str, str], list[Line]] = {}
+    for label, run, colour in zip(compared.labels, runs, COLOURS, strict=False):
+        recording = run.recordings[0] if run.groups else None
+        said = predicted(run.arrays, 0, len(run.groups) > 1, recording.outputs.shape) if recording else None
+        if recording is None or said is None:
+            continue
+        left = np.where(recording.mask, recording.outputs - said, np.nan)
+        for i, name in enumerate(recording.output_names):
+            unit, scale = shown_unit(recording.output_units[i])
+            lines.setdefault((name, unit), []).append((label, recording.time, scale * left[:, i], colour))
+    return [
+        Picture(f"compare_residual_{k + 1}", line_panel(name, "time, s", axis("read − estimate", unit), own))
+        for k, ((name, unit), own) in enumerate(lines.items())
+    ]

@@ -1,0 +1,175 @@
+"""fdi inspect, compare, recover and replay: what they say, their exit codes and their files."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdi_torch import cli
+from fdi_torch.config.run import load_run
+from fdi_torch.logbook import Message, RunLog, read_run
+from fdi_torch.main_job import train
+
+QUICK = [
+    "simulate.duration=200 s",
+    "simulate.sample_time=2 s",
+    "estimate.parameters=[T1.leak, P13.openness]",
+    "simulate.faults={T1.leak: 0.3}",
+    "estimate.search.evaluations=300",
+    "estimate.step={search: 10 s, refine: 2 s}",
+]
+
+
+def _with(message: Message, old: bytes, new: bytes) -> Message:
+    """The message with a piece of its payload replaced."""
+    assert old in message.data
+    return replace(message, data=message.data.replace(old, new))
+
+
+def write_estimate(path: Path, value: float, seed: int = 0) -> Path:
+    """A short run with one estimated parameter of standard error 0.01."""
+    with RunLog(path, "train", seeds={"seed": seed}, config={"a": 1, "b": seed}, env={}, git={}) as log:
+        log.recording(np.arange(3.0), np.ones((3, 1)), np.ones((3, 1)), ("Q1",), ("h1",), ("m^3/s",), ("m",))
+        for g in range(3):
+            log.generation(g, 1.0 / (g + 1 + seed), {"T1.leak.size": 0.1})
+        log.estimate(["T1.leak.size"], [value], [0.01], [[1e-4]], "converged", units=["1"])
+        log.result_arrays(predicted=np.full((3, 1), 0.99))
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A real, quick run of the main job."""
+    folder = tmp_path_factory.mktemp("logs")
+    return train(load_run(None, [*QUICK, f"output.folder={folder}"])).log
+
+
+def test_inspect_fits_on_a_screen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write_estimate(tmp_path / "run.mcap", 0.3)
+    assert cli.main(["inspect", str(log)]) == cli.DONE
+    shown = capsys.readouterr().out
+    assert "a log of fdi train" in shown and "sound: all CRCs, indices and counts agree" in shown
+    assert "/estimator/de/generation" in shown and shown.count("\n") < 40
+
+
+def test_inspect_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write_estimate(tmp_path / "run.mcap", 0.3)
+    assert cli.main(["inspect", str(log), "--json"]) == cli.DONE
+    found = json.loads(capsys.readouterr().out)
+    assert found["sound"] and {t["topic"]: t["messages"] for t in found["topics"]}["/plant/output"] == 3
+
+
+@pytest.mark.parametrize(("form", "start"), [("csv", b"t_s,h1_m"), ("ndjson", b'{"t"'), ("npz", b"PK")])
+def test_inspect_exports_a_topic_once(
+    form: str, start: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = write_estimate(tmp_path / "run.mcap", 0.3), tmp_path / "out"
+    words = ["inspect", str(log), "--topic", "/plant/output", "--format", form, "--out", str(out)]
+    assert cli.main(words) == cli.DONE
+    assert out.read_bytes().startswith(start)
+    assert cli.main(words) == cli.MISUSE
+    assert "exists" in capsys.readouterr().err
+
+
+def test_inspect_of_an_unknown_topic_leaves_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, out = write_estimate(tmp_path / "run.mcap", 0.3), tmp_path / "out"
+    assert cli.main(["inspect", str(log), "--topic", "/nothing", "--out", str(out)]) == cli.MISUSE
+    assert "expected one of the topics" in capsys.readouterr().err and not out.exists()
+
+
+def test_inspect_writes_an_attachment(tmp_path: Path) -> None:
+    log = write_estimate(tmp_path / "run.mcap", 0.3)
+    assert cli.main(["inspect", str(log), "--attachment", "results.npz", "--out", str(tmp_path / "a")]) == cli.DONE
+    assert (tmp_path / "a" / "results.npz").read_bytes().startswith(b"PK")
+
+
+def test_compare_says_what_differs_and_whether_results_agree(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs = [write_estimate(tmp_path / f"{k}.mcap", v, k) for k, v in enumerate((0.30, 0.31, 0.40))]
+    table, pictures = tmp_path / "c.csv", tmp_path / "pictures"
+    words = ["compare", *map(str, logs), "--csv", str(table), "--pictures", str(pictures)]
+    assert cli.main(words) == cli.DONE
+    shown = capsys.readouterr().out
+    assert "At 95 % these differ: T1.leak.size." in shown and "0.300 ± 0.010" in shown
+    with table.open(newline="") as file:
+        rows = {(row[0], row[1]): row[2:5] for row in csv.reader(file)}
+    assert rows["config", "b"] == ["0", "1", "2"] and ("config", "a") not in rows
+    assert {p.name for p in pictures.iterdir()} >= {"compare_cost_1.png", "compare_residual_1.svg"}
+
+
+def test_a_page_of_several_runs_compares_them(tmp_path: Path) -> None:
+    logs = [write_estimate(tmp_path / f"{k}.mcap", v) for k, v in enumerate((0.30, 0.31))]
+    assert cli.main(["report", *map(str, logs), "--quiet", "--out", str(tmp_path / "both.html")]) == cli.DONE
+    text = (tmp_path / "both.html").read_text(encoding="utf-8")
+    assert "At 95 % the results agree." in text and text.index("Comparison") < text.index("<article>")
+
+
+def test_equal_logs_are_said_to_be_equal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    logs = [write_estimate(tmp_path / f"{k}.mcap", 0.3) for k in range(2)]
+    assert cli.main(["compare", *map(str, logs)]) == cli.DONE
+    assert "All logs say the same, message by message." in capsys.readouterr().out
+    assert cli.main(["compare", str(logs[0])]) == cli.MISUSE
+    assert "expected at least two logs to compare, got 1" in capsys.readouterr().err
+
+
+def test_recover_has_an_exit_code_of_its_own_for_losses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write_estimate(tmp_path / "run.mcap", 0.3)
+    assert cli.main(["recover", str(log), "--out", str(tmp_path / "same.mcap")]) == cli.DONE
+    torn = tmp_path / "torn.mcap.partial"
+    torn.write_bytes(log.read_bytes()[:-800])
+    assert cli.main(["recover", str(torn), "--json"]) == 3
+    answer = json.loads(capsys.readouterr().out.partition("\n")[2])
+    assert Path(answer["target"]).exists() and not answer["ended"]
+
+
+def test_a_replay_is_bit_equal(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["replay", str(trained), "--quiet"]) == cli.DONE
+    assert "bit-equal: " in capsys.readouterr().out
+
+
+def test_a_changed_log_does_not_replay(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    forged = tmp_path / "forged.mcap"
+    source = read_run(trained)
+    with RunLog(forged, "train", config_text=source.config_text, seeds={"seed": 1}) as log:
+        log.carry_over(
+            [
+                m if m.topic != "/estimate/final" else _with(m, b'"status":"converged"', b'"status":"stalled"')
+                for m in source.messages()
+            ]
+        )
+    assert cli.main(["replay", str(forged), "--quiet"]) == 3
+    assert "first beyond the tolerance: event" in capsys.readouterr().out
+
+
+def test_what_if_writes_a_new_log_with_its_parent(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["replay", str(trained), "--set", "seed=5", "--quiet"]) == cli.DONE
+    child = read_run(trained.with_name(f"{trained.stem}.what_if.mcap"))
+    assert child.metadata["fdi_torch.run"]["parent_run_id"] == read_run(trained).metadata["fdi_torch.run"]["run_id"]
+    assert "What differs: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--set", "simulate.duration=5 s"], "expected a key other than the data's, got one; use fdi train"),
+        (["--set", "estimate.sarch=1"], "got 'sarch'; the nearest is 'search'"),
+    ],
+)
+def test_a_replay_that_makes_no_sense_is_refused(
+    trained: Path, words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["replay", str(trained), "--quiet", *words]) == cli.MISUSE
+    assert sentence in capsys.readouterr().err
+
+
+def test_a_log_of_another_command_cannot_be_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RunLog(tmp_path / "s.mcap", "study", env={}, git={}):
+        pass
+    assert cli.main(["replay", str(tmp_path / "s.mcap"), "--quiet"]) == cli.MISUSE
+    assert "expected a log of fdi train, got one of study" in capsys.readouterr().err
