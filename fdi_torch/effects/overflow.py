@@ -59,4 +59,4 @@ class Overflow(Effect):
         return {name.removeprefix("to_"): share for name, share in p.items() if name.startswith("to_")}
 
     def _weir(self, above: Tensor, local: Local, crest: Tensor) -> Tensor:
-        return weir_flow(above, 0.0, local.constants["area"], local.gravity, local.clock.resolution, crest)
+        return weir_flow(above, local.net, local.constants["area"], local.gravity, local.clock.resolution, crest)

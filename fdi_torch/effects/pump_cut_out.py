@@ -11,11 +11,11 @@ from fdi_torch.plant.description import PlantDescription, Pump
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
 from fdi_torch.plant.reach import Reach, inside
 
-EDGE_SHARE = 0.01
+EDGE_SHARE = 0.02
 
 
 class PumpCutOut(Effect):
-    """The flow is cut where the level exceeds a limit (a float switch, a safety interlock), drawn over a hundredth of
+    """The flow is cut where the level exceeds a limit (a float switch, a safety interlock), drawn over a fiftieth of
     the tank's height; nominal is far above the rim, where it changes nothing.
 
     Typical: 1 to 10 cm below the rim. Below it nothing shows.

@@ -40,8 +40,9 @@ class Local:
 
     level: of the tank (pump: its target; pipe: its source); far_level: at the other end; head: what drives the flow;
     capacity: flow at 1 m of head through the place's orifice (tank: through its leak reference), m^2.5/s;
-    command: of the pump or the valve's opening; width: the head below which roots are drawn smooth, m;
-    height: of that tank's rim, m; gravity: m/s^2; constants: the component's constants by field name.
+    command: of the pump or the valve's opening; net: what flows into the tank so far, m^3/s (BALANCE; elsewhere 0);
+    width: the head below which roots are drawn smooth, m; height: of that tank's rim, m; gravity: m/s^2;
+    constants: the component's constants by field name.
     """
 
     clock: Clock
@@ -50,6 +51,7 @@ class Local:
     head: Tensor
     capacity: Tensor
     command: Tensor
+    net: Tensor
     width: Tensor
     height: Tensor
     gravity: Tensor

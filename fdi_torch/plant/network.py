@@ -255,6 +255,7 @@ class TankNetwork(nn.Module):
     ) -> None:
         ends = placement.location.split("-") if placement.location not in self._tank_index else [placement.location]
         local = self._tank_local(ends[0], levels, clock, values, ends[-1])
+        local = replace(local, net=net[self._tank_index[ends[0]]])
         flow = placement.effect.inflow(local, values[placement.prefix])
         self._move(net, *((ends[0], ends[1]) if len(ends) == 2 else (OUTSIDE, ends[0])), flow)
         for tank, share in placement.effect.caught(values[placement.prefix]).items():
@@ -278,6 +279,7 @@ class TankNetwork(nn.Module):
             head,
             capacity=orifice_capacity(own["discharge_coefficient"], own["area"], gravity),
             command=torch.ones_like(level),
+            net=torch.zeros_like(level),
             width=self._width(pipe, clock),
             height=values[pipe.source]["height"],
             gravity=gravity,
@@ -297,6 +299,7 @@ class TankNetwork(nn.Module):
             head=level,
             capacity=own["leak_capacity"],
             command=level,
+            net=torch.zeros_like(level),
             width=self._width(leak_pipe(self.description, name), clock),
             height=own["height"],
             gravity=values[""]["gravity"],

@@ -1,0 +1,199 @@
+"""Single effects against closed forms: what each equation says, in numbers worked out by other means."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from rigs import blank_recording, constant_inputs, three_tank
+from torch import Tensor
+
+from fdi_torch.effects import build_network, effect
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlacedEffect, Sensor, Tank
+from fdi_torch.plant.effect import Effect, Local, Memory
+from fdi_torch.plant.reach import inside, reach_of
+from fdi_torch.plant.signals import Clock
+from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.integrate import ReferenceEngine
+
+
+def number(value: float) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def values(**parameters: float) -> dict[str, Tensor]:
+    return {name: number(value) for name, value in parameters.items()}
+
+
+def local(head: float, level: float = 0.5) -> Local:
+    """A place with 1 m^2.5/s of capacity under a tank 1 m tall, roots drawn smooth below 1e-9 m."""
+    one, zero, clock = number(1.0), number(0.0), Clock(number(0.0), number(1.0), number(1.0))
+    constants = {"area": number(0.01), "max_flow": number(1e-4)}
+    return Local(clock, number(level), zero, number(head), one, one, zero, number(1e-9), one, number(9.81), constants)
+
+
+def through(actuator: Effect, commands: list[float], step: float, p: dict[str, Tensor]) -> list[float]:
+    """What a chain of held commands, each one step long, becomes."""
+    memory: Memory = actuator.remember(number(commands[0]), p)
+    out = []
+    for k, u in enumerate(commands):
+        clock = Clock(number(k * step), number(step), number(step))
+        value, memory = actuator.command(number(u), memory, clock, p)
+        out.append(float(value))
+    return out
+
+
+def read(sensor: Effect, seen: list[float], step: float, p: dict[str, Tensor]) -> list[float]:
+    memory: Memory = sensor.remember(number(seen[0]), p)
+    out = []
+    for k, y in enumerate(seen):
+        clock = Clock(number((k - 1) * step), number(step), number(step))
+        value, memory = sensor.reading(number(y), memory, clock, p)
+        out.append(float(value))
+    return out
+
+
+def test_pump_lag_passes_on_the_exact_mean_whatever_the_step() -> None:
+    p, lag = values(time_constant=8.0), effect("pump_lag")
+    # 1 - exp(-t/8) from t = 0 to 20, averaged: 1 - (8/20) (1 - exp(-2.5))
+    expected = 1.0 - 0.4 * (1.0 - math.exp(-2.5))
+    assert through(lag, [0.0, 1.0], 20.0, p)[1] == pytest.approx(expected, rel=1e-14)
+    fine = through(lag, [0.0, *[1.0] * 40], 0.5, p)[1:]
+    assert sum(fine) / 40 == pytest.approx(expected, rel=1e-13)
+
+
+def test_sensor_lag_stays_a_time_constant_behind_a_ramp() -> None:
+    seen = read(effect("sensor_lag"), [0.3 * k for k in range(200)], 1.0, values(time_constant=7.0))
+    assert seen[-1] == pytest.approx(0.3 * 199 - 0.3 * 7.0, rel=1e-9)
+    early = 0.3 * 5 - 0.3 * 7.0 * (1.0 - math.exp(-5.0 / 7.0))
+    assert seen[5] == pytest.approx(early, rel=1e-12)
+
+
+def test_slew_moves_at_its_rate_and_stops_at_the_command() -> None:
+    # A whole stroke takes 10 s: after 4 s it is at 0.4, after 8 s at 0.8; it arrives in the middle of the third step.
+    means = through(effect("actuator_slew"), [0.0, 1.0, 1.0, 1.0, 1.0], 4.0, values(slowness=10.0))
+    assert means == pytest.approx([0.0, 0.2, 0.6, 0.95, 1.0], rel=1e-12)
+
+
+def test_stuck_actuator_and_sensor_keep_what_they_had_at_the_onset() -> None:
+    ramp = [float(k) for k in range(6)]
+    p = values(size=1.0, onset=3.0)
+    assert through(effect("actuator_stuck"), ramp, 1.0, p) == [0.0, 1.0, 2.0, 2.0, 2.0, 2.0]
+    assert read(effect("sensor_stuck"), ramp, 1.0, p) == [0.0, 1.0, 2.0, 2.0, 2.0, 2.0]
+
+
+def test_hysteresis_follows_half_its_band_behind() -> None:
+    up_and_down = [0.0, 1.0, 2.0, 1.8, 1.0, 0.0]
+    assert read(effect("sensor_hysteresis"), up_and_down, 1.0, values(play=0.25)) == [0.0, 0.75, 1.75, 1.75, 1.25, 0.25]
+
+
+def test_bias_is_there_from_its_onset_and_rises_along_its_ramp() -> None:
+    bias, flat = effect("sensor_bias"), [0.0] * 7
+    assert read(bias, flat, 1.0, values(bias=2.0, onset=3.0, ramp=0.0)) == [0.0, 0.0, 0.0, 2.0, 2.0, 2.0, 2.0]
+    ramp = read(bias, flat, 1.0, values(bias=2.0, onset=1.0, ramp=3.0))
+    assert ramp == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0, 2.0, 2.0])
+
+
+@pytest.mark.parametrize(("onset", "ramp"), [(3.2, 0.0), (3.2, 0.5), (1.0, 25.0), (-4.0, 9.0)])
+def test_a_rise_is_averaged_exactly(onset: float, ramp: float) -> None:
+    clock = Clock(number(2.0), number(5.0), number(5.0))
+    fine = 2.0 + 5.0 * (torch.arange(200000, dtype=torch.float64) + 0.5) / 200000
+    rise = torch.clamp((fine - onset) / ramp, 0.0, 1.0) if ramp else (fine > onset).double()
+    assert float(clock.risen(number(onset), number(ramp))) == pytest.approx(float(rise.mean()), abs=1e-5)
+
+
+def test_a_sine_is_averaged_exactly() -> None:
+    clock = Clock(number(2.0), number(5.0), number(5.0))
+    w, phase = 2.0 * math.pi / 17.0, 0.4
+    exact = (math.cos(w * 2.0 + phase) - math.cos(w * 7.0 + phase)) / (w * 5.0)
+    assert float(clock.sine(number(17.0), number(phase))) == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.parametrize("head", [1e-4, -1e-4])
+def test_laminar_flow_is_linear_below_its_head_and_torricellian_above(head: float) -> None:
+    low = effect("laminar_flow").flow(local(head).root(number(head)), local(head), values(transition_head=1.0))
+    assert float(low) == pytest.approx(head, rel=1e-3)
+    high = effect("laminar_flow").flow(number(1.0), local(1.0), values(transition_head=1e-4))
+    assert float(high) == pytest.approx(1.0, rel=1e-4)
+
+
+def test_an_exponent_of_one_is_a_linear_law() -> None:
+    law = effect("flow_exponent")
+    flows = [float(law.flow(local(x).root(number(x)), local(x), values(excess=0.5))) for x in (0.1, 0.2, 0.4)]
+    assert flows[1] == pytest.approx(2.0 * flows[0], rel=1e-9)
+    assert flows[2] == pytest.approx(4.0 * flows[0], rel=1e-9)
+    assert flows[1] == pytest.approx(math.sqrt(0.2), rel=1e-9), "the reference head keeps its flow"
+
+
+def test_valves() -> None:
+    assert through(effect("valve_dead_zone"), [0.1, 0.6, 1.0], 1.0, values(dead_zone=0.2)) == pytest.approx(
+        [0.0, 0.5, 1.0]
+    )
+    assert through(effect("valve_characteristic"), [0.0, 0.5, 1.0], 1.0, values(bend=1.0)) == pytest.approx(
+        [0.0, 0.25, 1.0]
+    )
+    assert through(effect("valve_leak"), [0.0, 0.5, 1.0], 1.0, values(size=0.1)) == pytest.approx([0.1, 0.55, 1.0])
+
+
+def filled(effects: tuple[PlacedEffect, ...], minutes: float = 10.0, height: float = 1.0) -> Tensor:
+    """Levels of three tanks without pipes, 50 cm3/s into T1 and T2 from empty."""
+    plant = three_tank((0.0, 0.0, 0.0), height)
+    tanks = tuple(replace(t, leak_reference=None) for t in plant.tanks)
+    plant = replace(plant, tanks=tanks, pipes=(), effects=effects)
+    network = build_network(plant)
+    engine = ReferenceEngine(
+        network, ParameterSpace(), lay_out(constant_inputs(plant, 60.0 * minutes, 5.0), plant.channels(), 1.0)
+    )
+    return engine.levels(torch.zeros(0, dtype=torch.float64))[-1]
+
+
+def test_an_internal_body_takes_up_its_own_volume() -> None:
+    body = PlacedEffect("internal_body", "T1", {"area": 40e-4, "bottom": 0.5, "height": 0.6})
+    # 30 l in all; 8 l to reach 0.5 m, 7.2 l to 1.1 m beside the body, the rest above it.
+    expected = 1.1 + (30e-3 - 8e-3 - 0.6 * 120e-4) / 160e-4
+    assert float(filled((body,), height=3.0)[0]) == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_tapered_tank_holds_its_mean_area_when_full() -> None:
+    taper = PlacedEffect("area_taper", "T1", {"taper": 0.8})
+    # V(h) = A (h (1 - s/2) + s h^2 / (2 H)); 30 l after 10 min in a tank 3 m tall.
+    level = float(filled((taper,), height=3.0)[0])
+    assert 160e-4 * (level * 0.6 + 0.8 * level**2 / 6.0) == pytest.approx(30e-3, rel=1e-6)
+
+
+def crest_height(flow: float) -> float:
+    """How high water stands over the whole rim of a round tank of 160 cm2 when `flow` runs over it (Poleni)."""
+    crest = 2.0 * math.sqrt(math.pi * 160e-4)
+    return (flow / ((2.0 / 3.0) * 0.6 * math.sqrt(2.0 * 9.81) * crest)) ** (2.0 / 3.0)
+
+
+def test_what_overflows_lands_where_it_should_and_no_volume_is_lost() -> None:
+    low_rim = PlacedEffect("overflow", "T1", {"below_rim": 0.5, "crest": 1.0, "to_T3": 0.25})
+    levels = filled((low_rim,), minutes=5.0)  # 15 l, of which T1 holds 8
+    assert float(levels[0]) == pytest.approx(0.5 + crest_height(50e-6), abs=1e-5)
+    spilt = 15e-3 - 160e-4 * float(levels[0])
+    assert 160e-4 * float(levels[2]) == pytest.approx(0.25 * spilt, rel=1e-6)
+
+
+def test_a_draw_ends_when_it_should() -> None:
+    draw = PlacedEffect("unmetered_flow", "T1", {"flow": -20e-6, "begin": 61.3, "duration": 100.0})
+    assert float(filled((draw,), height=3.0)[0]) == pytest.approx((30e-3 - 2e-3) / 160e-4, rel=1e-9)
+
+
+def test_reach_of_a_recording() -> None:
+    plant = replace(
+        three_tank(), tanks=(*three_tank().tanks, Tank("T4", 0.01, 0.7)), sensors=(Sensor("d1", "T1", "V", -2.0, 9.0),)
+    )
+    flows = torch.tensor([[1e-5, 0.0], [3e-5, 2e-5], [0.0, 0.0]], dtype=torch.float64)
+    recording = blank_recording(plant, flows, torch.arange(3, dtype=torch.float64))
+    seen = replace(recording, outputs=torch.tensor([[8.0], [8.4], [math.nan]], dtype=torch.float64), mask=None)
+    reach = reach_of(seen, plant)
+    assert (reach.duration, reach.commands["Q1"]) == (2.0, (0.0, 3e-5))
+    assert reach.readings["d1"] == pytest.approx((8.0, 8.4))
+    assert reach.levels["T1"] == pytest.approx((0.3, 0.5)), "a sensor that looks down"
+    assert reach.levels["T4"] == (0.0, 0.7), "a tank without a sensor"
+    assert reach_of(recording, plant).readings["d1"] == (7.0, 9.0), "nothing read: from floor to rim"
+    assert inside((0.0, 4.0), 3) == [1.0, 2.0, 3.0]
