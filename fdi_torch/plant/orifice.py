@@ -53,7 +53,7 @@ def weir_flow(
     """
     above = torch.clamp(excess, min=0.0)
     crest = 2.0 * torch.sqrt(math.pi * tank_area)
-    root = above / torch.sqrt(above + _DRY)
+    root = torch.sqrt(above + _DRY)
     strength = (2.0 / 3.0) * WEIR_COEFFICIENT * torch.sqrt(2.0 * gravity) * crest * share
     stiffness = torch.clamp(1.5 * strength * root * resolution / tank_area - STABLE_SPILL_TIMES_STEP, min=0.0)
     return torch.clamp((strength * above * root + stiffness * inflow) / (1.0 + stiffness), min=0.0)

@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 
 _FLAGS = (
-    "-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off",
+    "-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
     "-fno-strict-aliasing", "-fPIC", "-shared", "-pthread",
 )  # fmt: skip
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from fdi_torch.simulate.expression import Varies
 from fdi_torch.simulate.operations import OPERATIONS
-from fdi_torch.simulate.program import Output, Place, Program, Row, Section
+from fdi_torch.simulate.program import Program
+from fdi_torch.simulate.section import Output, Place, Row, Section
 
 _SKELETON = Path(__file__).with_name("kernel.hpp")
 _MATHS = ("FABS", "SQRT", "EXP", "LOG", "POW", "SIN", "COS", "TANH", "FLOOR", "CEIL", "TRUNC")

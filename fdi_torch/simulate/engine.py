@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import torch
@@ -32,22 +33,22 @@ class Readings:
         if self.ar is not None and self.ar.shape != expected:
             raise ValueError(f"expected ar of shape {tuple(expected)}, got {tuple(self.ar.shape)}")
 
-    @property
+    @cached_property
     def count(self) -> Tensor:
         """The number of readings that count, (C,) or (problems, C)."""
         return self.weight.sum(dim=-2)
 
-    @property
+    @cached_property
     def centred(self) -> Tensor:
         """Values less their channel's mean; zero where masked."""
         return torch.where(self.weight > 0, self.known - self.centre.unsqueeze(-2), 0.0)
 
-    @property
+    @cached_property
     def known(self) -> Tensor:
         """The values, 0 where masked."""
         return torch.where(self.weight > 0, self.values, 0.0)
 
-    @property
+    @cached_property
     def centre(self) -> Tensor:
         """Weighted means, (C,) or (problems, C); 0 where nothing counts."""
         return (self.known * self.weight).sum(dim=-2) / torch.where(self.count > 0, self.count, 1.0)

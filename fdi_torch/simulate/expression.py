@@ -143,7 +143,8 @@ class Graph:
                     return x
                 if v == -1.0:
                     return self.apply("neg", x)
-            return self._negated(operation, a)
+            grouped = self._negated(operation, a)
+            return self._grouped(a) if grouped is None else grouped
         if operation == "add":
             return self._add(a, value)
         if operation == "sub":
@@ -176,10 +177,34 @@ class Graph:
 
     def _divide(self, a: Sequence[int], value: Sequence[float | None]) -> int | None:
         """By what varies less: a product with its inverse, which is computed less often."""
-        top, bottom = (self.nodes[x].varies for x in a)
-        if value[0] == 1.0 or top | bottom == bottom:
+        quartic = self._fourth_root(a[1])
+        if quartic is not None and self.nodes[quartic].varies == Varies.BOTH:
+            return self.apply("mul", a[0], self.apply("inverse_fourth_root", quartic))
+        if value[0] == 1.0 or not self._below(a[1], self.nodes[a[0]].varies):
             return None
         return self.apply("mul", a[0], self.apply("div", self.literal(1.0), a[1]))
+
+    def _grouped(self, a: Sequence[int]) -> int | None:
+        """(x c) d = x (c d), where c and d vary less than x, so that c d is computed less often."""
+        for product, d in ((a[0], a[1]), (a[1], a[0])):
+            if self.nodes[product].operation != "mul":
+                continue
+            first, second = self.nodes[product].arguments
+            for x, c in ((first, second), (second, first)):
+                often = self.nodes[x].varies
+                if self._below(c, often) and self._below(d, often):
+                    return self.apply("mul", x, self.apply("mul", c, d))
+        return None
+
+    def _below(self, i: int, often: Varies) -> bool:
+        """Whether a node varies less than that."""
+        return self.nodes[i].varies | often == often and self.nodes[i].varies != often
+
+    def _fourth_root(self, i: int) -> int | None:
+        """What a node is the fourth root of."""
+        root = self.nodes[i]
+        inner = self.nodes[root.arguments[0]] if root.operation == "sqrt" else root
+        return inner.arguments[0] if root.operation == inner.operation == "sqrt" else None
 
     def _negated(self, operation: str, a: Sequence[int]) -> int | None:
         """(-x) y = -(x y), so that x y is one node whatever its sign."""

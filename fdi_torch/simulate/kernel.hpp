@@ -9,6 +9,7 @@
 #include <cstring>
 #include <memory>
 #include <thread>
+#include <type_traits>
 #include <vector>
 
 #define EACH_LANE _Pragma("GCC ivdep") for (int l = 0; l < LANES; ++l)
@@ -17,6 +18,22 @@
 static inline real MINIMUM(real a, real b) { return (a < b) | (a != a) ? a : b; }
 static inline real MAXIMUM(real a, real b) { return (a > b) | (a != a) ? a : b; }
 static inline real SIGN(real a) { return a > 0 ? real(1) : a < 0 ? real(-1) : a; }
+
+// s^(-1/4) for s > 0, to two units in the last place and in half the time of two roots and a division: a guess from
+// the exponent, right to 3 %, then twice y (1 + h/4 + 5 h^2/32 + 15 h^3/128) with h = 1 - s y^4.
+static inline real INVERSE_FOURTH_ROOT(real s) {
+    using Bits = std::conditional<sizeof(real) == 8, uint64_t, uint32_t>::type;
+    Bits bits;
+    std::memcpy(&bits, &s, sizeof s);
+    bits = (sizeof(real) == 8 ? Bits(0x4feb028f5c28f800) : Bits(0x4f58147a)) - (bits >> 2);
+    real y;
+    std::memcpy(&y, &bits, sizeof y);
+    for (int i = 0; i < 2; ++i) {
+        const real square = y * y, h = 1 - s * (square * square);
+        y += y * h * (real(0.25) + h * (real(5.0 / 32.0) + h * real(15.0 / 128.0)));
+    }
+    return y;
+}
 
 enum Mode { LEVELS, READINGS, MOMENTS, LINEARISE, GRAM };
 

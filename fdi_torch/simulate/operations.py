@@ -70,6 +70,12 @@ def _tanh(g: Graph, out: int, a: tuple[int, ...]) -> tuple[int | None, ...]:
     return (g.apply("sub", g.literal(1.0), g.apply("mul", out, out)),)
 
 
+def _inverse_fourth_root(g: Graph, out: int, a: tuple[int, ...]) -> tuple[int | None, ...]:
+    """-1/4 s^(-5/4), without a division."""
+    square = g.apply("mul", out, out)
+    return (g.apply("mul", g.literal(-0.25), g.apply("mul", out, g.apply("mul", square, square))),)
+
+
 def _divide(g: Graph, out: int, a: tuple[int, ...]) -> tuple[int | None, ...]:
     inverse = g.apply("div", g.literal(1.0), a[1])
     return inverse, g.apply("neg", g.apply("mul", out, inverse))
@@ -84,6 +90,10 @@ OPERATIONS: dict[str, Operation] = {
     "abs": Operation(torch.abs, "FABS({0})", lambda g, out, a: (g.apply("sign", a[0]),)),
     "sign": Operation(torch.sign, "SIGN({0})", _flat),
     "sqrt": Operation(torch.sqrt, "SQRT({0})", lambda g, out, a: (g.apply("div", g.literal(0.5), out),)),
+    # not among torch's own: the regularised square root's x / (x^2 + w^2)^(1/4) comes down to it
+    "inverse_fourth_root": Operation(
+        lambda s: 1.0 / torch.sqrt(torch.sqrt(s)), "INVERSE_FOURTH_ROOT({0})", _inverse_fourth_root
+    ),
     "exp": Operation(torch.exp, "EXP({0})", lambda g, out, a: (out,)),
     "log": Operation(torch.log, "LOG({0})", lambda g, out, a: (g.apply("div", g.literal(1.0), a[0]),)),
     "pow": Operation(torch.pow, "POW({0}, {1})", _power),

@@ -7,7 +7,7 @@ its inputs or a parameter change. Rates are differentiated stage by stage, so th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 from torch import Tensor
@@ -15,32 +15,9 @@ from torch import Tensor
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.expression import Graph, Varies
+from fdi_torch.simulate.runge_kutta import Stages, moved
+from fdi_torch.simulate.section import Output, Place, Row, Section
 from fdi_torch.simulate.trace import Tracer
-
-Place = tuple[str, int]
-
-
-@dataclass(frozen=True)
-class Row:
-    """One output's change: sum of coefficient x change of an input, plus a coefficient for each column of theta."""
-
-    terms: tuple[tuple[int, Place], ...] = ()
-    theta: Mapping[int, int] = field(default_factory=dict)
-
-    def __bool__(self) -> bool:
-        return bool(self.terms or self.theta)
-
-
-@dataclass(frozen=True)
-class Output:
-    """Where a result goes, the node that computes it, and how it changes."""
-
-    place: Place
-    node: int
-    row: Row = Row()
-
-
-Section = tuple[Output, ...]
 
 
 @dataclass(frozen=True)
@@ -174,7 +151,7 @@ class _Builder:
         return tuple(settle), (*act, *self._outputs("next_command_memory", then, lively))
 
     def _rates(self, act: Section) -> tuple[tuple[Section, ...], Section, Section]:
-        """RK4 by the 3/8 rule, in the order of operations of torchdiffeq's `rk4`, and the slopes at the step's end."""
+        """The stages of a step, the levels after it, and the slopes there."""
         graph, network, tensor = self.graph, self.network, self.tracer.tensor
         actions = [o.node for o in act if o.place[0] == "action"]
         held = [graph.input("action", a, Varies.BOTH if graph.nodes[n].varies & Varies.LANE else Varies.STEP)
@@ -182,54 +159,12 @@ class _Builder:
         levels = self._inputs("level", len(network.description.tanks))
         with self.tracer:
             rates = network.rates([tensor(h) for h in levels], [tensor(a) for a in held], self.clock, self.values)
-        law = [self.tracer.node(r) for r in rates]
-        moving: dict[int, Place] = {o.node: o.place for o in act if o.place[0] == "action" and o.row}
-        stages: list[Section] = []
-        one, eighth, step = graph.literal(1.0), graph.literal(0.125), self.span[1]
-        third = graph.number(1.0 / 3.0)
-        third_step, eighth_step = (graph.apply("mul", step, x) for x in (third, eighth))
-
-        def op(name: str, x: list[int], y: list[int] | int) -> list[int]:
-            other = y if isinstance(y, list) else [y] * len(x)
-            return [graph.apply(name, a, b) for a, b in zip(x, other, strict=True)]
-
-        def follows(i: int, *slopes: tuple[int, int]) -> Row:
-            """How a level within the step changes: with the one at its start, and factor x slope of earlier stages."""
-            if not self.tangent:
-                return Row()
-            of_slopes = [(factor, (f"slope{k}", i)) for factor, k in slopes if stages[k - 1][len(law) + i].row]
-            return Row(((one, ("level", i)), *of_slopes))
-
-        def slopes_at(at: list[int], *slopes: tuple[int, int]) -> list[int]:
-            stage = f"stage{len(stages)}"
-            found = graph.substitute(law, dict(zip(levels + held, at + actions, strict=True)))
-            wanted = moving | {n: (stage, i) for i, n in enumerate(at)}
-            reached = [Output((stage, i), n, follows(i, *slopes)) for i, n in enumerate(at)]
-            stages.append((*reached, *self._outputs(f"slope{len(stages) + 1}", found, wanted)))
-            return found
-
-        def times_step(x: list[int]) -> list[int]:
-            return op("mul", x, step)
-
-        def negative(x: int) -> int:
-            return graph.apply("neg", x)
-
-        k1 = slopes_at(levels)
-        k2 = slopes_at(op("add", levels, op("mul", times_step(k1), third)), (third_step, 1))
-        k3_at = op("add", levels, times_step(op("sub", k2, op("mul", k1, third))))
-        k3 = slopes_at(k3_at, (negative(third_step), 1), (step, 2))
-        k4_at = op("add", levels, times_step(op("add", op("sub", k1, k2), k3)))
-        k4 = slopes_at(k4_at, (step, 1), (negative(step), 2), (step, 3))
-        total = op("add", op("add", k1, op("mul", op("add", k2, k3), graph.literal(3.0))), k4)
-        after = op("add", levels, op("mul", times_step(total), eighth))
-        thrice = graph.apply("mul", eighth_step, graph.literal(3.0))
-        parts = ((eighth_step, 1), (thrice, 2), (thrice, 3), (eighth_step, 4))
-        advance = tuple(Output(("next_level", i), n, follows(i, *parts)) for i, n in enumerate(after))
+        moving: dict[int, Place] = {n: ("level", i) for i, n in enumerate(levels)}
+        moving |= {held[o.place[1]]: o.place for o in act if o.place[0] == "action" and o.row}
+        law = self._outputs("slope_right", [self.tracer.node(r) for r in rates], moving)
+        stages, advance = Stages(graph, law, levels, self.span[1], dict(zip(held, actions, strict=True))).write()
         uniform = {h: a for h, a in zip(held, actions, strict=True) if not graph.nodes[a].varies & Varies.LANE}
-        ends = graph.substitute(law, uniform)
-        wanted = {n: ("level", i) for i, n in enumerate(levels)}
-        wanted |= {held[o.place[1]]: o.place for o in act if o.place[0] == "action" and o.row}
-        return tuple(stages), advance, tuple(self._outputs("slope_right", ends, wanted))
+        return stages, advance, tuple(moved(graph, law, uniform, {}))
 
     def _readings(self) -> tuple[Section, Section]:
         network, tensor, node = self.network, self.tracer.tensor, self.tracer.node

@@ -18,7 +18,8 @@ from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.expression import Varies
 from fdi_torch.simulate.integrate import hermite
 from fdi_torch.simulate.operations import OPERATIONS
-from fdi_torch.simulate.program import Place, Program, Row, Section, build_program
+from fdi_torch.simulate.program import Program, build_program
+from fdi_torch.simulate.section import Place, Row, Section
 
 Change = Tensor | None
 

@@ -1,0 +1,96 @@
+"""One step of RK4 by the 3/8 rule as nodes of a graph, in the order of operations of torchdiffeq's `rk4`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from fdi_torch.simulate.expression import Graph
+from fdi_torch.simulate.section import Output, Row, Section
+
+Slopes = tuple[tuple[int, int], ...]
+
+
+class Stages:
+    """Writes the stages one by one; each is the levels it looks at and the rates there.
+
+    law: the rates with their rows, as functions of the nodes `levels`. step: the node of the step's length.
+    replaced: further nodes of the law and what stands for them in a step.
+    """
+
+    def __init__(
+        self, graph: Graph, law: Sequence[Output], levels: list[int], step: int, replaced: Mapping[int, int]
+    ) -> None:
+        self.graph, self.law, self.levels, self.step, self.replaced = graph, law, levels, step, replaced
+        self.stages: list[Section] = []
+        self.tangent = any(o.row for o in law)
+        self.third, self.eighth = graph.number(1.0 / 3.0), graph.literal(0.125)
+
+    def write(self) -> tuple[tuple[Section, ...], Section]:
+        """The four stages, and the levels after the step."""
+        g, h, step, third = self.graph, self.levels, self.step, self.third
+        third_step, eighth_step = g.apply("mul", step, third), g.apply("mul", step, self.eighth)
+        thrice = g.apply("mul", eighth_step, g.literal(3.0))
+        k1 = self._slopes(h, ())
+        second = self._each("add", h, self._each("mul", self._times_step(k1), third))
+        k2 = self._slopes(second, ((third_step, 1),))
+        change = self._each("sub", k2, self._each("mul", k1, third))
+        k3 = self._slopes(self._each("add", h, self._times_step(change)), ((g.apply("neg", third_step), 1), (step, 2)))
+        change = self._each("add", self._each("sub", k1, k2), k3)
+        parts: Slopes = ((step, 1), (g.apply("neg", step), 2), (step, 3))
+        k4 = self._slopes(self._each("add", h, self._times_step(change)), parts)
+        middle = self._each("mul", self._each("add", k2, k3), g.literal(3.0))
+        total = self._each("add", self._each("add", k1, middle), k4)
+        after = self._each("add", h, self._each("mul", self._times_step(total), self.eighth))
+        parts = ((eighth_step, 1), (thrice, 2), (thrice, 3), (eighth_step, 4))
+        advance = tuple(Output(("next_level", i), n, self._follows(i, parts)) for i, n in enumerate(after))
+        return tuple(self.stages), advance
+
+    def _slopes(self, at: list[int], slopes: Slopes) -> list[int]:
+        """The rates at some levels, which follow from earlier slopes."""
+        stage = len(self.stages)
+        reached = [Output((f"stage{stage}", i), n, self._follows(i, slopes)) for i, n in enumerate(at)]
+        replaced = {**self.replaced, **dict(zip(self.levels, at, strict=True))}
+        found = moved(self.graph, self.law, replaced, {("level", i): (f"stage{stage}", i) for i in range(len(at))})
+        rates = [Output((f"slope{stage + 1}", o.place[1]), o.node, o.row) for o in found]
+        self.stages.append((*reached, *rates))
+        return [o.node for o in rates]
+
+    def _follows(self, i: int, slopes: Slopes) -> Row:
+        """How a level within the step changes: as the one at its start, and by factor x earlier slopes."""
+        if not self.tangent:
+            return Row()
+        of_slopes = [(f, (f"slope{k}", i)) for f, k in slopes if self.stages[k - 1][len(self.law) + i].row]
+        return Row(((self.graph.literal(1.0), ("level", i)), *of_slopes))
+
+    def _each(self, operation: str, x: list[int], y: list[int] | int) -> list[int]:
+        other = y if isinstance(y, list) else [y] * len(x)
+        return [self.graph.apply(operation, a, b) for a, b in zip(x, other, strict=True)]
+
+    def _times_step(self, x: list[int]) -> list[int]:
+        return self._each("mul", x, self.step)
+
+
+def moved(
+    graph: Graph,
+    section: Sequence[Output],
+    replaced: Mapping[int, int],
+    renamed: Mapping[tuple[str, int], tuple[str, int]],
+) -> list[Output]:
+    """The same outputs and rows with other nodes as inputs, and changes taken from other places."""
+    slopes = [n for o in section for n in (*(c for c, _ in o.row.terms), *o.row.theta.values())]
+    new = dict(zip([*(o.node for o in section), *slopes], _substitute(graph, section, slopes, replaced), strict=True))
+    return [
+        Output(
+            o.place,
+            new[o.node],
+            Row(
+                tuple((new[c], renamed.get(place, place)) for c, place in o.row.terms),
+                {q: new[c] for q, c in o.row.theta.items()},
+            ),
+        )
+        for o in section
+    ]
+
+
+def _substitute(graph: Graph, section: Sequence[Output], slopes: list[int], replaced: Mapping[int, int]) -> list[int]:
+    return graph.substitute([*(o.node for o in section), *slopes], replaced)
