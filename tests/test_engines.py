@@ -285,42 +285,50 @@ def test_float32_is_near_float64() -> None:
     assert relative(single.double(), engine.readings(theta)) < 1e-4
 
 
-@pytest.mark.parametrize("effect", EFFECTS, ids=lambda e: e.name)
-def test_every_effect_survives_every_engine(effect: Effect) -> None:
-    """At the first place where it fits in any shipped plant, all its parameters off nominal."""
-    for name in ("three_tank", "quadruple_tank", "dts200"):
-        plant = load_plant(name)
-        placed = all_placements(plant, [effect])[:1]
-        if placed:
-            break
+@pytest.mark.parametrize("name", ["three_tank", "quadruple_tank"])
+def test_every_effect_survives_every_engine(name: str) -> None:
+    """All effects in one plant, each at the first place where it fits; each lane has one of them off nominal."""
+    plant = load_plant(name)
+    placed = [p for effect in EFFECTS for p in all_placements(plant, [effect])[:1]]
     network = TankNetwork(plant, placed)
-    names = [n for n in network.constants.names if n.startswith(placed[0].prefix + ".")]
+    names = [n for n in network.constants.names if n.count(".") == 2]
     space = ParameterSpace(network.constants[n] for n in names)
-    time = regular(2.0, 40)
-    channels = plant.channels()
+    e = lay_out(waves(plant), plant.channels(), 1.0)
+    low, high = space.low().clamp(min=-10.0), space.high().clamp(max=30.0)
+    generator = torch.Generator().manual_seed(4)
+    anywhere = low + (high - low) * torch.rand(3, len(placed), len(space), generator=generator, dtype=torch.float64)
+    own = torch.tensor([[n.startswith(p.prefix + ".") for n in names] for p in placed])
+    theta = torch.where(own, anywhere, space.nominal()).reshape(-1, len(space))
+    theta = torch.cat([theta, space.nominal().expand(1, -1)])
+    reference = ReferenceEngine(network, space, e)
+    truth = reference.readings(theta)
+    compiled, traced = CompiledEngine(network, space, e), TracedEngine(network, space, e)
+
+    def error(readings: Tensor) -> Tensor:
+        return ((readings - truth).abs() / truth.abs().amax((1, 2), keepdim=True)).amax((1, 2))
+
+    # a lane that chatters at its rim magnifies the last bit: the reference itself does, when theta moves by one
+    tame = error(reference.readings(theta * (1.0 + 1e-15))) < 1e-12
+    assert float(tame.double().mean()) > 0.9
+    for engine in (compiled, traced):
+        wrong = torch.where(tame, error(engine.readings(theta)), 0.0)
+        assert float(wrong.max()) < 1e-10, placed[int(wrong.argmax()) % len(placed)].prefix
+    jacobian, other = compiled.linearise(theta[tame])[1], traced.linearise(theta[tame])[1]
+    assert torch.equal(torch.isfinite(jacobian), torch.isfinite(other))
+    scale = other.nan_to_num(posinf=0.0, neginf=0.0).abs().amax((0, 1, 2))
+    torch.testing.assert_close(
+        jacobian / (scale + 1e-300), other / (scale + 1e-300), rtol=1e-8, atol=1e-9, equal_nan=True
+    )
+
+
+def waves(plant: PlantDescription) -> Recording:
+    """Every input of a plant up and down within its range."""
+    time, channels = regular(2.0, 40), plant.channels()
     wave = torch.stack([0.5 + 0.4 * torch.sin(time / (7 + c)) for c in range(len(channels))], dim=1)
     scale = torch.tensor([next((p.max_flow / p.gain for p in plant.pumps if p.channel == c), 1.0) for c in channels])
     outputs = torch.zeros(40, len(plant.sensors)).double()
     units = tuple(plant.channel_units().values()), tuple(s.unit for s in plant.sensors)
-    run = Recording(time, wave * scale, outputs, channels, tuple(s.column for s in plant.sensors), *units)
-    e = lay_out(run, channels, 1.0)
-    low, high = space.low().clamp(min=-10.0), space.high().clamp(max=30.0)
-    theta = low + (high - low) * torch.rand(
-        20, len(space), generator=torch.Generator().manual_seed(4), dtype=torch.float64
-    )
-    theta = torch.cat([theta, space.nominal().expand(1, -1)])
-    truth = ReferenceEngine(network, space, e).readings(theta)
-    compiled, traced = CompiledEngine(network, space, e), TracedEngine(network, space, e)
-    assert relative(compiled.readings(theta), truth) < 1e-10
-    assert relative(traced.readings(theta), truth) < 1e-10
-    jacobian = compiled.linearise(theta)[1]
-    torch.testing.assert_close(
-        jacobian,
-        traced.linearise(theta)[1],
-        rtol=1e-8,
-        atol=1e-9 * float(jacobian.abs().nan_to_num().max()),
-        equal_nan=True,
-    )
+    return Recording(time, wave * scale, outputs, channels, tuple(s.column for s in plant.sensors), *units)
 
 
 def test_a_compiled_plant_is_found_again_by_plants_that_differ_in_numbers_only(
