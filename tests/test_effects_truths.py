@@ -10,11 +10,11 @@ import torch
 from rigs import blank_recording, constant_inputs, three_tank
 from torch import Tensor
 
-from fdi_torch.effects import build_network, effect
+from fdi_torch.effects import build_network, effect, placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect, Sensor, Tank
 from fdi_torch.plant.effect import Effect, Local, Memory
-from fdi_torch.plant.reach import inside, reach_of
+from fdi_torch.plant.reach import bounded, inside, reach_of
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.integrate import ReferenceEngine
@@ -197,3 +197,11 @@ def test_reach_of_a_recording() -> None:
     assert reach.levels["T4"] == (0.0, 0.7), "a tank without a sensor"
     assert reach_of(recording, plant).readings["d1"] == (7.0, 9.0), "nothing read: from floor to rim"
     assert inside((0.0, 4.0), 3) == [1.0, 2.0, 3.0]
+
+
+def test_times_that_may_be_endless_are_bounded_by_the_recording() -> None:
+    network = build_network(three_tank(), placements_for(["T1.unmetered_flow.flow", "Q1.pump_lag.time_constant"]))
+    space = bounded(network.constants, 900.0)
+    assert space["T1.unmetered_flow.begin"].high == 900.0
+    assert bounded(network.constants, 60.0)["T1.unmetered_flow.duration"].high == 600.0, "never below nominal"
+    assert space["Q1.pump_lag.time_constant"].high == 60.0

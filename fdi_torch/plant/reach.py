@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
 
+from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.constants import reading_at
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -44,6 +46,14 @@ def reach_of(recording: Recording, plant: PlantDescription) -> Reach:
         readings=readings,
         levels=levels,
     )
+
+
+def bounded(space: ParameterSpace, duration: float) -> ParameterSpace:
+    """The same space with onsets, ramps and the like, which may otherwise last for ever, kept within the recording."""
+    endless = [p.name for p in space if p.unit == "s" and math.isinf(p.high)]
+    for name in endless:
+        space = space.with_changes(name, high=max(duration, space[name].nominal))
+    return space
 
 
 def inside(reached: Range, count: int) -> list[float]:
