@@ -20,6 +20,7 @@ LAYERS = (
     {"report", "gap", "study", "monitor"},
     {"config"},
     {"main_job", "study_job", "replay_job"},
+    {"paper"},
     {"cli", "train", "__main__", "__init__"},
 )
 RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}

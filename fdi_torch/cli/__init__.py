@@ -28,6 +28,7 @@ COMMANDS = {
     "recover": "save what is whole of a broken or unfinished log",
     "gap": "where a plant file falls short of a recording, by which effect, and how far the gap closes",
     "study": "many trials at once: errors against their bounds, coverage, failures",
+    "paper": "make the 2020 paper's tables and figures again",
 }
 
 

@@ -76,13 +76,13 @@ def panel(title: str, x_label: str, y_label: str, width: float = WIDTH, height: 
     return figure, axes
 
 
-def label_lines(axes: Axes) -> None:
+def label_lines(axes: Axes, columns: int = 4) -> None:
     """Names of the lines above the plot, each in its line's colour; no box hides data."""
     with styled():
         axes.legend(
             loc="lower right",
             bbox_to_anchor=(1.02, 0.97),
-            ncols=4,
+            ncols=columns,
             frameon=False,
             labelcolor="linecolor",
             handlelength=1.0,
