@@ -145,6 +145,16 @@ def test_other_parameters_than_the_papers_are_refused() -> None:
         solve(run)
 
 
+def test_a_short_case_is_solved_from_its_run_file() -> None:
+    """60 s, a small search and given steps: the way from run file to row, within the bound's reach."""
+    small = ["simulate.duration=60 s", "estimate.search.evaluations=1500"]
+    steps = ["estimate.step.search=2 s", "estimate.step.refine=0.5 s"]
+    found = solve(load_run(SHIPPED / "paper" / "table3_snr50.yaml", [*small, *steps]))
+    assert found.status == "converged" and found.history.shape[1] == 5
+    assert bool(((found.free - found.truth).abs() < 4.0 * found.bound).all())
+    assert torch.allclose(found.std, found.bound, rtol=0.2)
+
+
 def test_the_page_has_every_figure() -> None:
     wanted = {f"figure_{k}.png" for k in (3, 4, 5, 6, 7)} | {"fault_modes.png"}
     assert set(re.findall(r"\]\(([^)]+\.png)\)", PAGE)) == wanted
