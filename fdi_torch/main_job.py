@@ -49,12 +49,10 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False) -> TrainResu
     resume: goes on from the last generation that a killed run of the same file logged, and ends as it would have.
     """
     tell = tell or (lambda share, text: None)
-    device = usable_device(run.config.device)
     space = wanted_space(run)
     tell(0.0, "reading" if run.config.recordings else "simulating the recording")
     loaded = recordings_of(run)
-    fitting = fitting_of(run, space, loaded, device)
-    settings = hybrid_settings(run.config.estimate)
+    fitting = fitting_of(run, space, loaded)
     truth = simulated_truth(run)
     folder = Path(run.config.output.folder)
     path = killed_path(folder, run.name) if resume else free_path(folder, run.name)
@@ -62,13 +60,20 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False) -> TrainResu
     with RunLog(path, "train", **origin_of(run, loaded)) as log:
         if not log.carry_over(before):
             log_recordings(log, loaded, truth)
-        watch = Watch(log, fitting.space, settings, tell)
-        with device:
-            result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, search)
-        log_result(log, result, fitting.space)
+        result = estimate_logged(run, fitting, log, tell, search)
         pictures = draw(run, fitting, result, path)
     tell(1.0, "done")
     return TrainResult(result, fitting, truth, path, pictures)
+
+
+def estimate_logged(run: Run, fitting: Fitting, log: RunLog, tell: Tell, resume: Search | None = None) -> HybridResult:
+    """The estimate, each of its steps and its result in the log."""
+    settings = hybrid_settings(run.config.estimate)
+    watch = Watch(log, fitting.space, settings, tell)
+    with usable_device(run.config.device):
+        result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, resume)
+    log_result(log, result, fitting.space)
+    return result
 
 
 def origin_of(run: Run, loaded: Sequence[LoadedRecording]) -> dict[str, Any]:
@@ -133,8 +138,9 @@ def usable_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording], device: torch.device) -> Fitting:
-    """These parameters on these recordings, with all tensors on the device."""
+def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording]) -> Fitting:
+    """These parameters on these recordings, with all tensors on the device that the run file asks for."""
+    device = usable_device(run.config.device)
     recordings = [part.recording.to(device) for part in loaded]
     expect_enough_samples(recordings, space)
     with device:

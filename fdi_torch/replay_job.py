@@ -12,16 +12,13 @@ from fdi_torch.config.files import with_overrides
 from fdi_torch.config.logged import logged_mapping
 from fdi_torch.config.recordings import LoadedRecording
 from fdi_torch.config.run import Run, build_run
-from fdi_torch.estimate.hybrid import estimate_parameters
 from fdi_torch.logbook import LogError, RunLog, own_signals, series
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.main_job import (
     Tell,
-    Watch,
+    estimate_logged,
     fitting_of,
-    hybrid_settings,
     log_recordings,
-    log_result,
     origin_of,
     wanted_space,
 )
@@ -42,13 +39,11 @@ def run_again(log: LoggedRun, path: Path, overrides: Iterable[str] = (), tell: T
         raise LogError(f"{log.path}: expected a log of fdi train, got one of {kind or 'another program'}")
     run = asked_again(log, overrides)
     space, loaded = wanted_space(run), recorded(log, run)
-    fitting, settings = fitting_of(run, space, loaded), hybrid_settings(run.config.estimate)
+    fitting = fitting_of(run, space, loaded)
     parent = log.metadata["fdi_torch.run"].get("run_id", "")
     with RunLog(path, "train", **origin_of(run, loaded), parent_run_id=parent) as again:
         log_recordings(again, loaded, logged_truth(log))
-        watch = Watch(again, fitting.space, settings, tell or (lambda share, text: None))
-        result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration)
-        log_result(again, result, fitting.space)
+        estimate_logged(run, fitting, again, tell or (lambda share, text: None))
     return path
 
 
