@@ -114,8 +114,8 @@ def test_misuse_is_refused() -> None:
         make_detector("fixed", 10.0, 1.0, 3, generator)
     with pytest.raises(ValueError, match="at least one sample"):
         make_detector("glr", 1000.0, 1.0, 3, generator, window=0)
-    with pytest.raises(ValueError, match="at least 100 fault-free samples"):
-        fit_whitening(noise(50, 2))
+    with pytest.raises(ValueError, match="at least 40 fault-free samples"):
+        fit_whitening(noise(30, 2))
     with pytest.raises(ValueError, match="none in channel 2"):
         fit_whitening(noise(200, 2) * torch.tensor([1.0, 0.0], dtype=torch.float64))
 

@@ -21,6 +21,8 @@ COMMANDS = {
     "train": "estimate the faults in a recording, and log how",
     "simulate": "write a recording from a plant, inputs, faults and noise",
     "check": "examine a plant and a recording before any fit",
+    "monitor": "follow a recording: alarms, faults with their onset and size, recoveries",
+    "diagnosability": "what an experiment can tell: which faults show, which can be told apart",
     "report": "make one HTML page of one or more logs",
     "inspect": "what a log is about, whether it is sound, and its messages for other tools",
     "replay": "run a logged estimation again and compare, or try what another choice gives",

@@ -56,6 +56,12 @@ class Screen:
             sys.stdout.write(orjson.dumps(data, option=options).decode() + "\n")
             sys.stdout.flush()
 
+    def line(self, text: str) -> None:
+        """A line of JSON at once, for results that come one by one; only where JSON was asked for."""
+        if self.json:
+            sys.stdout.write(text + "\n")
+            sys.stdout.flush()
+
     def note(self, text: str) -> None:
         """A line of progress."""
         if not self.quiet:

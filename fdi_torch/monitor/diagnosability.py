@@ -170,7 +170,8 @@ def _reason(plant: PlantDescription, members: Sequence[str]) -> str:
     components = [plant.component(place) for place in places]
     sources = {c.source for c in components if isinstance(c, Pipe) and c.is_outlet}
     tanks = {c.name for c in components if isinstance(c, Tank)}
-    if sources and len(sources | tanks) == 1:
+    holes = [c for c in components if isinstance(c, Tank) or (isinstance(c, Pipe) and c.is_outlet)]
+    if sources and len(holes) == len(components) and len(sources | tanks) == 1:
         return f"they act through the same sqrt(2 g h) of {next(iter(sources))}, so that only their sum is seen"
     return "their signatures are the same under these inputs; other inputs or sensors may separate them"
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fdi_torch.monitor.gain import Gain, linearised, spectral_radius
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.stepper import LONGEST_STEP, PlantState, Stepper
+from fdi_torch.monitor.stepper import LONGEST_STEP, Move, PlantState, Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 
@@ -50,6 +50,7 @@ class Observer:
     ) -> None:
         self.stepper, self.gain = Stepper(network, longest_step), gain
         self.values = bound(network, space, theta)
+        self._moves: dict[torch.Size, Move | None] = {}
         self._expect_shape(network)
 
     def start(self, samples: Samples, levels: Tensor | None = None) -> PlantState:
@@ -85,7 +86,7 @@ class Observer:
 
     def resume(self, samples: Samples, state: PlantState, number: int) -> Observation:
         """From the state after the first sample: what is seen at the others. number: samples seen so far."""
-        move = self.stepper.recorded(state.levels, samples.input_at(0), self.values)
+        move = self._recorded(state.levels, samples.input_at(0))
         times = samples.time.tolist()
         seen, residuals, inflation = [], [], []
         for k in range(1, len(samples)):
@@ -123,6 +124,11 @@ class Observer:
                 f"{float(radius[worst]):.3g} a sample at {at:g} s; lower the gain or let it be designed"
             )
         return float(radius[worst])
+
+    def _recorded(self, levels: Tensor, inputs: Tensor) -> Move | None:
+        if levels.shape not in self._moves:
+            self._moves[levels.shape] = self.stepper.recorded(levels, inputs, self.values)
+        return self._moves[levels.shape]
 
     def _lanes(self, samples: Samples) -> torch.Size:
         """Recordings, lanes of parameters and lanes of gains side by side."""

@@ -80,7 +80,9 @@ class MonitorState:
 
 
 class Monitor:
-    """Follows one plant. faults: the parameters of `space` that may change. State in, state out: `advance`."""
+    """Follows one plant. The first `watched` parameters of `space` (all by default) may change, the others are only
+    believed. State in, state out: `advance`.
+    """
 
     def __init__(
         self,
@@ -90,11 +92,14 @@ class Monitor:
         detector: Detector,
         settings: MonitorSettings | None = None,
         longest_step: float = LONGEST_STEP,
+        watched: int | None = None,
     ) -> None:
         if not len(space):
             raise ValueError("expected at least one fault to watch for, got none; name some")
         self.network, self.space, self.noise, self.detector = network, space, noise, detector
         self.settings, self.longest_step = settings or MonitorSettings(), longest_step
+        self.watched = len(space) if watched is None else watched
+        self._latest: tuple[Tensor, Observer] | None = None
         self._changed = ChangedObserver(network, space, noise.gain, noise.whitening, longest_step)
 
     def start(self, samples: Samples, believed: Tensor | None = None, levels: Tensor | None = None) -> MonitorState:
@@ -234,7 +239,7 @@ class Monitor:
         predicted = self._predicted(state, first, believed)
         if only:
             return refit(self._changed, window, predicted, believed, only)[0], ()
-        columns = list(range(len(self.space)))
+        columns = list(range(self.watched))
         found = isolate(
             self._changed, window, predicted, believed, columns, self.settings.incipient, self.settings.together
         )
@@ -308,7 +313,11 @@ class Monitor:
         return tuple(self.space.names[c] for c in finding.hypothesis.columns)
 
     def _observer(self, believed: Tensor) -> Observer:
-        return Observer(self.network, self.noise.gain, self.space, believed, self.longest_step)
+        """The same one as long as the belief is the same, since its recorded step is worth keeping."""
+        if self._latest is None or not torch.equal(self._latest[0], believed):
+            fresh = Observer(self.network, self.noise.gain, self.space, believed, self.longest_step)
+            self._latest = (believed, fresh)
+        return self._latest[1]
 
     def _afresh(self, first: Samples, believed: Tensor, levels: Tensor | None) -> MonitorState:
         """The observer from one sample on, its levels from the readings."""

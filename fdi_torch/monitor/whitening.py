@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 HIGHEST_ORDER = 8
-FEWEST_SAMPLES = 100
+FEWEST_SAMPLES = 40
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,8 @@ def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> li
             f"expected residuals that vary, got none in channel {int(flat.nonzero()[0]) + 1}: no noise can be learnt "
             "from it; give a recording with measurement noise"
         )
+    # An order needs ten samples for each of its coefficients.
+    highest_order = min(highest_order, int(known.sum()) // (10 * residual.shape[1]))
     fits = [_fit(residual, order, highest_order, mean) for order in range(highest_order + 1) for mean in (False, True)]
     return sorted(fits, key=lambda fit: fit[0])
 

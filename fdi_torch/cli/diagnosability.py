@@ -1,0 +1,91 @@
+"""What an experiment can tell: which faults show, which can be told apart, how small they may be."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.plant import load_plant
+from fdi_torch.config.recordings import RecordingConfig, read_recording
+from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
+from fdi_torch.monitor.prepare import usual_faults
+from fdi_torch.parameters import parse_quantity
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
+    parser.add_argument("--faults", metavar="NAME,NAME", help="such as T1.leak.size; by default the usual ones")
+    parser.add_argument(
+        "--input",
+        metavar="FILE|AMOUNTS",
+        required=True,
+        help="a recording whose inputs are used, or constant inputs such as '50 cm^3/s,50 cm^3/s'",
+    )
+    parser.add_argument("--duration", metavar="SECONDS", type=float, default=1000.0, help="of constant inputs")
+    parser.add_argument("--noise", metavar="AMOUNT", default="1 mm", help="standard deviation of every reading")
+    parser.add_argument("--false-alarm", metavar="RATE", type=float, default=0.001)
+    parser.add_argument("--miss", metavar="RATE", type=float, default=0.05)
+    parser.add_argument("--calibrate", metavar="NAME,NAME", default="", help="constants uncertain by their tolerance")
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    plant = load_plant(arguments.plant)
+    faults = arguments.faults.split(",") if arguments.faults else usual_faults(plant)
+    noise = [parse_quantity(arguments.noise, sensor.unit) for sensor in plant.sensors]
+    recording, constant = _inputs(arguments, plant)
+    found = diagnosability(
+        plant,
+        faults,
+        recording,
+        torch.tensor(noise, dtype=torch.float64),
+        calibrate=[name for name in arguments.calibrate.split(",") if name],
+        start="equilibrium" if constant else "free",
+        false_alarm=arguments.false_alarm,
+        miss=arguments.miss,
+    )
+    _show(found, screen)
+    screen.result({"format": "fdi_torch.diagnosability/1", **found.to_dict()})
+    return 0
+
+
+def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Recording, bool]:
+    if Path(arguments.input).exists():
+        return read_recording(RecordingConfig(file=arguments.input), plant, Path.cwd()), False
+    units = plant.channel_units()
+    amounts = arguments.input.split(",")
+    if len(amounts) != len(units):
+        wanted = ", ".join(f"{name} in {unit}" for name, unit in units.items())
+        raise ValueError(f"--input: expected a file or {len(units)} amounts ({wanted}), got '{arguments.input}'")
+    values = [parse_quantity(text.strip(), unit) for text, unit in zip(amounts, units.values(), strict=True)]
+    time = torch.arange(0.0, arguments.duration + 0.5, dtype=torch.float64)
+    inputs = torch.tensor(values, dtype=torch.float64).expand(len(time), len(values))
+    columns = tuple(sensor.column for sensor in plant.sensors)
+    readings = time.new_zeros(len(time), len(columns))
+    sensor_units = tuple(sensor.unit for sensor in plant.sensors)
+    return Recording(time, inputs, readings, plant.channels(), columns, tuple(units.values()), sensor_units), True
+
+
+def _show(found: Diagnosability, screen: Screen) -> None:
+    screen.say(f"{found.rank} of {len(found.faults)} faults (or combinations) are determined together")
+    header = ("fault", "unit", "std, all together", "by correlation", "smallest detectable", "smallest isolable")
+    columns = (found.std, found.std_by_correlation, found.smallest_detectable, found.smallest_isolable)
+    rows = [
+        [name, unit or "1", *(f"{value:.3g}" for value in numbers)]
+        for name, unit, *numbers in zip(found.faults, found.units, *columns, strict=True)
+    ]
+    screen.table("", header, rows, left=2)
+    screen.say()
+    shows = [[name, *(f"{v:.3g}" for v in row)] for name, row in zip(found.faults, found.shows, strict=True)]
+    screen.table("how a unit of each fault shows, in noise levels", ("fault", *found.sensors), shows)
+    screen.say()
+    apart = [[str(i + 1), name, *(f"{v:.2g}" for v in row)] for i, (name, row) in
+             enumerate(zip(found.faults, found.apart, strict=True))]  # fmt: skip
+    numbers = tuple(str(i + 1) for i in range(len(found.faults)))
+    screen.table("how far signatures lie apart (sine of the angle; 0: one and the same)", ("", "fault", *numbers), apart, 2)
+    for sentence in (*found.groups, *found.remarks):
+        screen.say(f"- {sentence}")

@@ -1,0 +1,72 @@
+"""Monitor files: the plant, the recording to follow, its fault-free part, the faults to watch for and how."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+
+from fdi_torch.config.files import find_file, read_extended, with_overrides
+from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.problems import explain
+from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.strict import Seconds, Strict
+from fdi_torch.monitor.online import MonitorSettings
+from fdi_torch.plant.description import PlantDescription
+
+
+class WindowConfig(Strict):
+    lookback: Seconds = Field(300.0, description="how far before an alarm a change is sought, s")
+    confirm: Seconds = Field(60.0, description="how long after an alarm the faults are told apart, s")
+    longest: Seconds = Field(1000.0, description="no window reaches further back, s")
+    incipient: bool = Field(True, description="whether faults may also grow slowly")
+    together: int = Field(2, ge=1, description="how many faults may come at once")
+
+    def settings(self) -> MonitorSettings:
+        return MonitorSettings(
+            lookback=self.lookback,
+            confirm=self.confirm,
+            longest=self.longest,
+            incipient=self.incipient,
+            together=self.together,
+        )
+
+
+class MonitorConfig(Strict):
+    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+    recording: RecordingConfig = Field(description="what is followed")
+    fault_free: tuple[Seconds, Seconds] = Field(description="the part of it that noise is learnt from, s")
+    calibrate: list[str] = Field(default_factory=list, description="constants fitted to the fault-free part first")
+    faults: list[str] = Field(default_factory=list, description="parameters that may change; by default the usual ones")
+    ranges: dict[str, tuple[float, float]] = Field(
+        default_factory=dict, description="of faults whose usual range does not suit, SI"
+    )
+    detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="what raises alarms")
+    false_alarms_every: Seconds = Field(20000.0, description="mean time between false alarms, s")
+    window: WindowConfig = Field(default_factory=WindowConfig)
+    step: Seconds = Field(1.0, description="longest integration step, s")
+    seed: int = Field(0, ge=0, description="of the simulation that sets the threshold of the GLR")
+
+
+@dataclass(frozen=True)
+class MonitorRun:
+    """A monitor file understood. base: where its paths start."""
+
+    config: MonitorConfig
+    plant: PlantDescription
+    base: Path
+
+
+def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:
+    """A monitor file with some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
+    file = find_file(str(path), Path.cwd())
+    try:
+        config = MonitorConfig.model_validate(dict(with_overrides(read_extended(file), overrides)))
+    except ValidationError as error:
+        raise explain(error, str(file)) from None
+    plant = config.plant
+    known = build_plant(plant, str(file)) if isinstance(plant, dict) else load_plant(plant, file.parent)
+    return MonitorRun(config, known, file.parent)
