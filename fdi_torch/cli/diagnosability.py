@@ -86,6 +86,8 @@ def _show(found: Diagnosability, screen: Screen) -> None:
     apart = [[str(i + 1), name, *(f"{v:.2g}" for v in row)] for i, (name, row) in
              enumerate(zip(found.faults, found.apart, strict=True))]  # fmt: skip
     numbers = tuple(str(i + 1) for i in range(len(found.faults)))
-    screen.table("how far signatures lie apart (sine of the angle; 0: one and the same)", ("", "fault", *numbers), apart, 2)
+    screen.table(
+        "how far signatures lie apart (sine of the angle; 0: one and the same)", ("", "fault", *numbers), apart, 2
+    )
     for sentence in (*found.groups, *found.remarks):
         screen.say(f"- {sentence}")

@@ -1,0 +1,285 @@
+"""The monitor on simulated changes of known size and moment, on troubled clocks, and on a real leak."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from fdi_torch.cli import main
+from fdi_torch.config.monitor import load_monitor
+from fdi_torch.config.plant import load_plant
+from fdi_torch.config.recordings import read_recording
+from fdi_torch.effects import build_network, place
+from fdi_torch.monitor.change import ChangedObserver
+from fdi_torch.monitor.detection import make_detector
+from fdi_torch.monitor.events import Event
+from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.noise import Noise, learn_noise
+from fdi_torch.monitor.observer import bound
+from fdi_torch.monitor.online import Monitor, MonitorSettings, MonitorState, continuous
+from fdi_torch.monitor.prepare import fault_free_part, prepare, usual_faults
+from fdi_torch.monitor.samples import Samples, take
+from fdi_torch.monitor.stepper import Stepper
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.simulate.equilibrium import equilibrium
+
+PLANT = load_plant("three_tank")
+PLACES = [("leak", "T1"), ("leak", "T3"), ("plugging", "P13"), ("pump_gain", "Q2"), ("sensor_bias", "h3")]
+NETWORK = build_network(PLANT, [place(*p) for p in PLACES])
+NAMES = ["T1.leak.size", "T3.leak.size", "P13.plugging.size", "Q2.pump_gain.factor", "h3.sensor_bias.bias"]
+SPACE = ParameterSpace([NETWORK.constants[name] for name in NAMES])
+INPUTS = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
+REST = equilibrium(NETWORK, INPUTS)
+STD = 1e-3
+Truth = Callable[[float], Tensor]
+
+
+def recorded(
+    truth: Truth, samples: int, network=NETWORK, space: ParameterSpace = SPACE, std: Tensor | float = STD, seed: int = 0
+) -> Samples:  # type: ignore[no-untyped-def]
+    """One run whose parameters follow `truth` (s -> values of the space)."""
+    stepper, generator = Stepper(network), torch.Generator().manual_seed(seed)
+    state = stepper.start(REST, INPUTS, bound(network, None, None))
+    readings: list[Tensor] = []
+    theta, values, move = None, bound(network, None, None), None
+    for k in range(samples):
+        if theta is None or not torch.equal(theta, truth(k - 0.5)):
+            theta = truth(k - 0.5)
+            values = bound(network, space, theta)
+            move = stepper.recorded(state.levels, INPUTS, values)
+        if k:
+            state = stepper.advance(state, lambda share: INPUTS, k - 1.0, 1.0, values, move)
+        readings.append(stepper.read(state, float(k), 1.0, values)[0])
+    clean = torch.stack(readings)
+    noisy = clean + std * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
+    return Samples(torch.arange(samples, dtype=torch.float64), INPUTS.expand(samples, 2), noisy)
+
+
+def step_to(name: str, size: float, at: float, until: float = 1e9) -> Truth:
+    def truth(time: float) -> Tensor:
+        return SPACE.vector({name: size} if at <= time < until else {})
+
+    return truth
+
+
+@lru_cache
+def noise() -> Noise:
+    return learn_noise(NETWORK, recorded(lambda t: SPACE.nominal(), 600, seed=99), SPACE, SPACE.nominal())[0]
+
+
+def monitor(**settings: float) -> Monitor:
+    detector = make_detector("cusum", 20000.0, 1.0, 3, torch.Generator().manual_seed(0))
+    chosen = {"lookback": 120.0, "confirm": 40.0, "longest": 400.0, "incipient": False, "together": 1} | settings
+    return Monitor(NETWORK, SPACE, noise(), detector, MonitorSettings(**chosen))  # type: ignore[arg-type]
+
+
+def followed(watch: Monitor, samples: Samples, chunk: int = 20) -> tuple[MonitorState, list[Event]]:
+    state, events = watch.start(samples), []
+    for first in range(1, len(samples), chunk):
+        state, news = watch.advance(state, samples.stretch(first, min(first + chunk, len(samples))))
+        events += news
+    return state, events
+
+
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("T3.leak.size", 0.05),
+        pytest.param("Q2.pump_gain.factor", 0.9, marks=pytest.mark.slow),
+        pytest.param("h3.sensor_bias.bias", 4e-3, marks=pytest.mark.slow),
+    ],
+)
+def test_a_fault_is_alarmed_named_and_sized_with_its_onset(name: str, size: float) -> None:
+    _, events = followed(monitor(), recorded(step_to(name, size, 200.0), 320))
+    assert [event.kind for event in events][:2] == ["alarm", "isolated"]
+    assert 200.0 <= events[0].time < 240.0
+    found = events[1]
+    assert found.faults == (name,)
+    assert found.onset is not None and found.onset_std is not None
+    assert abs(found.sizes[0] - size) < 4 * found.stds[0]
+    assert abs(found.onset - 199.5) < 0.5 + 4 * found.onset_std
+
+
+@pytest.mark.slow
+def test_a_fault_that_goes_away_is_recovered() -> None:
+    _, events = followed(monitor(), recorded(step_to("T1.leak.size", 0.1, 150.0, 330.0), 460))
+    kinds = [event.kind for event in events]
+    assert kinds[:2] == ["alarm", "isolated"] and kinds.count("alarm") == 2
+    last = next(event for event in events if event.kind == "recovered")
+    assert last.faults == ("T1.leak.size",) and last.onset is not None and abs(last.onset - 329.5) < 3.0
+
+
+@pytest.mark.slow
+def test_a_slowly_growing_fault_is_told_from_a_sudden_one() -> None:
+    def truth(time: float) -> Tensor:
+        return SPACE.vector({"h3.sensor_bias.bias": 1e-4 * max(time - 100.0, 0.0)})
+
+    samples = recorded(truth, 260)
+    watch = ChangedObserver(NETWORK, SPACE, noise().gain, noise().whitening)
+    best = isolate(watch, samples, REST, SPACE.nominal(), range(5), incipient=True, deepest=1)[0]
+    assert best.hypothesis.columns == (4,) and best.hypothesis.incipient
+    assert float(best.value[4]) == pytest.approx(1e-4 * 159.0, rel=0.05)
+    assert abs(best.onset - 100.0) < 10.0
+
+
+@pytest.mark.slow
+def test_two_faults_at_once_are_found_together() -> None:
+    def truth(time: float) -> Tensor:
+        return SPACE.vector({"T1.leak.size": 0.05, "h3.sensor_bias.bias": 0.01} if time > 100.0 else {})
+
+    watch = ChangedObserver(NETWORK, SPACE, noise().gain, noise().whitening)
+    best = isolate(watch, recorded(truth, 260), REST, SPACE.nominal(), range(5), incipient=False, deepest=2)[0]
+    assert best.hypothesis.columns == (0, 4)
+    for column, size in ((0, 0.05), (4, 0.01)):
+        assert abs(float(best.value[column]) - size) < 4 * float(best.std[column])
+
+
+@pytest.mark.slow
+def test_standard_errors_are_those_of_repeated_runs() -> None:
+    watch = ChangedObserver(NETWORK, SPACE, noise().gain, noise().whitening)
+    pulls = []
+    for seed in range(8):
+        samples = recorded(step_to("T3.leak.size", 0.05, 60.0), 140, seed=seed)
+        best = isolate(watch, samples, REST, SPACE.nominal(), [1], incipient=False, deepest=1)[0]
+        pulls.append((float(best.value[1]) - 0.05) / float(best.std[1]))
+    assert 0.5 < float(torch.tensor(pulls).square().mean().sqrt()) < 1.7  # 8 runs: 95 % within 0.5 to 1.5
+
+
+@pytest.mark.slow
+def test_a_run_without_fault_says_nothing() -> None:
+    _, events = followed(monitor(), recorded(lambda t: SPACE.nominal(), 500, seed=5))
+    assert events == []
+
+
+def test_gaps_jumps_bursts_and_unknown_inputs_are_told_and_survived() -> None:
+    samples = recorded(lambda t: SPACE.nominal(), 300, seed=6)
+    time, inputs = samples.time.clone(), samples.inputs.clone()
+    time[100:] += 50.0
+    time[200:] -= 500.0
+    inputs[250:255] = torch.nan
+    state, events = followed(monitor(), replace(samples, time=time, inputs=inputs))
+    assert [event.kind for event in events] == ["notice"] * 3
+    assert "no samples for 51 s" in events[0].text
+    assert "the clock jumps back by 499 s" in events[1].text
+    assert "an input is unknown" in events[2].text
+    assert float(state.samples.time[-1]) == float(time[-1])
+
+
+def test_a_sample_that_comes_twice_is_taken_once() -> None:
+    samples = recorded(lambda t: SPACE.nominal(), 6)
+    twice = Samples(samples.time[[1, 1, 2]], samples.inputs[:3], samples.readings[[1, 1, 2]])
+    [(kept, notice)] = continuous(samples.stretch(0, 1), twice)
+    assert kept.time.tolist() == [1.0, 2.0] and notice == ""
+
+
+@pytest.mark.slow
+def test_what_is_seen_does_not_depend_on_how_samples_come() -> None:
+    samples = recorded(step_to("T3.leak.size", 0.05, 100.0), 180)
+    _, few = followed(monitor(), samples, 10)
+    _, single = followed(monitor(), samples, 5)
+    assert [e.kind for e in few][:2] == [e.kind for e in single][:2]
+    assert few[0].time == single[0].time and few[1].faults == single[1].faults
+
+
+def test_an_event_is_one_line_and_plain_values() -> None:
+    event = Event(12.0, "alarm", "the residual leaves its fault-free range")
+    assert "\n" not in event.line and "12.0 s" in event.line
+    assert json.loads(json.dumps(event.to_dict()))["faults"] == []
+
+
+def test_misuse_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one fault to watch for"):
+        Monitor(NETWORK, ParameterSpace(), noise(), monitor().detector)
+    with pytest.raises(ValueError, match="lookback > 0"):
+        MonitorSettings(lookback=0.0)
+    lagging = build_network(PLANT, [place("pump_lag", "Q1")])
+    with pytest.raises(ValueError, match="expected faults without memory, got Q1"):
+        ChangedObserver(lagging, SPACE, noise().gain, noise().whitening)
+
+
+def test_usual_faults_are_one_of_each_component() -> None:
+    assert len(usual_faults(PLANT)) == 3 + 3 + 2 + 3
+
+
+DATA = Path(os.environ.get("FDI_TORCH_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
+LEAK = Path(__file__).parents[1] / "configs" / "monitor" / "three_tank_leak.yaml"
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not (DATA / "three_tank_leak").is_dir(), reason="the recordings are not here")
+def test_the_real_leak_opens_at_61_s_and_loses_what_was_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FDI_TORCH_DATA", str(DATA))
+    wanted = load_monitor(LEAK)
+    recording = read_recording(wanted.config.recording, wanted.plant, wanted.base)
+    c = wanted.config
+    ready = prepare(
+        wanted.plant, fault_free_part(recording, *c.fault_free), c.faults, c.calibrate, c.detector,
+        c.false_alarms_every, c.window.settings(), c.step, c.seed, c.recording.start_levels, c.ranges,
+    )  # fmt: skip
+    samples = take(recording, wanted.plant)
+    state, events = ready.monitor.start(samples, ready.believed), []
+    for first in range(1, len(samples), 10):
+        state, news = ready.monitor.advance(state, samples.stretch(first, first + 10))
+        events += news
+    assert [e.time for e in events if e.kind == "alarm"] == [63.0]
+    assert all(e.faults == ("T2.leak.size",) for e in events if e.kind != "alarm")
+    assert all(abs((e.onset or 0.0) - 61.0) < 2.0 for e in events if e.kind != "alarm")
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not (DATA / "three_tank_leak").is_dir(), reason="the recordings are not here")
+def test_the_command_prints_one_line_of_json_an_event(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FDI_TORCH_DATA", str(DATA))
+    assert main(["monitor", "--config", str(LEAK), "--json", "--quiet", "--set", "recording.stop=90 s"]) == 0
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [e["kind"] for e in events] == ["alarm", "isolated"]
+    assert all(e["format"] == "fdi_torch.event/1" for e in events)
+
+
+def test_the_report_prints_the_inseparable_pair(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["diagnosability", "--plant", "three_tank", "--input", "50 cm^3/s,50 cm^3/s", "--duration", "200"]
+    assert main([*words, "--faults", "T2.leak.size,OUT2.plugging.size,T1.leak.size"]) == 0
+    assert "the same sqrt(2 g h) of T2" in capsys.readouterr().out
+    assert main(["diagnosability", "--plant", "three_tank", "--input", "50 cm^3/s"]) == 2
+
+
+@pytest.mark.slow
+def test_figures_6_and_7() -> None:
+    """Faults at 1000 s and 2000 s, SNR 50: both alarms, none before, every parameter within 3 standard errors."""
+    places = [("leak", "T1"), ("net_outlet", "OUT2"), ("leak", "T3"), ("openness", "P13"), ("openness", "P32")]
+    network = build_network(PLANT, [place(*p) for p in places])
+    space = ParameterSpace([network.constants[f"{at}.{effect}.size"] for effect, at in places])
+    first = torch.tensor([0.1, 0.6, 0.0, 1.0, 1.0], dtype=torch.float64)
+    second = torch.tensor([0.3, 0.3, 0.5, 0.6, 1.0], dtype=torch.float64)
+
+    def truth(time: float) -> Tensor:
+        return space.nominal() if time < 1000.0 else first if time < 2000.0 else second
+
+    clean = recorded(truth, 3001, network, space, 0.0).readings
+    std = clean.std(0) * 10**-2.5
+    samples = recorded(truth, 3001, network, space, std, seed=2)
+    free = Samples(
+        samples.time[:1000],
+        samples.inputs[:1000],
+        REST + std * torch.randn(1000, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64),
+    )
+    learnt, _ = learn_noise(network, free, space, space.nominal())
+    detector = make_detector("cusum", 20000.0, 1.0, 3, torch.Generator().manual_seed(0))
+    watch = Monitor(network, space, learnt, detector, MonitorSettings(lookback=200.0, together=4, incipient=False))
+    _, events = followed(watch, samples, 50)
+    alarms = [event.time for event in events if event.kind == "alarm"]
+    assert len(alarms) == 2 and 1000 < alarms[0] < 1010 and 2000 < alarms[1] < 2010
+    ends = [[e for e in events if e.sizes and e.time <= end][-1] for end in (2000.0, 3000.0)]
+    for event, expected in zip(ends, (first, second), strict=True):
+        for name, size, std_error in zip(event.faults, event.sizes, event.stds, strict=True):
+            assert abs(size - float(expected[space.index(name)])) < 3 * std_error, (name, size, std_error)
