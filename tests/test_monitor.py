@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -209,14 +208,14 @@ def test_usual_faults_are_one_of_each_component() -> None:
     assert len(usual_faults(PLANT)) == 3 + 3 + 2 + 3
 
 
-DATA = Path(os.environ.get("FDI_TORCH_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
 LEAK = Path(__file__).parents[1] / "configs" / "monitor" / "three_tank_leak.yaml"
 
 
 @pytest.mark.data
-@pytest.mark.skipif(not (DATA / "three_tank_leak").is_dir(), reason="the recordings are not here")
-def test_the_real_leak_opens_at_61_s_and_loses_what_was_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FDI_TORCH_DATA", str(DATA))
+def test_the_real_leak_opens_at_61_s_and_nothing_else_is_found(
+    monkeypatch: pytest.MonkeyPatch, real_data: Path
+) -> None:
+    monkeypatch.setenv("FDI_TORCH_DATA", str(real_data))
     wanted = load_monitor(LEAK)
     recording = read_recording(wanted.config.recording, wanted.plant, wanted.base)
     c = wanted.config
@@ -235,11 +234,10 @@ def test_the_real_leak_opens_at_61_s_and_loses_what_was_counted(monkeypatch: pyt
 
 
 @pytest.mark.data
-@pytest.mark.skipif(not (DATA / "three_tank_leak").is_dir(), reason="the recordings are not here")
 def test_the_command_prints_one_line_of_json_an_event(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], real_data: Path
 ) -> None:
-    monkeypatch.setenv("FDI_TORCH_DATA", str(DATA))
+    monkeypatch.setenv("FDI_TORCH_DATA", str(real_data))
     assert main(["monitor", "--config", str(LEAK), "--json", "--quiet", "--set", "recording.stop=90 s"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [e["kind"] for e in events] == ["alarm", "isolated"]
