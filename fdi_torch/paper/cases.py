@@ -58,7 +58,7 @@ def solve(run: Run) -> Case:
         raise ValueError(
             f"{run.source}: expected the parameters {', '.join(PARAMETERS)}, got {', '.join(space.names)}; name these"
         )
-    fitting = fitting_of(run, space, recordings_of(run), torch.device("cpu"))
+    fitting = fitting_of(run, space, recordings_of(run))
     assert run.config.simulate is not None
     settings = hybrid_settings(run.config.estimate)
     truth = space.vector(simulated_truth(run))
