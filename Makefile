@@ -5,6 +5,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
+COMPILER := $(shell command -v g++ || command -v c++ || command -v clang++)
+comma := ,
+EXTRAS := test$(if $(COMPILER),,$(comma)compiler)
 
 .PHONY: run test slow lint paper clean
 
@@ -27,7 +30,8 @@ paper: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	$(if $(COMPILER),,$(BIN)/python -c 'from fdi_torch.simulate.build import warm_up; warm_up()')
 	touch $@
 
 clean:

@@ -351,9 +351,10 @@ def test_without_a_compiler_auto_falls_back_and_says_so(tmp_path, monkeypatch: p
     network, space = rig()
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(build, "_packaged_compiler", lambda: None)
     engine = make_engine(network, space, experiment())
     assert engine.name == "traced" and "expected a C++ compiler" in engine.why
-    with pytest.raises(BuildError, match="install g\\+\\+ or set CXX"):
+    with pytest.raises(BuildError, match="or set CXX"):
         make_engine(network, space, experiment(), "compiled")
 
 

@@ -51,7 +51,7 @@ def show(done: TrainResult, screen: Screen) -> None:
     rho = ", ".join(f"{float(r):.6f}" for r in done.result.correlation)
     steps = done.result.steps
     screen.say(f"correlation of each sensor: {rho} (sum {float(done.result.correlation.sum()):.6f})")
-    screen.say(f"steps: search {steps[0]:g} s, refinement {steps[1]:g} s; engine: {done.result.engine}")
+    screen.say(f"steps: search {steps[0]:g} s, refinement {steps[1]:g} s; {done.result.engine}")
     screen.say(f"confidence of the whole statement: {100 * diagnosis.confidence:g} %")
     screen.say(f"log: {done.log}")
     for picture in done.pictures:

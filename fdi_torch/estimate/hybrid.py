@@ -236,5 +236,5 @@ def conclude(
         correlation=fitting.problem(steps[1], "likelihood").correlations(theta.unsqueeze(1), lanes)[0, 0],
         predicted=tuple(predicted),
         steps=steps,
-        engine=problem.terms[0].engine.name,
+        engine=problem.terms[0].engine.why or problem.terms[0].engine.name,
     )
