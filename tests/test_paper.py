@@ -80,6 +80,10 @@ def test_a_row_of_table_2_holds_errors_of_paper_search_and_refinement() -> None:
     assert len(rows) == 5 and {len(row) for row in rows} == {len(header)}
 
 
+def test_errors_below_rounding_are_said_to_be_so() -> None:
+    assert [tables.error(e, "+") for e in (0.0, -9e-8, 2e-7)] == ["< 1e-07", "< 1e-07", "+2.0e-07"]
+
+
 def test_a_row_of_table_3_scores_the_free_estimate_by_the_bound() -> None:
     header, _, *rows = cells(tables.table_3([case("table3_snr40", 40.0)], TABLE_3))
     assert rows[0][0] == "40 dB"

@@ -101,8 +101,8 @@ def text_of(results: Results) -> str:
     searched = max(float((c.searched - c.truth).abs().max()) for c in results.table_2)
     right = float(results.modes.right.double().mean())
     return PAGE.format(
-        worst=f"{worst:.1e}",
-        searched=f"{searched:.1e}",
+        worst=tables.error(worst),
+        searched=tables.error(searched),
         table_2=tables.table_2(results.table_2, TABLE_2),
         correlations_2=tables.correlations(results.table_2),
         table_3=tables.table_3(results.table_3, TABLE_3),
@@ -144,7 +144,7 @@ own; *bound* is the Cramér-Rao bound at the truth, the least that any unbiased 
 
 ## Table 2: five faults, free of noise
 
-Largest error of the refined estimates {worst}, of the search alone {searched}. Without noise a standard error only
+Largest error of the refined estimates: {worst}; of the search alone: {searched}. Without noise a standard error only
 reflects integration and rounding errors; the bound says what noise of 50 dB would cost. The search takes steps of 1 s;
 where the faults bring tanks 2 and 3 to nearly equal levels (3- to 5-dim), that step's error is what is left of its own.
 

@@ -13,6 +13,7 @@ from fdi_torch.paper.online import OnLine
 from fdi_torch.paper.published import SYMBOLS
 
 MISPRINT = "misprint"
+ROUNDING = 1e-7
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
@@ -128,6 +129,11 @@ def errata() -> str:
     return markdown(("where", "what is wrong", "what is built"), ERRATA, 3)
 
 
+def error(value: float | Tensor, sign: str = "") -> str:
+    """Two digits; what is below rounding is said to be so, for its digits are another machine's already."""
+    return f"< {ROUNDING:g}" if abs(float(value)) < ROUNDING else f"{float(value):{sign}.1e}"
+
+
 def fixed(value: float | Tensor) -> str:
     return f"{float(value):.6f}"
 
@@ -153,9 +159,9 @@ def _rows(case: Case, published: Sequence[float | None], first: str) -> list[lis
                 MISPRINT if theirs is None else fixed(theirs),
                 fixed(case.searched[i]),
                 fixed(case.refined[i]),
-                *("–" if e is None else f"{e:+.1e}" for e in errors),
-                f"{float(case.std[i]):.1e}",
-                f"{float(case.bound[i]):.1e}",
+                *("–" if e is None else error(e, "+") for e in errors),
+                error(case.std[i]),
+                error(case.bound[i]),
             ]
         )
     return rows
