@@ -103,17 +103,19 @@ GAP_ANSWER: dict[str, Any] = {
     },
     "shape": {
         "location": "Q1",
-        "variable": "command",
-        "variable_unit": "m^3/s",
-        "values": [1e-5, 2e-5, 4e-5, 8e-5],
-        "discrepancy": [-1e-6, -2e-6, 1e-6, 3e-6],
-        "discrepancy_unit": "m^3/s",
-        "std": [5e-7] * 4,
+        "tables": {
+            "free_delivery.command": {"at": [1e-5, 4e-5, 8e-5], "share": [-0.1, 0.1, 0.3], "scale": 2.7e-5},
+            "free_delivery.time": {"at": [0.0, 900.0, 1800.0], "share": [0.0, 0.1, 0.0], "scale": 2.7e-5},
+        },
     },
     "next_input": {
-        "time": [0.0, 100.0, 200.0],
-        "inputs": [{"channel": "Q1", "unit": "m^3/s", "values": [2e-5, 8e-5, 2e-5]}],
-        "text": "Steps of Q1 part lag from delay within 60 samples.",
+        "separation": 60.0,
+        "parted_after": 140.0,
+        "input": {
+            "duration": 300.0,
+            "unit": {"Q1": "m^3/s"},
+            "Q1": {"at": [0.0, 100.0, 200.0], "value": [2e-5, 8e-5, 2e-5]},
+        },
     },
     "remarks": ["Two input steps can never separate lag from delay."],
     "impostors": {"rate": 0.04, "of": "60 simulated rivals"},
@@ -135,12 +137,16 @@ def write_monitor(path: Path) -> Path:
 
 
 def write_study(path: Path) -> Path:
-    """Two settings of twenty trials."""
+    """Two settings of twenty trials that estimate two parameters."""
     rng = np.random.default_rng(3)
     with RunLog(path, "study", **FIXED) as log:
         for k, (group, spread) in enumerate((("SNR 50", 1e-3), ("SNR 30", 1e-2))):
             for n in range(20):
-                numbers = {"error": float(spread * rng.standard_normal()), "free": [0.1, 0.2]}
+                free = (np.array([0.3, 0.6]) + spread * rng.standard_normal(2)).tolist()
+                numbers = {"truth": [0.3, 0.6], "free": free, "bound": [spread, spread], "cost": float(n)}
                 log.trial(20 * k + n, numbers, group=group, seed=n, status="converged" if n else "stalled")
-            log.summary(group, 20, {"rmse": spread, "bound": [1e-3, 2e-3]})
+            scores = {
+                f"free.{name}.{score}": spread for name in ("T1.leak", "P13.openness") for score in ("bias", "rmse")
+            }
+            log.summary(group, 20, {"converged": 19.0, **scores})
     return path

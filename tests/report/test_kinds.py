@@ -48,7 +48,7 @@ def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> No
         "gap_posterior",
         "gap_closure",
         "holdout_3",
-        "gap_shape",
+        "gap_shape_2",
         "gap_by_8",
         "gap_next_input_1",
     } <= names(made)
@@ -90,8 +90,8 @@ def test_a_monitor_page_shows_residuals_thresholds_and_events(tmp_path: Path) ->
 def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
     made = report(write_study, tmp_path)
     assert headline(made.material) == "40 trials in 2 settings"
-    assert titles(made)[1:3] == ["Settings", "Trials"]
-    assert "trials_1" in names(made) and "0.001, 0.002" in page([made])
+    assert titles(made)[1:4] == ["Settings", "Errors", "Trials"]
+    assert {"trials_1", "errors_2"} <= names(made) and ">T1.leak<" in page([made])
 
 
 def test_several_runs_share_a_page(tmp_path: Path) -> None:

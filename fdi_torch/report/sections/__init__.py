@@ -15,7 +15,7 @@ from fdi_torch.report.sections.origin import configuration_section, health_secti
 from fdi_torch.report.sections.rig import rig_section
 from fdi_torch.report.sections.search import refinement_section, search_section
 from fdi_torch.report.sections.signals import fit_section, inputs_section
-from fdi_torch.report.sections.study import summary_section, trials_section
+from fdi_torch.report.sections.study import error_section, summary_section, trials_section
 
 SECTIONS: tuple[Maker, ...] = (
     rig_section,
@@ -30,6 +30,7 @@ SECTIONS: tuple[Maker, ...] = (
     event_section,
     residual_section,
     summary_section,
+    error_section,
     trials_section,
     fit_section,
     inputs_section,

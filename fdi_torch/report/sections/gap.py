@@ -1,8 +1,9 @@
 """A gap diagnosis: where the gap lies, what causes it, how far it closes, and what would tell the rivals apart.
 
 Beside the protocol's keys the answer may hold, SI:
-`shape`: location, variable, variable_unit, values (K,), discrepancy (K,), discrepancy_unit, std (K,) if known;
-`next_input`: time (S,), inputs (a list of channel, unit, values (S,)), text; `remarks`, `impostors`: texts.
+`shape`: location, tables (EFFECT.VARIABLE -> at (K,), share (K,) of scale, scale);
+`next_input`: separation, parted_after (s), input (duration, unit by channel, CHANNEL -> at (S,) in s, value (S,));
+`remarks`: texts; `impostors`: numbers by name.
 """
 
 from __future__ import annotations
@@ -91,38 +92,46 @@ def closure_section(material: Material) -> Section | None:
 
 
 def shape_section(material: Material) -> Section | None:
-    """The free-form discrepancy at the guilty place against its own variable."""
+    """The free-form discrepancy at the guilty place against its own variables."""
     shape = material.answer.get("shape")
-    if not isinstance(shape, dict) or "values" not in shape:
+    if not isinstance(shape, dict) or not shape.get("tables"):
         return None
-    x_unit, x_scale = shown_unit(str(shape.get("variable_unit", "")))
-    y_unit, y_scale = shown_unit(str(shape.get("discrepancy_unit", "")))
-    x, y = x_scale * _vector(shape["values"]), y_scale * _vector(shape["discrepancy"])
-    variable = axis(str(shape.get("variable", "variable")), x_unit)
-    lines = [("discrepancy", x, y, MARK)]
-    figure = line_panel(str(shape.get("location", "")), variable, axis("discrepancy", y_unit), lines)
-    figure.axes[0].axhline(0.0, color=SOFT, lw=0.8)
-    if shape.get("std"):
-        std = y_scale * _vector(shape["std"])
-        figure.axes[0].fill_between(x, y - 1.96 * std, y + 1.96 * std, color=MARK, alpha=0.18, lw=0)
+    pictures = []
+    for k, (name, curve) in enumerate(shape["tables"].items()):
+        variable = str(name).rpartition(".")[2]
+        unit, scale = shown_unit(_VARIABLE_UNITS.get(variable, "SI"))
+        x, y = scale * _vector(curve["at"]), _float(curve.get("scale", 1.0)) * _vector(curve["share"])
+        title = f"{shape.get('location', '')}: by {variable}"
+        figure = line_panel(title, axis(variable, unit), "discrepancy, SI", [("discrepancy", x, y, MARK)])
+        figure.axes[0].axhline(0.0, color=SOFT, lw=0.8)
+        pictures.append(Picture(f"gap_shape_{k + 1}", figure))
     words = "What has to be added at this place so that the readings are met, whatever its cause."
-    return Section("The discrepancy", [words, [Picture("gap_shape", figure)]])
+    return Section("The discrepancy", [words, pictures])
 
 
 def next_input_section(material: Material) -> Section | None:
     """The input that would part the rivals."""
     wanted = material.answer.get("next_input")
-    if not isinstance(wanted, dict) or not wanted.get("inputs"):
+    if not isinstance(wanted, dict) or not isinstance(wanted.get("input"), dict):
         return None
-    time, pictures = _vector(wanted["time"]), []
-    for k, channel in enumerate(wanted["inputs"]):
-        unit, scale = shown_unit(str(channel.get("unit", "")))
-        line = (str(channel["channel"]), time, scale * _vector(channel["values"]), MODEL)
-        figure = line_panel(str(channel["channel"]), "time, s", axis("command", unit), [line])
+    steps = {name: c for name, c in wanted["input"].items() if isinstance(c, dict) and "at" in c}
+    units, end = wanted["input"].get("unit") or {}, _float(wanted["input"].get("duration"))
+    pictures = []
+    for k, (name, channel) in enumerate(steps.items()):
+        unit, scale = shown_unit(str(units.get(name, "")))
+        time, values = _vector(channel["at"]), scale * _vector(channel["value"])
+        line = (name, np.append(time, end), np.append(values, values[-1:]), MODEL)
+        figure = line_panel(name, "time, s", axis("command", unit), [line])
         figure.axes[0].lines[0].set_drawstyle("steps-post")
         pictures.append(Picture(f"gap_next_input_{k + 1}", figure))
-    words = str(wanted.get("text", "The input within the pumps' and levels' limits that separates the rivals best."))
-    return Section("What to run next", [words, pictures])
+    words = ["The input within the limits of pumps and levels that separates the best two explanations most."]
+    when = wanted.get("parted_after")
+    words += [f"They are expected to part after {number(float(when))} s."] if isinstance(when, int | float) else []
+    return Section("What to run next", [" ".join(words), pictures])
+
+
+# SI units of the variables that a free-form discrepancy may depend on.
+_VARIABLE_UNITS = {"level": "m", "head": "m", "difference": "m", "time": "s", "period": "s"}
 
 
 def _chance(place: Mapping[str, Any]) -> str:

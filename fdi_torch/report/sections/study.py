@@ -12,22 +12,57 @@ from fdi_torch.report.html import folded, short, table
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import axis, number, percent, shown_unit
 from fdi_torch.report.section import Picture, Section
-from fdi_torch.report.style import MODEL, SOFT, panel
+from fdi_torch.report.style import MARK, MODEL, SOFT, panel
 
 TRIAL, SUMMARY = "/study/trial", "/study/summary"
-MOST_PANELS, MOST_GROUPS = 9, 40
+MOST_PANELS, MOST_GROUPS, MOST_ROWS = 9, 40, 30
+ESTIMATORS = ("free", "boxed", "correlation", "search")
 _OWN = ("t", "trial", "trials", "group", "seed", "status")
 
 
 def summary_section(material: Material) -> Section | None:
-    """One row a setting."""
-    settings = material.of(SUMMARY)
+    """One column a setting, one row a number."""
+    settings = material.of(SUMMARY)[:MOST_GROUPS]
     if not settings:
         return None
     names = list(dict.fromkeys(k for m in settings for k, v in m.items() if k not in _OWN and _shown(v) is not None))
-    header = ["setting", "trials", *(axis(name, shown_unit(material.unit(SUMMARY, name))[0]) for name in names)]
-    rows = [[str(m.get("group", "")), str(m.get("trials", "")), *_cells(material, m, names)] for m in settings]
-    return Section("Settings", [table(header, rows)])
+    header = ["", *(str(m.get("group", "")) for m in settings)]
+    rows = [["trials", *(str(m.get("trials", "")) for m in settings)]]
+    rows += [[name, *(_shown(m.get(name)) or "" for m in settings)] for name in names]
+    shown = table(header, rows)
+    return Section(
+        "Settings", [shown if len(rows) <= MOST_ROWS else folded(f"{len(rows)} numbers of each setting", shown)]
+    )
+
+
+def error_section(material: Material) -> Section | None:
+    """Size of every trial's error in each parameter, beside the bound that no unbiased estimator beats on average."""
+    trials = [m for m in material.of(TRIAL) if isinstance(m.get("truth"), list)]
+    estimator = next((name for name in ESTIMATORS if trials and name in trials[0]), None)
+    if estimator is None:
+        return None
+    groups = list(dict.fromkeys(str(m.get("group", "")) for m in trials))[:MOST_GROUPS]
+    pictures = []
+    for i, name in enumerate(_parameters(material, estimator, len(trials[0]["truth"]))[:MOST_PANELS]):
+        errors, bounds = [], []
+        for group in groups:
+            own = [m for m in trials if str(m.get("group", "")) == group]
+            errors.append(np.array([abs(float(m[estimator][i]) - float(m["truth"][i])) for m in own]))
+            bounds.append(np.median([float(m["bound"][i]) if "bound" in m else np.nan for m in own]))
+        figure = group_panel(name, "size of the error, SI", groups, errors)
+        if all(np.nanmax(e, initial=0.0) > 0 for e in errors):
+            figure.axes[0].set_yscale("log")
+        figure.axes[0].plot(range(len(groups)), bounds, "_", color=MARK, ms=22, mew=2.0)
+        pictures.append(Picture(f"errors_{i + 1}", figure))
+    words = f"Estimator: {estimator}. Each point is a trial, blue is the median, orange the Cramér-Rao bound."
+    return Section("Errors", [words, pictures])
+
+
+def _parameters(material: Material, estimator: str, count: int) -> list[str]:
+    """Names of the parameters, from the summary's ESTIMATOR.PARAMETER.rmse; their numbers where it tells none."""
+    keys = [k for m in material.of(SUMMARY)[:1] for k in m if k.startswith(f"{estimator}.") and k.endswith(".rmse")]
+    names = [key.removeprefix(f"{estimator}.").removesuffix(".rmse") for key in keys]
+    return names if len(names) == count else [f"parameter {i + 1}" for i in range(count)]
 
 
 def trials_section(material: Material) -> Section | None:
@@ -76,16 +111,6 @@ def group_panel(title: str, label: str, groups: Sequence[str], values: Sequence[
 def _column(trials: Sequence[Payload], group: str, name: str) -> np.ndarray:
     own = (m.get(name) for m in trials if str(m.get("group", "")) == group)
     return np.array([float(v) for v in own if isinstance(v, int | float)])
-
-
-def _cells(material: Material, message: Payload, names: Sequence[str]) -> list[str]:
-    cells = []
-    for name in names:
-        value = message.get(name)
-        scale = shown_unit(material.unit(SUMMARY, name))[1]
-        number_like = isinstance(value, int | float) and not isinstance(value, bool)
-        cells.append(number(scale * float(value), 4) if number_like else _shown(value) or "")  # type: ignore[arg-type]
-    return cells
 
 
 def _shown(value: Any) -> str | None:
