@@ -19,7 +19,7 @@ LAYERS = (
     {"estimate", "logbook"},
     {"report", "gap", "study", "monitor"},
     {"config"},
-    {"main_job", "study_job", "replay_job"},
+    {"main_job", "study_job", "replay_job", "gap_job"},
     {"paper"},
     {"cli", "train", "__main__", "__init__"},
 )

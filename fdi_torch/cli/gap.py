@@ -13,6 +13,7 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.config.recordings import RecordingConfig, read_recording
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap_job import log_gap
 from fdi_torch.parameters import display_unit
 
 
@@ -37,6 +38,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     with screen.progress("gap") as advance:
         answer = diagnose(plant, recording, holdout, settings, advance)
     show(answer, screen)
+    log = log_gap(Path(arguments.out), plant, recording, answer.to_dict(), holdout, vars(settings))
+    screen.say(f"log: {log}")
     screen.result(answer.to_dict())
     return DONE
 
