@@ -48,7 +48,9 @@ class _Drawing:
         self.crossings = 0
         rows = 1 + max(row for row, _ in self.places.values())
         columns = 1 + max(column for _, column in self.places.values())
-        left, right = -0.95, (columns - 1) * COLUMN + 1.1
+        longest = max((len(words) for name in plant.locations() for words in self.said(name)), default=0)
+        margin = max(1.0, 0.058 * longest)
+        left, right = -margin, (columns - 1) * COLUMN + margin
         words = 0.2 * max((len(self.said(name)) for name in plant.locations()), default=0)
         bottom, top = -(rows - 1) * ROW - 0.85 - words, TALL + 1.05 + words
         self.figure = Figure(figsize=((right - left) * INCH, (top - bottom) * INCH))
@@ -90,7 +92,10 @@ class _Drawing:
         """A component's name, and below it in colour what is wrong with it."""
         x, y = point
         step = 0.2 if va == "top" else -0.2
-        lines = [(short(name, 16), SOFT, "normal"), *((text, MARK, "bold") for text in self.said(name))]
+        marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
+        shares = self.said(name)[len(marks) :]
+        lines = [(short(name, 16), INK, "normal"), *((text, MARK, "bold") for text in marks)]
+        lines += [(text, INK, "bold") for text in shares]
         for k, (text, colour, weight) in enumerate(lines if va == "top" else reversed(lines)):
             self.axes.text(x, y - k * step, text, ha=ha, va=va, color=colour, weight=weight, fontsize=9.0, zorder=6)
 
@@ -98,7 +103,7 @@ class _Drawing:
         """A pipe along points, stressed where it is guilty."""
         x, y = np.array(points).T
         if self.overlay.heat.get(name, 0.0) > 0.0:
-            self.axes.plot(x, y, color=MARK, lw=11, alpha=0.65 * self.overlay.heat[name], solid_capstyle="round")
+            self.axes.plot(x, y, color=MARK, lw=11, alpha=strength(self.overlay.heat[name]), solid_capstyle="round")
         self.axes.plot(x, y, color=self.colour(name), lw=2.4 if name in self.overlay.marks else 1.6, zorder=2)
         if arrow:
             self.axes.add_patch(_arrow_head(points[-1], self.colour(name)))
@@ -108,7 +113,7 @@ class _Drawing:
         heat = self.overlay.heat.get(tank.name, 0.0)
         self.axes.add_patch(Rectangle((x - 0.5, y), 1.0, TALL, facecolor=PAPER, edgecolor="none", zorder=3))
         if heat > 0.0:
-            fill = Rectangle((x - 0.5, y), 1.0, TALL, facecolor=MARK, alpha=0.65 * heat, edgecolor="none", zorder=3)
+            fill = Rectangle((x - 0.5, y), 1.0, TALL, facecolor=MARK, alpha=strength(heat), edgecolor="none", zorder=3)
             self.axes.add_patch(fill)
         level = self.overlay.levels.get(tank.name, float("nan"))
         if np.isfinite(level):
@@ -133,7 +138,7 @@ class _Drawing:
         heat = self.overlay.heat.get(pump.name, 0.0)
         self.axes.add_patch(Circle(centre, radius, facecolor=PAPER, edgecolor=self.colour(pump.name), lw=1.6, zorder=4))
         if heat > 0.0:
-            self.axes.add_patch(Circle(centre, 1.6 * radius, facecolor=MARK, alpha=0.65 * heat, zorder=5))
+            self.axes.add_patch(Circle(centre, 1.6 * radius, facecolor=MARK, alpha=strength(heat), zorder=5))
         blade = [(x - 0.1, centre[1] + 0.07), (x + 0.1, centre[1] + 0.07), (x, centre[1] - 0.13)]
         self.axes.add_patch(Polygon(blade, facecolor=self.colour(pump.name), edgecolor="none", zorder=5))
         self.words(pump.name, (x, centre[1] + radius + 0.08), "center", "bottom")
@@ -144,7 +149,7 @@ class _Drawing:
         centre = (x + 0.5, y + 0.85 - 0.4 * same.index(sensor.name))
         heat = self.overlay.heat.get(sensor.name, 0.0)
         if heat > 0.0:
-            self.axes.add_patch(Circle(centre, 0.2, facecolor=MARK, alpha=0.65 * heat, zorder=6))
+            self.axes.add_patch(Circle(centre, 0.2, facecolor=MARK, alpha=strength(heat), zorder=6))
         colour = self.colour(sensor.name)
         self.axes.add_patch(Circle(centre, 0.085, facecolor=PAPER, edgecolor=colour, lw=1.6, zorder=7))
         self.words(sensor.name, (centre[0] + 0.15, centre[1] + 0.1), "left", "top")
@@ -213,8 +218,8 @@ class _Drawing:
             return
         (x, y), (to_x, to_y) = (self.corner(name) for name in pairs[location])
         points = [(x, y + 0.6), (to_x, to_y + 0.6)]
-        strength = 1.0 if location in self.overlay.marks else self.overlay.heat.get(location, 0.0)
-        self.axes.plot(*np.array(points).T, color=MARK, lw=1.8, ls="--", alpha=strength, zorder=1)
+        alpha = 1.0 if location in self.overlay.marks else strength(self.overlay.heat.get(location, 0.0))
+        self.axes.plot(*np.array(points).T, color=MARK, lw=1.8, ls="--", alpha=alpha, zorder=1)
         if location in self.overlay.marks:
             self.words(location, ((x + to_x) / 2, (y + to_y) / 2 + 1.3), "center", "top")
 
@@ -223,6 +228,11 @@ class _Drawing:
 
     def tank_height(self, name: str) -> float:
         return next(t.height for t in self.plant.tanks if t.name == name)
+
+
+def strength(share: float) -> float:
+    """How strong a share of the gap is coloured: much stronger for what closes all than for what closes most."""
+    return 0.5 * share**3
 
 
 def _middle(points: Sequence[Point]) -> Point:

@@ -21,6 +21,7 @@ from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import MARK, MODEL, SOFT
 
 MOST_BARS = 10
+LEAST_SHOWN = 1e-4  # of a probability
 STAGES = {
     "nominal": "as believed",
     "recalibrated": "recalibrated",
@@ -58,7 +59,8 @@ def causes_section(material: Material) -> Section | None:
     standing = [_explanation(causes) for causes in answer.get("ambiguity_set", [])]
     if len(standing) > 1:
         blocks += ["These explanations stand at 95 %:", tag("ul", *(tag("li", words) for words in standing))]
-    posterior = answer.get("posterior", [])[:MOST_BARS]
+    weighed = [item for item in answer.get("posterior", []) if _float(item.get("probability")) >= LEAST_SHOWN]
+    posterior = weighed[:MOST_BARS]
     if posterior:
         names = [_weighed(item) for item in posterior]
         chances = [100.0 * float(item["probability"]) for item in posterior]
