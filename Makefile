@@ -6,6 +6,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 COMPILER := $(shell command -v g++ || command -v c++ || command -v clang++)
+# One thread a worker: two of them on the same core wait for each other.
+TESTS = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(shell nproc) --dist worksteal
 comma := ,
 EXTRAS := test$(if $(COMPILER),,$(comma)compiler)
 
@@ -15,10 +17,10 @@ run: $(STAMP)
 	$(BIN)/python -m fdi_torch.train
 
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(TESTS)
 
 slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow
+	$(TESTS) -m slow
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
