@@ -186,6 +186,9 @@ def test_what_is_seen_does_not_depend_on_how_samples_come() -> None:
     _, single = followed(monitor(), samples, 5)
     assert [e.kind for e in few][:2] == [e.kind for e in single][:2]
     assert few[0].time == single[0].time and few[1].faults == single[1].faults
+    _, whole = followed(monitor(), samples, len(samples))
+    assert [e.kind for e in whole][:2] == [e.kind for e in few][:2]
+    assert whole[0].time == few[0].time and whole[1].faults == few[1].faults
 
 
 def test_an_event_is_one_line_and_plain_values() -> None:

@@ -27,6 +27,10 @@ GAP = 10.0  # sampling intervals without a sample before the observer starts afr
 RIVAL = 6.0  # difference in BIC below which another explanation stands beside the best
 
 
+# Samples between two looks of the detector, so that a long recording given at once is followed as it would have come.
+MOST_AT_ONCE = 16
+
+
 @dataclass(frozen=True)
 class MonitorSettings:
     """In seconds. lookback: how far before an alarm a change is sought. confirm: how long after an alarm the faults are
@@ -126,6 +130,7 @@ class Monitor:
         until = self._next_look(state)
         due = samples.time >= until
         count = int(due.to(torch.int8).argmax()) + 1 if bool(due.any()) else len(samples)
+        count = min(count, MOST_AT_ONCE)
         state = self._observe(state, samples.stretch(0, count))
         if state.alarm is None:
             white = self.noise.whitening(state.residual)[state.watched :]
@@ -172,7 +177,7 @@ class Monitor:
         keep_from = float(state.samples.time[-1]) - self.settings.longest - self.settings.lookback
         if state.alarm is not None:
             keep_from = min(keep_from, state.alarm - self.settings.lookback)
-        first = int((state.samples.time < keep_from).sum())
+        first = min(int((state.samples.time < keep_from).sum()), state.watched)
         if first < 0.25 * len(state.samples):
             return state
         return replace(
