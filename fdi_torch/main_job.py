@@ -249,7 +249,7 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace) -> None
     for fault in result.diagnosis.faults:
         location, _, effect = fault.name.partition(".")
         sizes = {"size": fault.value, "size_std": fault.std, "flow": fault.flow, "hole_diameter": fault.hole}
-        known = {name: number for name, number in sizes.items() if number is not None}
+        known: dict[str, Any] = {name: number for name, number in sizes.items() if number is not None}
         log.fault(effect, location, fault.present, unit=fault.unit, **known)
     several = len(result.predicted) > 1
     log.result_arrays(**{f"predicted_{k + 1}" if several else "predicted": p for k, p in enumerate(result.predicted)})
