@@ -18,11 +18,12 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.integrate import late
-from fdi_torch.simulate.memory import recur
+from fdi_torch.simulate.memory import recur, with_tangents
 from fdi_torch.simulate.scan import linear_scan
 
 
@@ -79,7 +80,8 @@ class Collocation:
         path = linear_scan(transition, forcing, first)
         corrected = levels + path[..., 0]
         slopes, defect = path[..., 1:], path[..., 0].abs().amax(dim=(-1, -2))
-        readings, jacobian = self._read_slopes(corrected, slopes, theta)
+        one = torch.eye(theta.shape[-1], dtype=theta.dtype, device=theta.device)
+        readings, jacobian = self._read_slopes(corrected, slopes, theta, one)
         return Linearised(corrected, slopes, readings, jacobian, transition, gain, defect)
 
     def settle(self, theta: Tensor, levels: Tensor, rounds: int = 12, tolerance: float = 1e-7) -> Linearised:
@@ -93,12 +95,18 @@ class Collocation:
 
     def rates(self, middle: Tensor, theta: Tensor) -> Tensor:
         """dh/dt (L, K, tanks) at given mid-step levels (L or 1, K, tanks)."""
-        return self._rates(middle, self.network.bind(self.space, theta.unsqueeze(-2)), theta.shape[:-1])
+        values = self.network.bind(self.space, theta.unsqueeze(-2))
+        signals, memory = self._commands_before(values, len(theta))
+        commands = self.network.commands(signals, memory.unbind(-1), self.clock, values)[0]
+        return self._rates(middle, commands, values, theta.shape[:-1])
 
     def read(self, levels: Tensor, theta: Tensor) -> Tensor:
         """Readings (L, S, C) of given levels (L or 1, K+1, tanks)."""
         lanes = levels.expand(theta.shape[0], *levels.shape[1:])
-        return self._read(self._at_samples(lanes), self.network.bind(self.space, theta.unsqueeze(-2)))
+        values = self.network.bind(self.space, theta.unsqueeze(-2))
+        seen, memory, _ = self._readings_before(self._at_samples(lanes), values)
+        readings, _ = self.network.read(seen, memory.unbind(-1), self._sample_clock, values)
+        return torch.stack([r.expand(seen[0].shape) for r in readings], dim=-1)
 
     def constant_guess(self, theta: Tensor) -> Tensor:
         """Levels that stay where they start (L, K+1, tanks)."""
@@ -107,13 +115,7 @@ class Collocation:
 
     def read_along(self, levels: Tensor, along: Tensor, theta: Tensor) -> Tensor:
         """How readings (L, S, C, M) change where levels (L, K+1, tanks) move `along` (L, K+1, tanks, M)."""
-        count = along.shape[-1]
-        with forward_ad.dual_level():
-            paths = levels.expand(count, *levels.shape).contiguous()
-            path = forward_ad.make_dual(paths, along.movedim(-1, 0).contiguous())
-            values = self.network.bind(self.space, theta.unsqueeze(-2))
-            _, found = forward_ad.unpack_dual(self._read(self._at_samples(path), values))
-        return found.movedim(0, -1)
+        return self._read_slopes(levels, along, theta, torch.zeros(along.shape[-1], theta.shape[-1]).to(theta))[1]
 
     def _start(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         values = self.network.bind(self.space, theta)
@@ -132,33 +134,52 @@ class Collocation:
             along_levels[i, ..., i] = 1.0
         for row, column in enumerate(moving):
             along_theta[n + row, ..., column] = 1.0
+        _, memory, memory_slopes = self._commands_before(self.network.bind(self.space, theta.unsqueeze(-2)), len(theta))
         with forward_ad.dual_level():
             dual = forward_ad.make_dual(theta.expand(count, *theta.shape).contiguous(), along_theta)
             dual_levels = forward_ad.make_dual(middle.expand(count, *middle.shape).contiguous(), along_levels)
             values = self.network.bind(self.space, dual.unsqueeze(-2))
-            rates, slopes = forward_ad.unpack_dual(self._rates(dual_levels, values, dual.shape[:-1]))
+            commands = self._dual_commands(values, memory, memory_slopes, count)
+            rates, slopes = forward_ad.unpack_dual(self._rates(dual_levels, commands, values, dual.shape[:-1]))
         by_theta = theta.new_zeros(*rates.shape[1:], theta.shape[-1])
         by_theta[..., moving] = slopes[n:].movedim(0, -1)
         return rates[0], slopes[:n].movedim(0, -1), by_theta
 
-    def _rates(self, middle: Tensor, values: PlaceValues, lanes: Sequence[int]) -> Tensor:
-        rates = self.network.rates(middle.unbind(-1), self._commands(values, lanes), self.clock, values)
+    def _rates(self, middle: Tensor, commands: list[Tensor], values: PlaceValues, lanes: Sequence[int]) -> Tensor:
+        rates = self.network.rates(middle.unbind(-1), commands, self.clock, values)
         return torch.stack([r.expand(*lanes, middle.shape[-2]) for r in rates], dim=-1)
 
-    def _commands(self, values: PlaceValues, lanes: Sequence[int]) -> list[Tensor]:
-        """What each actuator makes of its channel over each step, (*lanes, K)."""
-        e, network = self.experiment, self.network
-        delays = network.command_delays(values)
-        channels = [
+    def _channels(self, values: PlaceValues) -> list[Tensor]:
+        """Each actuator's channel averaged over each step, late where it is late; broadcasts to (*lanes, K)."""
+        e = self.experiment
+        delays = self.network.command_delays(values)
+        return [
             e.signal.average(e.nodes[:-1], e.steps, channel, delays[i]) if i in delays else e.inputs[:, channel]
-            for i, (_, channel) in enumerate(network.actuators())
+            for i, (_, channel) in enumerate(self.network.actuators())
         ]
+
+    def _commands_before(self, values: PlaceValues, lanes: int) -> tuple[list[Tensor], Tensor, Tensor]:
+        """Channels, the actuators' memory before each step (L, K, m) and its slope (L, K, m, m)."""
+        channels, network, steps = self._channels(values), self.network, len(self.experiment.steps)
         if network.command_memory() == 0:
+            nothing = self.experiment.steps.new_zeros(lanes, steps, 0)
+            return channels, nothing, nothing.unsqueeze(-1)
+        wide = [c.expand(lanes, steps) for c in channels]
+        first = network.remember_commands([c[..., :1] for c in wide], self._first_clock, values)
+        return wide, *recur(lambda m: network.commands(wide, m, self.clock, values), first, (lanes, steps))
+
+    def _dual_commands(self, values: PlaceValues, memory: Tensor, slopes: Tensor, count: int) -> list[Tensor]:
+        """What each actuator makes of its channel over each step, with tangents; broadcasts to (count, L, K)."""
+        channels, network = self._channels(values), self.network
+        if not memory.shape[-1]:
             return network.commands(channels, (), self.clock, values)[0]
-        channels = [c.expand(*lanes, len(e.steps)) for c in channels]
-        first = Clock(e.nodes[:1], e.steps[:1], e.resolution)
-        memory = network.remember_commands([c[..., :1] for c in channels], first, values)
-        return recur(lambda m: network.commands(channels, m, self.clock, values), memory, (*lanes, len(e.steps)))[0]
+        wide = [c.expand(count, *memory.shape[:-1]) for c in channels]
+        first = network.remember_commands([c[..., :1] for c in wide], self._first_clock, values)
+        return with_tangents(lambda m: network.commands(wide, m, self.clock, values), first, memory, slopes, count)
+
+    @property
+    def _first_clock(self) -> Clock:
+        return Clock(self.clock.start[:1], self.clock.step[:1], self.clock.resolution)
 
     def _at_samples(self, levels: Tensor) -> list[Tensor]:
         """The level at each sensor at the samples, (*lanes, S); straight within a step."""
@@ -167,31 +188,59 @@ class Collocation:
         seen = levels[..., e.sample_step, :] * (1.0 - share) + levels[..., e.sample_step + 1, :] * share
         return [seen[..., tank] for tank in self.network.sensor_tanks()]
 
-    def _read(self, seen: list[Tensor], values: PlaceValues) -> Tensor:
-        times, network = self.experiment.sample_times, self.network
-        for i, delay in network.reading_delays(values).items():
-            seen[i] = _late(seen[i], times, delay)
+    @property
+    def _sample_clock(self) -> Clock:
+        times = self.experiment.sample_times
         intervals = torch.diff(times, prepend=2 * times[:1] - times[1:2])
-        clock = Clock(times - intervals, intervals, self.experiment.resolution)
-        if network.reading_memory() == 0:
-            readings, _ = network.read(seen, (), clock, values)
-        else:
-            first = Clock(clock.start[:1], clock.step[:1], clock.resolution)
-            memory = network.remember_readings([s[..., :1] for s in seen], first, values)
-            readings = recur(lambda m: network.read(seen, m, clock, values), memory, seen[0].shape)[0]
-        return torch.stack([r.expand(seen[0].shape) for r in readings], dim=-1)
+        return Clock(times - intervals, intervals, self.experiment.resolution)
 
-    def _read_slopes(self, levels: Tensor, slopes: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
-        count = theta.shape[-1]
-        eye = torch.eye(count, dtype=theta.dtype, device=theta.device)
-        along = eye.reshape(count, 1, count).expand(count, *theta.shape).contiguous()
+    def _seen(self, levels: list[Tensor], values: PlaceValues) -> list[Tensor]:
+        """The level that each sensor sees, late where it is late."""
+        seen = list(levels)
+        for i, delay in self.network.reading_delays(values).items():
+            seen[i] = _late(seen[i], self.experiment.sample_times, delay)
+        return seen
+
+    def _first_memory(self, seen: list[Tensor], values: PlaceValues) -> Memory:
+        clock = self._sample_clock
+        first = Clock(clock.start[:1], clock.step[:1], clock.resolution)
+        return self.network.remember_readings([s[..., :1] for s in seen], first, values)
+
+    def _readings_before(self, levels: list[Tensor], values: PlaceValues) -> tuple[list[Tensor], Tensor, Tensor]:
+        """What sensors see, their memory before each sample (L, S, m) and its slope (L, S, m, m)."""
+        seen, clock = self._seen(levels, values), self._sample_clock
+        if self.network.reading_memory() == 0:
+            nothing = seen[0].new_zeros(*seen[0].shape, 0)
+            return seen, nothing, nothing.unsqueeze(-1)
+        first = self._first_memory(seen, values)
+        return seen, *recur(lambda m: self.network.read(seen, m, clock, values), first, seen[0].shape)
+
+    def _read_slopes(self, levels: Tensor, slopes: Tensor, theta: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+        """Readings (L, S, C) and their slopes (L, S, C, M) where levels move by slopes (L, K+1, tanks, M) while theta
+        moves by along (M, P).
+        """
+        plain = self.network.bind(self.space, theta.unsqueeze(-2))
+        _, memory, memory_slopes = self._readings_before(self._at_samples(levels), plain)
+        count, clock = slopes.shape[-1], self._sample_clock
         with forward_ad.dual_level():
-            dual = forward_ad.make_dual(theta.expand(count, *theta.shape).contiguous(), along)
+            tangents = along.unsqueeze(1).expand(count, *theta.shape).contiguous()
+            dual = forward_ad.make_dual(theta.expand(count, *theta.shape).contiguous(), tangents)
             paths = levels.expand(count, *levels.shape).contiguous()
             path = forward_ad.make_dual(paths, slopes.movedim(-1, 0).contiguous())
             values = self.network.bind(self.space, dual.unsqueeze(-2))
-            readings, found = forward_ad.unpack_dual(self._read(self._at_samples(path), values))
-        return readings[0], found.movedim(0, -1)
+            seen = self._seen(self._at_samples(path), values)
+            if memory.shape[-1]:
+                first = self._first_memory(seen, values)
+
+                def step(m: Memory) -> tuple[list[Tensor], Memory]:
+                    return self.network.read(seen, m, clock, values)
+
+                readings = with_tangents(step, first, memory, memory_slopes, count)
+            else:
+                readings = self.network.read(seen, (), clock, values)[0]
+            stacked = torch.stack([r.expand(seen[0].shape) for r in readings], dim=-1)
+            value, found = forward_ad.unpack_dual(stacked)
+        return value[0], found.movedim(0, -1)
 
 
 def _late(seen: Tensor, times: Tensor, delay: Tensor) -> Tensor:

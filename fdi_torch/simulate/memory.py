@@ -12,46 +12,52 @@ from fdi_torch.plant.effect import Memory
 from fdi_torch.simulate.scan import linear_scan
 
 ROUNDS = 40
+SETTLED = 1e-11
 Step = Callable[[Memory], tuple[list[Tensor], Memory]]
 
 
-def recur(step: Step, first: Memory, shape: Sequence[int]) -> tuple[list[Tensor], Memory]:
-    """step(memory before each of K steps, (*lanes, K)) -> (outputs, memory after each).
+def recur(step: Step, first: Memory, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """step(memory before each of K steps, (L, K)) -> (outputs, memory after each), first (L, 1), shape (L, K).
 
-    first: the memory before step 0, (*lanes, 1). shape: (*lanes, K). Exact after one round where F is linear in the
-    memory; duals pass through, for their tangents obey the same linear recurrence.
+    Returns the memory before each step (L, K, n) and its slope over each step (L, K, n, n). One round where F is
+    linear in the memory.
     """
-    lanes = shape[:-1]
-    starts = [forward_ad.unpack_dual(m.expand(*lanes, 1)) for m in first]
-    start = torch.stack([s.primal for s in starts], -1)
+    start = torch.stack([m.expand(*shape[:-1], 1) for m in first], -1)
     guess = start.expand(*shape, len(first)).clone()
     for _ in range(ROUNDS):
         after, slopes = _slopes(step, guess)
-        corrected = _scan(slopes, after - (slopes * guess.unsqueeze(-2)).sum(-1), start)
-        change, guess = (corrected - guess).abs().max() / (guess.abs().max() + 1e-12), corrected
-        if float(change) < 1e-12:
+        scale = guess.abs().max() + 1e-12
+        defect = torch.cat([guess[..., :1, :] - start, guess[..., 1:, :] - after[..., :-1, :]], dim=-2)
+        if float(defect.abs().max() / scale) < SETTLED:
             break
-    moved = [forward_ad.unpack_dual(a).tangent for a in step(guess.unbind(-1))[1]]
-    if all(t is None for t in moved):
-        return step(guess.unbind(-1))
-    none = torch.zeros_like(guess[..., 0])
-    forcing = torch.stack([none if t is None else t.expand(shape) for t in moved], -1)
-    begin = torch.stack([none[..., :1] if s.tangent is None else s.tangent for s in starts], -1)
-    tangents = _scan(slopes, forcing, begin)
-    return step(
-        tuple(
-            forward_ad.make_dual(g.contiguous(), t.contiguous())
-            for g, t in zip(guess.unbind(-1), tangents.unbind(-1), strict=True)
-        )
-    )
+        forcing = (after - (slopes * guess.unsqueeze(-2)).sum(-1)).unsqueeze(-1)
+        guess = linear_scan(slopes, forcing, start.transpose(-1, -2))[:, :-1, :, 0]
+    return guess, slopes
+
+
+def with_tangents(step: Step, first: Memory, guess: Tensor, slopes: Tensor, count: int) -> list[Tensor]:
+    """The outputs as duals: step's signals are duals (count, L, K), the memory's path (L, K, n) is known.
+
+    Tangents obey t_{k+1} = slopes_k t_k + dF_k, the same for each of the `count` directions.
+    """
+    size, shape = guess.shape[-1], guess.shape[:-1]
+    none = guess.new_zeros(count, *shape)
+    plain = tuple(m.expand(count, *shape) for m in guess.unbind(-1))
+    moved = [forward_ad.unpack_dual(a).tangent for a in step(plain)[1]]
+    forcing = torch.stack([none if t is None else t.expand(count, *shape) for t in moved], -1)
+    begun = [forward_ad.unpack_dual(m).tangent for m in first]
+    begin = torch.stack([none[..., :1] if t is None else t.expand(count, shape[0], 1) for t in begun], -1)
+    path = linear_scan(slopes, forcing.permute(1, 2, 3, 0), begin[..., 0, :].permute(1, 2, 0))[:, :-1]
+    tangents = path.permute(3, 0, 1, 2)
+    duals = tuple(forward_ad.make_dual(plain[i].contiguous(), tangents[..., i].contiguous()) for i in range(size))
+    return step(duals)[0]
 
 
 def _slopes(step: Step, guess: Tensor) -> tuple[Tensor, Tensor]:
-    """Memory after (*lanes, K, n) and its slope by the memory before (*lanes, K, n, n), by finite differences."""
+    """Memory after (L, K, n) and its slope by the memory before (L, K, n, n), by finite differences."""
 
     def after(memory: Tensor) -> Tensor:
-        found = [forward_ad.unpack_dual(a).primal.expand(guess.shape[:-1]) for a in step(memory.unbind(-1))[1]]
-        return torch.stack(found, -1)
+        return torch.stack([a.expand(guess.shape[:-1]) for a in step(memory.unbind(-1))[1]], -1)
 
     base = after(guess)
     columns = []
@@ -61,13 +67,3 @@ def _slopes(step: Step, guess: Tensor) -> tuple[Tensor, Tensor]:
         moved[..., j] += width
         columns.append((after(moved) - base) / width)
     return base, torch.stack(columns, -1)
-
-
-def _scan(slopes: Tensor, forcing: Tensor, start: Tensor) -> Tensor:
-    """The memory before each step, (*lanes, K, n)."""
-    lanes, n = forcing.shape[:-2], forcing.shape[-1]
-    flat = [
-        x.reshape(-1, *x.shape[len(lanes) :]) for x in (slopes, forcing.unsqueeze(-1), start[..., 0, :].unsqueeze(-1))
-    ]
-    path = linear_scan(*flat)[:, :-1, :, 0]
-    return path.reshape(*lanes, forcing.shape[-2], n)
