@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
+
+from fdi_torch.plant.description import PlacedEffect, PlantDescription
 
 FORMAT = "fdi_torch.gap/1"
 Verdict = Literal["no_gap", "named", "ambiguous", "unknown"]
@@ -72,6 +74,13 @@ class Answer:
             "remarks": list(self.remarks),
         }
         return finite(answer)
+
+
+def adopted(plant: PlantDescription, answer: Answer) -> PlantDescription:
+    """The plant as the answer says it is: its file with the causes among its effects."""
+    placed = [PlacedEffect(c.effect, c.location, {n: a.value for n, a in c.parameters.items()}) for c in answer.causes]
+    known = {(p.effect, p.location) for p in placed}
+    return replace(plant, effects=(*(e for e in plant.effects if (e.effect, e.location) not in known), *placed))
 
 
 def finite(value: Any) -> Any:

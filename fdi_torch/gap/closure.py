@@ -41,7 +41,8 @@ def closure(
 ) -> Closure:
     """fits: by the names of the answer ('nominal' has None); best: whose residual shows the hold-out's noise."""
     residuals = {name: free_run(subject, noise, fit) for name, fit in fits.items()}
-    floor = estimate_noise(residuals[best], subject.mask).std
+    found = estimate_noise(residuals[best], subject.mask)
+    floor = found.std
     mask = subject.mask
     squares = {name: torch.where(mask, r * r, 0.0) for name, r in residuals.items()}
     count = mask.sum(dim=0)
@@ -49,7 +50,7 @@ def closure(
     each = {name: torch.sqrt(s.sum(dim=0) / count) for name, s in squares.items()} | {"noise_floor": floor}
     pooled = {name: float(torch.sqrt((v * v * count).sum() / count.sum())) * scale for name, v in each.items()}
     sensors = {s: {name: float(v[i]) * scale for name, v in each.items()} for i, s in enumerate(names)}
-    closed, interval = _closed(squares["recalibrated"], squares["augmented"], mask, floor)
+    closed, interval = _closed(squares["recalibrated"], squares["augmented"], mask, found)
     return Closure(unit, sensors, pooled, closed, interval, residuals)
 
 
@@ -77,22 +78,26 @@ def _first(mask: Tensor) -> Tensor:
 
 
 def _closed(
-    recalibrated: Tensor, augmented: Tensor, mask: Tensor, floor: Tensor
+    recalibrated: Tensor, augmented: Tensor, mask: Tensor, noise: Noise
 ) -> tuple[float | None, tuple[float, float] | None]:
-    """The share closed and its 95 % interval over blocks of time; None where the gap is under 5 standard errors."""
-    noise = floor**2 * mask
-    gap = _blocks(recalibrated - noise)
-    left = _blocks(augmented - noise)
-    total = float(gap.sum())
-    error = float(gap.std()) * math.sqrt(len(gap))
-    floor_error = 2.0 * float((floor**2 * mask.sum(dim=0)).sum()) * math.sqrt(2.0 / float(mask.sum()))
-    if total < DEFINED * min(error, max(floor_error, 1e-300)) or total < DEFINED * floor_error:
+    """The share closed and its 95 % interval over blocks of time; None where the gap is under 5 standard errors.
+
+    The noise of the hold-out is the same in both runs, so that the gap is their difference, plus what the augmented
+    run leaves; the latter counts as far as it stands out of the uncertainty of the floor.
+    """
+    difference, count = _blocks(recalibrated - augmented), float(mask.sum())
+    excess = float((augmented - noise.std**2 * mask).sum())
+    uncertain = math.sqrt(float((2.0 * noise.std**4 * mask.sum(dim=0) * (1 + noise.ar**2) / (1 - noise.ar**2)).sum()))
+    left = math.copysign(max(abs(excess) - uncertain, 0.0), excess)
+    total, error = float(difference.sum()) + max(left, 0.0), float(difference.std()) * math.sqrt(len(difference))
+    if total < DEFINED * min(error, uncertain) or total <= 0.0 or count == 0.0:
         return None, None
     generator = torch.Generator().manual_seed(0)
-    pick = torch.randint(len(gap), (DRAWS, len(gap)), generator=generator)
-    drawn = 1.0 - left[pick].sum(dim=1) / gap[pick].sum(dim=1)
+    pick = torch.randint(len(difference), (DRAWS, len(difference)), generator=generator)
+    rest = max(left, 0.0) + uncertain * torch.randn(DRAWS, generator=generator, dtype=difference.dtype)
+    drawn = 1.0 - rest / (difference[pick].sum(dim=1) + rest.clamp(min=0.0)).clamp(min=1e-300)
     low, high = torch.quantile(drawn, torch.tensor([0.025, 0.975], dtype=drawn.dtype)).tolist()
-    return 1.0 - float(left.sum()) / total, (low, high)
+    return 1.0 - max(left, 0.0) / total, (max(low, -9.0), min(high, 1.0))
 
 
 def _blocks(x: Tensor) -> Tensor:

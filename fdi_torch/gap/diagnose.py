@@ -13,23 +13,26 @@ from torch import Tensor
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import Amount, Answer, Cause, CauseName, Explanation, Verdict
 from fdi_torch.gap.closure import Closure, closure
-from fdi_torch.gap.evidence import LOG_PRIOR_EFFECT, log_evidence, posterior, temperature
+from fdi_torch.gap.evidence import log_evidence, posterior, temperature
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject, subject_of
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step
-from fdi_torch.gap.freeform import free_forms
+from fdi_torch.gap.freeform import shape_of
 from fdi_torch.gap.library import canonical, library_of, possible_places, twins
+from fdi_torch.gap.next_input import next_input
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.where import Suspect, refit, suspects
 from fdi_torch.gap.which import Search, search
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import reach_of
+from fdi_torch.plant.reach import Reach, reach_of
 from fdi_torch.recording import Recording
 
 CONTENT = 0.95
 REFITS = 3
-LOG_PRIOR_UNKNOWN = math.log(0.01)  # odds of an effect outside the library, before the data
+UNEXPLAINED = 0.1  # share of the gap left open at which nothing has been explained
+LEFT_SHARE, LEFT_LEAST = 2e-3, 60.0  # share of the gap, and chi-square units, worth asking the free forms about
+FAR_BETTER = 0.35
 Tell = Callable[[float, str], None]
 
 
@@ -60,15 +63,41 @@ def diagnose(
     options = options_of([p for p in library if not p.effect.rounds], fitter, reach)
     found = search(fitter, null, options)
     tell(0.6, "where")
-    heat = temperature(null.cost - found.best.cost)
-    forms = free_forms(plant, reach, possible_places(plant))
-    places = suspects(fitter, null, forms, reach, heat)
-    refits = [refit(fitter, null, forms[s.location]) for s in places[:REFITS]] if _gap(subject, null) > 100.0 else []
+    places, refits = _places(fitter, found, plant, reach)
     rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
     rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]
-    weighed = _weighed(fitter, found, refits, len(library), plant)
+    weighed = _weighed(fitter, found, len(library), plant)
+    unknown = _unnamed(fitter, weighed.fits[0], found.null, refits)
     tell(0.8, "hold-out")
-    return _answer(fitter, found, places, weighed, rounded, lattice, holdout, settings)
+    return _answer(fitter, found, places, weighed, unknown, rounded, lattice, holdout, settings)
+
+
+def _places(fitter: Fitter, found: Search, plant: PlantDescription, reach: Reach) -> tuple[list[Suspect], list[Fit]]:
+    """Every place with what it could close; the likeliest refitted in full where the library leaves something open."""
+    dof = float(fitter.subject.mask.sum())
+    gap, left = found.null.cost - dof, found.best.cost - dof
+    heat = temperature(found.null.cost - found.best.cost)
+    everywhere = possible_places(plant)
+    places = suspects(fitter, found.null, everywhere, reach, heat, waves=left > UNEXPLAINED * gap > 0.0)
+    if left < max(LEFT_SHARE * gap, LEFT_LEAST):
+        return places, []
+    return places, [refit(fitter, found.null, s, reach) for s in places[:REFITS]]
+
+
+def _unnamed(fitter: Fitter, named: Fit, null: Fit, refits: Sequence[Fit]) -> Fit | None:
+    """The free discrepancy of one place that closes what no effect of the library does, if there is one.
+
+    Equations that differ a little leave a little open, and a free discrepancy at the same place cannot do much
+    better; where one place alone does far better than all that has a name, or nothing named does, it has no name.
+    """
+    if not refits:
+        return None
+    dof = float(fitter.subject.mask.sum())
+    best = min(refits, key=lambda f: f.cost)
+    gap, left, free = null.cost - dof, named.cost - dof, max(best.cost - dof, 0.0)
+    nothing_named = left > UNEXPLAINED * gap
+    far_better = free < FAR_BETTER * left and left - free > LEFT_SHARE * gap
+    return best if nothing_named or far_better else None
 
 
 def _interval(recording: Recording) -> float:
@@ -102,28 +131,19 @@ class Weighed:
     fits: tuple[Fit, ...]
 
 
-def _weighed(fitter: Fitter, found: Search, refits: Sequence[Fit], choices: int, plant: PlantDescription) -> Weighed:
-    ceiling = min([found.best.cost, *(f.cost for f in refits)])
-    heat = temperature(found.null.cost - ceiling)
-    scores: dict[tuple[str | None, frozenset[CauseName]], tuple[float, Fit]] = {}
+def _weighed(fitter: Fitter, found: Search, choices: int, plant: PlantDescription) -> Weighed:
+    """All fits of the search by their evidence; names of one thing count once."""
+    heat = temperature(found.null.cost - found.best.cost)
+    scores: dict[frozenset[CauseName], tuple[float, Fit]] = {}
     for fit in found.fits:
-        key = (None, frozenset(canonical(c, plant) for c in fit.key))
+        key = frozenset(canonical(c, plant) for c in fit.key)
         score = log_evidence(fitter, fit, heat, choices)
         if key not in scores or score > scores[key][0]:
             scores[key] = (score, fit)
-    for fit in refits:
-        place = fit.candidate.placements[0].location
-        extra = LOG_PRIOR_UNKNOWN - len(fit.key) * LOG_PRIOR_EFFECT + math.lgamma(len(fit.key) + 1)
-        count = len(possible_places(plant))
-        score = log_evidence(fitter, fit, heat, 1) + extra - math.log(count)
-        scores[(place, frozenset())] = (score, fit)
-    ranked = sorted(scores.items(), key=lambda item: -item[1][0])
-    weights = posterior([score for _, (score, _) in ranked])
-    explanations = tuple(
-        Explanation(_ordered(fit) if place is None else (), weight, place)
-        for ((place, _), (_, fit)), weight in zip(ranked, weights, strict=True)
-    )
-    return Weighed(explanations, tuple(fit for _, (_, fit) in ranked))
+    ranked = sorted(scores.values(), key=lambda item: -item[0])
+    weights = posterior([score for score, _ in ranked])
+    pairs = zip(ranked, weights, strict=True)
+    return Weighed(tuple(Explanation(_ordered(f), w) for (_, f), w in pairs), tuple(f for _, f in ranked))
 
 
 def _ordered(fit: Fit) -> tuple[CauseName, ...]:
@@ -135,36 +155,75 @@ def _answer(
     found: Search,
     places: Sequence[Suspect],
     weighed: Weighed,
+    unnamed: Fit | None,
     rounded: Sequence[CauseName],
     lattice: Sequence[float],
     holdout: Recording | None,
     settings: Settings,
 ) -> Answer:
-    standing = _content(weighed.explanations)
     explanations, fit = weighed.explanations, weighed.fits[0]
-    library_fit = next(f for e, f in zip(explanations, weighed.fits, strict=True) if e.unknown_at is None)
-    unknown = sum(e.probability for e in weighed.explanations if e.unknown_at) > 0.5
-    verdict: Verdict = "unknown" if unknown else _verdict([e for e in standing if e.unknown_at is None], rounded)
-    causes = () if verdict in ("no_gap", "unknown") else _causes(fitter, library_fit, rounded, lattice)
-    sets = [(*e.causes, *rounded) for e in standing if e.unknown_at is None] if causes else []
+    standing = _content(explanations)
+    verdict: Verdict = "unknown" if unnamed else _verdict(standing, rounded)
+    causes = () if verdict in ("no_gap", "unknown") else _causes(fitter, fit, rounded, lattice)
     gap = max(_gap(fitter.subject, found.null), 1.0)
     where = [(s.location, min(max(s.closes / gap, 0.0), 1.0)) for s in places]
-    if unknown:
-        first = next(e.unknown_at for e in weighed.explanations if e.unknown_at)
-        where = sorted(where, key=lambda w: w[0] != first)
+    if unnamed:
+        place = unnamed.candidate.placements[0].location
+        where = sorted(where, key=lambda w: w[0] != place)
+        explanations = (Explanation((), 1.0, place),)
     return Answer(
         verdict=verdict,
         p_value=_p_value(found, rounded),
         where=where,
         causes=causes,
-        ambiguity_set=sets,
+        ambiguity_set=[(*e.causes, *rounded) for e in standing] if causes else [],
         posterior=[
             Explanation(() if e.unknown_at else (*e.causes, *rounded), e.probability, e.unknown_at)
             for e in explanations[:12]
         ],
-        closure=_closure(fitter, found, library_fit if not unknown else fit, holdout, settings, unknown),
+        closure=(closed := _closure(fitter, found, unnamed or fit, holdout, settings, unnamed is not None)),
         noise=_noise(fitter, lattice),
+        shape=shape_of(unnamed) if unnamed else None,
+        next_input=_next(fitter, weighed) if verdict == "ambiguous" else None,
+        impostors=_impostors(fitter, found, fit) if causes else None,
+        remarks=_remarks(fitter, found, unnamed or fit, closed),
     )
+
+
+def _next(fitter: Fitter, weighed: Weighed) -> Mapping[str, Any] | None:
+    """The input that would part the two likeliest explanations."""
+    found = next_input(fitter, weighed.fits[0], weighed.fits[1])
+    between = [[{"effect": n, "location": at} for n, at in e.causes] for e in weighed.explanations[:2]]
+    return {"between": between, **found} if found else None
+
+
+def _impostors(fitter: Fitter, found: Search, named: Fit) -> dict[str, object]:
+    """What would be left open, had the library lacked what was named: the best of the fits without it.
+
+    would_pass: whether that impostor would have closed all but two per cent of the gap.
+    """
+    dof = float(fitter.subject.mask.sum())
+    others = [f for f in found.fits if f.key and not f.key & named.key]
+    gap = max(found.null.cost - dof, 1.0)
+    if not others:
+        return {"best": [], "left_open": 1.0, "would_pass": False}
+    best = min(others, key=lambda f: f.cost)
+    left = max(best.cost - dof, 0.0) / gap
+    causes = [{"effect": name, "location": place} for name, place in _ordered(best)]
+    return {"best": causes, "left_open": left, "would_pass": left < 0.02}
+
+
+def _remarks(fitter: Fitter, found: Search, best: Fit, closed: Mapping[str, Any]) -> list[str]:
+    remarks = []
+    if all(float(torch.diff(column).abs().max()) == 0.0 for column in fitter.subject.recording.inputs.T):
+        remarks.append("the inputs never change: most effects cannot be told apart; --plan shows what steps would tell")
+    if len(fitter.subject.nuisance) == len(fitter.subject.plant.tanks):
+        remarks.append("the plant file gives no tolerances: every constant is taken to be exact")
+    dof = float(fitter.subject.mask.sum())
+    explained = best.cost - dof < 0.1 * max(found.null.cost - dof, dof)
+    if closed and explained and closed["augmented"] > 3.0 * closed["noise_floor"] and (closed["closed"] or 0.0) < 0.5:
+        remarks.append("what explains the recording does not explain the hold-out: is it of the same rig?")
+    return remarks
 
 
 def _content(explanations: Sequence[Explanation]) -> list[Explanation]:

@@ -22,7 +22,7 @@ from fdi_torch.simulate.experiment import Experiment, lay_out
 
 ROUNDS = 14
 SETTLED = 0.05  # chi-square units; smaller gains decide nothing
-PATIENCE, ENOUGH = 2, 5.0  # a start is given up that gains less than a fifth of its arrears after two rounds
+PATIENCE, ENOUGH = 1, 4.0  # a start is given up that gains less than a quarter of its arrears after two rounds
 Key = frozenset[tuple[str, str]]
 
 
@@ -59,10 +59,14 @@ def subject_of(plant: PlantDescription, believed: Sequence[Placement], recording
 
 @dataclass(frozen=True)
 class Candidate:
-    """Effects at places; free: which of their parameters are fitted, and from where ('Q1.pump_lag.time_constant')."""
+    """Effects at places. starts: which of their parameters are fitted, and from where ('Q1.pump_lag.time_constant').
+
+    promise: chi-square that the newest of them closes to first order.
+    """
 
     placements: tuple[Placement, ...] = ()
     starts: tuple[Mapping[str, float], ...] = ({},)
+    promise: float = 0.0
 
     @property
     def key(self) -> Key:

@@ -6,12 +6,14 @@ level, a sensor its reading) and in time. Coefficients are shares of a typical f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from fdi_torch.gap.fitting import Fit
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor
@@ -19,8 +21,11 @@ from fdi_torch.plant.effect import Effect, Local, Memory, Placement, Stage, Valu
 from fdi_torch.plant.reach import Range, Reach
 from fdi_torch.plant.signals import Clock
 
-LOCAL_NODES, TIME_NODES = 8, 24
+LOCAL_NODES, TIME_NODES = 8, 16
+HEAD_NODES = 14
 PRIOR = 0.2
+HARMONICS = 3
+UNIT = 0.01  # size of a coefficient at which its effect on the readings is taken
 
 
 class _Free(Effect):
@@ -29,31 +34,43 @@ class _Free(Effect):
     nodes: dict[str, list[float]]
     scale: float
 
-    def __init__(self, nodes: dict[str, list[float]], scale: float, prior: float = PRIOR) -> None:
-        self.nodes, self.scale, self.prior = nodes, scale, prior
+    def __init__(
+        self, nodes: dict[str, list[float]], scale: float, periods: Sequence[float] = (), prior: float = PRIOR
+    ) -> None:
+        self.nodes, self.scale, self.periods, self.prior = nodes, scale, tuple(periods), prior
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return tuple(
-            Parameter(f"{variable}_{j}", "1", 0.0, std=self.prior)
-            for variable, grid in self.nodes.items()
-            for j in range(len(grid))
-        )
+        names = [f"{variable}_{j}" for variable, grid in self.nodes.items() for j in range(len(grid))]
+        names += [f"{wave}_{j}" for j in range(len(self.periods)) for wave in ("cosine", "sine")]
+        return tuple(Parameter(name, "1", 0.0, std=self.prior) for name in names)
 
     def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
-        return [{p.name: 0.01} for p in self.parameters(place, plant)]
+        """One for each coefficient, all of one form, so that they make one batch."""
+        names = [p.name for p in self.parameters(place, plant)]
+        return [{name: UNIT if name == one else 0.0 for name in names} for one in names]
 
     def curve(self, variable: str, x: Tensor, p: Values) -> Tensor:
         """The piecewise linear function of x, constant beyond its grid; 0 where the effect has no such variable."""
-        grid = self.nodes.get(variable, [])
-        total = torch.zeros_like(x)
-        for j, node in enumerate(grid):
-            width = grid[1] - grid[0]
-            hat = 1.0 - torch.abs(x - node) / width
-            if j == 0:
-                hat = torch.where(x < node, torch.ones_like(hat), hat)
-            if j == len(grid) - 1:
-                hat = torch.where(x > node, torch.ones_like(hat), hat)
-            total = total + p[f"{variable}_{j}"] * torch.clamp(hat, min=0.0)
+        if variable not in self.nodes:
+            return torch.zeros_like(x)
+        grid = x.new_tensor(self.nodes[variable])
+        table = torch.stack(torch.broadcast_tensors(*(p[f"{variable}_{j}"] for j in range(len(grid)))), dim=-1)
+        table = table.squeeze(-2) if table.dim() > 1 else table
+        lanes = torch.broadcast_shapes(table.shape[:-1], x.shape[:-1])
+        inside = torch.minimum(torch.maximum(x, grid[0]), grid[-1]).expand(*lanes, x.shape[-1])
+        table = table.expand(*lanes, len(grid))
+        left = (torch.searchsorted(grid, inside.detach().contiguous(), right=True) - 1).clamp(0, len(grid) - 2)
+        share = (inside - grid[left]) / (grid[left + 1] - grid[left])
+        low, high = table.gather(-1, left), table.gather(-1, left + 1)
+        return low + share * (high - low)
+
+    def waves(self, clock: Clock, p: Values) -> Tensor | float:
+        """Sines and cosines of the effect's periods, averaged over each step."""
+        total: Tensor | float = 0.0
+        for j, period in enumerate(self.periods):
+            each = clock.start.new_tensor(period)
+            total = total + p[f"sine_{j}"] * clock.sine(each, each.new_tensor(0.0))
+            total = total + p[f"cosine_{j}"] * clock.sine(each, each.new_tensor(0.5 * math.pi))
         return total
 
 
@@ -66,7 +83,8 @@ class FreeFlow(_Free):
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
         own = self.curve("command", local.command, p) + self.curve("head", local.head, p)
-        factor = self.curve("level", local.level, p) + self.curve("time", local.clock.middle, p)
+        time = self.curve("time", local.clock.middle, p) + self.waves(local.clock, p)
+        factor = self.curve("level", local.level, p) + time
         return flow + self.scale * own + flow * factor
 
 
@@ -79,7 +97,7 @@ class FreeInflow(_Free):
 
     def inflow(self, local: Local, p: Values) -> Tensor:
         own = self.curve("level", local.level, p) + self.curve("difference", local.level - local.far_level, p)
-        return self.scale * (own + self.curve("time", local.clock.middle, p))
+        return self.scale * (own + self.curve("time", local.clock.middle, p) + self.waves(local.clock, p))
 
 
 class FreeArea(_Free):
@@ -101,41 +119,80 @@ class FreeReading(_Free):
     places: ClassVar[tuple[str, ...]] = ("sensor",)
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
-        return value + self.scale * (self.curve("reading", value, p) + self.curve("time", clock.end, p)), memory
+        time = self.curve("time", clock.end, p) + self.waves(clock, p)
+        return value + self.scale * (self.curve("reading", value, p) + time), memory
 
 
-def free_forms(plant: PlantDescription, reach: Reach, places: Sequence[str]) -> dict[str, tuple[Placement, ...]]:
-    """The free discrepancy of each place."""
-    return {place: tuple(Placement(e, place) for e in _free_at(place, plant, reach)) for place in places}
+def free_form(
+    place: str, plant: PlantDescription, reach: Reach, periods: Sequence[float] = ()
+) -> tuple[Placement, ...]:
+    """The free discrepancy of a place; periods (s): of what comes and goes by itself."""
+    return tuple(Placement(e, place) for e in _free_at(place, plant, reach, periods))
 
 
-def _free_at(place: str, plant: PlantDescription, reach: Reach) -> list[Effect]:
+def shape_of(fit: Fit) -> dict[str, object]:
+    """The discrepancy as tables against its local variables, in shares of `scale`."""
+    values, tables = fit.effect_values, {}
+    for placement in fit.candidate.placements:
+        effect = placement.effect
+        assert isinstance(effect, _Free)
+        for variable, grid in effect.nodes.items():
+            share = [values[f"{placement.prefix}.{variable}_{j}"] for j in range(len(grid))]
+            tables[f"{effect.name}.{variable}"] = {"at": grid, "share": share, "scale": effect.scale}
+        if effect.periods:
+            sizes = [
+                math.hypot(values[f"{placement.prefix}.sine_{j}"], values[f"{placement.prefix}.cosine_{j}"])
+                for j in range(len(effect.periods))
+            ]
+            tables[f"{effect.name}.period"] = {"at": list(effect.periods), "share": sizes, "scale": effect.scale}
+    return {"location": fit.candidate.placements[0].location, "tables": tables}
+
+
+def waves_at(place: str, plant: PlantDescription, reach: Reach, periods: Sequence[float]) -> Placement:
+    """Nothing but sines and cosines, to find a period by."""
+    effect = _free_at(place, plant, reach, periods)[0]
+    assert isinstance(effect, _Free)
+    effect.nodes = {}
+    return Placement(effect, place)
+
+
+def _free_at(place: str, plant: PlantDescription, reach: Reach, periods: Sequence[float]) -> list[Effect]:
     kind, time = place_kind(plant, place), _grid((0.0, reach.duration), TIME_NODES)
     if kind == "tank_pair":
         first, second = place.split("-")
         ends = reach.levels[first], reach.levels[second]
-        span = (ends[0][0] - ends[1][1], ends[0][1] - ends[1][0])
-        return [FreeInflow({"difference": _grid(span, LOCAL_NODES), "time": time}, 0.3 * flow_scale(plant, first))]
+        grid = _root_grid((ends[0][0] - ends[1][1], ends[0][1] - ends[1][0]), HEAD_NODES)
+        return [FreeInflow({"difference": grid, "time": time}, 0.3 * flow_scale(plant, first), periods)]
     if kind == "tank":
         levels, flow = _grid(reach.levels[place], LOCAL_NODES), 0.3 * flow_scale(plant, place)
-        return [FreeInflow({"level": levels, "time": time}, flow), FreeArea({"level": levels}, 1.0)]
+        return [FreeInflow({"level": levels, "time": time}, flow, periods), FreeArea({"level": levels}, 1.0)]
     component = plant.component(place)
     if isinstance(component, Sensor):
         readings = _grid(reach.readings[place], LOCAL_NODES)
-        return [FreeReading({"reading": readings, "time": time}, 0.2 * reading_span(plant, component))]
+        return [FreeReading({"reading": readings, "time": time}, 0.2 * reading_span(plant, component), periods)]
     if isinstance(component, Pump):
         command = _grid(reach.commands[component.channel], LOCAL_NODES)
         nodes = {"command": command, "level": _grid(reach.levels[component.target], 5), "time": time}
-        return [FreeFlow(nodes, component.gain * max(abs(command[0]), abs(command[-1])))]
+        return [FreeFlow(nodes, component.gain * max(abs(command[0]), abs(command[-1])), periods)]
     assert isinstance(component, Pipe)
     near = reach.levels[component.source]
-    far = (0.0, 0.0) if component.is_outlet else reach.levels[component.target]
-    heads = (near[0] - far[1], near[1] - far[0]) if not component.is_outlet else near
+    far = reach.levels[component.target] if not component.is_outlet else (0.0, 0.0)
+    heads = near if component.is_outlet else (near[0] - far[1], near[1] - far[0])
     flow = 0.5 * flow_scale(plant, component.source)
-    return [FreeFlow({"head": _grid(heads, LOCAL_NODES), "time": time}, flow)]
+    return [FreeFlow({"head": _root_grid(heads, HEAD_NODES), "time": time}, flow, periods)]
 
 
 def _grid(span: Range, count: int) -> list[float]:
     low, high = span
     width = max(high - low, 1e-6)
     return [low + width * j / (count - 1) for j in range(count)]
+
+
+def _root_grid(span: Range, count: int) -> list[float]:
+    """Even in the signed root of a head, where flows bend most, with zero among the nodes if it lies inside."""
+    ends = (math.copysign(math.sqrt(abs(span[0])), span[0]), math.copysign(math.sqrt(abs(span[1])), span[1]))
+    roots = _grid(ends, count)
+    if ends[0] < 0.0 < ends[1]:
+        nearest = min(range(1, count - 1), key=lambda j: abs(roots[j]))
+        roots[nearest] = 0.0
+    return [math.copysign(r * r, r) for r in roots]

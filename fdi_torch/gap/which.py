@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from fdi_torch.gap.evidence import temperature
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Key
 from fdi_torch.gap.screening import Option, Screen, screen
 
@@ -14,7 +15,7 @@ SINGLES, STARTS = 14, 2
 PARENTS, PARTNERS = 3, 5
 DEEPEST = 4
 PROMISE = 10.0  # chi-square units that an effect has to promise, to first order, to be fitted
-PROMISED_SHARE = 1e-3  # the same as a share of the gap, beside other effects
+SETTLED_SHARE = 0.02  # of the gap left open by the best single, below which lesser promises are not followed
 
 
 @dataclass(frozen=True)
@@ -35,10 +36,11 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option]) -> Search:
     fits: dict[Key, Fit] = {null.key: null}
     screens = {null.key: screen(fitter, null, options)}
     for candidate in _further(null, screens[null.key], SINGLES, PROMISE):
-        _keep(fits, fitter.fit(candidate, null, target=_best(fits)))
+        if not _outdone(fitter, null, _best(fits), candidate.promise):
+            _keep(fits, fitter.fit(candidate, null, target=_best(fits)))
     for depth in range(2, DEEPEST + 1):
         before = len(fits)
-        worth = max(PROMISE, PROMISED_SHARE * (null.cost - _best(fits)))
+        worth = PROMISE * temperature(null.cost - _best(fits))
         for parent in _parents(fits.values(), depth - 1, PARENTS if depth == 2 else 2):
             screens[parent.key] = screen(fitter, parent, _beside(parent, options))
             for candidate in _further(parent, screens[parent.key], PARTNERS if depth == 2 else 3, worth):
@@ -51,6 +53,12 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option]) -> Search:
         if len(fits) == before:
             break
     return Search(null, tuple(sorted(fits.values(), key=lambda f: f.cost)), screens)
+
+
+def _outdone(fitter: Fitter, null: Fit, best: float, promise: float) -> bool:
+    """Whether another effect alone has closed all but a little, and this one promises not half as much."""
+    dof = float(fitter.subject.mask.sum())
+    return best - dof < SETTLED_SHARE * (null.cost - dof) and promise < 0.5 * (null.cost - best)
 
 
 def _best(fits: dict[Key, Fit]) -> float:
@@ -77,13 +85,15 @@ def _further(fit: Fit, found: Screen, count: int, worth: float) -> list[Candidat
         if float(found.gain[i]) > worth:
             by_cause.setdefault(found.options[i].cause, []).append(i)
     chosen = list(by_cause.values())[:count]
-    return [_with(fit, [found.options[i] for i in group[:STARTS]], found, group) for group in chosen]
+    kept = [[i for i in group[:STARTS] if found.gain[i] > 0.3 * found.gain[group[0]]] for group in chosen]
+    return [_with(fit, [found.options[i] for i in group], found, group) for group in kept]
 
 
 def _with(fit: Fit, options: Sequence[Option], found: Screen, group: Sequence[int]) -> Candidate:
     """Each start once with the size that the screen suggests, the rest where the fit has it."""
     starts = [fit.effect_values | sized(o, float(found.size[i])) for o, i in zip(options, group, strict=False)]
-    return Candidate((*fit.candidate.placements, options[0].placement), tuple(starts))
+    promise = float(found.gain[group[0]])
+    return Candidate((*fit.candidate.placements, options[0].placement), tuple(starts), promise)
 
 
 def sized(option: Option, factor: float) -> dict[str, float]:

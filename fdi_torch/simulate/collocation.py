@@ -96,7 +96,7 @@ class Collocation:
     def rates(self, middle: Tensor, theta: Tensor) -> Tensor:
         """dh/dt (L, K, tanks) at given mid-step levels (L or 1, K, tanks)."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
-        signals, memory = self._commands_before(values, len(theta))
+        signals, memory, _ = self._commands_before(values, len(theta))
         commands = self.network.commands(signals, memory.unbind(-1), self.clock, values)[0]
         return self._rates(middle, commands, values, theta.shape[:-1])
 

@@ -1,0 +1,113 @@
+"""What next: of many step inputs within the pumps' limits, the one under which two rival explanations part soonest.
+
+Both are simulated with what was fitted; what their difference keeps beside the first one's constants and start levels,
+over the noise, is the chi-square by which they part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.fitting import Fit, Fitter, subject_of
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.experiment import lay_out
+
+DESIGNS, DURATION, SEED = 6, 1500.0, 0
+HOLDS = (60.0, 120.0, 250.0)  # s
+PARTED = 20.0  # chi-square units: odds of 20000 to 1
+HIGH = 0.8  # of a pump's limit, and of a tank's height
+
+
+def next_input(fitter: Fitter, first: Fit, second: Fit) -> Mapping[str, Any] | None:
+    """The best of the designs under which no tank comes near its rim; None where none of them is safe."""
+    generator = torch.Generator().manual_seed(SEED)
+    best: Mapping[str, Any] | None = None
+    for k in range(DESIGNS):
+        recording = _design(fitter, HOLDS[k % len(HOLDS)], generator)
+        parted = _separation(fitter, first, second, recording)
+        if parted is None:
+            continue
+        total, when = parted
+        if best is None or total > best["separation"]:
+            best = {"separation": total, "parted_after": when, "input": _table(recording)}
+    return best
+
+
+def _design(fitter: Fitter, hold: float, generator: torch.Generator) -> Recording:
+    """Random steps of all channels, none of which changes with another."""
+    subject = fitter.subject
+    interval = float(torch.median(torch.diff(subject.recording.time)))
+    time = torch.arange(0.0, DURATION, interval, dtype=torch.float64)
+    columns = []
+    for low, high in _limits(fitter):
+        steps = torch.rand(int(DURATION / hold) + 2, generator=generator, dtype=torch.float64)
+        shift = float(torch.rand(1, generator=generator, dtype=torch.float64))
+        index = torch.clamp(torch.floor(time / hold + shift).long(), max=len(steps) - 1)
+        columns.append(low + (high - low) * steps[index])
+    blank = torch.zeros(len(time), len(subject.plant.sensors), dtype=torch.float64)
+    outputs = tuple(s.column for s in subject.plant.sensors)
+    units = tuple(s.unit for s in subject.plant.sensors)
+    inputs = torch.stack(columns, dim=1)
+    channels = subject.plant.channels()
+    return Recording(
+        time, inputs, blank, channels, outputs, tuple(subject.plant.channel_units()[c] for c in channels), units
+    )
+
+
+def _limits(fitter: Fitter) -> list[tuple[float, float]]:
+    """Lowest and highest value of each channel, in its SI unit."""
+    plant = fitter.subject.plant
+    limits = {channel: (0.2, 1.0) for channel in plant.channels()}
+    for pump in plant.pumps:
+        full = HIGH * pump.max_flow / pump.gain
+        limits[pump.channel] = (0.1 * full, full)
+    return [limits[channel] for channel in plant.channels()]
+
+
+def _separation(fitter: Fitter, first: Fit, second: Fit, recording: Recording) -> tuple[float, float | None] | None:
+    """Chi-square between both predictions, and after how many seconds it is enough; None where a tank gets too full."""
+    subject = fitter.subject
+    step = float(torch.median(subject.experiment.steps))
+    planned = replace(
+        subject_of(subject.plant, subject.believed, recording, step),
+        experiment=lay_out(recording, subject.plant.channels(), step),
+    )
+    there = Fitter(planned, fitter.noise)
+    runs = [_run(there, fit) for fit in (first, second)]
+    heights = torch.tensor([t.height for t in subject.plant.tanks], dtype=torch.float64)
+    if any(bool((levels > 0.95 * heights).any()) for _, _, levels in runs):
+        return None
+    difference = there.noise.whiten(runs[0][0] - runs[1][0], planned.mask)
+    slopes = there.noise.whiten(runs[0][1], planned.mask).flatten(0, 1)
+    slopes = slopes / slopes.norm(dim=0).clamp(min=1e-300)
+    q, _ = torch.linalg.qr(slopes)
+    rest = difference.flatten() - q @ (q.T @ difference.flatten())
+    grown = torch.cumsum((rest.reshape(difference.shape) ** 2).sum(dim=1), dim=0)
+    enough = (grown > PARTED).nonzero().flatten()
+    return float(grown[-1]), float(recording.time[enough[0]]) if len(enough) else None
+
+
+def _run(there: Fitter, fit: Fit) -> tuple[Tensor, Tensor, Tensor]:
+    """Readings (S, C), slopes by the nuisances (S, C, P) and levels of a fit under the planned input."""
+    engine = there.engine(fit.candidate, list(fit.effect_values))
+    theta = fit.theta.unsqueeze(0)
+    near = engine.settle(theta, engine.constant_guess(theta), rounds=30)
+    columns = [engine.space.index(n) for n in there.subject.nuisance]
+    return near.readings[0], near.jacobian[0][..., columns], near.levels[0]
+
+
+def _table(recording: Recording) -> dict[str, Any]:
+    """The steps of each channel: when, and to what, in SI."""
+    table: dict[str, Any] = {
+        "duration": float(recording.time[-1]),
+        "unit": dict(zip(recording.input_names, recording.input_units, strict=True)),
+    }
+    for name, column in zip(recording.input_names, recording.inputs.T, strict=True):
+        changes = torch.cat([torch.tensor([True]), torch.diff(column) != 0.0])
+        table[name] = {"at": recording.time[changes].tolist(), "value": column[changes].tolist()}
+    return table

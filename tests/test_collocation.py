@@ -1,0 +1,66 @@
+"""Whole-trajectory simulation against a sequential recurrence, the reference engine and finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from fdi_torch.effects import build_network, place
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.collocation import Collocation
+from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.integrate import ReferenceEngine
+from fdi_torch.simulate.scan import linear_scan
+from tests.rigs import constant_inputs, three_tank
+
+
+def stepped(duration: float = 200.0) -> Recording:
+    """Inputs that change every 40 s."""
+    blank = constant_inputs(three_tank(), duration)
+    inputs = blank.inputs.clone()
+    for k, level in enumerate((20e-6, 70e-6, 45e-6, 80e-6, 30e-6)):
+        inputs[40 * k : 40 * (k + 1), 0] = level
+        inputs[40 * k + 20 : 40 * (k + 1) + 20, 1] = 90e-6 - level
+    return replace(blank, inputs=inputs)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 50])
+def test_the_scan_is_the_recurrence(count: int) -> None:
+    generator = torch.Generator().manual_seed(1)
+    draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+    a, b, first = 0.5 * draw(2, count, 3, 3), draw(2, count, 3, 4), draw(2, 3, 4)
+    expected = [first]
+    for k in range(count):
+        expected.append(a[:, k] @ expected[-1] + b[:, k])
+    torch.testing.assert_close(linear_scan(a, b, first), torch.stack(expected, dim=1), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "causes",
+    [
+        {},
+        {("pump_gain", "Q1"): {"factor": 1.1}},
+        {("pump_lag", "Q1"): {"time_constant": 9.0}, ("sensor_lag", "h2"): {"time_constant": 12.0}},
+        {("pump_delay", "Q2"): {"delay": 7.3}, ("sensor_delay", "h1"): {"delay": 4.6}},
+    ],
+)
+def test_levels_and_slopes_are_those_of_the_reference_and_of_finite_differences(causes: dict) -> None:
+    recording = stepped()
+    network = build_network(three_tank(), [place(*cause) for cause in causes])
+    values = {f"{at}.{name}.{p}": v for (name, at), ps in causes.items() for p, v in ps.items()}
+    names = ["P13.discharge_coefficient", "T1.start_level", *values]
+    space = ParameterSpace(network.constants[n] for n in names)
+    theta = space.vector(values).unsqueeze(0)
+    engine = Collocation(network, space, lay_out(recording, network.description.channels(), 1.0))
+    found = engine.settle(theta, engine.constant_guess(theta))
+    exact = ReferenceEngine(network, space, lay_out(recording, network.description.channels(), 0.25)).readings(theta)
+    assert float((found.readings - exact).abs().max()) < 1e-5  # m
+    for j, name in enumerate(names):
+        step = 1e-5 * max(abs(float(theta[0, j])), 0.1)
+        ends = [engine.settle(theta + sign * step * torch.eye(len(names))[j], found.levels) for sign in (1.0, -1.0)]
+        slope = (ends[0].readings - ends[1].readings) / (2 * step)
+        error = (slope - found.jacobian[..., j]).norm() / slope.norm()
+        assert float(error) < 1e-3, name

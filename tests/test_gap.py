@@ -1,0 +1,167 @@
+"""The gap diagnosis against noise, plants and causes that are known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import build_network, place
+from fdi_torch.gap.answer import adopted
+from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step
+from fdi_torch.gap.library import STANDARD, canonical, library_of
+from fdi_torch.gap.plan import plan
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.collocation import Collocation
+from fdi_torch.simulate.experiment import lay_out
+from tests.rigs import blank_recording, constant_inputs, three_tank
+
+SMALL = ("pump_gain", "pump_lag", "laminar_flow", "leak@T1", "sensor_bias")
+
+
+def believed() -> PlantDescription:
+    tolerances = {f"{p}.discharge_coefficient": 0.03 for p in ("P13", "P32", "OUT2")}
+    return replace(three_tank(), tolerances=tolerances)
+
+
+def noise(samples: int, ar: float, std: float, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    fresh = torch.randn(samples, 3, generator=generator, dtype=torch.float64) * std * math.sqrt(1 - ar * ar)
+    rows = [fresh[0] / math.sqrt(1 - ar * ar)]
+    for row in fresh[1:]:
+        rows.append(ar * rows[-1] + row)
+    return torch.stack(rows)
+
+
+def recorded(values: dict[str, float], seed: int, samples: int = 1000, std: float = 1e-3, ar: float = 0.0) -> Recording:
+    """The three tanks with some parameters changed, under random steps, read with noise (m)."""
+    plant = believed()
+    generator = torch.Generator().manual_seed(seed)
+    time = torch.arange(samples, dtype=torch.float64)
+    levels = 15e-6 + 60e-6 * torch.rand(samples // 70 + 1, 2, generator=generator, dtype=torch.float64)
+    blank = blank_recording(plant, levels.repeat_interleave(70, dim=0)[:samples], time)
+    placements = [place(n.split(".")[1], n.split(".")[0]) for n in values if n.count(".") == 2]
+    network = build_network(plant, placements)
+    names = [*values, *(n for n in ("P13.discharge_coefficient",) if n not in values)]
+    space = ParameterSpace(network.constants[n] for n in names)
+    engine = Collocation(network, space, lay_out(blank, plant.channels(), 1.0))
+    theta = space.vector(values).unsqueeze(0)
+    readings = engine.settle(theta, engine.constant_guess(theta)).readings[0]
+    return replace(blank, outputs=readings + noise(samples, ar, std, seed + 1), mask=None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("ar", [0.0, 0.8])
+def test_level_and_colour_of_noise_are_found_beside_a_slow_misfit(ar: float) -> None:
+    x = noise(4000, ar, 0.002, 3)
+    slow = 0.01 * torch.sin(torch.arange(4000, dtype=torch.float64) / 200.0).unsqueeze(1)
+    found = estimate_noise(x + slow, torch.ones_like(x, dtype=torch.bool))
+    assert found.std.tolist() == pytest.approx([0.002] * 3, rel=0.15 if ar else 0.04)
+    assert found.ar.tolist() == pytest.approx([ar] * 3, abs=0.04)
+
+
+def test_whitened_noise_is_white_and_of_unit_variance_also_across_masked_samples() -> None:
+    x = noise(20000, 0.7, 0.5, 5)
+    mask = torch.rand(x.shape, generator=torch.Generator().manual_seed(2)) > 0.2
+    ar = torch.full((3,), 0.7, dtype=torch.float64)
+    white = Noise(0.5 * torch.sqrt(1 - ar**2), ar).whiten(x, mask)
+    assert float((white[~mask]).abs().max()) == 0.0
+    assert float(white[mask].var()) == pytest.approx(1.0, abs=0.02)
+    assert float((white[1:] * white[:-1])[mask[1:] & mask[:-1]].mean()) == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_rounded_channel_shows_its_step_and_a_printed_one_does_not() -> None:
+    x = 0.3 + 0.1 * torch.sin(torch.arange(2000, dtype=torch.float64) / 90) + noise(2000, 0.0, 0.001, 1)[:, 0]
+    assert lattice_step((x / 0.013).round() * 0.013, 0.001) == pytest.approx(0.013, rel=1e-6)
+    assert lattice_step((x * 1e6).round() / 1e6, 0.001) == 0.0
+    assert lattice_step(x, 0.001) == 0.0
+
+
+def test_a_sound_rig_with_constants_within_tolerance_has_no_gap() -> None:
+    answer = diagnose(believed(), recorded({"P13.discharge_coefficient": 0.615}, 11), settings=Settings(SMALL))
+    assert answer.verdict == "no_gap" and not answer.causes
+    assert answer.p_value > 1e-3
+
+
+@pytest.mark.parametrize("ar", [0.0, 0.8])
+def test_a_known_cause_is_named_with_its_size_and_closes_the_gap(ar: float) -> None:
+    values = {"Q1.pump_lag.time_constant": 12.0, "P32.discharge_coefficient": 0.61}
+    recording, holdout = recorded(values, 21, ar=ar), recorded(values, 22, ar=ar)
+    answer = diagnose(believed(), recording, holdout, Settings(SMALL))
+    assert answer.verdict == "named"
+    (cause,) = answer.causes
+    assert (cause.effect, cause.location) == ("pump_lag", "Q1")
+    amount = cause.parameters["time_constant"]
+    assert abs(amount.value - 12.0) < 5 * amount.std < 3.0
+    assert answer.closure["closed"] == pytest.approx(1.0, abs=0.03)
+    assert answer.closure["augmented"] == pytest.approx(0.1, rel=0.1)  # cm: the noise
+
+
+def test_two_causes_are_named_together() -> None:
+    values = {"Q2.pump_gain.factor": 1.12, "h1.sensor_bias.bias": 0.012}
+    answer = diagnose(believed(), recorded(values, 31), settings=Settings(SMALL))
+    assert answer.verdict == "named"
+    assert {(c.effect, c.location) for c in answer.causes} == {("pump_gain", "Q2"), ("sensor_bias", "h1")}
+
+
+def test_a_cause_that_the_library_lacks_is_unknown_at_its_place() -> None:
+    values = {"P13.laminar_flow.transition_head": 0.06}
+    answer = diagnose(believed(), recorded(values, 41), settings=Settings(SMALL, leave_out=("laminar_flow",)))
+    assert answer.verdict == "unknown" and not answer.causes
+    assert answer.where[0][0] == "P13"
+
+
+def test_the_answer_is_the_protocols() -> None:
+    answer = diagnose(believed(), recorded({"Q2.pump_gain.factor": 1.12}, 51), settings=Settings(("pump_gain",)))
+    found = answer.to_dict()
+    assert found["format"] == "fdi_torch.gap/1"
+    assert found["ambiguity_set"] == [[{"effect": "pump_gain", "location": "Q2"}]]
+    assert sum(e["probability"] for e in found["posterior"]) == pytest.approx(1.0)
+
+
+def test_the_library_offers_62_effects_at_places_of_the_three_tanks() -> None:
+    assert len(library_of(believed(), STANDARD)) == 62
+    assert canonical(("plugging", "OUT2"), believed()) == ("leak", "T2")
+
+
+@pytest.mark.parametrize(
+    ("names", "left_out", "message"),
+    [
+        (("pump_lagg",), (), "the nearest is 'pump_lag'"),
+        (("pump_lag@T1",), (), "expected a place of kind pump, got T1"),
+        (("pump_lag",), ("pump_lag",), "expected at least one effect"),
+    ],
+)
+def test_a_wrong_library_is_said(names: tuple[str, ...], left_out: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        library_of(believed(), names, left_out)
+
+
+def test_a_recording_without_a_sensor_is_refused() -> None:
+    recording = recorded({"Q2.pump_gain.factor": 1.1}, 1, samples=100)
+    with pytest.raises(ValueError, match="expected a sensor 'h1'"):
+        diagnose(believed(), replace(recording, output_names=("x", "h2", "h3")))
+
+
+def test_a_plan_knows_twins_and_what_stays_hidden() -> None:
+    library = ("pump_gain", "pump_dead_zone@Q1", "sensor_bias@h2", "sensor_saturation@h1")
+    steady = constant_inputs(believed(), 600.0)
+    found = plan(believed(), steady, 1e-3, library)
+    assert any({a, b} == {("pump_gain", "Q1"), ("pump_dead_zone", "Q1")} for a, b, _ in found.twins)
+    lively = plan(believed(), recorded({"P13.discharge_coefficient": 0.6}, 61), 1e-3, library)
+    assert not any({a, b} == {("pump_gain", "Q1"), ("pump_dead_zone", "Q1")} for a, b, _ in lively.twins)
+
+
+def test_what_was_found_can_be_adopted() -> None:
+    recording = recorded({"Q2.pump_gain.factor": 1.12}, 71, samples=600)
+    answer = diagnose(believed(), recording, settings=Settings(("pump_gain", "sensor_bias@h1")))
+    plant = adopted(believed(), answer)
+    (placed,) = plant.effects
+    assert placed.effect == "pump_gain" and placed.location == "Q2"
+    again = diagnose(plant, recording, settings=Settings(("pump_gain@Q1", "sensor_bias@h1")))
+    assert again.verdict == "no_gap"
