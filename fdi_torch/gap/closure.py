@@ -8,14 +8,14 @@ Constants and effects come from the recording; of the hold-out only the start le
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject
-from fdi_torch.gap.floor import Noise, estimate_noise
+from fdi_torch.gap.floor import Noise, estimate_noise, with_rounding
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation
 
@@ -37,11 +37,12 @@ class Closure:
 
 
 def closure(
-    subject: Subject, noise: Noise, fits: Mapping[str, Fit | None], best: str, scale: float, unit: str
+    subject: Subject, noise: Noise, fits: Mapping[str, Fit | None], lattice: Sequence[float], scale: float, unit: str
 ) -> Closure:
-    """fits: by the names of the answer ('nominal' has None); best: whose residual shows the hold-out's noise."""
+    """fits: by the names of the answer ('nominal' has None). lattice (C,): the step of each rounded channel, or 0."""
     residuals = {name: free_run(subject, noise, fit) for name, fit in fits.items()}
-    found = estimate_noise(residuals[best], subject.mask)
+    fast = estimate_noise(residuals["augmented"], subject.mask, [step > 0.0 for step in lattice])
+    found = with_rounding(fast, lattice, subject.readings - residuals["augmented"])
     floor = found.std
     mask = subject.mask
     squares = {name: torch.where(mask, r * r, 0.0) for name, r in residuals.items()}
@@ -62,7 +63,9 @@ def free_run(subject: Subject, noise: Noise, fit: Fit | None) -> Tensor:
     network = fitter.engine(candidate, free).network
     if fit:
         for name, value in fit.values.items():
-            network.nominal[network.constants.index(name)] = value
+            # A free course in time belongs to the recording's own clock and tells nothing of another day.
+            timed = name.rpartition(".")[2].startswith("time_") and ".free_" in name
+            network.nominal[network.constants.index(name)] = 0.0 if timed else value
     starts = [f"{t.name}.start_level" for t in subject.plant.tanks]
     engine = Collocation(network, ParameterSpace(network.constants[n] for n in starts), subject.experiment)
     theta = engine.space.vector(fitter.first_levels()).unsqueeze(0)

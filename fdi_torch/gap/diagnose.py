@@ -15,7 +15,7 @@ from fdi_torch.gap.answer import Amount, Answer, Cause, CauseName, Explanation, 
 from fdi_torch.gap.closure import Closure, closure
 from fdi_torch.gap.evidence import log_evidence, posterior, temperature
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject, subject_of
-from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step
+from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, slow_excess, with_rounding
 from fdi_torch.gap.freeform import shape_of
 from fdi_torch.gap.library import canonical, library_of, possible_places, twins
 from fdi_torch.gap.next_input import next_input
@@ -31,7 +31,7 @@ from fdi_torch.recording import Recording
 CONTENT = 0.95
 REFITS = 3
 UNEXPLAINED = 0.1  # share of the gap left open at which nothing has been explained
-LEFT_SHARE, LEFT_LEAST = 2e-3, 60.0  # share of the gap, and chi-square units, worth asking the free forms about
+LEFT_SHARE, LEFT_LEAST = 2e-3, 150.0  # share of the gap, and chi-square units, worth asking the free forms about
 FAR_BETTER = 0.35
 Tell = Callable[[float, str], None]
 
@@ -67,15 +67,14 @@ def diagnose(
     rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
     rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]
     weighed = _weighed(fitter, found, len(library), plant)
-    unknown = _unnamed(fitter, weighed.fits[0], found.null, refits)
+    unknown = _unnamed(fitter, weighed.fits[0], found, refits)
     tell(0.8, "hold-out")
     return _answer(fitter, found, places, weighed, unknown, rounded, lattice, holdout, settings)
 
 
 def _places(fitter: Fitter, found: Search, plant: PlantDescription, reach: Reach) -> tuple[list[Suspect], list[Fit]]:
     """Every place with what it could close; the likeliest refitted in full where the library leaves something open."""
-    dof = float(fitter.subject.mask.sum())
-    gap, left = found.null.cost - dof, found.best.cost - dof
+    gap, left = _gap(fitter, found), _left(fitter, found.best)
     heat = temperature(found.null.cost - found.best.cost)
     everywhere = possible_places(plant)
     places = suspects(fitter, found.null, everywhere, reach, heat, waves=left > UNEXPLAINED * gap > 0.0)
@@ -84,7 +83,7 @@ def _places(fitter: Fitter, found: Search, plant: PlantDescription, reach: Reach
     return places, [refit(fitter, found.null, s, reach) for s in places[:REFITS]]
 
 
-def _unnamed(fitter: Fitter, named: Fit, null: Fit, refits: Sequence[Fit]) -> Fit | None:
+def _unnamed(fitter: Fitter, named: Fit, found: Search, refits: Sequence[Fit]) -> Fit | None:
     """The free discrepancy of one place that closes what no effect of the library does, if there is one.
 
     Equations that differ a little leave a little open, and a free discrepancy at the same place cannot do much
@@ -92,11 +91,10 @@ def _unnamed(fitter: Fitter, named: Fit, null: Fit, refits: Sequence[Fit]) -> Fi
     """
     if not refits:
         return None
-    dof = float(fitter.subject.mask.sum())
     best = min(refits, key=lambda f: f.cost)
-    gap, left, free = null.cost - dof, named.cost - dof, max(best.cost - dof, 0.0)
+    gap, left, free = _gap(fitter, found), _left(fitter, named), _left(fitter, best)
     nothing_named = left > UNEXPLAINED * gap
-    far_better = free < FAR_BETTER * left and left - free > LEFT_SHARE * gap
+    far_better = free < FAR_BETTER * left and left - free > max(LEFT_SHARE * gap, LEFT_LEAST)
     return best if nothing_named or far_better else None
 
 
@@ -104,8 +102,14 @@ def _interval(recording: Recording) -> float:
     return float(torch.median(torch.diff(recording.time)))
 
 
-def _gap(subject: Subject, null: Fit) -> float:
-    return null.cost - float(subject.mask.sum())
+def _left(fitter: Fitter, fit: Fit) -> float:
+    """What a fit leaves open, chi-square units."""
+    return max(slow_excess(fitter.white(fit.near)[0][0]), 0.0)
+
+
+def _gap(fitter: Fitter, found: Search) -> float:
+    """What the recalibrated plant leaves open: what the best explanation closes, and what that leaves."""
+    return found.null.cost - found.best.cost + _left(fitter, found.best)
 
 
 def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
@@ -119,7 +123,7 @@ def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
     values = [subject.readings[subject.mask[:, c], c] for c in range(channels)]
     lattice = [lattice_step(v, float(noise.std[c])) for c, v in enumerate(values)]
     noise = estimate_noise(residual, subject.mask, [step > 0.0 for step in lattice])
-    fitter = Fitter(subject, noise)
+    fitter = Fitter(subject, with_rounding(noise, lattice, null.near.readings[0]))
     return fitter, fitter.fit(Candidate(), null), lattice
 
 
@@ -165,7 +169,7 @@ def _answer(
     standing = _content(explanations)
     verdict: Verdict = "unknown" if unnamed else _verdict(standing, rounded)
     causes = () if verdict in ("no_gap", "unknown") else _causes(fitter, fit, rounded, lattice)
-    gap = max(_gap(fitter.subject, found.null), 1.0)
+    gap = max(_gap(fitter, found), 1.0)
     where = [(s.location, min(max(s.closes / gap, 0.0), 1.0)) for s in places]
     if unnamed:
         place = unnamed.candidate.placements[0].location
@@ -181,7 +185,7 @@ def _answer(
             Explanation(() if e.unknown_at else (*e.causes, *rounded), e.probability, e.unknown_at)
             for e in explanations[:12]
         ],
-        closure=(closed := _closure(fitter, found, unnamed or fit, holdout, settings, unnamed is not None)),
+        closure=(closed := _closure(fitter, found, unnamed or fit, lattice, holdout, settings)),
         noise=_noise(fitter, lattice),
         shape=shape_of(unnamed) if unnamed else None,
         next_input=_next(fitter, weighed) if verdict == "ambiguous" else None,
@@ -202,13 +206,12 @@ def _impostors(fitter: Fitter, found: Search, named: Fit) -> dict[str, object]:
 
     would_pass: whether that impostor would have closed all but two per cent of the gap.
     """
-    dof = float(fitter.subject.mask.sum())
     others = [f for f in found.fits if f.key and not f.key & named.key]
-    gap = max(found.null.cost - dof, 1.0)
+    gap = max(_gap(fitter, found), 1.0)
     if not others:
         return {"best": [], "left_open": 1.0, "would_pass": False}
     best = min(others, key=lambda f: f.cost)
-    left = max(best.cost - dof, 0.0) / gap
+    left = min((_left(fitter, named) + best.cost - named.cost) / gap, 1.0)
     causes = [{"effect": name, "location": place} for name, place in _ordered(best)]
     return {"best": causes, "left_open": left, "would_pass": left < 0.02}
 
@@ -219,8 +222,7 @@ def _remarks(fitter: Fitter, found: Search, best: Fit, closed: Mapping[str, Any]
         remarks.append("the inputs never change: most effects cannot be told apart; --plan shows what steps would tell")
     if len(fitter.subject.nuisance) == len(fitter.subject.plant.tanks):
         remarks.append("the plant file gives no tolerances: every constant is taken to be exact")
-    dof = float(fitter.subject.mask.sum())
-    explained = best.cost - dof < 0.1 * max(found.null.cost - dof, dof)
+    explained = _left(fitter, best) < UNEXPLAINED * max(_gap(fitter, found), float(fitter.subject.mask.sum()))
     if closed and explained and closed["augmented"] > 3.0 * closed["noise_floor"] and (closed["closed"] or 0.0) < 0.5:
         remarks.append("what explains the recording does not explain the hold-out: is it of the same rig?")
     return remarks
@@ -276,14 +278,14 @@ def _p_value(found: Search, rounded: Sequence[CauseName]) -> float:
 
 
 def _closure(
-    fitter: Fitter, found: Search, best: Fit, holdout: Recording | None, settings: Settings, unknown: bool
+    fitter: Fitter, found: Search, best: Fit, lattice: Sequence[float], holdout: Recording | None, settings: Settings
 ) -> Mapping[str, Any]:
     if holdout is None:
         return {}
     subject = subject_of(fitter.subject.plant, fitter.subject.believed, holdout, settings.step or _interval(holdout))
     unit, scale = display_unit(subject.plant.sensors[0].unit)
     fits: dict[str, Fit | None] = {"nominal": None, "recalibrated": found.null, "augmented": best}
-    done: Closure = closure(subject, fitter.noise, fits, "augmented", scale, unit)
+    done: Closure = closure(subject, fitter.noise, fits, lattice, scale, unit)
     return {
         "metric": "free-run RMSE on the hold-out, per sensor and pooled, in the sensor's unit",
         "unit": done.unit,
@@ -291,7 +293,7 @@ def _closure(
         "per_sensor": done.per_sensor,
         "closed": done.closed,
         "closed_ci95": done.closed_ci95,
-        "with": "a free discrepancy" if unknown else "the causes named",
+        "augmented_with": [{"effect": n, "location": at} for n, at in _ordered(best)],
     }
 
 

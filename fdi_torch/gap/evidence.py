@@ -19,6 +19,8 @@ from fdi_torch.gap.fitting import Fit, Fitter
 
 MISMATCH = 4000.0
 LOG_PRIOR_EFFECT = math.log(0.1)  # odds of one more thing being wrong, before the data
+# Two effects at one place are mostly one effect there with another equation than the library's.
+LOG_PRIOR_SAME_PLACE = math.log(1e-4)
 
 
 def temperature(gap: float) -> float:
@@ -37,8 +39,9 @@ def log_evidence(fitter: Fitter, fit: Fit, heat: float, choices: int) -> float:
     cost = (fit.cost - _prior_cost(fit)) / heat + _prior_cost(fit)
     widths = torch.tensor([_log_width(fitter, fit, i) for i in range(len(space))], dtype=torch.float64)
     occam = -0.5 * _log_det(hessian) + float((torch.log(scale) - widths).sum())
-    causes = len(fit.key)
-    return -0.5 * cost + occam + causes * (LOG_PRIOR_EFFECT - math.log(choices)) - math.lgamma(causes + 1)
+    causes, places = len(fit.key), len({place for _, place in fit.key})
+    prior = causes * (LOG_PRIOR_EFFECT - math.log(choices)) + (causes - places) * LOG_PRIOR_SAME_PLACE
+    return -0.5 * cost + occam + prior + math.lgamma(causes + 1)
 
 
 def _prior_cost(fit: Fit) -> float:

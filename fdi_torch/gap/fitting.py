@@ -187,7 +187,8 @@ class Fitter:
             curvature = curvature.index_copy(0, take, new_curvature[better])
             near = _replaced(near, take, tried.lanes(better))
             damping[lanes] = torch.where(better, damping[lanes] * 0.2, damping[lanes] * 10.0).clamp(1e-9, 1e8)
-            behind = cost[lanes] - max(target, float(cost.min()) if len(cost) > 1 else target)
+            rival = float(cost.min()) if len(cost) > 1 and not math.isfinite(target) else target
+            behind = cost[lanes] - rival if math.isfinite(rival) else torch.zeros_like(gain)
             hopeless = (turn >= PATIENCE) & (ENOUGH * gain < behind) & (behind > 30.0)
             done = (better & (gain < SETTLED)) | (damping[lanes] > 1e4) | hopeless
             active[lanes[done]] = False

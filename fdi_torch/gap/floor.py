@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+DECAY_SHARE = 0.3  # of a rounding step, over which its error is forgotten
 FAST_PERIOD = 30.0  # samples; slower parts of a residual may be the model's
 
 
@@ -55,6 +56,18 @@ class Noise:
         fresh = torch.sqrt(1.0 - ar**2)
         white = torch.where(follows, x - ar * before, fresh * x)
         return torch.where(keep, white / innovation, torch.zeros_like(x))
+
+
+def slow_excess(white: Tensor) -> float:
+    """What a whitened residual (S, C) holds below the corner frequency beyond what its fast part lets expect.
+
+    In chi-square units. The fast part is the yardstick, so that an error of the noise's level does not count.
+    """
+    power = torch.fft.rfft(white, dim=0).abs() ** 2 * 2.0 / len(white)
+    slow = torch.arange(len(power), dtype=white.dtype) / len(white) <= 1.0 / FAST_PERIOD
+    power[0] *= 0.5
+    level = power[~slow].mean(dim=0)
+    return float((power[slow].sum(dim=0) - (float(slow.sum()) - 0.5) * level).sum())
 
 
 def estimate_noise(residual: Tensor, mask: Tensor, rounded: Sequence[bool] = ()) -> Noise:
@@ -108,6 +121,26 @@ def _chosen(likelihood: Tensor, count: int) -> int:
     """The likeliest colour; white unless colour earns what the BIC asks for one parameter."""
     best = int(likelihood.argmin())
     return best if float(likelihood[_WHITE] - likelihood[best]) > math.log(count) else _WHITE
+
+
+def with_rounding(noise: Noise, steps: Sequence[float], readings: Tensor) -> Noise:
+    """What rounding adds, for channels (C,) that are rounded to steps > 0; readings (S, C): about what they would read.
+
+    A variance of step^2/12 (Widrow and Kollar, 2008) on that of the other channels. It stays the same until the level
+    has moved by a good part of a step: its colour is that of the time which the level takes for it.
+    """
+    if not any(steps):
+        return noise
+    std, ar = noise.std.clone(), noise.ar.clone()
+    plain = [float(s) for s, step in zip(std, steps, strict=True) if not step]
+    for c, step in enumerate(steps):
+        if not step:
+            continue
+        below = sorted(plain)[len(plain) // 2] if plain else 0.0
+        moved = float(readings[:, c].diff().abs().mean())
+        slow = math.exp(-max(moved, 1e-4 * step) / (DECAY_SHARE * step))
+        std[c], ar[c] = math.hypot(below, step / math.sqrt(12.0)), max(float(ar[c]), min(slow, 0.98))
+    return Noise(std * torch.sqrt(1.0 - ar**2), ar)
 
 
 def lattice_step(values: Tensor, noise: float) -> float:

@@ -14,6 +14,7 @@ from fdi_torch.gap.screening import Option, Screen, screen
 SINGLES, STARTS = 14, 2
 PARENTS, PARTNERS = 3, 5
 DEEPEST = 4
+POLISH = 20
 PROMISE = 10.0  # chi-square units that an effect has to promise, to first order, to be fitted
 SETTLED_SHARE = 0.02  # of the gap left open by the best single, below which lesser promises are not followed
 
@@ -38,6 +39,7 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option]) -> Search:
     for candidate in _further(null, screens[null.key], SINGLES, PROMISE):
         if not _outdone(fitter, null, _best(fits), candidate.promise):
             _keep(fits, fitter.fit(candidate, null, target=_best(fits)))
+    _polish(fitter, fits, 1)
     for depth in range(2, DEEPEST + 1):
         before = len(fits)
         worth = PROMISE * temperature(null.cost - _best(fits))
@@ -52,7 +54,15 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option]) -> Search:
                     _keep(fits, fitter.fit(candidate, null, target=_best(fits)))
         if len(fits) == before:
             break
+        _polish(fitter, fits, depth)
     return Search(null, tuple(sorted(fits.values(), key=lambda f: f.cost)), screens)
+
+
+def _polish(fitter: Fitter, fits: dict[Key, Fit], effects: int) -> None:
+    """The two best fits of so many effects go on to where they end: thresholds come to rest slowly."""
+    for fit in _parents(fits.values(), effects, 2):
+        again = Candidate(fit.candidate.placements, (fit.effect_values,))
+        _keep(fits, fitter.fit(again, fit, rounds=POLISH))
 
 
 def _outdone(fitter: Fitter, null: Fit, best: float, promise: float) -> bool:
