@@ -15,8 +15,8 @@ from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.recordings import RecordingConfig, read_recording
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap_job import log_gap
 from fdi_torch.gap.plan import Plan, plan
+from fdi_torch.gap_job import log_gap
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 

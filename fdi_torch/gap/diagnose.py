@@ -30,6 +30,7 @@ from fdi_torch.recording import Recording
 
 CONTENT = 0.95
 REFITS = 3
+PATIENT = 40  # rounds for the recalibration, on which all else rests
 UNEXPLAINED = 0.1  # share of the gap left open at which nothing has been explained
 LEFT_SHARE, LEFT_LEAST = 2e-3, 150.0  # share of the gap, and chi-square units, worth asking the free forms about
 FAR_BETTER = 0.35
@@ -117,14 +118,14 @@ def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
     channels = len(subject.plant.sensors)
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     first = Fitter(subject, Noise(1e-2 * spread, torch.zeros(channels, dtype=spread.dtype)))
-    null = first.fit(Candidate())
+    null = first.fit(Candidate(), rounds=PATIENT)
     residual = subject.readings - null.near.readings[0]
     noise = estimate_noise(residual, subject.mask)
     values = [subject.readings[subject.mask[:, c], c] for c in range(channels)]
     lattice = [lattice_step(v, float(noise.std[c])) for c, v in enumerate(values)]
     noise = estimate_noise(residual, subject.mask, [step > 0.0 for step in lattice])
     fitter = Fitter(subject, with_rounding(noise, lattice, null.near.readings[0]))
-    return fitter, fitter.fit(Candidate(), null), lattice
+    return fitter, fitter.fit(Candidate(), null, rounds=PATIENT), lattice
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ def _marginal(spectrum: Tensor, score: Tensor, amplitude: float) -> tuple[float,
     return evidence, closes
 
 
-def refit(fitter: Fitter, fit: Fit, suspect: Suspect, reach: Reach, rounds: int = 9) -> Fit:
+def refit(fitter: Fitter, fit: Fit, suspect: Suspect, reach: Reach, rounds: int = 16) -> Fit:
     """The free discrepancy of one place fitted in full, about the moving trajectory."""
     plant = fitter.subject.plant
     placements = free_form(suspect.location, plant, reach, suspect.periods)
