@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import build_network, place
+from fdi_torch.effects import build_network, placements_for
 from fdi_torch.gap.answer import adopted
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step
@@ -46,8 +46,7 @@ def recorded(values: dict[str, float], seed: int, samples: int = 1000, std: floa
     time = torch.arange(samples, dtype=torch.float64)
     levels = 15e-6 + 60e-6 * torch.rand(samples // 70 + 1, 2, generator=generator, dtype=torch.float64)
     blank = blank_recording(plant, levels.repeat_interleave(70, dim=0)[:samples], time)
-    placements = [place(n.split(".")[1], n.split(".")[0]) for n in values if n.count(".") == 2]
-    network = build_network(plant, placements)
+    network = build_network(plant, placements_for(values))
     names = [*values, *(n for n in ("P13.discharge_coefficient",) if n not in values)]
     space = ParameterSpace(network.constants[n] for n in names)
     engine = Collocation(network, space, lay_out(blank, plant.channels(), 1.0))

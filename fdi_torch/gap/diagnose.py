@@ -93,7 +93,10 @@ def _unnamed(fitter: Fitter, named: Fit, found: Search, refits: Sequence[Fit]) -
     if not refits:
         return None
     best = min(refits, key=lambda f: f.cost)
-    gap, left, free = _gap(fitter, found), _left(fitter, named), _left(fitter, best)
+    gap, left = _gap(fitter, found), _left(fitter, named)
+    if _left(fitter, best) > UNEXPLAINED * gap:
+        best = refits[0]  # no place alone does it: the likeliest one to first order
+    free = _left(fitter, best)
     nothing_named = left > UNEXPLAINED * gap
     far_better = free < FAR_BETTER * left and left - free > max(LEFT_SHARE * gap, LEFT_LEAST)
     return best if nothing_named or far_better else None
