@@ -31,13 +31,20 @@ def make_trials(plan: Plan, block: Block) -> Trials:
     """Noise-free readings at fine steps, and each trial's own noise."""
     setting = plan.settings[block.setting]
     truth = setting.faults[block.first : block.last]
-    clean = plan.fitting.engines(plan.method.data_step)[0].readings(truth)
+    clean = _clean(plan.fitting.engines(plan.method.data_step)[0], truth)
     if setting.snr_db is None:
         none = torch.zeros_like(clean)
         return Trials(truth, clean, none, torch.full_like(clean[:, 0], NOMINAL_NOISE))
     std = noise_level(clean, setting.snr_db, plan.snr_definition)
     noise = plan.noise(block, tuple(clean.shape[1:])) * std[:, None, :]
     return Trials(truth, clean + noise, noise, std)
+
+
+def _clean(engine: Engine, truth: Tensor) -> Tensor:
+    """Noise-free readings (B, S, C); a fault that all trials share is simulated once."""
+    if bool((truth == truth[:1]).all()):
+        return engine.readings(truth[:1]).expand(len(truth), -1, -1)
+    return engine.readings(truth)
 
 
 @dataclass(frozen=True)
