@@ -12,7 +12,7 @@ from fdi_torch.estimate.diagnosis import UNEXPLAINED_RATIO, sample_noise
 from fdi_torch.estimate.evolution import evolve
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
-from fdi_torch.estimate.objectives import Objective, Problem, Term, spread_of
+from fdi_torch.estimate.objectives import OBJECTIVES, Objective, Problem, Term, spread_of
 from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.refined import CONVERGED, STATUSES, Refined
 from fdi_torch.simulate.engine import Engine, Readings
@@ -89,13 +89,17 @@ class Fits:
         self.low, self.high = plan.fitting.space.low(), plan.fitting.space.high()
         self.engines: list[Engine] = [plan.fitting.engines(step)[0] for step in plan.method.steps]
 
-    def searched(self, seeds: Tensor, lanes: Tensor | None = None) -> Tensor:
-        """The best members (B, K, P) of a differential evolution for each trial."""
+    def searched(self, seeds: Tensor, lanes: Tensor | None = None, again: int = 0) -> Tensor:
+        """The best members (B, K, P) of differential evolution for each trial; every second on the other objective.
+
+        What one objective takes for the best basin the other may not: correlation is blind to gain and offset.
+        """
         every, method = self.method.search_every, self.method
         data = self.data if lanes is None else self.data.of(lanes)
         thinned = Readings(data.values[:, ::every], data.weight[:, ::every])
         engine = thinned_fitting(self.fitting, every).engines(method.search_step)[0]
-        problem = Problem(self.fitting.space, [Term(engine, thinned)], method.objective)
+        first = OBJECTIVES.index(method.objective)
+        problem = Problem(self.fitting.space, [Term(engine, thinned)], OBJECTIVES[(first + again) % len(OBJECTIVES)])
         low, high = (bound.expand(len(seeds), -1) for bound in (self.low, self.high))
         result = evolve(problem.cost, low, high, method.search, seeds)
         return distant(result.population, result.cost, self.high - self.low, method.starts)
@@ -115,7 +119,7 @@ class Fits:
             lanes = self._unexplained(fit.theta).nonzero()[:, 0]
             if not len(lanes):
                 break
-            other = self.refined(self.searched(plan.search_seeds(block, again)[lanes], lanes), lanes)
+            other = self.refined(self.searched(plan.search_seeds(block, again)[lanes], lanes, again), lanes)
             better = other.cost < fit.cost[lanes]
             values = {n: v[better] for n, v in vars(other).items() if v is not None}
             fit = fit.file(lanes[better], **values)
