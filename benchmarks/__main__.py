@@ -1,0 +1,50 @@
+"""`python -m benchmarks [speed] [precision] [search] [--seconds S] [--write FILE]`: tables in Markdown."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+
+from benchmarks import machine, precision, search, speed  # noqa: E402
+
+PARTS = {
+    "speed": ("Trajectories per CPU second, 1000 s in 10 s RK4 steps, float64", speed),
+    "precision": ("Trajectories per CPU second at a given worst error, 1024 lanes", precision),
+    "search": ("CPU seconds to find a noise-free 5-parameter fault to 1e-6", search),
+}
+
+
+NOTES = """# Benchmarks
+
+One command compares fdi_torch with other tools on the same work, in one run on one machine:
+
+    pip install -e '.[benchmarks]' && python -m benchmarks --write benchmarks/README.md
+
+The peers' equations are written by hand in `physics.py` and give the same levels to 1e-9 m, which each run checks.
+`numba, blocks of lanes` is our kernel's own layout (trajectories side by side) written by hand for one plant.
+
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="which; all by default")
+    parser.add_argument("--seconds", type=float, default=1.0, help="time for each entry of a table")
+    parser.add_argument("--write", help="also write the tables to this file")
+    arguments = parser.parse_args()
+    text = NOTES + machine.describe(sys.argv)
+    for name in arguments.parts or PARTS:
+        title, part = PARTS[name]
+        text += f"\n## {title}\n\n{part.table(part.measure(arguments.seconds))}\n"
+    print(text)
+    if arguments.write:
+        with open(arguments.write, "w", encoding="utf-8") as file:
+            file.write(text)
+
+
+main()

@@ -1,0 +1,42 @@
+"""Work against precision: worst and median error over random faults, and trajectories per CPU second."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.simulators import ADAPTIVE, FIXED, Simulator, fdi, random_faults
+from benchmarks.timing import best_seconds
+
+FAULTS = 256
+FINEST = 0.005  # s; the truth
+STEPS = (10.0, 5.0, 2.0, 1.0, 0.5, 0.2, 0.1)
+TOLERANCES = (1e-4, 1e-6, 1e-8)
+PEERS = ("fdi_torch, compiled", "numba, by hand, blocks of lanes", "JAX lax.scan, by hand")
+Row = tuple[str, str, float, float, float]
+
+
+def measure(budget: float) -> list[Row]:
+    theta = random_faults(FAULTS)
+    truth = fdi(FINEST)(theta)
+    rows: list[Row] = []
+    for name in (*PEERS, *ADAPTIVE):
+        make = {**FIXED, **ADAPTIVE}[name]
+        for setting in STEPS if name in FIXED else TOLERANCES:
+            try:
+                simulate = make(setting)
+            except ImportError:
+                break
+            label = f"{setting:g} s" if name in FIXED else f"tolerance {setting:g}"
+            rows.append((name, label, *_row(simulate, theta, truth, budget)))
+    return rows
+
+
+def _row(simulate: Simulator, theta: np.ndarray, truth: np.ndarray, budget: float) -> tuple[float, float, float]:
+    """Worst and median error (cm) of a trajectory, and trajectories per CPU second."""
+    error = 100.0 * np.abs(simulate(theta) - truth).max(axis=(1, 2))
+    return float(error.max()), float(np.median(error)), len(theta) / best_seconds(lambda: simulate(theta), budget, 5)
+
+
+def table(rows: list[Row]) -> str:
+    lines = ["| simulator | setting | worst error, cm | median error, cm | trajectories/s |", "|---|---|---|---|---|"]
+    return "\n".join(lines + [f"| {n} | {s} | {w:.1e} | {m:.1e} | {r:,.0f} |" for n, s, w, m, r in rows])
