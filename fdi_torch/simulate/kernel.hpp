@@ -15,8 +15,15 @@
 #define EACH_LANE _Pragma("GCC ivdep") for (int l = 0; l < LANES; ++l)
 #define SOME(n) ((n) > 0 ? (n) : 1)
 
-static inline real MINIMUM(real a, real b) { return (a < b) | (a != a) ? a : b; }
-static inline real MAXIMUM(real a, real b) { return (a > b) | (a != a) ? a : b; }
+// NaN wins, as in torch. Two selects and no `or` of conditions: GCC then still makes vectors of the loop around them.
+static inline real MINIMUM(real a, real b) {
+    const real least = a < b ? a : b;
+    return a != a ? a : least;
+}
+static inline real MAXIMUM(real a, real b) {
+    const real most = a > b ? a : b;
+    return a != a ? a : most;
+}
 static inline real SIGN(real a) { return a > 0 ? real(1) : a < 0 ? real(-1) : a; }
 
 // s^(-1/4) for s > 0, to two units in the last place and in half the time of two roots and a division: a guess from
