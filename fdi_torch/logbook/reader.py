@@ -25,6 +25,9 @@ from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.payload import decode
 from fdi_torch.logbook.sink import EPOCH_NS
 
+# Outside chunks nothing guards these by a CRC. Our logs hold none there, so that one is another record, damaged.
+_LOOSE = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
+
 
 @dataclass(frozen=True, slots=True)
 class Message:
@@ -121,7 +124,7 @@ class Run:
             if isinstance(part, scan.Damage):
                 if place < len(self.parts) - 1 and not self.salvage:
                     raise self._damaged(part)
-            elif part.opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+            elif part.opcode == Opcode.CHUNK or (part.opcode in _LOOSE and not self.ours):
                 yield from self._part_messages(part, directory)
             elif part.opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
                 yield part
