@@ -1,28 +1,23 @@
-"""The gap diagnosis: noise floor, recalibration, where, which, and how far the gap closes on data not used."""
+"""The gap diagnosis: noise floor, recalibration, which, where; then the answer, with the hold-out."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from torch import Tensor
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.answer import Amount, Answer, Cause, CauseName, Explanation, Verdict
-from fdi_torch.gap.closure import Closure, closure
+from fdi_torch.gap.answer import Answer, CauseName, Explanation, Verdict
+from fdi_torch.gap.answering import answered
 from fdi_torch.gap.evidence import log_evidence, posterior, temperature
+from fdi_torch.gap.finding import UNEXPLAINED, Finding, Weighed, in_order, left_open, whole_gap
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject, subject_of
-from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, slow_excess, with_rounding
-from fdi_torch.gap.freeform import shape_of
-from fdi_torch.gap.library import canonical, library_of, possible_places, twins
-from fdi_torch.gap.next_input import next_input
+from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_rounding
+from fdi_torch.gap.library import canonical, library_of, possible_places
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.where import Suspect, refit, suspects
 from fdi_torch.gap.which import Search, search
-from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.reach import Reach, reach_of
@@ -31,7 +26,6 @@ from fdi_torch.recording import Recording
 CONTENT = 0.95
 REFITS = 3
 PATIENT = 40  # rounds for the recalibration, on which all else rests
-UNEXPLAINED = 0.1  # share of the gap left open at which nothing has been explained
 LEFT_SHARE, LEFT_LEAST = 2e-3, 150.0  # share of the gap, and chi-square units, worth asking the free forms about
 FAR_BETTER = 0.35
 Tell = Callable[[float, str], None]
@@ -69,13 +63,16 @@ def diagnose(
     rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]
     weighed = _weighed(fitter, found, len(library), plant)
     unknown = _unnamed(fitter, weighed.fits[0], found, refits)
+    standing = _content(weighed.explanations)
+    verdict: Verdict = "unknown" if unknown else _verdict(standing, rounded)
+    finding = Finding(fitter, library, reach, found, places, weighed, standing, unknown, verdict, rounded, lattice)
     tell(0.8, "hold-out")
-    return _answer(fitter, found, places, weighed, unknown, rounded, lattice, holdout, settings)
+    return answered(finding, holdout, settings.step or _interval(holdout or recording))
 
 
 def _places(fitter: Fitter, found: Search, plant: PlantDescription, reach: Reach) -> tuple[list[Suspect], list[Fit]]:
     """Every place with what it could close; the likeliest refitted in full where the library leaves something open."""
-    gap, left = _gap(fitter, found), _left(fitter, found.best)
+    gap, left = whole_gap(fitter, found), left_open(fitter, found.best)
     heat = temperature(found.null.cost - found.best.cost)
     everywhere = possible_places(plant)
     places = suspects(fitter, found.null, everywhere, reach, heat, waves=left > UNEXPLAINED * gap > 0.0)
@@ -93,10 +90,10 @@ def _unnamed(fitter: Fitter, named: Fit, found: Search, refits: Sequence[Fit]) -
     if not refits:
         return None
     best = min(refits, key=lambda f: f.cost)
-    gap, left = _gap(fitter, found), _left(fitter, named)
-    if _left(fitter, best) > UNEXPLAINED * gap:
+    gap, left = whole_gap(fitter, found), left_open(fitter, named)
+    if left_open(fitter, best) > UNEXPLAINED * gap:
         best = refits[0]  # no place alone does it: the likeliest one to first order
-    free = _left(fitter, best)
+    free = left_open(fitter, best)
     nothing_named = left > UNEXPLAINED * gap
     far_better = free < FAR_BETTER * left and left - free > max(LEFT_SHARE * gap, LEFT_LEAST)
     return best if nothing_named or far_better else None
@@ -104,16 +101,6 @@ def _unnamed(fitter: Fitter, named: Fit, found: Search, refits: Sequence[Fit]) -
 
 def _interval(recording: Recording) -> float:
     return float(torch.median(torch.diff(recording.time)))
-
-
-def _left(fitter: Fitter, fit: Fit) -> float:
-    """What a fit leaves open, chi-square units."""
-    return max(slow_excess(fitter.white(fit.near)[0][0]), 0.0)
-
-
-def _gap(fitter: Fitter, found: Search) -> float:
-    """What the recalibrated plant leaves open: what the best explanation closes, and what that leaves."""
-    return found.null.cost - found.best.cost + _left(fitter, found.best)
 
 
 def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
@@ -131,14 +118,6 @@ def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
     return fitter, fitter.fit(Candidate(), null, rounds=PATIENT), lattice
 
 
-@dataclass(frozen=True)
-class Weighed:
-    """Explanations with their probabilities, likeliest first; fit: the best one of each."""
-
-    explanations: tuple[Explanation, ...]
-    fits: tuple[Fit, ...]
-
-
 def _weighed(fitter: Fitter, found: Search, choices: int, plant: PlantDescription) -> Weighed:
     """All fits of the search by their evidence; names of one thing count once."""
     heat = temperature(found.null.cost - found.best.cost)
@@ -151,85 +130,7 @@ def _weighed(fitter: Fitter, found: Search, choices: int, plant: PlantDescriptio
     ranked = sorted(scores.values(), key=lambda item: -item[0])
     weights = posterior([score for score, _ in ranked])
     pairs = zip(ranked, weights, strict=True)
-    return Weighed(tuple(Explanation(_ordered(f), w) for (_, f), w in pairs), tuple(f for _, f in ranked))
-
-
-def _ordered(fit: Fit) -> tuple[CauseName, ...]:
-    return tuple((p.effect.name, p.location) for p in fit.candidate.placements)
-
-
-def _answer(
-    fitter: Fitter,
-    found: Search,
-    places: Sequence[Suspect],
-    weighed: Weighed,
-    unnamed: Fit | None,
-    rounded: Sequence[CauseName],
-    lattice: Sequence[float],
-    holdout: Recording | None,
-    settings: Settings,
-) -> Answer:
-    explanations, fit = weighed.explanations, weighed.fits[0]
-    standing = _content(explanations)
-    verdict: Verdict = "unknown" if unnamed else _verdict(standing, rounded)
-    causes = () if verdict in ("no_gap", "unknown") else _causes(fitter, fit, rounded, lattice)
-    gap = max(_gap(fitter, found), 1.0)
-    where = [(s.location, min(max(s.closes / gap, 0.0), 1.0)) for s in places]
-    if unnamed:
-        place = unnamed.candidate.placements[0].location
-        where = sorted(where, key=lambda w: w[0] != place)
-        explanations = (Explanation((), 1.0, place),)
-    return Answer(
-        verdict=verdict,
-        p_value=_p_value(found, rounded),
-        where=where,
-        causes=causes,
-        ambiguity_set=[(*e.causes, *rounded) for e in standing] if causes else [],
-        posterior=[
-            Explanation(() if e.unknown_at else (*e.causes, *rounded), e.probability, e.unknown_at)
-            for e in explanations[:12]
-        ],
-        closure=(closed := _closure(fitter, found, unnamed or fit, lattice, holdout, settings)),
-        noise=_noise(fitter, lattice),
-        shape=shape_of(unnamed) if unnamed else None,
-        next_input=_next(fitter, weighed) if verdict == "ambiguous" else None,
-        impostors=_impostors(fitter, found, fit) if causes else None,
-        remarks=_remarks(fitter, found, unnamed or fit, closed),
-    )
-
-
-def _next(fitter: Fitter, weighed: Weighed) -> Mapping[str, Any] | None:
-    """The input that would part the two likeliest explanations."""
-    found = next_input(fitter, weighed.fits[0], weighed.fits[1])
-    between = [[{"effect": n, "location": at} for n, at in e.causes] for e in weighed.explanations[:2]]
-    return {"between": between, **found} if found else None
-
-
-def _impostors(fitter: Fitter, found: Search, named: Fit) -> dict[str, object]:
-    """What would be left open, had the library lacked what was named: the best of the fits without it.
-
-    would_pass: whether that impostor would have closed all but two per cent of the gap.
-    """
-    others = [f for f in found.fits if f.key and not f.key & named.key]
-    gap = max(_gap(fitter, found), 1.0)
-    if not others:
-        return {"best": [], "left_open": 1.0, "would_pass": False}
-    best = min(others, key=lambda f: f.cost)
-    left = min((_left(fitter, named) + best.cost - named.cost) / gap, 1.0)
-    causes = [{"effect": name, "location": place} for name, place in _ordered(best)]
-    return {"best": causes, "left_open": left, "would_pass": left < 0.02}
-
-
-def _remarks(fitter: Fitter, found: Search, best: Fit, closed: Mapping[str, Any]) -> list[str]:
-    remarks = []
-    if all(float(torch.diff(column).abs().max()) == 0.0 for column in fitter.subject.recording.inputs.T):
-        remarks.append("the inputs never change: most effects cannot be told apart; --plan shows what steps would tell")
-    if len(fitter.subject.nuisance) == len(fitter.subject.plant.tanks):
-        remarks.append("the plant file gives no tolerances: every constant is taken to be exact")
-    explained = _left(fitter, best) < UNEXPLAINED * max(_gap(fitter, found), float(fitter.subject.mask.sum()))
-    if closed and explained and closed["augmented"] > 3.0 * closed["noise_floor"] and (closed["closed"] or 0.0) < 0.5:
-        remarks.append("what explains the recording does not explain the hold-out: is it of the same rig?")
-    return remarks
+    return Weighed(tuple(Explanation(in_order(f), w) for (_, f), w in pairs), tuple(f for _, f in ranked))
 
 
 def _content(explanations: Sequence[Explanation]) -> list[Explanation]:
@@ -247,64 +148,3 @@ def _verdict(standing: Sequence[Explanation], rounded: Sequence[CauseName]) -> V
     if not standing[0].causes and not rounded:
         return "no_gap"
     return "named" if len(standing) == 1 else "ambiguous"
-
-
-def _causes(fitter: Fitter, fit: Fit, rounded: Sequence[CauseName], lattice: Sequence[float]) -> tuple[Cause, ...]:
-    plant, stds = fitter.subject.plant, _standard_errors(fitter, fit)
-    causes = []
-    for p in fit.candidate.placements:
-        amounts = {}
-        for name, value in fit.effect_values.items():
-            if name.rpartition(".")[0] == p.prefix:
-                amounts[name.rpartition(".")[2]] = Amount(value, stds[name], fit.space[name].unit)
-        causes.append(Cause(p.effect.name, p.location, amounts, twins((p.effect.name, p.location), plant)))
-    steps = {s.name: (step, s.unit) for s, step in zip(plant.sensors, lattice, strict=True)}
-    for name, place in rounded:
-        causes.append(Cause(name, place, {"step": Amount(steps[place][0], 0.0, steps[place][1])}))
-    return tuple(causes)
-
-
-def _standard_errors(fitter: Fitter, fit: Fit) -> dict[str, float]:
-    scale = fitter.box(fit.space)[2]
-    curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.near, scale)[2][0]
-    variance = torch.diagonal(torch.linalg.pinv(curvature, hermitian=True))
-    return dict(zip(fit.space.names, (torch.sqrt(variance.clamp(min=0.0)) * scale).tolist(), strict=True))
-
-
-def _p_value(found: Search, rounded: Sequence[CauseName]) -> float:
-    """Chance that noise alone lets some option of the library gain as much (Bonferroni over the options)."""
-    if rounded:
-        return 0.0
-    screen = found.screens[found.null.key]
-    singles = [f.cost for f in found.fits if len(f.key) == 1]
-    gain = max(float(screen.gain.max()), found.null.cost - min(singles, default=found.null.cost))
-    return min(1.0, len(screen.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))
-
-
-def _closure(
-    fitter: Fitter, found: Search, best: Fit, lattice: Sequence[float], holdout: Recording | None, settings: Settings
-) -> Mapping[str, Any]:
-    if holdout is None:
-        return {}
-    subject = subject_of(fitter.subject.plant, fitter.subject.believed, holdout, settings.step or _interval(holdout))
-    unit, scale = display_unit(subject.plant.sensors[0].unit)
-    fits: dict[str, Fit | None] = {"nominal": None, "recalibrated": found.null, "augmented": best}
-    done: Closure = closure(subject, fitter.noise, fits, lattice, scale, unit)
-    return {
-        "metric": "free-run RMSE on the hold-out, per sensor and pooled, in the sensor's unit",
-        "unit": done.unit,
-        **done.pooled,
-        "per_sensor": done.per_sensor,
-        "closed": done.closed,
-        "closed_ci95": done.closed_ci95,
-        "augmented_with": [{"effect": n, "location": at} for n, at in _ordered(best)],
-    }
-
-
-def _noise(fitter: Fitter, lattice: Sequence[float]) -> Mapping[str, Any]:
-    sensors = fitter.subject.plant.sensors
-    std: Tensor = fitter.noise.std
-    return {
-        s.name: {"std": float(std[i]), "ar1": float(fitter.noise.ar[i]), "rounded_to": lattice[i], "unit": s.unit}
-        for i, s in enumerate(sensors)
-    }
