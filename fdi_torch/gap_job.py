@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.plant_writer import dump_plant
+from fdi_torch.log_paths import free_path
 from fdi_torch.logbook import RunLog
-from fdi_torch.main_job import free_path
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 

@@ -14,15 +14,9 @@ from fdi_torch.config.recordings import LoadedRecording
 from fdi_torch.config.run import Run, build_run
 from fdi_torch.logbook import LogError, RunLog, own_signals, series
 from fdi_torch.logbook import Run as LoggedRun
-from fdi_torch.main_job import (
-    Tell,
-    estimate_logged,
-    fitting_of,
-    log_recordings,
-    origin_of,
-    wanted_space,
-)
+from fdi_torch.main_job import Tell, estimate_logged, log_recordings, origin_of
 from fdi_torch.recording import Recording
+from fdi_torch.run_setup import fitting_of, wanted_space
 
 # The data are the log's own: what would make others cannot be changed.
 _DATA_KEYS = ("simulate", "recordings")

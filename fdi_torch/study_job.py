@@ -7,11 +7,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from fdi_torch.config.study import Study
-from fdi_torch.logbook import RunLog, read_run, unfinished
+from fdi_torch.log_paths import free_path
+from fdi_torch.logbook import Listener, RunLog, read_run, unfinished
 from fdi_torch.logbook.reader import Run as OldLog
-from fdi_torch.main_job import free_path
 from fdi_torch.report.fit_figure import save
 from fdi_torch.report.study_figures import correlation_figure, error_figure
 from fdi_torch.study.cluster import run_on_cluster
@@ -39,17 +40,23 @@ class StudyResult:
     pictures: tuple[Path, ...]
 
 
-def run_study(study: Study, resume: bool = False, cluster: str | None = None, tell: Tell | None = None) -> StudyResult:
+def run_study(
+    study: Study,
+    resume: bool = False,
+    cluster: str | None = None,
+    tell: Tell | None = None,
+    listener: Listener | None = None,
+) -> StudyResult:
     """Computes every trial that the log does not hold yet. tell(share, text) is called after each block.
 
-    cluster: address of a Dask scheduler, or 'local'; None: this process.
+    cluster: address of a Dask scheduler, or 'local'; None: this process. listener: hears every message of the log.
     """
     tell = tell or (lambda share, text: None)
     output = study.run.config.output
     path = Path(output.folder) / f"{study.run.name}.mcap"
     before = earlier(path, study) if resume else None
     path = path if resume else free_path(path.parent, study.run.name)
-    with RunLog(path, "study", config_text=study.text, seeds={"seed": study.plan.seed}) as log:
+    with RunLog(path, "study", **origin_of(study), listener=listener) as log:
         trials = carried_over(log, before)
         found = len(trials)
         started = time.monotonic()
@@ -63,6 +70,12 @@ def run_study(study: Study, resume: bool = False, cluster: str | None = None, te
         log_summaries(log, summaries, isolation)
     pictures = draw(study, trials, path)
     return StudyResult(summaries, isolation, trials, len(trials) - found, seconds, path, pictures)
+
+
+def origin_of(study: Study) -> dict[str, Any]:
+    """What a log says of where its study comes from."""
+    resolved = study.run.resolved | {"study": study.config.model_dump(mode="json")}
+    return {"config_text": study.text, "config": resolved, "seeds": {"seed": study.plan.seed}}
 
 
 def earlier(path: Path, study: Study) -> OldLog | None:

@@ -19,6 +19,7 @@ LAYERS = (
     {"estimate", "logbook"},
     {"report", "gap", "study", "monitor"},
     {"config"},
+    {"run_setup", "log_paths"},
     {"main_job", "study_job", "replay_job", "gap_job"},
     {"paper"},
     {"cli", "train", "__main__", "__init__"},
@@ -36,6 +37,7 @@ DOORS = {
     "dask": ("study/cluster.py",),
     "distributed": ("study/cluster.py",),
     "rich": ("cli/",),
+    "foxglove": ("logbook/live.py",),
 }
 
 

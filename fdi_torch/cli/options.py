@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from fdi_torch.cli.screen import Screen
+from fdi_torch.logbook import Listener, serve
+
+LIVE = "127.0.0.1:8765"
 
 
 def add_config(parser: argparse.ArgumentParser, required: bool = False) -> None:
@@ -27,3 +34,27 @@ def overrides(arguments: argparse.Namespace) -> list[str]:
     short = {"output.folder": "out", "device": "device", "seed": "seed"}
     given = [(key, getattr(arguments, name, None)) for key, name in short.items()]
     return [*arguments.set, *(f"{key}={value}" for key, value in given if value is not None)]
+
+
+def add_live(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--live",
+        metavar="[HOST:]PORT",
+        nargs="?",
+        const=LIVE,
+        help=f"serve the running job to Foxglove or Lichtblick (alone: {LIVE}; needs the extra live)",
+    )
+
+
+@contextmanager
+def live(arguments: argparse.Namespace, name: str, screen: Screen) -> Iterator[Listener | None]:
+    """What --live asks for: a server that hears the log, whose address is told; None without --live."""
+    if arguments.live is None:
+        yield None
+        return
+    host, _, port = arguments.live.rpartition(":")
+    if not (port.isdigit() and int(port) < 2**16):
+        raise ValueError(f"--live: expected [HOST:]PORT such as {LIVE}, got {arguments.live}")
+    with serve(name, host or LIVE.partition(":")[0], int(port)) as server:
+        screen.note(f"live: {server.address}")
+        yield server

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_config, add_run, overrides
+from fdi_torch.cli.options import add_config, add_live, add_run, live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.study import load_study
 from fdi_torch.study.isolation import Isolation
@@ -18,15 +18,16 @@ from fdi_torch.study_job import StudyResult, run_study
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, required=True)
     add_run(parser)
+    add_live(parser)
     parser.add_argument("--resume", action="store_true", help="go on from what a killed run left in its log")
     parser.add_argument("--cluster", metavar="local|ADDRESS", help="run on Dask: local, or tcp://host:8786")
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     study = load_study(arguments.config, overrides(arguments))
-    with screen.progress(study.run.name) as advance:
+    with live(arguments, study.run.name, screen) as listener, screen.progress(study.run.name) as advance:
         advance(0.0, f"{study.plan.trials} trials")
-        result = run_study(study, arguments.resume, arguments.cluster, advance)
+        result = run_study(study, arguments.resume, arguments.cluster, advance, listener)
     show(result, screen)
     screen.result(as_json(result))
     return 0

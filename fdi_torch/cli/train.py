@@ -9,7 +9,7 @@ import argparse
 import math
 
 from fdi_torch.cli import DONE, NOT_CONVERGED
-from fdi_torch.cli.options import add_config, add_run, overrides
+from fdi_torch.cli.options import add_config, add_live, add_run, live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.run import load_run
 from fdi_torch.main_job import TrainResult, train
@@ -19,13 +19,14 @@ from fdi_torch.parameters import display_unit
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     add_run(parser)
+    add_live(parser)
     parser.add_argument("--resume", action="store_true", help="go on where a killed run of the same file stopped")
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     job = load_run(arguments.config, overrides(arguments))
-    with screen.progress(job.name) as advance:
-        done = train(job, advance, arguments.resume)
+    with live(arguments, job.name, screen) as listener, screen.progress(job.name) as advance:
+        done = train(job, advance, arguments.resume, listener)
     show(done, screen)
     screen.result(as_json(done))
     return DONE if done.result.estimate.status == "converged" else NOT_CONVERGED

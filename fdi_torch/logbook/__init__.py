@@ -6,6 +6,7 @@ from fdi_torch.logbook.export import export, export_attachment
 from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.follow import follow
 from fdi_torch.logbook.inspect import Inspection, inspect_log
+from fdi_torch.logbook.live import Live, serve
 from fdi_torch.logbook.payload import unpack
 from fdi_torch.logbook.reader import Message, Run, read_run
 from fdi_torch.logbook.recover import Recovery, recover
@@ -13,11 +14,13 @@ from fdi_torch.logbook.replay import Replay, replay
 from fdi_torch.logbook.resume import last_state, set_aside, unfinished
 from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, own_signals, series
 from fdi_torch.logbook.terminate import Terminated, exit_on_sigterm
-from fdi_torch.logbook.writer import RunLog
+from fdi_torch.logbook.writer import Listener, RunLog
 
 __all__ = [
     "Comparison",
     "Inspection",
+    "Listener",
+    "Live",
     "LogError",
     "Message",
     "Recovery",
@@ -42,6 +45,7 @@ __all__ = [
     "recover",
     "replay",
     "series",
+    "serve",
     "set_aside",
     "unfinished",
     "unpack",

@@ -21,18 +21,21 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-import orjson
 
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.copying import copy_log
 from fdi_torch.logbook.errors import LogError, log_error
-from fdi_torch.logbook.payload import as_array, plain
+from fdi_torch.logbook.flat import flatten
+from fdi_torch.logbook.payload import as_array
 from fdi_torch.logbook.provenance import environment, git_state
 from fdi_torch.logbook.reader import Message
 from fdi_torch.logbook.schemas import FORMAT_VERSION
 from fdi_torch.logbook.sink import Sink, log_time_of
 from fdi_torch.logbook.terminate import Terminated
 from fdi_torch.logbook.topics import Topics
+
+Listener = Callable[[Channel, int, bytes], None]
+"""Hears each message as it is logged: its channel, its log time in ns and its payload."""
 
 WALL_CLOCK = {"fdi_torch.run": ("started", "run_id"), "fdi_torch.status": ("ended", "wall_seconds")}
 
@@ -42,7 +45,8 @@ class RunLog(Topics):
 
     path: NAME.mcap, which must not exist. kind: the command, such as "train". config_text: the configuration exactly
     as given; config: the same, resolved, as plain nested values. seeds: name -> seed. data: one mapping an input file,
-    with its "path" and "sha256". env, git: found out where not given. clock: wall time in ns.
+    with its "path" and "sha256". env, git: found out where not given. clock: wall time in ns. listener: hears every
+    message as it is logged.
     Raises LogError where the file cannot be written.
     """
 
@@ -60,12 +64,13 @@ class RunLog(Topics):
         git: Mapping[str, str] | None = None,
         clock: Callable[[], int] = time.time_ns,
         flush_seconds: float = 0.5,
+        listener: Listener | None = None,
     ) -> None:
         super().__init__()
         self.path = Path(path)
         self.partial_path = self.path.with_name(self.path.name + ".partial")
         self.status, self.reason = "completed", ""
-        self._clock, self._flush_seconds = clock, flush_seconds
+        self._clock, self._flush_seconds, self._listener = clock, flush_seconds, listener
         self._start_records = {
             "config": {"sha256": _sha256(config_text), **flatten(config or {})},
             "env": dict(environment() if env is None else env),
@@ -147,22 +152,23 @@ class RunLog(Topics):
     def put(self, channel: Channel, t: float, sequence: int, payload: bytes) -> None:
         """One encoded message; the methods of `Topics` end here."""
         log_time = log_time_of(t)
-        with self._lock:
-            self._open_sink().message(channel, log_time, log_time, sequence, payload)
-            self._note_progress(waiting=True)
+        self._put(channel, log_time, log_time, sequence, payload)
 
     def carry_over(self, messages: Iterable[Message]) -> int:
         """Messages of an earlier log of the same run, as they were; what is logged next follows them. Their number."""
         count = 0
         for message in messages:
             self.follow_on(message.channel, message.sequence, message.t)
-            with self._lock:
-                self._open_sink().message(
-                    message.channel, message.log_time, message.publish_time, message.sequence, message.data
-                )
-                self._note_progress(waiting=True)
+            self._put(message.channel, message.log_time, message.publish_time, message.sequence, message.data)
             count += 1
         return count
+
+    def _put(self, channel: Channel, log_time: int, publish_time: int, sequence: int, payload: bytes) -> None:
+        with self._lock:
+            self._open_sink().message(channel, log_time, publish_time, sequence, payload)
+            self._note_progress(waiting=True)
+        if self._listener is not None:
+            self._listener(channel, log_time, payload)
 
     def wall(self) -> dict[str, int]:
         """Wall time for a message's field `wall`."""
@@ -225,24 +231,6 @@ class RunLog(Topics):
                 self.partial_path.unlink()
         except OSError as error:
             raise log_error(self.path, error) from error
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Nested values as dotted names and texts: {"a": {"b": [1, 2]}} -> {"a.b": "[1,2]"}."""
-    flat: dict[str, str] = {}
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            flat.update(flatten(value, f"{prefix}{name}."))
-        else:
-            flat[f"{prefix}{name}"] = value if isinstance(value, str) else _text(value)
-    return flat
-
-
-def _text(value: Any) -> str:
-    try:
-        return orjson.dumps(value).decode()
-    except TypeError:
-        return orjson.dumps(plain({"value": value}).get("value", str(value))).decode()
 
 
 def _make_room(path: Path) -> None:

@@ -1,0 +1,106 @@
+"""From a run file to what a job works on: recordings, the truth where they are simulated, parameters, settings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from fdi_torch.config.estimation import EstimationConfig, estimated_space, parameter_values, placements_of
+from fdi_torch.config.recordings import LoadedRecording, load_recordings
+from fdi_torch.config.run import Run
+from fdi_torch.config.simulation import noise_std, planned_recording
+from fdi_torch.effects import build_network
+from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
+from fdi_torch.estimate.hybrid import HybridSettings
+from fdi_torch.estimate.refine import RefineSettings
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.record import clean_readings, with_noise
+
+
+def recordings_of(run: Run) -> list[LoadedRecording]:
+    """The recordings that a run file names, or the one that it asks to simulate."""
+    if run.config.simulate is None:
+        return load_recordings(run.config.recordings, run.plant, run.base)
+    return [LoadedRecording(simulate_recording(run), run.config.simulate.start_levels)]
+
+
+def simulate_recording(run: Run) -> Recording:
+    """The recording that `simulate:` of a run file describes, with its faults and its noise; repeats for a seed."""
+    config = run.config.simulate
+    if config is None:
+        raise ValueError(f"{run.source}: expected simulate, got none; say what is to be simulated")
+    planned = planned_recording(config, run.plant)
+    placements = placements_of(config.faults, run.plant)
+    network = build_network(run.plant, placements)
+    levels, _ = start_levels(run.plant, network, planned, config.start_levels)
+    tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(run.plant.tanks, levels, strict=True))
+    network = build_network(replace(run.plant, tanks=tanks), placements)
+    clean = clean_readings(network, planned, parameter_values(config.faults, network.constants, run.plant))
+    seed = run.config.seed if config.seed is None else config.seed
+    generator = torch.Generator().manual_seed(seed)
+    return with_noise(planned, clean, noise_std(config.noise, run.plant, clean), generator, network)
+
+
+def simulated_truth(run: Run) -> dict[str, float]:
+    """The faults that were simulated, SI by full name; empty for real data."""
+    if run.config.simulate is None:
+        return {}
+    network = build_network(run.plant, placements_of(run.config.simulate.faults, run.plant))
+    return parameter_values(run.config.simulate.faults, network.constants, run.plant)
+
+
+def wanted_space(run: Run) -> ParameterSpace:
+    """The parameters that the run file asks for, and the constants to calibrate beside them."""
+    config = run.config.estimate
+    if not config.parameters:
+        raise ValueError(
+            f"{run.source}: estimate.parameters: expected at least one, got none; name some, as in T1.leak"
+        )
+    network = build_network(run.plant, placements_of([p.name for p in config.parameters], run.plant))
+    return estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
+
+
+def usable_device(name: str) -> torch.device:
+    """The device of that name. Raises ValueError where this machine or this torch lacks it."""
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"device: expected one that torch can use here, such as cpu, got '{name}'") from error
+    return torch.device(name)
+
+
+def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording]) -> Fitting:
+    """These parameters on these recordings, with all tensors on the device that the run file asks for."""
+    device = usable_device(run.config.device)
+    recordings = [part.recording.to(device) for part in loaded]
+    expect_enough_samples(recordings, space)
+    with device:
+        return set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
+
+
+def expect_enough_samples(recordings: Sequence[Recording], space: ParameterSpace) -> None:
+    """Raises ValueError where there are fewer readings than parameters."""
+    readings = sum(int(r.mask.sum()) for r in recordings)
+    if readings <= len(space):
+        source = recordings[0].source
+        raise ValueError(
+            f"{source}: expected more readings than parameters, got {readings} readings for {len(space)} parameters; "
+            "take a longer stretch or fewer parameters"
+        )
+
+
+def hybrid_settings(config: EstimationConfig) -> HybridSettings:
+    """The run file's settings in the estimator's own form."""
+    steps = [None if step == "auto" else float(step) for step in (config.step.search, config.step.refine)]
+    return HybridSettings(
+        objectives=(config.objective.search, config.objective.refine),
+        search=config.search,
+        method=config.refine.method,
+        refine=RefineSettings(iterations=config.refine.iterations),
+        search_step=steps[0],
+        refine_step=steps[1],
+        confidence=config.confidence,
+    )
