@@ -1,44 +1,99 @@
-"""A logged run done again from its own recordings, configuration and seeds; `fdi replay` calls it."""
+"""A logged run or study done again from its own recordings, configuration and seeds; `fdi replay` calls it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from fdi_torch import study_job
 from fdi_torch.config.files import with_overrides
 from fdi_torch.config.logged import logged_mapping
 from fdi_torch.config.recordings import LoadedRecording
 from fdi_torch.config.run import Run, build_run
-from fdi_torch.logbook import LogError, RunLog, own_signals, series
+from fdi_torch.config.study import build_study
+from fdi_torch.logbook import LogError, Message, RunLog, own_signals, series
 from fdi_torch.logbook import Run as LoggedRun
+from fdi_torch.logbook.replay import Select
 from fdi_torch.main_job import Tell, estimate_logged, log_recordings, origin_of
 from fdi_torch.recording import Recording
 from fdi_torch.run_setup import fitting_of, wanted_space
+from fdi_torch.study.monte_carlo import Trial, run_blocks
+from fdi_torch.study_job import TRIAL, concluded, log_trials
 
 # The data are the log's own: what would make others cannot be changed.
 _DATA_KEYS = ("simulate", "recordings")
 
 
-def run_again(log: LoggedRun, path: Path, overrides: Iterable[str] = (), tell: Tell | None = None) -> Path:
-    """Estimates again what a log of `fdi train` says, into a new log whose parent it is. Returns the new log's path.
+def run_again(
+    log: LoggedRun, path: Path, overrides: Iterable[str] = (), trials: Sequence[int] = (), tell: Tell | None = None
+) -> Path:
+    """Does again what a log of `fdi train` or `fdi study` says, into a new log whose parent it is. Returns its path.
 
+    trials: of a study, only these; by default all that were logged.
     Raises LogError for other logs, ConfigError for a configuration that cannot be used, ValueError for overrides of
-    the data.
+    the data and for trials that there are not.
     """
-    kind = log.metadata.get("fdi_torch.run", {}).get("kind", "")
-    if kind != "train":
-        raise LogError(f"{log.path}: expected a log of fdi train, got one of {kind or 'another program'}")
+    about = log.metadata.get("fdi_torch.run", {})
+    kind, parent = about.get("kind", ""), about.get("run_id", "")
+    tell = tell or (lambda share, text: None)
+    if kind == "study":
+        study_again(log, path, overrides, trials, tell, parent)
+    elif kind != "train":
+        raise LogError(f"{log.path}: expected a log of fdi train or fdi study, got one of {kind or 'another program'}")
+    elif trials:
+        raise ValueError(f"--trial: expected a study's log, got one of fdi train: {log.path}; leave --trial out")
+    else:
+        estimate_again(log, path, overrides, tell, parent)
+    return path
+
+
+def estimate_again(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
+    """The estimation, from the recordings in the log."""
     run = asked_again(log, overrides)
     space, loaded = wanted_space(run), recorded(log, run)
     fitting = fitting_of(run, space, loaded)
-    parent = log.metadata["fdi_torch.run"].get("run_id", "")
     with RunLog(path, "train", **origin_of(run, loaded), parent_run_id=parent) as again:
         log_recordings(again, loaded, logged_truth(log))
-        estimate_logged(run, fitting, again, tell or (lambda share, text: None))
-    return path
+        estimate_logged(run, fitting, again, tell)
+
+
+def study_again(
+    log: LoggedRun, path: Path, overrides: Iterable[str], trials: Sequence[int], tell: Tell, parent: str
+) -> None:
+    """The study's trials; its sums too where every trial is made."""
+    overrides = list(overrides)
+    study = build_study(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
+    logged = range(study.plan.trials) if overrides else (m.payload["trial"] for m in log.messages([TRIAL]))
+    numbers = sorted(set(trials or logged))
+    done: dict[int, Trial] = {}
+    with RunLog(path, "study", **study_job.origin_of(study), parent_run_id=parent) as again:
+        for block in run_blocks(study.plan, study.plan.blocks_of(numbers)):
+            log_trials(again, study.plan, block)
+            done |= {trial.number: trial for trial in block}
+            tell(len(done) / len(numbers), f"{len(done)} of {len(numbers)} trials")
+        if len(done) == study.plan.trials:
+            concluded(study, done, again)
+
+
+def comparable(trials: Sequence[int] = ()) -> Select:
+    """Which events of a log and its replay are held against each other: a study's trials by number, then its sums."""
+
+    def select(messages: Iterable[Message]) -> Iterator[Message]:
+        waiting: list[Message] = []
+        for message in messages:
+            if message.topic != TRIAL:
+                yield from sorted(waiting, key=lambda m: m.payload["trial"])
+                waiting = []
+                if not trials:
+                    yield message
+            elif not trials or message.payload["trial"] in trials:
+                waiting.append(message)
+        yield from sorted(waiting, key=lambda m: m.payload["trial"])
+
+    return select
 
 
 def asked_again(log: LoggedRun, overrides: Iterable[str] = ()) -> Run:

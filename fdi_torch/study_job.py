@@ -65,9 +65,7 @@ def run_study(
             trials |= {trial.number: trial for trial in done if trial.number not in trials}
             tell(*progress(len(trials), found, study.plan.trials, time.monotonic() - started))
         seconds = time.monotonic() - started
-        summaries = tuple(summed_up(study, trials))
-        isolation = isolated(study, trials)
-        log_summaries(log, summaries, isolation)
+        summaries, isolation = concluded(study, trials, log)
     pictures = draw(study, trials, path)
     return StudyResult(summaries, isolation, trials, len(trials) - found, seconds, path, pictures)
 
@@ -151,12 +149,15 @@ def isolated(study: Study, trials: Mapping[int, Trial]) -> Isolation | None:
     return isolate(study.plan.fitting.space, ordered, study.run.config.estimate.confidence)
 
 
-def log_summaries(log: RunLog, summaries: tuple[Summary, ...], isolation: Isolation | None) -> None:
+def concluded(study: Study, trials: Mapping[int, Trial], log: RunLog) -> tuple[tuple[Summary, ...], Isolation | None]:
+    """What all trials together say, into the log."""
+    summaries, isolation = tuple(summed_up(study, trials)), isolated(study, trials)
     for summary in summaries:
         log.summary(summary.setting, summary.trials, summary.numbers())
     if isolation is not None:
         log.result({"isolation": {name: value for name, value in vars(isolation).items() if name != "confusion"}})
         log.result_arrays(confusion=isolation.confusion)
+    return summaries, isolation
 
 
 def draw(study: Study, trials: Mapping[int, Trial], log: Path) -> tuple[Path, ...]:

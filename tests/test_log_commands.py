@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from fdi_torch import cli
 from fdi_torch.config.run import load_run
-from fdi_torch.logbook import Message, RunLog, read_run
+from fdi_torch.config.study import load_study
+from fdi_torch.logbook import Message, RunLog, read_run, replay
 from fdi_torch.main_job import train
+from fdi_torch.replay_job import run_again
+from fdi_torch.study_job import run_study
 
 QUICK = [
     "simulate.duration=200 s",
@@ -133,6 +138,71 @@ def test_a_replay_is_bit_equal(trained: Path, capsys: pytest.CaptureFixture[str]
     assert "bit-equal: " in capsys.readouterr().out
 
 
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1 if before > 1 else 2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_the_number_of_threads_changes_no_bit(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["replay", str(trained), "--json"]) == cli.DONE
+    done = json.loads(capsys.readouterr().out)["replay"]
+    assert done["outcome"] == "bit-equal" and list(done["versions"]) == ["threads"]
+
+
+@pytest.mark.slow
+def test_a_whole_run_of_the_paper_replays(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    log = train(load_run("configs/paper/table3_snr30.yaml", [f"output.folder={tmp_path}"])).log
+    assert replay(log, lambda run: run_again(run, tmp_path / "same.mcap")).outcome == "bit-equal"
+    request.getfixturevalue("two_threads")
+    again = replay(log, lambda run: run_again(run, tmp_path / "threads.mcap"))
+    assert again.outcome == "bit-equal" and list(again.versions) == ["threads"]
+
+
+STUDY = ["study.steps=[1 s]", "study.data_step=0.2 s", "study.evaluations=600", "study.population=24"]
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven trials at each of two noise levels, in blocks of three."""
+    changes = [*STUDY, "study.trials=7", "study.block=3", "study.snr_db=[30, 20]"]
+    folder = tmp_path_factory.mktemp("studies")
+    return run_study(load_study("configs/studies/table3_noise.yaml", [*changes, f"output.folder={folder}"])).log
+
+
+def test_a_study_replays_whole_and_trial_by_trial(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["replay", str(study), "--quiet"]) == cli.DONE
+    assert "bit-equal: 16 events compared" in capsys.readouterr().out
+    assert cli.main(["replay", str(study), "--quiet", "--trial", "12", "--trial", "5"]) == cli.DONE
+    assert "bit-equal: 2 events compared" in capsys.readouterr().out
+
+
+def test_an_unfinished_study_replays_what_it_has(
+    study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, part = read_run(study), tmp_path / "part.mcap"
+    with RunLog(part, "study", config_text=source.config_text) as log:
+        log.carry_over(m for m in source.messages(["/study/trial"]) if m.payload["trial"] in (9, 2, 1))
+    assert cli.main(["replay", str(part), "--quiet"]) == cli.DONE
+    assert "bit-equal: 3 events compared" in capsys.readouterr().out
+
+
+def test_a_study_with_another_choice_is_a_new_log(study: Path, tmp_path: Path) -> None:
+    words = ["--set", "study.searches=1", "--set", "study.snr_db=[30]", "--out", str(tmp_path / "other.mcap")]
+    assert cli.main(["replay", str(study), "--quiet", *words]) == cli.DONE
+    assert len(list(read_run(tmp_path / "other.mcap").messages(["/study/trial"]))) == 7
+
+
+def test_trials_that_there_are_not(study: Path, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["replay", str(study), "--quiet", "--trial", "14"]) == cli.MISUSE
+    assert "expected trials from 0 to 13, got 14" in capsys.readouterr().err
+    assert cli.main(["replay", str(trained), "--quiet", "--trial", "0"]) == cli.MISUSE
+    assert "--trial: expected a study's log, got one of fdi train" in capsys.readouterr().err
+
+
 def test_a_changed_log_does_not_replay(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     forged = tmp_path / "forged.mcap"
     source = read_run(trained)
@@ -169,7 +239,7 @@ def test_a_replay_that_makes_no_sense_is_refused(
 
 
 def test_a_log_of_another_command_cannot_be_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with RunLog(tmp_path / "s.mcap", "study", env={}, git={}):
+    with RunLog(tmp_path / "m.mcap", "monitor", env={}, git={}):
         pass
-    assert cli.main(["replay", str(tmp_path / "s.mcap"), "--quiet"]) == cli.MISUSE
-    assert "expected a log of fdi train, got one of study" in capsys.readouterr().err
+    assert cli.main(["replay", str(tmp_path / "m.mcap"), "--quiet"]) == cli.MISUSE
+    assert "expected a log of fdi train or fdi study, got one of monitor" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Run an estimation again from its log alone and compare event by event; with --set, try what another choice gives.
+"""Run an estimation or a study again from its log alone and compare event by event; with --set, try another choice.
 
 Exit code 3 where an event differs by more than the tolerance.
 """
@@ -18,7 +18,7 @@ DIFFERS = 3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", metavar="RUN.mcap", help="a log of fdi train")
+    parser.add_argument("log", metavar="RUN.mcap", help="a log of fdi train or fdi study")
     parser.add_argument(
         "--relative", metavar="R", type=float, default=1e-9, help="tolerance of numbers (default: 1e-9)"
     )
@@ -29,6 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="what if: another objective, seed ...; may be repeated",
     )
+    parser.add_argument(
+        "--trial", metavar="N", type=int, action="append", default=[], help="of a study, only this; may be repeated"
+    )
     parser.add_argument("--out", metavar="FILE", help="the new log (with --set: NAME.what_if.mcap; otherwise not kept)")
 
 
@@ -38,11 +41,16 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
     """The same again: every event must be the same."""
-    from fdi_torch.replay_job import run_again
+    from fdi_torch.replay_job import comparable, run_again
 
     with tempfile.TemporaryDirectory() as folder, screen.progress("replay") as advance:
         target = Path(arguments.out or Path(folder) / "again.mcap")
-        done = replay(arguments.log, lambda log: run_again(log, target, (), advance), relative=arguments.relative)
+        done = replay(
+            arguments.log,
+            lambda log: run_again(log, target, (), arguments.trial, advance),
+            relative=arguments.relative,
+            select=comparable(arguments.trial),
+        )
         advance(1.0)
     for line in in_words(done, arguments.relative):
         screen.say(line)
@@ -57,7 +65,7 @@ def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
     source = Path(arguments.log)
     target = Path(arguments.out or source.with_name(f"{source.name.removesuffix('.mcap')}.what_if.mcap"))
     with screen.progress("replay") as advance:
-        run_again(read_run(source), target, arguments.set, advance)
+        run_again(read_run(source), target, arguments.set, arguments.trial, advance)
         advance(1.0)
     compared = compare([source, target])
     comparing.show(compared, screen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -73,15 +74,19 @@ class Study:
 def load_study(path: str | Path, overrides: list[str] | None = None) -> Study:
     """A study file, some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
     file = find_file(str(path), Path.cwd())
-    data = with_overrides(read_extended(file), overrides or [])
+    return build_study(with_overrides(read_extended(file), overrides or []), file.parent, str(file))
+
+
+def build_study(data: Mapping[str, Any], base: Path, source: str) -> Study:
+    """A study from a mapping as in a study file. `base` is where its paths start."""
     if "study" not in data:
-        raise ConfigError([f"{file}: expected a block study, got none; fdi train estimates a single run"])
-    varied = data.pop("study")
-    run = build_run(data, file.parent, str(file))
+        raise ConfigError([f"{source}: expected a block study, got none; fdi train estimates a single run"])
+    varied = data["study"]
+    run = build_run({key: value for key, value in data.items() if key != "study"}, base, source)
     try:
         config = StudyConfig.model_validate(varied)
     except ValidationError as error:
-        raise explain(error, f"{file}: study") from None
+        raise explain(error, f"{source}: study") from None
     text = run.text + write_yaml({"study": varied})
     return Study(config, run, _plan(config, run), text)
 

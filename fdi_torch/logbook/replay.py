@@ -18,6 +18,7 @@ from fdi_torch.logbook.provenance import environment
 from fdi_torch.logbook.reader import Message, Run, read_run
 
 Rerun = Callable[[Run], "str | Path | Iterable[Message]"]
+Select = Callable[[Iterable[Message]], Iterable[Message]]
 Outcome = Literal["bit-equal", "within tolerance", "differs"]
 
 
@@ -56,20 +57,21 @@ def replay(
     relative: float = 1e-9,
     absolute: float = 1e-12,
     skip_topics: Collection[str] = ("/log",),
+    select: Select | None = None,
     env: Mapping[str, str] | None = None,
 ) -> Replay:
     """Do a run again and compare.
 
     rerun: gets the opened log and returns the new log's path, or its messages. Numbers are within tolerance where
     |a - b| <= absolute + relative max(|a|, |b|). skip_topics: not compared; by default what is said in words.
+    select: which messages of each side are compared, and in which order; by default all, as they were logged.
     Raises LogError where a log cannot be read.
     """
     run = read_run(path)
     again = rerun(run)
     replayed = read_run(again).messages() if isinstance(again, str | Path) else again
     return compare_events(
-        run.messages(),
-        replayed,
+        *((select(side) if select else side) for side in (run.messages(), replayed)),
         relative=relative,
         absolute=absolute,
         skip_topics=skip_topics,

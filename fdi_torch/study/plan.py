@@ -7,8 +7,8 @@ is computed.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from itertools import combinations
+from dataclasses import dataclass, field, replace
+from itertools import combinations, groupby
 from typing import Literal
 
 import torch
@@ -103,6 +103,18 @@ class Plan:
             for first in range(0, setting.trials, self.block):
                 yield Block(k, first, min(first + self.block, setting.trials), offset)
             offset += setting.trials
+
+    def blocks_of(self, numbers: Iterable[int]) -> Iterator[Block]:
+        """Blocks that hold these trials and no others. Raises ValueError for a trial that the study does not have."""
+        wanted = set(numbers)
+        for number in sorted(wanted):
+            if not 0 <= number < self.trials:
+                raise ValueError(f"expected trials from 0 to {self.trials - 1}, got {number}")
+        for block in self.blocks():
+            for gap, run in groupby(block.numbers, lambda number: number not in wanted):
+                chosen = [] if gap else list(run)
+                if chosen:
+                    yield replace(block, first=chosen[0] - block.offset, last=chosen[-1] + 1 - block.offset)
 
     def noise(self, block: Block, shape: tuple[int, ...]) -> Tensor:
         """Standard normal draws (trials, *shape) of the block's trials, a generator each."""
