@@ -54,15 +54,14 @@ class _Free(Effect):
         if variable not in self.nodes:
             return torch.zeros_like(x)
         grid = x.new_tensor(self.nodes[variable])
-        table = torch.stack(torch.broadcast_tensors(*(p[f"{variable}_{j}"] for j in range(len(grid)))), dim=-1)
-        table = table.squeeze(-2) if table.dim() > 1 else table
-        lanes = torch.broadcast_shapes(table.shape[:-1], x.shape[:-1])
-        inside = torch.minimum(torch.maximum(x, grid[0]), grid[-1]).expand(*lanes, x.shape[-1])
-        table = table.expand(*lanes, len(grid))
+        inside = torch.minimum(torch.maximum(x, grid[0]), grid[-1])
         left = (torch.searchsorted(grid, inside.detach().contiguous(), right=True) - 1).clamp(0, len(grid) - 2)
         share = (inside - grid[left]) / (grid[left + 1] - grid[left])
-        low, high = table.gather(-1, left), table.gather(-1, left + 1)
-        return low + share * (high - low)
+        total = torch.zeros_like(x)
+        for j in range(len(grid)):
+            weight = torch.where(left == j, 1.0 - share, torch.where(left + 1 == j, share, 0.0))
+            total = total + p[f"{variable}_{j}"] * weight
+        return total
 
     def waves(self, clock: Clock, p: Values) -> Tensor | float:
         """Sines and cosines of the effect's periods, averaged over each step."""

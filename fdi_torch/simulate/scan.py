@@ -1,58 +1,72 @@
-"""A linear recurrence in time, solved in blocks: about 2 sqrt(K) vector operations instead of K."""
+"""A linear recurrence in time, solved in blocks of blocks: a few dozen vector operations instead of K."""
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
+
+LENGTH = 16  # steps taken one after the other in each block, and in blocks of blocks
 
 
 def linear_scan(transition: Tensor, forcing: Tensor, first: Tensor) -> Tensor:
     """x_{k+1} = A_k x_k + b_k for k = 0..K-1.
 
-    transition (L, K, n, n), forcing (L, K, n, m), first (L, n, m) -> x (L, K+1, n, m). All blocks run side by side
-    from zero, with the product of their A; the blocks' starts follow, and then every x.
+    transition (L, K, n, n), forcing (L, K, n, m), first (L, n, m) -> x (L, K+1, n, m), with time last in memory.
     """
-    lanes, count, n, m = forcing.shape
-    length = max(1, math.isqrt(count))
-    blocks = -(-count // length)
-    a = _in_blocks(transition.expand(lanes, count, n, n), blocks, length, torch.eye(n, dtype=first.dtype))
-    b = _in_blocks(forcing, blocks, length, first.new_zeros(n, m))
-    inner = _side_by_side(a, b)
-    starts = [first]
-    for j in range(blocks - 1):
-        end = inner[-1][:, j]
-        starts.append(end[..., :m] + _times(end[..., m:], starts[-1]))
-    start = torch.stack(starts, dim=1)
-    path = torch.stack(inner, dim=2)  # (L, blocks, length, n, m + n)
-    x = path[..., :m] + _times(path[..., m:], start.unsqueeze(2))
-    return torch.cat([first.unsqueeze(1), x.reshape(lanes, blocks * length, n, m)[:, :count]], dim=1)
+    a, b = transition.permute(0, 2, 3, 1), forcing.permute(0, 2, 3, 1)
+    return scan_in_time(a, b, first).permute(0, 3, 1, 2)
 
 
-def _in_blocks(x: Tensor, blocks: int, length: int, filler: Tensor) -> Tensor:
-    """(L, K, ...) -> (L, blocks, length, ...), the last block filled up."""
-    missing = blocks * length - x.shape[1]
+def scan_in_time(a: Tensor, b: Tensor, first: Tensor) -> Tensor:
+    """The same with time last: a (L, n, n, K), b (L, n, m, K), first (L, n, m) -> (L, n, m, K+1).
+
+    All blocks run side by side from zero, with the product of their A; the starts of the blocks are such a
+    recurrence again, and then every x follows.
+    """
+    m, count = b.shape[2], b.shape[-1]
+    a = a.expand(b.shape[0], *a.shape[1:])
+    if count <= LENGTH:
+        return torch.stack(_one_by_one(a, b, first), dim=-1)
+    blocks = -(-count // LENGTH)
+    inner = _side_by_side(_in_blocks(a, blocks, one=True), _in_blocks(b, blocks, one=False))
+    ends = inner[-1][..., :-1]
+    start = scan_in_time(ends[:, :, m:], ends[:, :, :m], first)
+    x = torch.stack([y[:, :, :m] + _times(y[:, :, m:], start) for y in inner], dim=-1)
+    return torch.cat([first.unsqueeze(-1), x.flatten(-2)[..., :count]], dim=-1)
+
+
+def _in_blocks(x: Tensor, blocks: int, one: bool) -> Tensor:
+    """(L, n, m, K) -> (LENGTH, L, n, m, blocks), the last block filled up with ones on the diagonal, or zeros."""
+    lanes, n, m, count = x.shape
+    missing = blocks * LENGTH - count
     if missing:
-        x = torch.cat([x, filler.expand(x.shape[0], missing, *filler.shape)], dim=1)
-    return x.reshape(x.shape[0], blocks, length, *x.shape[2:])
+        filler = torch.eye(n, m, dtype=x.dtype, device=x.device) if one else x.new_zeros(n, m)
+        x = torch.cat([x, filler.unsqueeze(-1).expand(lanes, n, m, missing)], dim=-1)
+    return x.reshape(lanes, n, m, blocks, LENGTH).permute(4, 0, 1, 2, 3).contiguous()
 
 
 def _side_by_side(a: Tensor, b: Tensor) -> list[Tensor]:
-    """Within each block: [x from zero | product of A] after each of its steps."""
-    m = b.shape[-1]
-    state = torch.cat([b[:, :, 0], a[:, :, 0]], dim=-1)
+    """Within each block: [x from zero | product of A] after each of its steps, (L, n, m + n, blocks)."""
+    m = b.shape[3]
+    state = torch.cat([b[0], a[0]], dim=2)
     found = [state]
-    for k in range(1, a.shape[2]):
-        state = _times(a[:, :, k], state)
-        state[..., :m] += b[:, :, k]
+    for k in range(1, len(a)):
+        state = _times(a[k], state)
+        state[:, :, :m] += b[k]
         found.append(state)
     return found
 
 
+def _one_by_one(a: Tensor, b: Tensor, first: Tensor) -> list[Tensor]:
+    found = [first]
+    for k in range(b.shape[-1]):
+        found.append(_times(a[..., k : k + 1], found[-1].unsqueeze(-1))[..., 0] + b[..., k])
+    return found
+
+
 def _times(a: Tensor, x: Tensor) -> Tensor:
-    """a (..., n, n) times x (..., n, m) as an explicit sum: the same bits alone and in a batch."""
-    total = a[..., :, :1] * x[..., :1, :]
-    for j in range(1, a.shape[-1]):
-        total = total + a[..., :, j : j + 1] * x[..., j : j + 1, :]
+    """a (L, n, n, B) times x (L, n, m, B) as an explicit sum: the same bits alone and in a batch."""
+    total = a[:, :, 0, None] * x[:, None, 0]
+    for j in range(1, a.shape[2]):
+        total += a[:, :, j, None] * x[:, None, j]
     return total
