@@ -1,4 +1,4 @@
-"""`python -m benchmarks [speed] [precision] [scaling] [search] [--seconds S] [--write FILE]`: tables in Markdown."""
+"""`python -m benchmarks [PART ...] [--seconds S] [--write FILE]`: tables in Markdown."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUM
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
-from benchmarks import machine, precision, scaling, search, speed  # noqa: E402
+from benchmarks import machine, monitoring, precision, scaling, search, speed  # noqa: E402
 
 PARTS = {
     "speed": ("Trajectories per CPU second, 1000 s in 10 s RK4 steps, float64", speed),
     "precision": ("Trajectories per CPU second at a given worst error, 256 random faults", precision),
     "scaling": ("Sums over the samples, fused with the simulation: many lanes, sensitivities, memory", scaling),
     "search": ("CPU seconds to find a noise-free 5-parameter fault to 1e-6", search),
+    "monitoring": ("The monitor on three tanks, beside the time that samples take to come", monitoring),
 }
 
 

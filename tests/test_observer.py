@@ -14,13 +14,18 @@ from fdi_torch.effects import build_network, place
 from fdi_torch.monitor.gain import hand_gain, kalman_gain, linearised, riccati, spectral_radius, timed_gain
 from fdi_torch.monitor.noise import learn_noise, operating_point
 from fdi_torch.monitor.observer import Observer, bound
+from fdi_torch.monitor.running import run_lanes
 from fdi_torch.monitor.samples import Samples, stack, take
 from fdi_torch.monitor.stepper import PlantState, Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.engine import Readings
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.injection import Injection, expect_injectable, lay_out_samples
 from fdi_torch.simulate.integrate import ReferenceEngine
+from fdi_torch.simulate.traced import TracedEngine
 
 PLANT = load_plant("three_tank")
 NETWORK = build_network(PLANT)
@@ -142,12 +147,46 @@ def test_a_run_is_the_same_alone_and_beside_a_nan_neighbour() -> None:
     assert torch.equal(together, alone)
 
 
-def test_the_recorded_step_is_the_plain_one_to_the_last_bit() -> None:
-    stepper, values = Stepper(NETWORK), bound(NETWORK, None, None)
-    state = stepper.start(REST + 0.01, INPUTS, values)
-    move = stepper.recorded(state.levels, INPUTS, values)
-    plain = stepper.advance(state, lambda share: INPUTS, 3.0, 2.5, values)
-    assert torch.equal(plain.levels, stepper.advance(state, lambda share: INPUTS, 3.0, 2.5, values, move).levels)
+def test_without_a_compiler_the_observer_is_the_same() -> None:
+    lagging = build_network(PLANT, [place("pump_lag", "Q1"), place("sensor_lag", "h2")])
+    names = ["Q1.pump_lag.time_constant", "h2.sensor_lag.time_constant"]
+    space = ParameterSpace([lagging.constants[name] for name in names])
+    samples = at_rest(40, (2,))
+    samples.readings[0, 5:9, 1] = torch.nan
+    experiment = lay_out_samples(
+        samples.time, torch.cat([INPUTS.expand(20, 2), 2 * INPUTS.expand(20, 2)]), "linear", 0.7
+    )
+    data = Readings(samples.readings, torch.isfinite(samples.readings).double())
+    gains = 0.1 * torch.eye(3, dtype=torch.float64).expand(40, 3, 3)
+    theta = torch.tensor([[[3.0, 4.0]], [[8.0, 2.0]]], dtype=torch.float64)
+    for memory in (None, torch.full((2, 3), 0.1, dtype=torch.float64)):
+        injection = Injection(gains, REST.expand(2, 3), memory)
+        compiled, traced = (e(lagging, space, experiment).observe(theta, data, injection).reshape(2, 40, -1)
+                            for e in (CompiledEngine, TracedEngine))  # fmt: skip
+        torch.testing.assert_close(compiled, traced, rtol=0, atol=1e-12)
+
+
+def test_a_run_goes_on_from_any_of_its_states() -> None:
+    lagging = build_network(PLANT, [place("pump_lag", "Q1"), place("sensor_lag", "h2")])
+    names = ["Q1.pump_lag.time_constant", "h2.sensor_lag.time_constant"]
+    space = ParameterSpace([lagging.constants[name] for name in names])
+    theta = torch.tensor([[20.0, 9.0]], dtype=torch.float64)
+    samples = at_rest(40)
+    samples = replace(samples, inputs=torch.where(samples.time < 18.0, 1.0, 2.0).unsqueeze(1) * INPUTS)
+    gains = 0.1 * torch.eye(3, dtype=torch.float64).expand(40, 3, 3)
+    whole = run_lanes(lagging, space, theta, samples, REST[None], gains, 1.0, from_first=True).state
+    rest = run_lanes(lagging, space, theta, samples.stretch(20, 40), whole[:, 20], gains[21:], 1.0, from_first=False)
+    assert torch.equal(rest.state, whole[:, 21:])
+
+
+def test_a_correction_within_a_step_is_refused() -> None:
+    time = torch.arange(4, dtype=torch.float64)
+    experiment = lay_out_samples(time, INPUTS.expand(4, 2), "zero_order", 1.0)
+    inside = replace(experiment, sample_share=torch.tensor([0.0, 0.5, 1.0, 1.0], dtype=torch.float64))
+    with pytest.raises(ValueError, match="every sample at the end of a step"):
+        expect_injectable(inside, Injection(torch.zeros(4, 3, 3), REST[None]), 0)
+    with pytest.raises(ValueError, match="expected 3 remembered numbers a lane, got 2"):
+        expect_injectable(experiment, Injection(torch.zeros(4, 3, 3), REST[None], REST[None, :2]), 3)
 
 
 def test_noise_is_learnt_from_a_fault_free_recording() -> None:

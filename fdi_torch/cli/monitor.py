@@ -11,7 +11,8 @@ from fdi_torch.cli.options import add_config
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.monitor import load_monitor
 from fdi_torch.config.recordings import read_recording
-from fdi_torch.monitor.online import Monitor, MonitorState
+from fdi_torch.monitor.following import MonitorState
+from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.prepare import Prepared, fault_free_part, prepare
 from fdi_torch.monitor.samples import Samples, take
 

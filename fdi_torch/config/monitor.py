@@ -14,7 +14,7 @@ from fdi_torch.config.plant import build_plant, load_plant
 from fdi_torch.config.problems import explain
 from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.config.strict import Seconds, Strict
-from fdi_torch.monitor.online import MonitorSettings
+from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.plant.description import PlantDescription
 
 

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from fdi_torch.monitor.changing import ONSET, RAMP, ChangingNetwork
 from fdi_torch.monitor.gain import Gain
+from fdi_torch.monitor.observer import first_levels
+from fdi_torch.monitor.running import run_lanes
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.stepper import LONGEST_STEP, Stepper, substeps
+from fdi_torch.monitor.stepper import LONGEST_STEP, Stepper
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.signals import Clock
 
-Step = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+NEVER, LONG_AGO = 1e30, -1e30  # s
+# Readings of all lanes that are worked on at once: what a processor's cache and a small machine's memory like.
+MOST_READINGS = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -31,19 +33,53 @@ class Changes:
     onset: Tensor
     incipient: Tensor
 
-    def share(self, start: float, end: float, last: float) -> Tensor:
-        """How far the change has come, as a mean over [start, end], (L,)."""
-        abrupt = ((end - self.onset) / (end - start)).clamp(0.0, 1.0)
-        middle = 0.5 * (start + end)
-        ramp = ((middle - self.onset) / (last - self.onset).clamp(min=end - start)).clamp(0.0, 1.0)
-        return torch.where(self.incipient, ramp, abrupt)
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def part(self, first: int, last: int) -> Changes:
+        return Changes(self.theta[first:last], self.onset[first:last], self.incipient[first:last])
+
+    def ramp(self, end: float) -> Tensor:
+        """How long the change takes, (L,) s."""
+        return torch.where(self.incipient, (end - self.onset).clamp(min=0.0), 0.0)
+
+
+def unchanged(believed: Tensor) -> Changes:
+    """The hypothesis that nothing changes."""
+    return Changes(believed[None], believed.new_tensor([NEVER]), torch.tensor([False]))
+
+
+@dataclass(frozen=True)
+class Window:
+    """A stretch in which a change is sought. samples: from the one after whose correction the observer's state was
+    `state` (tanks + M,); number: how many the observer had then seen. What the others show is compared.
+    """
+
+    samples: Samples
+    state: Tensor
+    number: int
+
+    def __len__(self) -> int:
+        return len(self.samples) - 1
+
+    @property
+    def times(self) -> Tensor:
+        """Of the samples that are compared, (S,) s."""
+        return self.samples.time[1:]
+
+    @property
+    def readings(self) -> int:
+        """How many there are."""
+        return int(torch.isfinite(self.samples.readings[1:]).sum())
 
 
 class ChangedObserver:
-    """An observer with a steady gain, run along a window under many hypotheses at once.
+    """An observer run along a window under many hypotheses at once.
 
     Where a hypothesis is right its innovations are white: half their sum of squares is its negative log-likelihood
     (prediction-error method; Ljung 1999, ch. 7). believed (P,): values of `space` before the change.
+
+    An effect that remembers and has an onset of its own (a stuck sensor keeps what it read then) is given the change's.
     """
 
     def __init__(
@@ -54,47 +90,56 @@ class ChangedObserver:
         whitening: Whitening,
         longest_step: float = LONGEST_STEP,
     ) -> None:
-        if network.command_memory() or network.reading_memory():
-            lagging = [p.prefix for p in network.placements if p.effect.memory]
-            raise ValueError(
-                f"expected faults without memory, got {lagging[0]}; leave it out of the monitor's list of faults"
-            )
-        self.network, self.space, self.gain, self.whitening = network, space, gain, whitening
         self.stepper = Stepper(network, longest_step)
-        self._recorded: dict[tuple[int, ...], Step] = {}
+        self.network, self.space, self.gain, self.whitening = network, space, gain, whitening
+        self.changing = ChangingNetwork(network, space.names)
+        self._held = _with_own_onset(network, space)
+        onsets = [f"{name.rpartition('.')[0]}.onset" for name in self._held]
+        names = [*space.names, *(f"after {name}" for name in space.names), ONSET, RAMP, *onsets]
+        self._columns = ParameterSpace(self.changing.constants[name] for name in names)
 
-    def white(self, samples: Samples, levels: Tensor, believed: Tensor, changes: Changes) -> Tensor:
-        """White innovations (L, S, sensors) along one recording, from levels (tanks) before its first correction."""
-        white = self.whitening(self.follow(samples, levels, believed, changes)[1])
+    def white(self, window: Window, believed: Tensor, changes: Changes) -> Tensor:
+        """White innovations (L, S, sensors); zero where a reading or one that it is compared with is missing."""
+        white = self.whitening(self.follow(window, believed, changes)[1])
         white[:, : self.whitening.order] = 0.0
         return torch.nan_to_num(white, nan=0.0)
 
-    def follow(self, samples: Samples, levels: Tensor, believed: Tensor, changes: Changes) -> tuple[Tensor, Tensor]:
-        """Corrected levels (L, S, tanks) and innovations (L, S, sensors) along one recording."""
-        theta = changes.theta
-        times, last = samples.time.tolist(), float(samples.time[-1])
-        state = levels.expand(len(theta), -1).contiguous()
-        step = self._step(state, samples.input_at(0), theta, samples.readings[0])
-        seen, innovations = [], []
-        for k, end in enumerate(times):
-            start = times[k - 1] if k else end - (times[1] - times[0])
-            now = believed + (theta - believed) * changes.share(start, end, last).unsqueeze(-1)
-            if k:
-                for begin, span, share in substeps(start, end - start, self.stepper.longest)[:-1]:
-                    state = self._drift(state, samples.input_at(k - 1, share), begin, span, now)
-                begin, span, share = substeps(start, end - start, self.stepper.longest)[-1]
-                clock = state.new_tensor([begin, span, end, end - start])
-                state, innovation = step(
-                    state, samples.input_at(k - 1, share), clock, now, samples.readings[k], state.new_tensor(1.0)
-                )
-            else:
-                clock = state.new_tensor([start, 1.0, end, end - start])
-                state, innovation = step(
-                    state, samples.input_at(0), clock, now, samples.readings[0], state.new_tensor(0.0)
-                )
-            seen.append(state)
-            innovations.append(innovation)
-        return torch.stack(seen, dim=1), torch.stack(innovations, dim=1)
+    def blocks(self, window: Window, changes: Changes) -> list[Changes]:
+        """The hypotheses in parts that fit into memory side by side."""
+        size = max(MOST_READINGS // (len(window) * len(self.network.description.sensors)), 1)
+        return [changes.part(first, first + size) for first in range(0, len(changes), size)]
+
+    def follow(self, window: Window, believed: Tensor, changes: Changes) -> tuple[Tensor, Tensor]:
+        """States (L, S, tanks + M) after each sample, and residuals (L, S, sensors) at the steady ones' spread."""
+        samples, count = window.samples, len(window)
+        ran = run_lanes(
+            self.changing,
+            self._columns,
+            self._lanes(believed, changes, float(samples.time[-1])),
+            samples,
+            window.state.expand(len(changes), -1),
+            self.gain.table(window.number, count),
+            self.stepper.longest,
+            from_first=False,
+        )
+        return ran.state, (samples.readings[1:] - ran.expected) / self.gain.spread(window.number, count)
+
+    def first_state(self, samples: Samples, believed: Tensor, levels: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """State (tanks + M,) after the first sample of a run, its levels from the readings, and the residual there."""
+        first = samples.stretch(0, 1)
+        if levels is None:
+            levels = first_levels(self.network, first, self.network.bind(self.space, believed))
+        ran = run_lanes(
+            self.changing,
+            self._columns,
+            self._lanes(believed, unchanged(believed), float(first.time[0])),
+            first,
+            levels[None],
+            self.gain.table(0, 1),
+            self.stepper.longest,
+            from_first=True,
+        )
+        return ran.state[0, 0], (first.readings[0] - ran.expected[0, 0]) / self.gain.spread(0, 1)[0]
 
     def space_width(self) -> Tensor:
         """The length of each parameter's range, (P,); its size or 1 where it has none."""
@@ -103,36 +148,24 @@ class ChangedObserver:
         width = torch.where(torch.isfinite(high - low), high - low, torch.where(typical > 0, typical, 1.0))
         return width
 
-    def _drift(self, state: Tensor, inputs: Tensor, begin: float, span: float, now: Tensor) -> Tensor:
-        """One integration step without a reading at its end."""
-        nothing = state.new_full((len(self.network.description.sensors),), torch.nan)
-        clock = state.new_tensor([begin, span, begin + span, span])
-        return self._step(state, inputs, now, nothing)(state, inputs, clock, now, nothing, state.new_tensor(1.0))[0]
+    def _lanes(self, believed: Tensor, changes: Changes, end: float) -> Tensor:
+        """What the changing plant wants to know of each hypothesis, (L, columns)."""
+        before = believed.expand(len(changes), -1)
+        moment = torch.stack([changes.onset, changes.ramp(end)], dim=1)
+        own = []
+        for name in self._held:
+            p = self.space.parameters[self.space.index(name)]
+            already = float(believed[self.space.index(name)]) != p.nominal
+            own.append(torch.full_like(changes.onset, LONG_AGO) if already else changes.onset)
+        return torch.cat([before, changes.theta, moment, *(column.unsqueeze(1) for column in own)], dim=1)
 
-    def _step(self, state: Tensor, inputs: Tensor, theta: Tensor, reading: Tensor) -> Step:
-        """move by one step (times 0 or 1), read, correct; recorded once for each number of lanes."""
-        key = tuple(state.shape)
-        if key in self._recorded:
-            return self._recorded[key]
 
-        def step(x: Tensor, u: Tensor, clock: Tensor, now: Tensor, y: Tensor, moves: Tensor) -> tuple[Tensor, Tensor]:
-            values = self.network.bind(self.space, now)
-            moved = self.stepper.move(x, u, (), Clock(clock[0], clock[1], clock[1]), values)[0]
-            x = x + moves * (moved - x)
-            seen = [x[..., tank] for tank in self.network.sensor_tanks()]
-            predicted, _ = self.network.read(seen, (), Clock(clock[2] - clock[3], clock[3], clock[3]), values)
-            innovation = y - torch.stack(torch.broadcast_tensors(*predicted), dim=-1)
-            known = torch.nan_to_num(innovation, nan=0.0)
-            gain = self.gain.steady
-            for c in range(known.shape[-1]):
-                x = x + gain[..., c] * known[..., c : c + 1]
-            return torch.clamp(x, min=0.0), innovation
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch announces a successor of its tracer; it does not do this job yet
-            clock = state.new_tensor([0.0, 1.0, 1.0, 1.0])
-            recorded: Step = torch.jit.trace(
-                step, (state, inputs, clock, theta, reading, state.new_tensor(1.0)), check_trace=False
-            )
-        self._recorded[key] = recorded
-        return recorded
+def _with_own_onset(network: TankNetwork, space: ParameterSpace) -> list[str]:
+    """The parameters of `space` that are sizes of effects with a memory and an onset."""
+    named = []
+    for placement in network.placements:
+        size, *shape = placement.effect.parameters(placement.location, network.description)
+        name = f"{placement.prefix}.{size.name}"
+        if placement.effect.memory and any(p.name == "onset" for p in shape) and name in space:
+            named.append(name)
+    return named

@@ -34,8 +34,16 @@ class Gain:
     def at(self, k: int) -> Tensor:
         return self.opening[k] if k < len(self.opening) else self.steady
 
-    def inflation_at(self, k: int) -> Tensor:
-        return self.inflation[k] if k < len(self.inflation) else torch.ones_like(self.steady[..., 0, :])
+    def table(self, first: int, count: int) -> Tensor:
+        """The gains of `count` samples from the `first` of a run on, (count, *batch, tanks, sensors)."""
+        opening = self.opening[first : first + count]
+        return torch.cat([opening, self.steady.expand(count - len(opening), *self.steady.shape)])
+
+    def spread(self, first: int, count: int) -> Tensor:
+        """The inflation at `count` samples from the `first` of a run on, (*batch, count, sensors)."""
+        opening = self.inflation[first : first + count]
+        rest = torch.ones_like(self.steady[..., 0, :]).expand(count - len(opening), *self.steady[..., 0, :].shape)
+        return torch.cat([opening, rest]).movedim(0, -2)
 
 
 @dataclass(frozen=True)

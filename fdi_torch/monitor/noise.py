@@ -75,7 +75,7 @@ class _Attempt:
 
 
 def _attempt(seen: Observation, lane: int, exponent: float) -> _Attempt:
-    own = Observation(seen.time, seen.levels[lane], seen.residual[lane], seen.inflation[..., lane, :, :])
+    own = Observation(seen.time, seen.state[lane], seen.residual[lane], seen.inflation[..., lane, :, :], seen.tanks)
     score, whitening = score_whitenings(own.steady_residual)[0]
     return _Attempt(exponent, score + 2.0 * float(torch.log(own.inflation).sum()), whitening, own)
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from fdi_torch.monitor.gain import Gain, linearised, spectral_radius
+from fdi_torch.monitor.running import run_lanes
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.stepper import LONGEST_STEP, Move, PlantState, Stepper
+from fdi_torch.monitor.stepper import LONGEST_STEP, Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 
@@ -19,19 +19,36 @@ CHECKED_POINTS = 200
 
 @dataclass(frozen=True)
 class Observation:
-    """What an observer saw: levels (*batch, S, tanks) m after each correction, residual (*batch, S, sensors) = reading
-    less prediction, NaN where a reading is missing, and inflation (S, *batch or 1, sensors), see `Gain`.
+    """What an observer saw: state (*batch, S, tanks + M) after each correction, levels in m and then what actuators and
+    sensors remember; residual (*batch, S, sensors) = reading less prediction, NaN where a reading is missing; and
+    inflation (S, *batch or 1, sensors), see `Gain`.
     """
 
     time: Tensor
-    levels: Tensor
+    state: Tensor
     residual: Tensor
     inflation: Tensor
+    tanks: int
+
+    @property
+    def levels(self) -> Tensor:
+        """(*batch, S, tanks) m."""
+        return self.state[..., : self.tanks]
 
     @property
     def steady_residual(self) -> Tensor:
         """The residual with its first samples brought to the spread of the later ones."""
         return self.residual / self.inflation
+
+    def last(self, count: int) -> Observation:
+        """Its last samples."""
+        return Observation(
+            self.time[-count:],
+            self.state[..., -count:, :],
+            self.residual[..., -count:, :],
+            self.inflation[..., -count:, :],
+            self.tanks,
+        )
 
 
 class Observer:
@@ -50,56 +67,53 @@ class Observer:
     ) -> None:
         self.stepper, self.gain = Stepper(network, longest_step), gain
         self.values = bound(network, space, theta)
-        self._moves: dict[torch.Size, Move | None] = {}
+        self.space = space or ParameterSpace()
+        self.theta = network.nominal.new_zeros(0) if theta is None else theta
         self._expect_shape(network)
 
-    def start(self, samples: Samples, levels: Tensor | None = None) -> PlantState:
-        """The state before the first sample: given levels (*batch, tanks), or those that the first readings show."""
-        if levels is None:
-            levels = first_levels(self.stepper.network, samples, self.values)
-        return self.stepper.start(levels, samples.input_at(0), self.values)
-
-    def correct(self, state: PlantState, reading: Tensor, k: int, end: float, span: float) -> tuple[PlantState, Tensor]:
-        """State and reading (*batch, sensors) at sample k of the run -> corrected state, residual (*batch, sensors)."""
-        predicted, state = self.stepper.read(state, end, span, self.values)
-        residual = reading - predicted
-        known = torch.nan_to_num(residual, nan=0.0)
-        gain = self.gain.at(k)
-        # Explicit sums: a lane's result must not depend on how many lanes run beside it.
-        move = sum(gain[..., c] * known[..., c : c + 1] for c in range(known.shape[-1]))
-        levels = torch.clamp(state.levels + move, min=0.0)
-        return PlantState(levels, state.commands, state.readings), residual
-
     def run(self, samples: Samples, levels: Tensor | None = None) -> Observation:
-        """Along whole recordings. levels: before the first correction, where known."""
-        state = self.start(samples, levels)
-        state = replace(state, levels=state.levels.expand(*self._lanes(samples), -1))
-        times = samples.time.tolist()
-        state, residual = self.correct(state, samples.readings[..., 0, :], 0, times[0], times[1] - times[0])
-        rest = self.resume(samples, state, 1)
-        return Observation(
-            samples.time,
-            torch.cat([state.levels.unsqueeze(-2), rest.levels], dim=-2),
-            torch.cat([residual.unsqueeze(-2), rest.residual], dim=-2),
-            torch.cat([self.gain.inflation_at(0).unsqueeze(-2), rest.inflation], dim=-2),
+        """Along whole recordings. levels (*batch, tanks): before the first correction; the first readings' if None."""
+        network = self.stepper.network
+        lanes = self._lanes(samples)
+        if levels is None:
+            levels = first_levels(network, samples, self.values)
+        if samples.inputs.dim() > 2:
+            return self._one_by_one(samples, levels.expand(*lanes, -1))
+        flat = lanes.numel()
+        readings = samples.readings
+        if samples.batch:
+            readings = readings.expand(*lanes, *readings.shape[-2:]).reshape(flat, *readings.shape[-2:])
+        ran = run_lanes(
+            network,
+            self.space,
+            self.theta.expand(*lanes, -1).reshape(flat, -1),
+            replace(samples, readings=readings),
+            levels.expand(*lanes, -1).reshape(flat, -1),
+            self._gains(len(samples), lanes),
+            self.stepper.longest,
+            from_first=True,
         )
+        residual = (readings - ran.expected).reshape(*lanes, len(samples), -1)
+        state = ran.state.reshape(*lanes, len(samples), -1)
+        return Observation(samples.time, state, residual, self.gain.spread(0, len(samples)), levels.shape[-1])
 
-    def resume(self, samples: Samples, state: PlantState, number: int) -> Observation:
-        """From the state after the first sample: what is seen at the others. number: samples seen so far."""
-        move = self._recorded(state.levels, samples.input_at(0))
-        times = samples.time.tolist()
-        seen, residuals, inflation = [], [], []
-        for k in range(1, len(samples)):
-            span = times[k] - times[k - 1]
-            inputs = partial(samples.input_at, k - 1)
-            state = self.stepper.advance(state, inputs, times[k - 1], span, self.values, move)
-            count = number + k - 1
-            state, residual = self.correct(state, samples.readings[..., k, :], count, times[k], span)
-            seen.append(state.levels)
-            residuals.append(residual)
-            inflation.append(self.gain.inflation_at(count))
-        return Observation(
-            samples.time[1:], torch.stack(seen, -2), torch.stack(residuals, -2), torch.stack(inflation, -2)
+    def _one_by_one(self, samples: Samples, levels: Tensor) -> Observation:
+        """Recordings each under inputs of its own."""
+        rows = range(levels.shape[0])
+        seen = [
+            self.run(Samples(samples.time, samples.inputs[i], samples.readings[i], samples.hold), levels[i])
+            for i in rows
+        ]
+        state, residual = torch.stack([s.state for s in seen]), torch.stack([s.residual for s in seen])
+        return Observation(samples.time, state, residual, seen[0].inflation, seen[0].tanks)
+
+    def _gains(self, count: int, lanes: torch.Size) -> Tensor:
+        """(S, tanks, sensors), or one such table for each lane."""
+        table = self.gain.table(0, count)
+        if table.dim() == 3:
+            return table
+        return (
+            table.movedim(0, -3).expand(*lanes, -1, -1, -1).reshape(lanes.numel(), *table.shape[:1], *table.shape[-2:])
         )
 
     def check_stable(self, samples: Samples, seen: Observation) -> float:
@@ -124,11 +138,6 @@ class Observer:
                 f"{float(radius[worst]):.3g} a sample at {at:g} s; lower the gain or let it be designed"
             )
         return float(radius[worst])
-
-    def _recorded(self, levels: Tensor, inputs: Tensor) -> Move | None:
-        if levels.shape not in self._moves:
-            self._moves[levels.shape] = self.stepper.recorded(levels, inputs, self.values)
-        return self._moves[levels.shape]
 
     def _lanes(self, samples: Samples) -> torch.Size:
         """Recordings, lanes of parameters and lanes of gains side by side."""

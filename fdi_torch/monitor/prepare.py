@@ -14,8 +14,9 @@ from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
 from fdi_torch.monitor.detection import Chart, make_detector
 from fdi_torch.monitor.noise import Noise, learn_noise
 from fdi_torch.monitor.observer import Observer
-from fdi_torch.monitor.online import Monitor, MonitorSettings
+from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.samples import take
+from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.monitor.stepper import LONGEST_STEP
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -17,10 +16,6 @@ from fdi_torch.plant.signals import Clock
 
 # RK4 at this step is right to 1e-3 cm on the paper's plant, far below what sensors resolve.
 LONGEST_STEP = 1.0
-
-
-Move = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""levels (*batch, tanks), inputs (*batch, channels), (start, step) s -> levels at the end of the step."""
 
 
 @dataclass(frozen=True)
@@ -62,35 +57,13 @@ class Stepper:
         begin: float,
         span: float,
         values: PlaceValues,
-        move: Move | None = None,
     ) -> PlantState:
-        """The state `span` s later. inputs: share (0..1) of the span -> (*batch, channels). move: from `recorded`."""
+        """The state `span` s later. inputs: share (0..1) of the span -> (*batch, channels)."""
         for start, step, share in substeps(begin, span, self.longest):
-            if move is not None:
-                times = state.levels.new_tensor([start, step])
-                state = replace(state, levels=move(state.levels, inputs(share), times))
-                continue
             clock = self._clock(state.levels, start, step, step)
             levels, memory = self.move(state.levels, inputs(share), state.commands, clock, values)
             state = replace(state, levels=levels, commands=memory)
         return state
-
-    def recorded(self, levels: Tensor, inputs: Tensor, values: PlaceValues) -> Move | None:
-        """The same step recorded once as flat pointwise operations, several times faster; the same to the last bit.
-
-        None for a plant whose actuators remember.
-        """
-        if self.network.command_memory():
-            return None
-
-        def move(x: Tensor, u: Tensor, times: Tensor) -> Tensor:
-            clock = Clock(times[0], times[1], times[1])
-            return self.move(x, u, (), clock, values)[0]
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch announces a successor of its tracer; it does not do this job yet
-            recorded: Move = torch.jit.trace(move, (levels, inputs, levels.new_tensor([0.0, 1.0])), check_trace=False)
-        return recorded
 
     def read(self, state: PlantState, end: float, span: float, values: PlaceValues) -> tuple[Tensor, PlantState]:
         """Readings (*batch, sensors) at the end of an interval of `span` s, and the state with the sensors' memory."""

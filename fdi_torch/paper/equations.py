@@ -23,7 +23,7 @@ EQUATIONS = (
     Equation((1,), "a plant whose rates are linear in unknown parameters", ("plant.network:TankNetwork.forward",)),
     Equation((2,), "each parameter stays within a range about its nominal value", ("parameters:Parameter",)),
     Equation((3,), "the same plant at its nominal parameters", ("parameters:ParameterSpace.nominal",)),
-    Equation((4,), "output error: reading less nominal prediction", ("monitor.observer:Observer.correct",)),
+    Equation((4,), "output error: reading less nominal prediction", ("monitor.observer:Observer.run",)),
     Equation((5,), "the model that is fitted has the plant's structure", ("estimate.fitting:Fitting.engines",)),
     Equation((6,), "plant and model start from the same levels", ("estimate.fitting:start_levels",)),
     Equation((7,), "and share them ever after", ("estimate.hybrid:HybridResult",)),

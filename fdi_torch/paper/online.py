@@ -81,7 +81,7 @@ def follow(runs: Sequence[Run]) -> OnLine:
         part = recording.window(begin, end)
         # The observer runs on until its parameters change.
         observed = take(recording.window(since, end), network.description)
-        seen = last_samples(Observer(network, gain, space, believed).run(observed, levels), len(part))
+        seen = Observer(network, gain, space, believed).run(observed, levels).last(len(part))
         alarm = first_alarm(seen, noise, detector)
         result = sized(part, space, runs[-1]) if varies(part) else None
         windows.append(Window(begin, end, space.vector(faults_of(run, network)), alarm, result))
@@ -93,10 +93,6 @@ def follow(runs: Sequence[Run]) -> OnLine:
             (believed, levels), since = fed_back(result, len(space)), end
         begin = end
     return OnLine(recording, tuple(windows), torch.cat(predicted), nominal, torch.cat(adaptive))
-
-
-def last_samples(seen: Observation, count: int) -> Observation:
-    return Observation(*(part[-count:] for part in (seen.time, seen.levels, seen.residual, seen.inflation)))
 
 
 def laid_end_to_end(runs: Sequence[Run]) -> tuple[Recording, Recording, TankNetwork, ParameterSpace]:

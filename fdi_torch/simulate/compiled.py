@@ -15,15 +15,16 @@ from fdi_torch.simulate.build import is_cached, load_library
 from fdi_torch.simulate.emit import emit
 from fdi_torch.simulate.engine import Readings, expect_problems
 from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.injection import Injection, expect_injectable
 from fdi_torch.simulate.program import build_program
 
-_INTEGERS = ("lanes", "lanes_per_problem", "steps", "samples", "signal_samples", "mode", "threads")
+_INTEGERS = ("lanes", "lanes_per_problem", "steps", "samples", "signal_samples", "mode", "threads", "gain_stride")
 _ARRAYS = (
     "theta", "nominal", "lifted", "resolution", "starts", "spans", "means", "first_sample", "sample_times",
     "sample_intervals", "sample_shares", "signal_times", "signal_integral", "signal_slopes", "values", "weights",
-    "centres", "memory", "out", "jacobian",
+    "centres", "memory", "gains", "start", "start_memory", "out", "jacobian",
 )  # fmt: skip
-_MODES = {"levels": 0, "readings": 1, "moments": 2, "linearise": 3, "gram": 4}
+_MODES = {"levels": 0, "readings": 1, "moments": 2, "linearise": 3, "gram": 4, "observe": 5}
 _REALS = {torch.float64: "double", torch.float32: "float"}
 VALUE_LANES, TANGENT_LANES = 32, 16
 
@@ -76,6 +77,13 @@ class CompiledEngine:
         self._run("gram", theta, out, data=data)
         return out
 
+    def observe(self, theta: Tensor, data: Readings, injection: Injection) -> Tensor:
+        memory = self.network.command_memory() + self.network.reading_memory()
+        out = self._empty(theta, len(self.network.description.tanks) + memory + self._sensors)
+        expect_injectable(self.experiment, injection, memory)
+        self._run("observe", theta, out, data=data, injection=injection)
+        return out
+
     def prepare(self, tangent: bool = False, dtype: torch.dtype = torch.float64) -> None:
         """Compiles ahead of the first use."""
         _kernel(self.network, self.space.names, tangent, self._inner, _REALS[dtype])
@@ -92,7 +100,13 @@ class CompiledEngine:
         return theta.new_empty(*theta.shape[:-1], len(self.experiment.sample_times), *width)
 
     def _run(
-        self, mode: str, theta: Tensor, out: Tensor, jacobian: Tensor | None = None, data: Readings | None = None
+        self,
+        mode: str,
+        theta: Tensor,
+        out: Tensor,
+        jacobian: Tensor | None = None,
+        data: Readings | None = None,
+        injection: Injection | None = None,
     ) -> None:
         lanes = self._lanes(theta)
         tangent = mode in ("linearise", "gram")
@@ -105,6 +119,8 @@ class CompiledEngine:
             arrays |= self._data(theta, data)
             if data.values.dim() > 2:
                 per_problem = theta.shape[-2]
+        if injection is not None:
+            arrays |= injection.tables(theta)
         if len(lanes) == 0:
             return
         sizes = {
@@ -115,6 +131,7 @@ class CompiledEngine:
             "signal_samples": len(self.experiment.signal.time),
             "mode": _MODES[mode],
             "threads": torch.get_num_threads(),
+            "gain_stride": 0 if injection is None else injection.stride,
         }
         pointers = {name: None if a is None else a.data_ptr() for name, a in arrays.items()}
         run(ctypes.byref(_Job(**sizes, **pointers)))
@@ -140,7 +157,7 @@ class CompiledEngine:
                 "spans": e.steps,
                 "means": e.inputs,
                 "sample_times": times,
-                "sample_intervals": torch.diff(times, prepend=2 * times[:1] - times[1:2]),
+                "sample_intervals": e.sample_intervals,
                 "sample_shares": e.sample_share,
                 "signal_times": e.signal.time,
                 "signal_integral": e.signal.integral,

@@ -33,6 +33,17 @@ class Experiment:
     def steps(self) -> Tensor:
         return torch.diff(self.nodes)
 
+    @property
+    def sample_intervals(self) -> Tensor:
+        """How long before each sample the one before it was, (S,) s. The first: since the start, or where it is the
+        start, as the second; a single one as the first step.
+        """
+        times = self.sample_times
+        if float(self.sample_share[0]) > 0.0:
+            return torch.diff(times, prepend=self.nodes[:1])
+        first = times[1] - times[0] if len(times) > 1 else self.nodes[1] - self.nodes[0]
+        return torch.diff(times, prepend=times[:1] - first)
+
 
 def lay_out(recording: Recording, channels: tuple[str, ...], step: float) -> Experiment:
     """The experiment that a recording was, in steps no longer than `step` (s).

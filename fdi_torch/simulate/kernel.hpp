@@ -42,16 +42,18 @@ static inline real INVERSE_FOURTH_ROOT(real s) {
     return y;
 }
 
-enum Mode { LEVELS, READINGS, MOMENTS, LINEARISE, GRAM };
+enum Mode { LEVELS, READINGS, MOMENTS, LINEARISE, GRAM, OBSERVE };
+enum { MEMORY = COMMAND_MEMORY + READING_MEMORY, STATE = TANKS + MEMORY };
 
 struct Job {
-    int64_t lanes, lanes_per_problem, steps, samples, signal_samples, mode, threads;
+    int64_t lanes, lanes_per_problem, steps, samples, signal_samples, mode, threads, gain_stride;
     const real *theta, *nominal, *lifted, *resolution;
     const real *starts, *spans, *means;                      // (K), (K), (K, CHANNELS)
     const int64_t *first_sample;                             // (K + 1): step k holds samples first[k] .. first[k + 1]
     const real *sample_times, *sample_intervals, *sample_shares;
     const real *signal_times, *signal_integral, *signal_slopes;  // (T), (T, CHANNELS), (T + 1, CHANNELS)
     const real *values, *weights, *centres, *memory;         // (problems, S, SENSORS) twice, (problems, SENSORS) twice
+    const real *gains, *start, *start_memory;                // (lanes or 1, S, TANKS, SENSORS), (lanes, TANKS), (lanes, MEMORY)
     real *out, *jacobian;
 };
 
@@ -252,6 +254,42 @@ static void write(const Job &job, Block &b, const Rows &rows, int64_t s) {
 #endif
 }
 
+// An observer at a sample: level += gain (value - reading) where something was read, never below zero. Writes the state
+// after it and the reading that it expected.
+static void correct(const Job &job, Block &b, const Rows &rows, int64_t s) {
+    Lane error[SENSORS];
+    for (int c = 0; c < SENSORS; ++c) {
+        fetch_data(job, b, s, c);
+        EACH_LANE error[c][l] = b.weight[l] != 0 ? b.value[l] - b.reading[c][l] : 0;
+    }
+    for (int64_t l = 0; l < LANES; ++l) {
+        const int64_t lane = rows.first + (l < rows.count ? l : rows.count - 1);
+        const real *gain = job.gains + lane * job.gain_stride + s * TANKS * SENSORS;
+        for (int i = 0; i < TANKS; ++i) {
+            real move = 0;
+            for (int c = 0; c < SENSORS; ++c) move += *gain++ * error[c][l];
+            const real level = b.level[i][l] + move;
+            b.level[i][l] = level < 0 ? 0 : level;
+        }
+    }
+    for (int64_t l = 0; l < rows.count; ++l) {
+        real *out = job.out + ((rows.first + l) * job.samples + s) * (STATE + SENSORS);
+        for (int i = 0; i < TANKS; ++i) *out++ = b.level[i][l];
+        for (int i = 0; i < COMMAND_MEMORY; ++i) *out++ = b.command_memory[i][l];
+        for (int i = 0; i < READING_MEMORY; ++i) *out++ = b.reading_memory[i][l];
+        for (int c = 0; c < SENSORS; ++c) *out++ = b.reading[c][l];
+    }
+}
+
+// What a run begins with, where it is told: levels, and what actuators and sensors remember.
+static void begin_with(Lane *into, const real *from, int width, int first, int count, const Rows &rows) {
+    if (!from) return;
+    for (int64_t l = 0; l < LANES; ++l) {
+        const int64_t lane = rows.first + (l < rows.count ? l : rows.count - 1);
+        for (int i = 0; i < count; ++i) into[i][l] = from[lane * width + first + i];
+    }
+}
+
 static void consume(const Job &job, Block &b, const Rows &rows, int64_t s) {
     if (job.mode == LEVELS) return write(job, b, rows, s);
     for (int i = 0; i < SENSORS; ++i) {
@@ -262,10 +300,14 @@ static void consume(const Job &job, Block &b, const Rows &rows, int64_t s) {
     }
     look_up_late_levels(job, b, s);
     const real clock[2] = {job.sample_times[s] - job.sample_intervals[s], job.sample_intervals[s]};
-    if (s == 0) settle_readings(b, clock, nullptr);
+    if (s == 0) {
+        settle_readings(b, clock, nullptr);
+        begin_with(b.reading_memory, job.start_memory, MEMORY, COMMAND_MEMORY, READING_MEMORY, rows);
+    }
     read(b, clock, nullptr);
     if (job.mode == READINGS || job.mode == LINEARISE) write(job, b, rows, s);
     if (job.mode == MOMENTS) add_moments(job, b, s);
+    if (job.mode == OBSERVE) correct(job, b, rows, s);
 #if TANGENT
     if (job.mode == GRAM) add_gram(job, b, s);
 #endif
@@ -318,13 +360,17 @@ static bool has_inner_sample(const Job &job, int64_t k) {
 static void run_block(const Job &job, Block &b, const Rows &rows) {
     load(job, b, rows);
     prepare(b, nullptr, nullptr);
+    begin_with(b.level, job.start, TANKS, 0, TANKS, rows);
     for (int64_t k = 0; k < job.steps; ++k) {
         const real clock[2] = {job.starts[k], job.spans[k]};
         const real *channel = job.means + k * CHANNELS;
         int64_t s = job.first_sample[k];
         const int64_t stop = job.first_sample[k + 1];
         if (LATE_ACTUATORS) look_up_late_channels(job, b, clock[0], clock[1]);
-        if (k == 0) settle_commands(b, clock, channel);
+        if (k == 0) {
+            settle_commands(b, clock, channel);
+            begin_with(b.command_memory, job.start_memory, MEMORY, 0, COMMAND_MEMORY, rows);
+        }
         for (; s < stop && job.sample_shares[s] <= 0; ++s) {
             copy_levels(b, false);
             consume(job, b, rows, s);

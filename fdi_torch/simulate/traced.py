@@ -16,6 +16,7 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.expression import Varies
+from fdi_torch.simulate.injection import Injection, expect_injectable
 from fdi_torch.simulate.integrate import hermite
 from fdi_torch.simulate.operations import OPERATIONS
 from fdi_torch.simulate.program import Program, build_program
@@ -51,6 +52,15 @@ class TracedEngine:
         expect_problems(theta, data)
         return gram_of(*self.linearise(theta), data)
 
+    def observe(self, theta: Tensor, data: Readings, injection: Injection) -> Tensor:
+        program = build_program(self.network, self.space.names, False)
+        expect_injectable(self.experiment, injection, program.command_memory + program.reading_memory)
+        lanes = theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
+        run = _Run(program, self.network, self.experiment, lanes, injection)
+        values, weight = (t.expand(len(lanes), *t.shape[-2:]) for t in (data.known, data.weight))
+        rows = [run.correct(s, values[:, s], weight[:, s]) for s in run.samples()]
+        return torch.stack(rows, dim=1).reshape(*theta.shape[:-1], len(rows), -1)
+
     def _simulate(self, theta: Tensor, tangent: bool, levels: bool = False) -> tuple[Tensor, Tensor | None]:
         program = build_program(self.network, self.space.names, tangent)
         run = _Run(
@@ -84,8 +94,15 @@ class _State:
 class _Run:
     """One simulation of lanes (L, P)."""
 
-    def __init__(self, program: Program, network: TankNetwork, experiment: Experiment, lanes: Tensor) -> None:
-        self.program, self.experiment, self.lanes = program, experiment, lanes
+    def __init__(
+        self,
+        program: Program,
+        network: TankNetwork,
+        experiment: Experiment,
+        lanes: Tensor,
+        injection: Injection | None = None,
+    ) -> None:
+        self.program, self.experiment, self.lanes, self.injection = program, experiment, lanes, injection
         self.state = _State()
         self.constants: dict[int, Tensor] = {}
         self.orders: dict[int, list[int]] = {}
@@ -103,10 +120,13 @@ class _Run:
         firsts = torch.searchsorted(e.sample_step, torch.arange(len(e.nodes))).tolist()
         shares = e.sample_share.tolist()
         self._section(p.prepare)
+        if self.injection is not None:
+            self._begin_with("level", self.injection.start)
         for k in range(len(e.nodes) - 1):
             self._enter(k)
             if k == 0:
                 self._section(p.settle_commands)
+                self._remember("command_memory", 0, p.command_memory)
             mine = list(range(firsts[k], firsts[k + 1]))
             for s in [s for s in mine if shares[s] <= 0.0]:
                 state.put("sample", self._levels())
@@ -125,15 +145,38 @@ class _Run:
 
     def read(self, s: int) -> list[tuple[Tensor, Change]]:
         p, times = self.program, self.experiment.sample_times
-        interval = times[s] - times[s - 1] if s else times[1] - times[0]
+        interval = self.experiment.sample_intervals[s]
         self._set_clock(times[s] - interval, interval)
         seen = self.levels()
         self.state.put("seen", [seen[tank] for tank in p.sensor_tanks])
         self._see_late(s)
         if s == 0:
             self._section(p.settle_readings)
+            self._remember("reading_memory", p.command_memory, p.reading_memory)
         self._section(p.read)
         return self.state.group("reading", p.sensors)
+
+    def correct(self, s: int, values: Tensor, weight: Tensor) -> Tensor:
+        """The observer's correction at sample s: levels, memories and the reading expected, (L, n + M + C)."""
+        assert self.injection is not None
+        full = len(self.lanes)
+        expected = torch.stack([value.expand(full) for value, _ in self.read(s)], dim=-1)
+        error = torch.where(weight != 0, values - expected, 0.0)
+        gain = self.injection.gains[..., s, :, :]
+        move = sum(gain[..., c] * error[..., c : c + 1] for c in range(error.shape[-1]))
+        levels = torch.stack([level.expand(full) for level, _ in self._levels()], dim=-1) + move
+        self._begin_with("level", torch.clamp(levels, min=0.0))
+        p, state = self.program, self.state
+        kinds = (("level", p.tanks), ("command_memory", p.command_memory), ("reading_memory", p.reading_memory))
+        kept = [value.expand(full) for kind, count in kinds for value, _ in state.group(kind, count)]
+        return torch.cat([torch.stack(kept, dim=-1), expected], dim=-1)
+
+    def _begin_with(self, kind: str, values: Tensor) -> None:
+        self.state.put(kind, [(value, None) for value in values.unbind(-1)])
+
+    def _remember(self, kind: str, first: int, count: int) -> None:
+        if self.injection is not None and self.injection.memory is not None:
+            self._begin_with(kind, self.injection.memory[..., first : first + count])
 
     def full(self, change: Change) -> Tensor:
         """(P, L), zeros where nothing changes."""
