@@ -17,7 +17,15 @@ from fdi_torch.log_paths import free_path, killed_path, left_behind
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.report.fit_figure import fit_figure, save
-from fdi_torch.run_setup import fitting_of, hybrid_settings, recordings_of, simulated_truth, usable_device, wanted_space
+from fdi_torch.run_setup import (
+    fitting_of,
+    hybrid_settings,
+    recordings_of,
+    simulated_truth,
+    tensors_on,
+    usable_device,
+    wanted_space,
+)
 
 Tell = Callable[[float, str], None]
 
@@ -62,7 +70,7 @@ def estimate_logged(run: Run, fitting: Fitting, log: RunLog, tell: Tell, resume:
     """The estimate, each of its steps and its result in the log."""
     settings = hybrid_settings(run.config.estimate)
     watch = Watch(log, fitting.space, settings, tell)
-    with usable_device(run.config.device):
+    with tensors_on(usable_device(run.config.device)):
         result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, resume)
     log_result(log, result, fitting.space)
     return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 import torch
@@ -72,12 +73,17 @@ def usable_device(name: str) -> torch.device:
     return torch.device(name)
 
 
+def tensors_on(device: torch.device) -> AbstractContextManager[object]:
+    """New tensors are made there. Where they are made anyway this is nothing: torch's context slows every call down."""
+    return nullcontext() if device == torch.get_default_device() else device
+
+
 def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording]) -> Fitting:
     """These parameters on these recordings, with all tensors on the device that the run file asks for."""
     device = usable_device(run.config.device)
     recordings = [part.recording.to(device) for part in loaded]
     expect_enough_samples(recordings, space)
-    with device:
+    with tensors_on(device):
         return set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
 
 

@@ -45,6 +45,11 @@ class Tracer(TorchDispatchMode):
         self._node: dict[int, int] = {}
         self._alive: list[Tensor] = []  # an id is a name only while its tensor lives
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Nothing here is ever compiled by torch: without this, it imports its compiler at the first call (1.5 s)."""
+        return False
+
     def tensor(self, node: int) -> Tensor:
         """A tensor that stands for a node: (2,) where it varies between lanes, else without dimensions."""
         shape = (_LANES,) if self.graph.nodes[node].varies & Varies.LANE else ()
