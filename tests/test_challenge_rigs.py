@@ -11,8 +11,10 @@ import pytest
 import torch
 
 from fdi_torch.effects import build_network
+from fdi_torch.gap.challenge.built import WIDEST, as_built
 from fdi_torch.gap.challenge.cases import make, noise, plans
-from fdi_torch.gap.challenge.conditions import asked_of_pumps, random_steps, sound_conductance, two_steps
+from fdi_torch.gap.challenge.conditions import asked_of_pumps, random_steps, two_steps
+from fdi_torch.gap.challenge.exercise import exercised
 from fdi_torch.gap.challenge.kinds import KINDS, STANDARD, choose
 from fdi_torch.gap.challenge.known import KNOWN
 from fdi_torch.gap.challenge.laws_sensor import SENSOR_LAWS
@@ -35,6 +37,13 @@ def rig_of(pipes: Sequence[Pipe], pumps: Sequence[Pump] = ()) -> PlantDescriptio
     return PlantDescription("two", tanks, tuple(pipes), tuple(pumps), (Sensor("a", "A"),))
 
 
+def conducting(plant: PlantDescription, conductance: float) -> PlantDescription:
+    """The plant with pipes of this conductance, m^2.5/s."""
+    root = math.sqrt(2 * plant.gravity)
+    pipes = (replace(p, discharge_coefficient=conductance / p.area / root) for p in plant.pipes)
+    return replace(plant, pipes=tuple(pipes))
+
+
 def run(
     plant: PlantDescription,
     conductance: float,
@@ -44,7 +53,7 @@ def run(
     asked: float = 0.0,
 ) -> Array:
     """Levels (T, N) of one lane."""
-    rigs = HiddenRigs(plant, np.full((len(plant.pipes), 1), conductance), [off])
+    rigs = HiddenRigs([conducting(plant, conductance)], [off])
     flow = np.full((seconds + 1, len(plant.pumps), 1), asked)
     return simulate(rigs, flow, np.array(start)[:, None])[:, :, 0]
 
@@ -65,7 +74,7 @@ def test_a_tank_drains_as_torricelli_says() -> None:
 def test_halving_the_step_quarters_the_error() -> None:
     k = 1.6e-4
     exact = (math.sqrt(0.5) - k * 60 / (2 * AREA)) ** 2
-    rigs = HiddenRigs(rig_of(OUTLET), np.full((1, 1), k), [()])
+    rigs = HiddenRigs([conducting(rig_of(OUTLET), k)], [()])
     asked, start = np.zeros((61, 0, 1)), np.array([[0.5], [0.0]])
     coarse, fine = (abs(simulate(rigs, asked, start, step)[-1, 0, 0] - exact) for step in (1.0, 0.5))
     # The first, Euler, step weighs in both alike with the square of the step.
@@ -90,24 +99,44 @@ def test_water_that_only_changes_tanks_stays_in_them(off: tuple[Deviation, ...])
 def test_what_a_conical_tank_is_given_is_in_it() -> None:
     slope, middle, flow, seconds = 0.5, 0.4, 5e-5, 100
     cone = Deviation("area_taper", "A", "cone", {"slope": slope, "reference": middle})
-    levels = run(rig_of((), PUMP), 0.0, [0.2, 0.0], seconds, cone, asked=flow)[:, 0]
+    levels = run(rig_of((), PUMP), 1.0, [0.2, 0.0], seconds, cone, asked=flow)[:, 0]
     volume = AREA * ((1 + slope * levels) ** 3 - 1) / (3 * slope) / (1 + slope * middle) ** 2
     np.testing.assert_allclose(volume - volume[0], flow * np.arange(seconds + 1), atol=1e-9)
 
 
 def test_a_body_displaces_its_volume() -> None:
     body = Deviation("internal_body", "A", "block", {"low": 0.3, "high": 0.4, "share": 0.5, "chamfer": 0.2})
-    sound = run(rig_of((), PUMP), 0.0, [0.2, 0.0], 100, asked=5e-5)[-1, 0]
-    filled = run(rig_of((), PUMP), 0.0, [0.2, 0.0], 100, body, asked=5e-5)[-1, 0]
+    sound = run(rig_of((), PUMP), 1.0, [0.2, 0.0], 100, asked=5e-5)[-1, 0]
+    filled = run(rig_of((), PUMP), 1.0, [0.2, 0.0], 100, body, asked=5e-5)[-1, 0]
     # Its mean share of the cross-section: 0.5 x (1 - chamfer), over 0.1 m of level.
     assert filled - sound == pytest.approx(0.5 * 0.8 * 0.1, abs=1e-5)
 
 
 def filled_by(law: str, numbers: dict[str, float], seconds: int, asked: Array) -> Array:
     """Volumes (T,) m^3 that a closed tank received from a pump that is off."""
-    rigs = HiddenRigs(rig_of((), PUMP), np.zeros((0, 1)), [(Deviation("x", "Q", law, numbers),)])
+    rigs = HiddenRigs([rig_of((), PUMP)], [(Deviation("x", "Q", law, numbers),)])
     levels = simulate(rigs, asked[:, None, None], np.zeros((2, 1)))[:, 0, 0]
     return levels * AREA
+
+
+def test_what_stands_above_a_rim_runs_over_into_the_tank_that_catches_it() -> None:
+    low, wide = Tank("A", AREA, 0.3, overflow_to="B"), Tank("B", AREA, 1.0)
+    plant = PlantDescription("two", (low, wide), (), PUMP, (Sensor("a", "A"),))
+    levels = run(plant, 1.0, [0.25, 0.0], 60, asked=8e-5)
+    np.testing.assert_allclose(levels.sum(axis=1), 0.25 + 8e-5 / AREA * np.arange(61), atol=1e-12)
+    assert levels[-1] == pytest.approx([0.3, 0.25], abs=1e-12)
+    lost = run(replace(plant, tanks=(replace(low, overflow_to=OUTSIDE), wide)), 1.0, [0.25, 0.0], 60, asked=8e-5)
+    assert lost[-1] == pytest.approx([0.3, 0.0], abs=1e-12)
+
+
+def test_a_rig_is_built_within_its_tolerances() -> None:
+    plant = replace(three_tank().plant, tolerances={"P13.discharge_coefficient": 0.03, "h1.offset": 0.01})
+    drawn = [as_built(plant, np.random.default_rng(seed)) for seed in range(400)]
+    coefficients = np.array([p.pipes[0].discharge_coefficient for p in drawn]) / 0.6 - 1
+    offsets = np.array([p.sensors[0].offset for p in drawn])
+    assert coefficients.std() == pytest.approx(0.03, rel=0.1) and offsets.std() == pytest.approx(0.01, rel=0.1)
+    assert np.abs(coefficients).max() <= WIDEST * 0.03 + 1e-12
+    assert all(p.pipes[1:] == plant.pipes[1:] and p.tanks == plant.tanks for p in drawn)
 
 
 def test_a_late_pump_delivers_the_same_later() -> None:
@@ -154,7 +183,7 @@ def test_two_independent_simulations_of_a_sound_rig_agree(rig: Rig) -> None:
     plant, seconds = rig.plant, 200
     commands = random_steps(rig, np.random.default_rng(2), seconds + 1)
     start = [0.2 * t.height * (1 + 0.3 * i) for i, t in enumerate(plant.tanks)]
-    rigs = HiddenRigs(plant, sound_conductance(plant)[:, None], [()])
+    rigs = HiddenRigs([plant], [()])
     hidden = simulate(rigs, asked_of_pumps(plant, commands)[..., None], np.array(start)[:, None])[:, :, 0]
     started = replace(plant, tanks=tuple(replace(t, start_level=h) for t, h in zip(plant.tanks, start, strict=True)))
     si = commands * [1e-6 if p.gain_unit == "1" else 1.0 for p in (plant.pumps[0],) * commands.shape[1]]
@@ -173,7 +202,7 @@ def test_two_independent_simulations_of_a_sound_rig_agree(rig: Rig) -> None:
 
 
 def test_a_step_that_does_not_divide_a_second_is_refused() -> None:
-    rigs = HiddenRigs(rig_of(OUTLET), np.full((1, 1), 1e-4), [()])
+    rigs = HiddenRigs([rig_of(OUTLET)], [()])
     with pytest.raises(ValueError, match="a step that divides one second"):
         simulate(rigs, np.zeros((3, 0, 1)), np.zeros((2, 1)), 0.03)
 
@@ -181,14 +210,12 @@ def test_a_step_that_does_not_divide_a_second_is_refused() -> None:
 def test_a_law_twice_in_a_rig_is_refused() -> None:
     holes = [Deviation("leak", t, "floor_hole", {"conductance": 1e-5}) for t in ("A", "B")]
     with pytest.raises(ValueError, match="each law once"):
-        HiddenRigs(rig_of(OUTLET), np.full((1, 1), 1e-4), [holes])
+        HiddenRigs([rig_of(OUTLET)], [holes])
 
 
 def test_a_tank_has_no_past_commands() -> None:
-    rigs = HiddenRigs(rig_of(OUTLET), np.full((1, 1), 1e-4), [()])
-    rigs.tank_groups = HiddenRigs(
-        rig_of((), PUMP), np.zeros((0, 1)), [(Deviation("x", "Q", "late", {"delay": 1.0}),)]
-    ).pump_groups
+    rigs = HiddenRigs([rig_of(OUTLET)], [()])
+    rigs.tank_groups = HiddenRigs([rig_of((), PUMP)], [(Deviation("x", "Q", "late", {"delay": 1.0}),)]).pump_groups
     rigs.tank_groups[0].law = lambda level, other, now, p, state: (now.asked(p["delay"]), None)
     with pytest.raises(ValueError, match="use a pump law"):
         simulate(rigs, np.zeros((3, 0, 1)), np.zeros((2, 1)))
@@ -211,6 +238,19 @@ def test_a_rig_that_always_overflows_is_refused() -> None:
     small = PlantDescription("small", (Tank("A", AREA, 1.0),), (), (Pump("Q", "A", 0.1),), (Sensor("a", "A"),))
     with pytest.raises(ValueError, match="lower input_high"):
         make(plans(1, 1, ("null",)), Rig(small), 1)
+
+
+def test_a_rig_of_its_plant_file_alone_is_filled_half() -> None:
+    given, found = three_tank(), exercised(three_tank().plant)
+    assert (found.input_low, found.input_high) == (given.input_low, given.input_high)
+    assert found.noise_unit == pytest.approx(given.noise_unit, rel=0.05)
+    narrow = replace(given.plant, pipes=tuple(replace(p, area=0.5 * p.area) for p in given.plant.pipes))
+    assert 0.3 < exercised(narrow).input_high < 0.6
+
+
+def test_a_rig_that_cannot_drain_is_refused() -> None:
+    with pytest.raises(ValueError, match="check that every tank drains"):
+        exercised(rig_of((), PUMP))
 
 
 def test_strange_kinds_are_refused() -> None:

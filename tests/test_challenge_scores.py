@@ -47,7 +47,7 @@ def sealed(out: Path, leave_out: tuple[str, ...] = ()) -> Path:
 
 
 def test_a_recording_comes_back_in_si_as_its_manifest_says(tmp_path: Path) -> None:
-    recording = read_recording(sealed(tmp_path), "case0001", "recording", RIG)
+    recording = read_recording(sealed(tmp_path), manifest(tmp_path)["case0001"], "recording", RIG)
     rng = np.random.default_rng(0)
     commands, readings = np.round(rng.uniform(12, 72, (5, 2)), 1), rng.uniform(0.2, 0.5, (5, 3))
     np.testing.assert_allclose(recording.inputs, commands * 1e-6, rtol=1e-12)
@@ -63,7 +63,7 @@ def test_a_changed_recording_shows(tmp_path: Path) -> None:
     last = text[-2]
     path.write_bytes(gzip.compress((text[:-2] + ("1" if last != "1" else "2") + "\n").encode(), mtime=0))
     with pytest.raises(ValueError, match="case0002: expected a holdout of SHA-256"):
-        read_recording(tmp_path, "case0002", "holdout", RIG)
+        read_recording(tmp_path, manifest(tmp_path)["case0002"], "holdout", RIG)
 
 
 def test_a_changed_key_shows(tmp_path: Path) -> None:

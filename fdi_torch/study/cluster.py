@@ -1,4 +1,4 @@
-"""The blocks of a study on a Dask cluster. The only importer of the distributed engine.
+"""The blocks of a study, or other independent work, on a Dask cluster. The only importer of the distributed engine.
 
 A block is a pure function of the plan, so that one whose worker was lost is simply computed again elsewhere, with the
 same numbers. Which worker does what, when, and what to do about lost ones is left to Dask.
@@ -6,9 +6,9 @@ same numbers. Which worker does what, when, and what to do about lost ones is le
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 
@@ -18,6 +18,8 @@ from fdi_torch.study.plan import Block, Plan
 if TYPE_CHECKING:
     from distributed import Client
 
+T = TypeVar("T")
+R = TypeVar("R")
 LOCAL = "local"
 # A block may lose its worker this often before the study gives up.
 LOST_WORKERS = 20
@@ -42,6 +44,15 @@ def run_with(client: Client, plan: Plan, blocks: Iterable[Block]) -> Iterator[li
     shared = client.scatter(plan, broadcast=True, hash=False)
     tasks = [client.submit(_on_worker, shared, block, pure=False, key=_key(block)) for block in blocks]
     for done in as_completed(tasks):
+        yield done.result()
+        done.release()
+
+
+def each_on(client: Client, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """work(item) of each item, as they get done. Raises what a piece of work raises."""
+    from distributed import as_completed
+
+    for done in as_completed([client.submit(_alone, work, item, pure=False) for item in items]):
         yield done.result()
         done.release()
 
@@ -75,6 +86,11 @@ def _on_worker(plan: Plan, block: Block) -> list[Trial]:
     """Each worker has one core; its neighbours have the others."""
     torch.set_num_threads(1)
     return run_block(plan, block)
+
+
+def _alone(work: Callable[[T], R], item: T) -> R:
+    torch.set_num_threads(1)
+    return work(item)
 
 
 def _key(block: Block) -> str:

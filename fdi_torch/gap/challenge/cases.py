@@ -25,6 +25,7 @@ from fdi_torch.gap.challenge.moment import Array, Deviation
 from fdi_torch.gap.challenge.plants import Rig
 from fdi_torch.gap.challenge.simulator import STEP, HiddenRigs, grouped, simulate
 from fdi_torch.gap.challenge.surroundings import Surroundings
+from fdi_torch.plant.description import PlantDescription
 
 PARTS = (("recording", RECORDED), ("holdout", HELD_OUT))
 
@@ -96,11 +97,11 @@ def _conditions(plan: Plan, chosen: Chosen, rig: Rig, seed: int, rest: Array) ->
 def _deviations(
     plan: Plan, chosen: Chosen, conditions: Conditions, rig: Rig, sound: Array, seed: int
 ) -> tuple[Deviation, ...]:
-    kind, asked = KINDS[plan.kind], asked_of_pumps(rig.plant, conditions.commands[0])
+    kind, asked = KINDS[plan.kind], asked_of_pumps(conditions.built, conditions.commands[0])
     rng = case_generator(seed, plan.kind, plan.index, 4)
 
     def surroundings(strength: float) -> Surroundings:
-        return Surroundings(rig.plant, sound, asked, conditions.conductance, strength, rng)
+        return Surroundings(conditions.built, sound, asked, strength, rng)
 
     if chosen.unknown:
         return (chosen.unknown.draw(surroundings(kind.strength), chosen.place),)
@@ -112,16 +113,15 @@ def _deviations(
 def _run(rig: Rig, conditions: Sequence[Conditions], deviations: Sequence[tuple[Deviation, ...]]) -> Array:
     """Levels (T, N, 4 cases) m: recording and hold-out of the rig as it is, then of the same rig with nothing wrong."""
     asked = np.empty((RECORDED, len(rig.plant.pumps), 4 * len(conditions)))
-    starts, conductance, lanes = [], [], []
+    starts, built, lanes = [], [], []
     for i, c in enumerate(conditions):
         for j, commands in enumerate((*c.commands, *c.commands)):
-            flow = asked_of_pumps(rig.plant, commands)
+            flow = asked_of_pumps(c.built, commands)
             asked[:, :, 4 * i + j] = flow[np.minimum(np.arange(RECORDED), len(flow) - 1)]
         starts += [c.starts[0], c.starts[1]] * 2
-        conductance += [c.conductance] * 4
+        built += [c.built] * 4
         lanes += [deviations[i]] * 2 + [()] * 2
-    rigs = HiddenRigs(rig.plant, np.stack(conductance, axis=-1), lanes)
-    return simulate(rigs, asked, np.stack(starts, axis=-1), STEP)
+    return simulate(HiddenRigs(built, lanes), asked, np.stack(starts, axis=-1), STEP)
 
 
 def _read(
@@ -136,8 +136,8 @@ def _read(
     rng = case_generator(seed, plan.kind, plan.index, 5)
     readings, noise_rms, gap_rms, highest = [], {}, {}, []
     for lane, (part, samples) in enumerate(PARTS):
-        clean = _sensed(rig, levels[:samples, :, lane], deviations)
-        sound = _sensed(rig, levels[:samples, :, lane + 2], ())
+        clean = _sensed(rig, conditions.built, levels[:samples, :, lane], deviations)
+        sound = _sensed(rig, conditions.built, levels[:samples, :, lane + 2], ())
         noisy = clean + noise(rng, clean.shape, conditions.noise, conditions.colour)
         shown = _applied(READOUT_LAWS, rig, noisy, deviations)
         readings.append(shown)
@@ -148,7 +148,7 @@ def _read(
         "noise_rms_m": noise_rms,
         "gap_rms_m": gap_rms,
         "colour": conditions.colour,
-        "over_rim": bool((np.array(highest) > [t.height for t in rig.plant.tanks]).any()),
+        "over_rim": bool((np.array(highest) >= [t.height for t in conditions.built.tanks]).any()),
     }
     return Case(plan, conditions.commands, (readings[0], readings[1]), truth)
 
@@ -166,9 +166,13 @@ def _truth(plan: Plan, chosen: Chosen, deviations: tuple[Deviation, ...]) -> dic
     }
 
 
-def _sensed(rig: Rig, levels: Array, deviations: Sequence[Deviation]) -> Array:
+def _sensed(rig: Rig, built: PlantDescription, levels: Array, deviations: Sequence[Deviation]) -> Array:
+    """(T, N) m -> (T, S) m: the level that each reading stands for by what is believed of its sensor."""
     tanks = [t.name for t in rig.plant.tanks]
-    return _applied(SENSOR_LAWS, rig, levels[:, [tanks.index(s.tank) for s in rig.plant.sensors]], deviations)
+    shown = _applied(SENSOR_LAWS, rig, levels[:, [tanks.index(s.tank) for s in rig.plant.sensors]], deviations)
+    pairs = list(zip(built.sensors, rig.plant.sensors, strict=True))
+    gain = np.array([true.gain / believed.gain for true, believed in pairs])
+    return shown * gain + np.array([(true.offset - believed.offset) / believed.gain for true, believed in pairs])
 
 
 def _applied(laws: Any, rig: Rig, signal: Array, deviations: Sequence[Deviation]) -> Array:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdi_torch.gap.challenge.built import as_built
 from fdi_torch.gap.challenge.moment import Array
 from fdi_torch.gap.challenge.plants import Rig
 from fdi_torch.gap.challenge.simulator import HiddenRigs, simulate
@@ -20,14 +21,14 @@ _COARSE = 0.25
 
 @dataclass(frozen=True)
 class Conditions:
-    """commands: recording and hold-out, (T, C) in the header's unit. starts (2, N) m. conductance (P,) m^2.5/s.
+    """commands: recording and hold-out, (T, C) in the header's unit. starts (2, N) m. built: the rig's true constants.
 
     noise: standard deviation of a reading, m. colour: AR(1) coefficient from sample to sample.
     """
 
     commands: tuple[Array, Array]
     starts: Array
-    conductance: Array
+    built: PlantDescription
     noise: float
     colour: float
 
@@ -49,23 +50,10 @@ def draw_conditions(
     held_out = random_steps(rig, rng, HELD_OUT, resting)
     heights = np.array([t.height for t in plant.tanks])
     starts = np.minimum(rest * rng.uniform(0.75, 1.25, size=(2, len(rest))), 0.85 * heights)
-    constants = sound_conductance(plant) * (
-        1 + tolerance(plant) * np.clip(rng.normal(size=len(plant.pipes)), -2.5, 2.5)
-    )
+    built = as_built(plant, rng)
     noise = float(rng.choice([0.05, 0.1, 0.2])) * rig.noise_unit
     colour = float(rng.uniform(0.6, 0.9)) if rng.random() < coloured else 0.0
-    return Conditions((recorded, held_out), starts, constants, noise, colour)
-
-
-def sound_conductance(plant: PlantDescription) -> Array:
-    """(P,): discharge coefficient x bore x sqrt(2 g), m^2.5/s."""
-    root = np.sqrt(2 * plant.gravity)
-    return np.array([p.discharge_coefficient * p.area * root for p in plant.pipes])
-
-
-def tolerance(plant: PlantDescription) -> Array:
-    """(P,): one standard deviation of each discharge coefficient, as a share of it."""
-    return np.array([plant.tolerances.get(f"{p.name}.discharge_coefficient", 0.0) for p in plant.pipes])
+    return Conditions((recorded, held_out), starts, built, noise, colour)
 
 
 def channel_limits(rig: Rig) -> Array:
@@ -120,11 +108,10 @@ def in_print(rig: Rig, commands: Array) -> Array:
 
 
 def asked_of_pumps(plant: PlantDescription, commands: Array) -> Array:
-    """(T, C) in the header's unit -> (T, M) m^3/s."""
+    """(T, C) in the header's unit -> (T, M) m^3/s, within each pump's range."""
     channels = plant.channels()
-    return np.stack(
-        [p.gain * _FACTORS[command_unit(p)] * commands[:, channels.index(p.channel)] for p in plant.pumps], axis=1
-    )
+    flows = [p.gain * _FACTORS[command_unit(p)] * commands[:, channels.index(p.channel)] for p in plant.pumps]
+    return np.stack([np.clip(q, 0.0, p.max_flow) for p, q in zip(plant.pumps, flows, strict=True)], axis=1)
 
 
 def levels_at_rest(rig: Rig) -> Array:
@@ -132,16 +119,15 @@ def levels_at_rest(rig: Rig) -> Array:
     middle = in_print(rig, np.tile(channel_limits(rig).mean(axis=1), (4001, 1)))
     asked = asked_of_pumps(rig.plant, middle)[..., None]
     start = np.array([[0.4 * t.height] for t in rig.plant.tanks])
-    rigs = HiddenRigs(rig.plant, sound_conductance(rig.plant)[:, None], [()])
-    return simulate(rigs, asked, start, _COARSE)[-1, :, 0]
+    return simulate(HiddenRigs([rig.plant], [()]), asked, start, _COARSE)[-1, :, 0]
 
 
 def sound_levels(rig: Rig, all_conditions: list[Conditions], part: int) -> Array:
     """(T, N, L) m: each recording (0) or hold-out (1) as the rig without any effect would run, coarsely."""
-    asked = np.stack([asked_of_pumps(rig.plant, c.commands[part]) for c in all_conditions], axis=-1)
+    asked = np.stack([asked_of_pumps(c.built, c.commands[part]) for c in all_conditions], axis=-1)
     start = np.stack([c.starts[part] for c in all_conditions], axis=-1)
-    conductance = np.stack([c.conductance for c in all_conditions], axis=-1)
-    return simulate(HiddenRigs(rig.plant, conductance, [()] * len(all_conditions)), asked, start, _COARSE)
+    rigs = HiddenRigs([c.built for c in all_conditions], [()] * len(all_conditions))
+    return simulate(rigs, asked, start, _COARSE)
 
 
 def kept_below_the_rim(rig: Rig, all_conditions: list[Conditions]) -> tuple[list[Conditions], Array]:

@@ -1,7 +1,7 @@
 """A challenge on disk: recordings as CSV, sealed causes, and the manifest that holds the hashes of both.
 
 spec.json          what was asked for: seed, kinds, rig
-cases/caseNNNN_recording.csv.gz, cases/caseNNNN_holdout.csv.gz
+cases/caseNNNN_recording.csv.gz, cases/caseNNNN_holdout.csv.gz: the SHA-256 of the sealed key stands above the header
 manifest.jsonl     a line a case: SHA-256 of both recordings and of the sealed key
 key.jsonl          a line a case: the truth; opened after the diagnosis
 """
@@ -28,8 +28,8 @@ from fdi_torch.recording_csv import file_sha256, read_csv
 _DECIMALS_OF_LEVEL = 3
 
 
-def as_csv(rig: Rig, commands: Array, readings: Array) -> str:
-    """commands (T, C) in the header's unit, readings (T, S) as levels in m; samples a second apart."""
+def as_csv(rig: Rig, commands: Array, readings: Array, seal: str) -> str:
+    """commands (T, C) in the header's unit, readings (T, S) as levels in m; a second apart. seal: the key's."""
     header, columns, decimals = ["t_s"], [np.arange(len(commands), dtype=np.float64)], [0]
     for i, channel in enumerate(rig.plant.channels()):
         unit = command_unit(next(p for p in rig.plant.pumps if p.channel == channel))
@@ -39,10 +39,13 @@ def as_csv(rig: Rig, commands: Array, readings: Array) -> str:
     for i, sensor in enumerate(rig.plant.sensors):
         in_metres = sensor.unit == "m"
         header.append(f"{sensor.column}_{'cm' if in_metres else sensor.unit}")
-        columns.append((sensor.gain * readings[:, i] + sensor.offset) * (100 if in_metres else 1))
+        shown = np.clip(sensor.gain * readings[:, i] + sensor.offset, sensor.low, sensor.high)
+        columns.append(shown * (100 if in_metres else 1))
         decimals.append(_DECIMALS_OF_LEVEL)
     rows = zip(*([f"{v:.{d}f}" for v in column] for column, d in zip(columns, decimals, strict=True)), strict=True)
-    return "\n".join([",".join(header), *(",".join(row) for row in rows)]) + "\n"
+    return (
+        "\n".join([f"# SHA-256 of the sealed key: {seal}", ",".join(header), *(",".join(row) for row in rows)]) + "\n"
+    )
 
 
 def digest(text: str) -> str:
@@ -62,12 +65,12 @@ def write_cases(out: Path, rig: Rig, made: Iterable[Case], secrets: Iterable[str
     (out / "cases").mkdir(parents=True, exist_ok=True)
     for case, secret in zip(made, secrets, strict=True):
         line: dict[str, Any] = {"case": case.plan.name, "leave_out": case.truth["leave_out"]}
+        key = sealed_line(case.truth | {"nonce": secret})
         for (part, _), commands, readings in zip(PARTS, case.commands, case.readings, strict=True):
-            text = as_csv(rig, commands, readings)
+            text = as_csv(rig, commands, readings, digest(key))
             path = out / "cases" / f"{case.plan.name}_{part}.csv.gz"
             path.write_bytes(gzip.compress(text.encode(), compresslevel=5, mtime=0))
             line[part] = file_sha256(path)
-        key = sealed_line(case.truth | {"nonce": secret})
         append(out / "key.jsonl", key)
         append(out / "manifest.jsonl", json.dumps(line | {"key": digest(key)}))
 
@@ -88,14 +91,14 @@ def lines_of(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in whole.splitlines()]
 
 
-def read_recording(out: Path, case: str, part: str, rig: Rig) -> Recording:
-    """One recording of a case, checked against the manifest. Its source names the case and nothing else."""
+def read_recording(out: Path, line: Mapping[str, Any], part: str, rig: Rig) -> Recording:
+    """One recording of a case, checked against its line of the manifest. Its source names the case and nothing else."""
+    case = line["case"]
     path = out / "cases" / f"{case}_{part}.csv.gz"
     found = read_csv(path, rig.plant.channels(), [s.column for s in rig.plant.sensors])
-    expected = manifest(out)[case][part]
-    if found.sha256 != expected:
+    if found.sha256 != line[part]:
         raise ValueError(
-            f"{case}: expected a {part} of SHA-256 {expected[:12]}..., got {found.sha256[:12]}...; "
+            f"{case}: expected a {part} of SHA-256 {line[part][:12]}..., got {found.sha256[:12]}...; "
             "it was changed after it was sealed: make the challenge anew"
         )
     return replace(found, source=f"{case}/{part}")

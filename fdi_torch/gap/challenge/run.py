@@ -25,7 +25,8 @@ from fdi_torch.gap.challenge.kinds import STANDARD
 from fdi_torch.gap.challenge.plants import Rig, three_tank
 from fdi_torch.gap.challenge.score import Row, by_effect, judge, summary
 
-Each = Callable[[Callable[[str], dict[str, Any]], Iterable[str]], Iterable[dict[str, Any]]]
+Line = Mapping[str, Any]
+Each = Callable[[Callable[[Line], dict[str, Any]], Iterable[Line]], Iterable[dict[str, Any]]]
 CHUNK = 200
 
 
@@ -106,25 +107,22 @@ def answer_all(
     """Diagnoses what has no answer yet, a JSON line a case. The key stays shut."""
     path = out / f"answers_{name}.jsonl"
     done = {line["case"] for line in lines_of(path)}
-    todo = [case for case in list(manifest(out))[:cases] if case not in done]
-    denied = {case: tuple(line["leave_out"]) for case, line in manifest(out).items() if line["leave_out"]}
-    for n, line in enumerate(each(partial(answer, diagnose, out, rig, denied), todo)):
+    todo = [line for line in list(manifest(out).values())[:cases] if line["case"] not in done]
+    for n, line in enumerate(each(partial(answer, diagnose, out, rig), todo)):
         append(path, json.dumps(line))
         tell(f"{name} {len(done) + n + 1}/{cases} {line['case']} {line['answer'].get('verdict')} {line['sec']:.1f} s")
 
 
-def answer(
-    diagnose: Diagnosis, out: Path, rig: Rig, denied: Mapping[str, tuple[str, ...]], case: str
-) -> dict[str, Any]:
-    """One case; an exception of the diagnosis is an answer too, and a wrong one."""
-    recording, holdout = (read_recording(out, case, part, rig) for part in ("recording", "holdout"))
-    options = {"leave_out": denied[case]} if case in denied else {}
+def answer(diagnose: Diagnosis, out: Path, rig: Rig, line: Line) -> dict[str, Any]:
+    """One case, by its line of the manifest; an exception of the diagnosis is an answer too, and a wrong one."""
+    recording, holdout = (read_recording(out, line, part, rig) for part in ("recording", "holdout"))
+    options = {"leave_out": tuple(line["leave_out"])} if line["leave_out"] else {}
     start = time.perf_counter()
     try:
         found = diagnose(recording, holdout, **options)
     except Exception as error:  # a crash is scored, not raised: one case must not end the challenge
         found = {"verdict": "crash", "error": f"{type(error).__name__}: {error}"}
-    return {"case": case, "sec": round(time.perf_counter() - start, 3), "answer": without_nan(found)}
+    return {"case": line["case"], "sec": round(time.perf_counter() - start, 3), "answer": without_nan(found)}
 
 
 def without_nan(value: Any) -> Any:

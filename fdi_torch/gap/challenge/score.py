@@ -65,7 +65,7 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
     if kind == "null":
         alarm = verdict != "no_gap"
         return row | {"right": not alarm, "false_alarm": alarm, "named_wrong": verdict == "named"}
-    row |= {"detected": verdict not in ("no_gap", "crash")} | judge_closure(truth, answer)
+    row |= {"detected": verdict not in ("no_gap", "crash")} | judge_closure(truth, answer, plant)
     if nameless:
         return row | _judge_nameless(true, verdict, [w["location"] for w in answer.get("where") or []])
     if kind == "messy":
@@ -100,15 +100,17 @@ def _judge_named(true: list[Cause], causes: list[Cause], sets: list[list[Cause]]
     }
 
 
-def judge_closure(truth: Mapping[str, Any], answer: Answer) -> Row:
+def judge_closure(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> Row:
     """How far `closed` is from 1 - (a^2 - f^2)/(r^2 - f^2) with the true noise f of the hold-out.
 
-    Defined where the gap r^2 - f^2 left by recalibration is over five of its standard errors.
+    Defined where the gap r^2 - f^2 left by recalibration is over five of its standard errors. The answer is in the
+    unit of the first sensor, the key in metres of level.
     """
     closure = answer.get("closure") or {}
     if not truth.get("noise_rms_m") or any(closure.get(k) is None for k in ("recalibrated", "augmented")):
         return {}
-    metres = unit_factor(closure.get("unit", "cm"), "m")
+    sensor = plant.sensors[0]
+    metres = unit_factor(closure.get("unit", "cm"), sensor.unit) / sensor.gain
     floor = truth["noise_rms_m"]["holdout"]
     square = math.fsum(f * f for f in floor) / len(floor)
     left, gap = ((closure[k] * metres) ** 2 - square for k in ("augmented", "recalibrated"))

@@ -3,6 +3,7 @@
 It integrates volumes, not levels: V' = inflow - outflow, with h = h(V) by inverting V(h) = integral of A(h).
 Inflow is a mean over the step; the flows that depend on levels are extrapolated by Adams-Bashforth 2:
     V_{n+1} = V_n + dt (pumped_n + 3/2 f_n - 1/2 f_{n-1}).
+What stands above a rim at the end of a step runs over it at once, into the tank that catches it or outside.
 Every operation is elementwise over lanes, so a lane does not depend on its neighbours.
 """
 
@@ -14,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.gap.challenge.built import conductance
 from fdi_torch.gap.challenge.laws_pipe import HEAD_LAWS, PIPE_LAWS
 from fdi_torch.gap.challenge.laws_pump import PUMP_LAWS
 from fdi_torch.gap.challenge.laws_tank import STORAGE_LAWS, TANK_LAWS
 from fdi_torch.gap.challenge.moment import Array, Deviation, Index, Moment
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import OUTSIDE, PlantDescription
 
 STEP = 0.02
 _GRID = 4001
@@ -60,15 +62,17 @@ def grouped(
 
 
 class HiddenRigs:
-    """A batch of rigs of one plant. conductance (P, L): discharge coefficient x bore x sqrt(2 g), m^2.5/s."""
+    """A batch of rigs of one layout, a plant as built and what is off there for each lane."""
 
-    def __init__(self, plant: PlantDescription, conductance: Array, deviations: Sequence[Sequence[Deviation]]) -> None:
+    def __init__(self, built: Sequence[PlantDescription], deviations: Sequence[Sequence[Deviation]]) -> None:
+        plant, self.count = built[0], len(built)
         tanks = [t.name for t in plant.tanks]
         pipes, pumps = [p.name for p in plant.pipes], [p.name for p in plant.pumps]
-        self.conductance = conductance
-        self.area = np.array([[t.area] for t in plant.tanks])
+        self.conductance = np.stack([conductance(p) for p in built], axis=-1)
+        self.area = np.array([[p.tanks[i].area for p in built] for i in range(len(tanks))])
+        self.caught = np.array([(*tanks, OUTSIDE).index(t.overflow_to) for t in plant.tanks], dtype=np.intp)
         self.source = np.array([tanks.index(p.source) for p in plant.pipes], dtype=np.intp)
-        self.target = np.array([(*tanks, "outside").index(p.target) for p in plant.pipes], dtype=np.intp)
+        self.target = np.array([(*tanks, OUTSIDE).index(p.target) for p in plant.pipes], dtype=np.intp)
         self.fed = np.array([tanks.index(p.target) for p in plant.pumps], dtype=np.intp)
         self.elevation = np.array([[p.elevation] for p in plant.pipes])
         self.submerged = np.array([[0.0 if p.is_outlet else 1.0] for p in plant.pipes])
@@ -77,15 +81,18 @@ class HiddenRigs:
         self.pipe_groups = grouped(PIPE_LAWS, pipes, deviations)
         self.tank_groups = grouped(TANK_LAWS, tanks, deviations, tanks)
         self.tables = [
-            VolumeTable(plant.tanks[row], group.law, {k: v[i : i + 1] for k, v in group.numbers.items()}, row, lane)
+            VolumeTable(
+                built[lane].tanks[row], group.law, {k: v[i : i + 1] for k, v in group.numbers.items()}, row, lane
+            )
             for group in grouped(STORAGE_LAWS, tanks, deviations)
             for i, (row, lane) in enumerate(zip(group.rows, group.lanes, strict=True))
         ]
         self._stack_tables()
+        self.rim = self.volumes(np.array([[p.tanks[i].height for p in built] for i in range(len(tanks))]))
 
     def _stack_tables(self) -> None:
         """All tables in one array (n, grid), so that one look-up serves all lanes."""
-        self.table_spot = np.array([t.row * self.conductance.shape[1] + t.lane for t in self.tables], dtype=np.intp)
+        self.table_spot = np.array([t.row * self.count + t.lane for t in self.tables], dtype=np.intp)
         if self.tables:
             self.table_levels = np.concatenate([t.levels for t in self.tables])
             self.table_last = np.array([t.volumes_per_cell for t in self.tables])
@@ -108,6 +115,16 @@ class HiddenRigs:
             low, high = self.table_levels[at], self.table_levels[at + 1]
             level.reshape(-1)[self.table_spot] = low + (x - cell) * (high - low)
         return level
+
+    def spilled(self, volume: Array) -> Array:
+        """(N, L) m^3, less what stands above the rims, plus what runs over into other tanks."""
+        over = np.maximum(volume - self.rim, 0.0)
+        if not over.any():
+            return volume
+        kept = np.concatenate((volume - over, np.zeros((1, self.count))))
+        for tank, into in enumerate(self.caught):
+            kept[into] += over[tank]
+        return kept[:-1]
 
     def pumped(
         self, level: Array, asked: Array, time: float, dt: float, past: Callable[[Group, Array], Array]
@@ -196,6 +213,7 @@ def simulate(rigs: HiddenRigs, asked: Array, start: Array, step: float = STEP) -
         volume = volume + step * (drained if before is None else 1.5 * drained - 0.5 * before)
         for pump, tank in enumerate(rigs.fed):
             volume[tank] += step * pumped[pump]
+        volume = rigs.spilled(volume)
         before = drained
         if (n + 1) % per_second == 0:
             levels[(n + 1) // per_second] = rigs.levels(volume)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fdi_torch.gap.challenge.built import conductance
 from fdi_torch.gap.challenge.moment import Array
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 
@@ -14,14 +15,13 @@ from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Ta
 class Surroundings:
     """One case's sound rig.
 
-    levels (T, N) m and asked (T, M) m^3/s of the recording; seconds: its length; conductance (P,) m^2.5/s.
+    plant: as built. levels (T, N) m and asked (T, M) m^3/s of the recording; seconds: its length.
     strength: 1 usual, 0.2 weak. rng: this case's own.
     """
 
     plant: PlantDescription
     levels: Array
     asked: Array
-    conductance: Array
     strength: float
     rng: np.random.Generator
 
@@ -76,7 +76,7 @@ class Surroundings:
         return float(np.quantile(np.abs(head), share))
 
     def conductance_of(self, pipe: str) -> float:
-        return float(self.conductance[[p.name for p in self.plant.pipes].index(pipe)])
+        return float(conductance(self.plant)[[p.name for p in self.plant.pipes].index(pipe)])
 
     def conductance_at(self, tank: str) -> float:
         """That of the pipe a leak of this tank is compared with."""

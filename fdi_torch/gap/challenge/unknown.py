@@ -105,23 +105,23 @@ def _bursting(s: Surroundings, at: str) -> dict[str, float]:
 
 
 UNKNOWN = (
-    Unknown("pulsating", (PUMP,), _pulsating, ("pump_pulsation", "pulsing_pump", "pump_ripple")),
-    Unknown("backlash", (PUMP,), _backlash, ("pump_backlash", "pump_hysteresis")),
+    Unknown("pulsating", (PUMP,), _pulsating, ("pump_oscillation",)),
+    Unknown("backlash", (PUMP,), _backlash, ("pump_backlash",)),
     Unknown("sticking", (PUMP,), _sticking, ("pump_stiction",)),
-    Unknown("tiring", (PUMP,), _tiring, ("pump_derating", "pump_heating")),
-    Unknown("stalling", (PUMP,), _stalling, ("pump_stall", "pump_dropout")),
-    Unknown("silting", (PIPE, OUTLET), _silting, ("silting", "intermittent_clogging")),
-    Unknown("two_regimes", (PIPE, OUTLET), _two_regimes, ("flow_hysteresis", "flow_regimes")),
+    Unknown("tiring", (PUMP,), _tiring, ("pump_derating",)),
+    Unknown("stalling", (PUMP,), _stalling, ("pump_stall",)),
+    Unknown("silting", (PIPE, OUTLET), _silting, ("silting",)),
+    Unknown("two_regimes", (PIPE, OUTLET), _two_regimes, ("flow_hysteresis",)),
     Unknown("fluttering", (PIPE, OUTLET), _fluttering, ("coefficient_ripple",)),
     Unknown("check_valve", (PIPE,), _check_valve, ("check_valve",), reversing=True),
     Unknown("siphon", (TANK,), _siphon, ("siphon",)),
     Unknown("cycling_user", (TANK,), _cycling_user, ("periodic_draw",)),
     Unknown("float_valve", (TANK,), _float_valve, ("float_valve",)),
-    Unknown("bowed", (SENSOR,), _bowed, ("sensor_curvature", "sensor_nonlinearity")),
-    Unknown("sticking_float", (SENSOR,), _sticking_float, ("sensor_hysteresis", "sensor_backlash")),
-    Unknown("humming", (SENSOR,), _humming, ("sensor_ripple", "sensor_hum")),
-    Unknown("bursting", (SENSOR,), _bursting, ("outliers", "sensor_outliers")),
-    Unknown("freezing", (SENSOR,), _freezing, ("sensor_freeze", "sensor_stuck")),
+    Unknown("bowed", (SENSOR,), _bowed, ("sensor_curvature",)),
+    Unknown("sticking_float", (SENSOR,), _sticking_float, ("sensor_hysteresis",)),
+    Unknown("humming", (SENSOR,), _humming, ("sensor_oscillation",)),
+    Unknown("bursting", (SENSOR,), _bursting, ("sensor_outliers",)),
+    Unknown("freezing", (SENSOR,), _freezing, ("sensor_stuck",)),
 )
 
 
