@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-PACKAGES = ("torch", "torchdiffeq", "numpy", "scipy", "numba", "jax", "diffrax", "evosax")
+PACKAGES = ("torch", "torchdiffeq", "numpy", "scipy", "numba", "jax", "diffrax", "evosax", "evox")
 
 
 def describe(arguments: list[str]) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from benchmarks.simulators import ADAPTIVE, FIXED, Simulator, fdi, random_faults
@@ -40,3 +42,20 @@ def _row(simulate: Simulator, theta: np.ndarray, truth: np.ndarray, budget: floa
 def table(rows: list[Row]) -> str:
     lines = ["| simulator | setting | worst error, cm | median error, cm | trajectories/s |", "|---|---|---|---|---|"]
     return "\n".join(lines + [f"| {n} | {s} | {w:.1e} | {m:.1e} | {r:,.0f} |" for n, s, w, m, r in rows])
+
+
+def draw(rows: list[Row], path: Path) -> None:
+    """Trajectories per CPU second against the worst error, both logarithmic; up and to the left is better."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.2), layout="constrained", dpi=150)
+    axes = figure.subplots()
+    for name in dict.fromkeys(row[0] for row in rows):
+        own = [row for row in rows if row[0] == name]
+        axes.plot([row[2] for row in own], [row[4] for row in own], "o-", label=name)
+    axes.set(
+        xscale="log", yscale="log", xlabel="worst error over random faults, cm", ylabel="trajectories per CPU second"
+    )
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(path)

@@ -83,9 +83,36 @@ def evosax_evolution() -> Callable[[int], np.ndarray]:
     return lambda seed: np.asarray(search(jax.random.key(seed)))
 
 
+def evox_evolution() -> Callable[[int], np.ndarray]:
+    """EvoX' differential evolution on torch, the population simulated by one RK4 step of plain torch, compiled."""
+    from evox.algorithms import DE
+    from evox.core import Problem as Task
+    from evox.workflows import StdWorkflow
+
+    simulate = simulators.torch_compiled_step(STEP)
+    values = simulate(TRUTH[None])
+    low, high = torch.from_numpy(LOW), torch.from_numpy(HIGH)
+
+    class Misfit(Task):
+        def evaluate(self, members: torch.Tensor) -> torch.Tensor:
+            return torch.from_numpy(((simulate(members.numpy()) - values) ** 2).sum(axis=(1, 2)))
+
+    def run(seed: int) -> np.ndarray:
+        torch.manual_seed(seed)
+        algorithm = DE(MEMBERS, low, high)
+        workflow = StdWorkflow(algorithm, Misfit())
+        workflow.init_step()
+        for _ in range(GENERATIONS):
+            workflow.step()
+        return algorithm.pop[int(algorithm.fit.argmin())].numpy()
+
+    return run
+
+
 SEARCHERS: dict[str, Callable[[], Callable[[int], np.ndarray]]] = {
     "fdi_torch, hybrid": fdi_hybrid,
     "evosax DE + JAX": evosax_evolution,
+    "EvoX DE + torch.compile": evox_evolution,
     "SciPy differential_evolution + LSODA": scipy_evolution,
 }
 Row = tuple[str, float, float]
