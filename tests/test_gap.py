@@ -39,12 +39,15 @@ def noise(samples: int, ar: float, std: float, seed: int) -> Tensor:
     return torch.stack(rows)
 
 
-def recorded(values: dict[str, float], seed: int, samples: int = 1000, std: float = 1e-3, ar: float = 0.0) -> Recording:
-    """The three tanks with some parameters changed, under random steps, read with noise (m)."""
+def recorded(
+    values: dict[str, float], seed: int, samples: int = 1000, std: float = 1e-3, ar: float = 0.0, steady: bool = False
+) -> Recording:
+    """The three tanks with some parameters changed, under random steps or steady inputs, read with noise (m)."""
     plant = believed()
     generator = torch.Generator().manual_seed(seed)
     time = torch.arange(samples, dtype=torch.float64)
     levels = 15e-6 + 60e-6 * torch.rand(samples // 70 + 1, 2, generator=generator, dtype=torch.float64)
+    levels = torch.full_like(levels, 50e-6) if steady else levels
     blank = blank_recording(plant, levels.repeat_interleave(70, dim=0)[:samples], time)
     network = build_network(plant, placements_for(values))
     names = [*values, *(n for n in ("P13.discharge_coefficient",) if n not in values)]

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from torch import Tensor
+
+from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 
 FORMAT = "fdi_torch.gap/1"
 Verdict = Literal["no_gap", "named", "ambiguous", "unknown"]
 CauseName = tuple[str, str]
+# Effects of a tank whose size is a share of what flows through its leak reference.
+SHARES_OF_CAPACITY = ("leak", "cross_flow")
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,11 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Answer:
-    """See the protocol of gap diagnosis; `to_dict` is its JSON."""
+    """See the protocol of gap diagnosis; `to_dict` is its JSON.
+
+    excitation: what the inputs can never show or tell apart. constants: by name what each model takes it to be. curves:
+    the discrepancy at the guilty places. arrays: what the models predict, for the log; not in the JSON.
+    """
 
     verdict: Verdict
     p_value: float
@@ -55,7 +64,11 @@ class Answer:
     shape: Mapping[str, Any] | None = None
     next_input: Mapping[str, Any] | None = None
     impostors: Mapping[str, Any] | None = None
+    excitation: Mapping[str, Any] = field(default_factory=dict)
+    constants: Mapping[str, Any] = field(default_factory=dict)
+    curves: Sequence[Mapping[str, Any]] = ()
     remarks: Sequence[str] = ()
+    arrays: Mapping[str, Tensor] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         answer: dict[str, Any] = {
@@ -64,23 +77,62 @@ class Answer:
             "alarm": {"p_value": self.p_value},
             "where": [{"location": place, "share": share} for place, share in self.where],
             "causes": [_cause(c) for c in self.causes],
-            "ambiguity_set": [[_name(c) for c in causes] for causes in self.ambiguity_set],
+            "ambiguity_set": [names(causes) for causes in self.ambiguity_set],
             "posterior": [_explanation(e) for e in self.posterior],
             "closure": dict(self.closure),
             "noise": dict(self.noise),
             "shape": self.shape,
             "next_input": self.next_input,
             "impostors": self.impostors,
+            "excitation": dict(self.excitation),
+            "constants": dict(self.constants),
+            "curves": [dict(c) for c in self.curves],
             "remarks": list(self.remarks),
         }
         return finite(answer)
 
 
-def adopted(plant: PlantDescription, answer: Answer) -> PlantDescription:
-    """The plant as the answer says it is: its file with the causes among its effects."""
+def adopted(plant: PlantDescription, answer: Answer, constants: bool = False) -> PlantDescription:
+    """The plant as the answer says it is: its file with the causes among its effects.
+
+    constants: also with the calibration constants as they were fitted beside the causes. Their tolerances stay what the
+    file says: how far they may lie off another day, the fit does not know.
+    """
     placed = [PlacedEffect(c.effect, c.location, {n: a.value for n, a in c.parameters.items()}) for c in answer.causes]
     known = {(p.effect, p.location) for p in placed}
-    return replace(plant, effects=(*(e for e in plant.effects if (e.effect, e.location) not in known), *placed))
+    effects = (*(e for e in plant.effects if (e.effect, e.location) not in known), *placed)
+    if not constants:
+        return replace(plant, effects=effects)
+    fitted = with_constants(plant, {n: c["augmented"] for n, c in answer.constants.items()})
+    return replace(fitted, effects=tuple(_same_flow(e, plant, fitted) for e in effects))
+
+
+def _same_flow(placed: PlacedEffect, before: PlantDescription, after: PlantDescription) -> PlacedEffect:
+    """The effect with as large a flow as before, where its size is a share of a pipe's capacity that has changed."""
+    if placed.effect not in SHARES_OF_CAPACITY:
+        return placed
+    tank = placed.location.split("-")[0]
+    old, new = (nominal_capacity(p, leak_pipe(p, tank)) for p in (before, after))
+    return replace(placed, parameters={**placed.parameters, "size": placed.parameters["size"] * old / new})
+
+
+def with_constants(plant: PlantDescription, values: Mapping[str, float]) -> PlantDescription:
+    """The plant with other constants, by full name, SI: 'P13.discharge_coefficient'."""
+    changed: dict[str, dict[str, float]] = {}
+    for name, value in values.items():
+        component, _, constant = name.partition(".")
+        changed.setdefault(component, {})[constant] = value
+
+    def updated(parts: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(replace(part, **changed.get(part.name, {})) for part in parts)
+
+    return replace(
+        plant,
+        tanks=updated(plant.tanks),
+        pipes=updated(plant.pipes),
+        pumps=updated(plant.pumps),
+        sensors=updated(plant.sensors),
+    )
 
 
 def finite(value: Any) -> Any:
@@ -92,16 +144,17 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _name(cause: CauseName) -> dict[str, str]:
-    return {"effect": cause[0], "location": cause[1]}
+def names(causes: Iterable[CauseName]) -> list[dict[str, str]]:
+    """Causes as they stand in the JSON."""
+    return [{"effect": effect, "location": location} for effect, location in causes]
 
 
 def _cause(cause: Cause) -> dict[str, Any]:
     parameters = {n: {"value": a.value, "std": a.std, "unit": a.unit} for n, a in cause.parameters.items()}
     named: dict[str, Any] = {"effect": cause.effect, "location": cause.location, "parameters": parameters}
-    return named | ({"same_as": [_name(c) for c in cause.same_as]} if cause.same_as else {})
+    return named | ({"same_as": names(cause.same_as)} if cause.same_as else {})
 
 
 def _explanation(explanation: Explanation) -> dict[str, Any]:
-    shown: dict[str, Any] = {"causes": [_name(c) for c in explanation.causes], "probability": explanation.probability}
+    shown: dict[str, Any] = {"causes": names(explanation.causes), "probability": explanation.probability}
     return shown | ({"unknown_at": explanation.unknown_at} if explanation.unknown_at else {})

@@ -6,25 +6,30 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from fdi_torch.gap.answer import Amount, Answer, Cause, Explanation
-from fdi_torch.gap.closure import Closure, closure
+from fdi_torch.gap.answer import Amount, Answer, Cause, Explanation, names
+from fdi_torch.gap.ceiling import constants_of, guilty_places, models_of
+from fdi_torch.gap.closure import HeldOut, run_all
+from fdi_torch.gap.closure_answer import closure_in_full
+from fdi_torch.gap.curves import curves_at
+from fdi_torch.gap.evidence import temperature
+from fdi_torch.gap.excitation import excitation
 from fdi_torch.gap.finding import Finding, in_order, left_open
-from fdi_torch.gap.fitting import Fit, Fitter, subject_of
+from fdi_torch.gap.fitting import Fitter, Subject
 from fdi_torch.gap.freeform import shape_of
+from fdi_torch.gap.impostors import PASSES, simulated_impostors
 from fdi_torch.gap.library import twins
 from fdi_torch.gap.next_input import next_input
-from fdi_torch.parameters import display_unit
-from fdi_torch.recording import Recording
+from fdi_torch.gap.remarks import remarks_on
+from fdi_torch.gap.standard_errors import standard_errors
+from fdi_torch.gap.traces import traces
 
 MOST_EXPLANATIONS = 12
-PASSES = 0.02  # share of the gap left open by an impostor that a fit test would let pass
 
 
-def answered(found: Finding, holdout: Recording | None, step: float) -> Answer:
-    """step: of the hold-out's simulation, s."""
+def answered(found: Finding, holdouts: Sequence[Subject]) -> Answer:
+    """holdouts: laid out for the same plant."""
     has_causes = found.verdict in ("named", "ambiguous")
     gap = max(found.gap, 1.0)
     where = [(s.location, min(max(s.closes / gap, 0.0), 1.0)) for s in found.places]
@@ -33,7 +38,7 @@ def answered(found: Finding, holdout: Recording | None, step: float) -> Answer:
         place = found.unnamed.candidate.placements[0].location
         where = sorted(where, key=lambda w: w[0] != place)
         explanations = (Explanation((), 1.0, place),)
-    closed = _closure(found, holdout, step)
+    held = _held_out(found, holdouts)
     return Answer(
         verdict=found.verdict,
         p_value=_p_value(found),
@@ -44,48 +49,87 @@ def answered(found: Finding, holdout: Recording | None, step: float) -> Answer:
             Explanation(() if e.unknown_at else (*e.causes, *found.rounded), e.probability, e.unknown_at)
             for e in explanations[:MOST_EXPLANATIONS]
         ],
-        closure=closed,
+        closure=closure_in_full(held, found) if held else {},
         noise=_noise(found.fitter, found.lattice),
         shape=shape_of(found.unnamed) if found.unnamed else None,
         next_input=_next(found) if found.verdict == "ambiguous" else None,
         impostors=_impostors(found) if has_causes else None,
-        remarks=_remarks(found, closed),
+        excitation=_excitation(found),
+        constants=_constants(found),
+        curves=_curves(found),
+        remarks=remarks_on(found, held),
+        arrays=traces(found, held),
     )
+
+
+def _held_out(found: Finding, holdouts: Sequence[Subject]) -> list[HeldOut]:
+    """Free runs of all models on all hold-outs."""
+    if not holdouts:
+        return []
+    models = models_of(found)
+    return [run_all(each, found.fitter.noise, models, found.lattice) for each in holdouts]
+
+
+def _curves(found: Finding) -> list[dict[str, Any]]:
+    """The discrepancy at every guilty place."""
+    if found.verdict == "no_gap":
+        return []
+    heat = temperature(found.null.cost - found.search.best.cost)
+    places = guilty_places(found)
+    return [
+        curve.to_dict() for place in places for curve in curves_at(found.fitter, found.best, place, found.reach, heat)
+    ]
+
+
+def _constants(found: Finding) -> dict[str, dict[str, object]]:
+    """What each calibration constant is believed to be, and what it becomes without and with the causes."""
+    errors = standard_errors(found.fitter, found.best)
+    null, best, space = constants_of(found.null), constants_of(found.best), found.best.space
+    return {
+        name: {
+            "nominal": space[name].nominal,
+            "tolerance": space[name].std,
+            "recalibrated": null[name],
+            "augmented": best[name],
+            "std": errors[name],
+            "unit": space[name].unit,
+        }
+        for name in null
+    }
 
 
 def _next(found: Finding) -> Mapping[str, Any] | None:
     """The input that would part the two likeliest explanations."""
     weighed = found.weighed
     parting = next_input(found.fitter, weighed.fits[0], weighed.fits[1])
-    between = [[{"effect": n, "location": at} for n, at in e.causes] for e in weighed.explanations[:2]]
+    between = [names(e.causes) for e in weighed.explanations[:2]]
     return {"between": between, **parting} if parting else None
 
 
 def _impostors(found: Finding) -> dict[str, object]:
-    """What would be left open, had the library lacked what was named: the best of the fits without it.
+    """What would be left open, had the library lacked what was named: the best of the fits without it; and, for one
+    cause alone, how often another would have passed for it.
 
     would_pass: whether that impostor would have closed all but two per cent of the gap.
     """
-    named = found.named
+    named, gap = found.named, max(found.gap, 1.0)
     others = [f for f in found.search.fits if f.key and not f.key & named.key]
-    if not others:
-        return {"best": [], "left_open": 1.0, "would_pass": False}
-    best = min(others, key=lambda f: f.cost)
-    left = min((left_open(found.fitter, named) + best.cost - named.cost) / max(found.gap, 1.0), 1.0)
-    causes = [{"effect": name, "location": place} for name, place in in_order(best)]
-    return {"best": causes, "left_open": left, "would_pass": left < PASSES}
+    best = min(others, key=lambda f: f.cost, default=None)
+    left = 1.0 if best is None else min((left_open(found.fitter, named) + best.cost - named.cost) / gap, 1.0)
+    told: dict[str, object] = {"best": names(in_order(best)) if best else [], "left_open": left}
+    told["would_pass"] = left < PASSES
+    if len(named.key) == 1:
+        (cause,) = named.key
+        screen = found.search.screens[found.null.key]
+        told["simulated"] = simulated_impostors(screen, cause, gap, found.fitter.subject.plant)
+    return told
 
 
-def _remarks(found: Finding, closed: Mapping[str, Any]) -> list[str]:
-    remarks, subject = [], found.fitter.subject
-    if all(float(torch.diff(column).abs().max()) == 0.0 for column in subject.recording.inputs.T):
-        remarks.append("the inputs never change: most effects cannot be told apart; --plan shows what steps would tell")
-    if len(subject.nuisance) == len(subject.plant.tanks):
-        remarks.append("the plant file gives no tolerances: every constant is taken to be exact")
-    far_off = closed and closed["augmented"] > 3.0 * closed["noise_floor"] and (closed["closed"] or 0.0) < 0.5
-    if far_off and found.explained:
-        remarks.append("what explains the recording does not explain the hold-out: is it of the same rig?")
-    return remarks
+def _excitation(found: Finding) -> dict[str, Any]:
+    """What this recording's inputs cannot show or tell apart, by the names of the answer."""
+    shown = excitation(found.search.screens[found.null.key], found.fitter.subject.plant)
+    twins_found = [{"between": names((a, b)), "parted_by": left} for a, b, left in shown.twins]
+    return {"hidden": names(shown.hidden), "inseparable": twins_found}
 
 
 def _causes(found: Finding) -> tuple[Cause, ...]:
@@ -104,14 +148,6 @@ def _causes(found: Finding) -> tuple[Cause, ...]:
     return tuple(causes)
 
 
-def standard_errors(fitter: Fitter, fit: Fit) -> dict[str, float]:
-    """Of every parameter of a fit, tolerances included, in its unit."""
-    scale = fitter.box(fit.space)[2]
-    curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.near, scale)[2][0]
-    variance = torch.diagonal(torch.linalg.pinv(curvature, hermitian=True))
-    return dict(zip(fit.space.names, (torch.sqrt(variance.clamp(min=0.0)) * scale).tolist(), strict=True))
-
-
 def _p_value(found: Finding) -> float:
     """Chance that noise alone lets some option of the library gain as much (Bonferroni over the options)."""
     if found.rounded:
@@ -120,25 +156,6 @@ def _p_value(found: Finding) -> float:
     singles = [f.cost for f in found.search.fits if len(f.key) == 1]
     gain = max(float(screen.gain.max()), null.cost - min(singles, default=null.cost))
     return min(1.0, len(screen.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))
-
-
-def _closure(found: Finding, holdout: Recording | None, step: float) -> Mapping[str, Any]:
-    if holdout is None:
-        return {}
-    fitter = found.fitter
-    subject = subject_of(fitter.subject.plant, fitter.subject.believed, holdout, step)
-    unit, scale = display_unit(subject.plant.sensors[0].unit)
-    fits: dict[str, Fit | None] = {"nominal": None, "recalibrated": found.null, "augmented": found.best}
-    done: Closure = closure(subject, fitter.noise, fits, found.lattice, scale, unit)
-    return {
-        "metric": "free-run RMSE on the hold-out, per sensor and pooled, in the sensor's unit",
-        "unit": done.unit,
-        **done.pooled,
-        "per_sensor": done.per_sensor,
-        "closed": done.closed,
-        "closed_ci95": done.closed_ci95,
-        "augmented_with": [{"effect": n, "location": at} for n, at in in_order(found.best)],
-    }
 
 
 def _noise(fitter: Fitter, lattice: Sequence[float]) -> Mapping[str, Any]:

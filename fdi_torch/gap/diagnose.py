@@ -12,10 +12,11 @@ from fdi_torch.gap.answer import Answer, CauseName, Explanation, Verdict
 from fdi_torch.gap.answering import answered
 from fdi_torch.gap.evidence import log_evidence, posterior, temperature
 from fdi_torch.gap.finding import UNEXPLAINED, Finding, Weighed, in_order, left_open, whole_gap
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject, subject_of
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_rounding
 from fdi_torch.gap.library import canonical, library_of, possible_places
 from fdi_torch.gap.screening import options_of
+from fdi_torch.gap.usable import expect_another, laid_out
 from fdi_torch.gap.where import Suspect, refit, suspects
 from fdi_torch.gap.which import Search, search
 from fdi_torch.plant.description import PlantDescription
@@ -43,14 +44,17 @@ class Settings:
 def diagnose(
     plant: PlantDescription,
     recording: Recording,
-    holdout: Recording | None = None,
+    holdout: Recording | Sequence[Recording] | None = None,
     settings: Settings = Settings(),
     tell: Tell = lambda share, text: None,
 ) -> Answer:
-    """What keeps the plant file from explaining the recording; the hold-out only measures how far the gap closes."""
+    """What keeps the plant file from explaining the recording; hold-outs only measure how far the gap closes."""
+    holdouts = () if holdout is None else (holdout,) if isinstance(holdout, Recording) else tuple(holdout)
+    for one in holdouts:
+        expect_another(one, recording)
     library = library_of(plant, settings.library, settings.leave_out)
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
-    subject = subject_of(plant, believed, recording, settings.step or _interval(recording))
+    subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recording, *holdouts))
     tell(0.05, "noise floor and recalibration")
     fitter, null, lattice = _recalibrated(subject)
     reach = reach_of(recording, plant)
@@ -67,7 +71,7 @@ def diagnose(
     verdict: Verdict = "unknown" if unknown else _verdict(standing, rounded)
     finding = Finding(fitter, library, reach, found, places, weighed, standing, unknown, verdict, rounded, lattice)
     tell(0.8, "hold-out")
-    return answered(finding, holdout, settings.step or _interval(holdout or recording))
+    return answered(finding, held)
 
 
 def _places(fitter: Fitter, found: Search, plant: PlantDescription, reach: Reach) -> tuple[list[Suspect], list[Fit]]:
@@ -97,10 +101,6 @@ def _unnamed(fitter: Fitter, named: Fit, found: Search, refits: Sequence[Fit]) -
     nothing_named = left > UNEXPLAINED * gap
     far_better = free < FAR_BETTER * left and left - free > max(LEFT_SHARE * gap, LEFT_LEAST)
     return best if nothing_named or far_better else None
-
-
-def _interval(recording: Recording) -> float:
-    return float(torch.median(torch.diff(recording.time)))
 
 
 def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.fitting import Fit, Fitter, subject_of
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import lay_out
 
@@ -34,7 +35,10 @@ def next_input(fitter: Fitter, first: Fit, second: Fit) -> Mapping[str, Any] | N
             continue
         total, when = parted
         if best is None or total > best["separation"]:
-            best = {"separation": total, "parted_after": when, "input": _table(recording)}
+            interval = float(torch.median(torch.diff(recording.time)))
+            samples = None if when is None else round(when / interval) + 1
+            best = {"separation": total, "parted_after": when, "parted_after_samples": samples}
+            best |= {"input": _table(recording, interval)}
     return best
 
 
@@ -101,10 +105,26 @@ def _run(there: Fitter, fit: Fit) -> tuple[Tensor, Tensor, Tensor]:
     return near.readings[0], near.jacobian[0][..., columns], near.levels[0]
 
 
-def _table(recording: Recording) -> dict[str, Any]:
+def planned(table: Mapping[str, Any], plant: PlantDescription) -> Recording:
+    """The input of an answer as a recording that has yet to be read: its outputs are empty."""
+    time = torch.arange(0.0, table["duration"] + 0.5 * table["interval"], table["interval"], dtype=torch.float64)
+    channels = plant.channels()
+    columns = []
+    for channel in channels:
+        at = torch.tensor(table[channel]["at"], dtype=torch.float64)
+        since = torch.searchsorted(at, time, right=True) - 1
+        columns.append(torch.tensor(table[channel]["value"], dtype=torch.float64)[since])
+    units = tuple(table["unit"][c] for c in channels)
+    names, reading_units = tuple(s.column for s in plant.sensors), tuple(s.unit for s in plant.sensors)
+    blank = torch.full((len(time), len(names)), torch.nan, dtype=torch.float64)
+    return Recording(time, torch.stack(columns, dim=1), blank, channels, names, units, reading_units)
+
+
+def _table(recording: Recording, interval: float) -> dict[str, Any]:
     """The steps of each channel: when, and to what, in SI."""
     table: dict[str, Any] = {
         "duration": float(recording.time[-1]),
+        "interval": interval,
         "unit": dict(zip(recording.input_names, recording.input_units, strict=True)),
     }
     for name, column in zip(recording.input_names, recording.inputs.T, strict=True):

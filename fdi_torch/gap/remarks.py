@@ -1,0 +1,49 @@
+"""What a reader of the answer has to know beside it, one sentence each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from fdi_torch.gap.closure import HeldOut
+from fdi_torch.gap.finding import Finding
+from fdi_torch.gap.same_rig import other_rig
+from fdi_torch.parameters import display_unit
+
+AT_END = 1e-3  # of a parameter's range
+
+
+def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
+    """Of the inputs, the plant file, the parameters found, and the hold-outs."""
+    subject = found.fitter.subject
+    remarks = []
+    if all(float(torch.diff(column).abs().max()) == 0.0 for column in subject.recording.inputs.T):
+        remarks.append(
+            "the inputs never change, so that most effects cannot be told from another or from a constant within its "
+            "tolerance; `fdi gap --plan` with inputs that step shows what they would tell"
+        )
+    if len(subject.nuisance) == len(subject.plant.tanks):
+        remarks.append(
+            "the plant file lists no tolerances, so that every constant is taken to be exact and what is a little off "
+            "looks like an effect; list them under tolerances, as in P13.discharge_coefficient: 3 %"
+        )
+    remarks += _at_their_ends(found)
+    return remarks + [sentence for h in held if (sentence := other_rig(found, h))]
+
+
+def _at_their_ends(found: Finding) -> list[str]:
+    """Parameters that were stopped by the end of their sensible range."""
+    told, fit = [], found.named
+    for name, value in fit.effect_values.items():
+        parameter, (unit, scale) = fit.space[name], display_unit(fit.space[name].unit)
+        width = parameter.high - parameter.low
+        ends = [e for e in (parameter.low, parameter.high) if math.isfinite(e) and e != parameter.nominal]
+        near = [e for e in ends if abs(value - e) < AT_END * (width if math.isfinite(width) else abs(e))]
+        if near:
+            end = f"{scale * near[0]:.4g} {unit}".rstrip()
+            told.append(
+                f"{name} would lie at the end of its sensible range ({end}): that effect alone is hardly the cause"
+            )
+    return told

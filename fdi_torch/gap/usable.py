@@ -1,0 +1,46 @@
+"""Can this recording be diagnosed at all? Asked before any fit, answered in one sentence where it cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from fdi_torch.gap.fitting import Subject, subject_of
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.recording import Recording
+
+LEAST = 60
+"""Readings of a sensor below which its noise cannot be told from what a model gets wrong: two of the slowest periods
+that still count as noise."""
+
+
+def expect_another(holdout: Recording, recording: Recording) -> None:
+    """Raises ValueError where a hold-out is the very recording that is diagnosed."""
+    same_file = bool(holdout.sha256) and holdout.sha256 == recording.sha256
+    if same_file or holdout is recording:
+        raise ValueError(
+            f"{holdout.source}: expected a hold-out other than the recording, got the same data; what was used for the "
+            "fits says nothing of how far the gap closes"
+        )
+
+
+def laid_out(
+    plant: PlantDescription, believed: Sequence[Placement], recording: Recording, step: float | None
+) -> Subject:
+    """The recording on the grid of its simulation. step: s; None for the sampling interval."""
+    subject = subject_of(plant, believed, recording, step or float(torch.median(torch.diff(recording.time))))
+    expect_usable(subject)
+    return subject
+
+
+def expect_usable(subject: Subject) -> None:
+    """Raises ValueError where a sensor has too few readings."""
+    recording, plant = subject.recording, subject.plant
+    for sensor, count in zip(plant.sensors, subject.mask.sum(dim=0).tolist(), strict=True):
+        if count < LEAST:
+            raise ValueError(
+                f"{recording.source}: expected at least {LEAST} readings of every sensor, got {count} of "
+                f"{sensor.name}; record longer or more often, or leave the sensor out of the plant file"
+            )

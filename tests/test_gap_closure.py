@@ -1,0 +1,151 @@
+"""What a gap diagnosis says of hold-outs, constants and the guilty component, against rigs that are known."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+
+from fdi_torch.gap.answer import Answer
+from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.parameters import Parameter
+from fdi_torch.recording import Recording
+from tests.rigs import three_tank
+from tests.test_gap import believed, recorded
+
+LAMINAR = {"P13.laminar_flow.transition_head": 0.05}
+LIBRARY = ("laminar_flow", "pump_lag", "leak")
+
+
+@pytest.fixture(scope="module")
+def answer() -> Answer:
+    """A laminar pipe, and two hold-outs of the same rig with other inputs, one of them noisier."""
+    recording = recorded(LAMINAR, 3)
+    holdouts = [recorded(LAMINAR, 5, samples=500), recorded(LAMINAR, 7, samples=700, std=2e-3)]
+    holdouts = [replace(h, source=f"day{k}.csv") for k, h in enumerate(holdouts, 1)]
+    return diagnose(believed(), recording, holdouts, Settings(LIBRARY))
+
+
+def test_hold_outs_count_together_and_one_by_one(answer: Answer) -> None:
+    closure = answer.closure
+    assert closure["holdouts"] == ["day1.csv", "day2.csv"]
+    first, second = closure["per_holdout"]
+    assert first["augmented"] == pytest.approx(0.1, rel=0.1) and second["augmented"] == pytest.approx(0.2, rel=0.1)
+    for model in ("nominal", "recalibrated", "augmented", "ceiling", "noise_floor"):
+        pooled = (500 * first[model] ** 2 + 700 * second[model] ** 2) / 1200
+        assert closure[model] ** 2 == pytest.approx(pooled, rel=1e-9)
+    assert closure["closed"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_ceiling_is_no_worse_than_the_right_effect(answer: Answer) -> None:
+    closure = answer.closure
+    assert closure["ceiling_at"] == ["P13"]
+    assert closure["ceiling"] == pytest.approx(closure["augmented"], rel=0.02)
+    assert closure["recalibrated"] > 1.5 * closure["augmented"]
+
+
+def test_what_recalibration_took_for_the_cause_shows_as_counted_twice(answer: Answer) -> None:
+    constant = answer.constants["P13.discharge_coefficient"]
+    assert constant["recalibrated"] < 0.58 < 0.59 < constant["augmented"] < 0.61
+    frozen = answer.closure["frozen"]
+    assert frozen["recalibrated"] > 2.0 * answer.closure["augmented"]
+    assert frozen["nominal"] == pytest.approx(answer.closure["augmented"], rel=0.1)  # the rig has nominal constants
+
+
+def test_the_free_curve_finds_the_effect_that_is_there(answer: Answer) -> None:
+    by_head, by_time = answer.curves
+    assert (by_head["location"], by_head["variable"], by_time["variable"]) == ("P13", "T1 − T3", "time")
+    assert (by_head["quantity"], by_head["quantity_unit"]) == ("flow", "m^3/s")
+    free, std, effect = (torch.tensor(by_head[name]) for name in ("free", "free_std", "effect"))
+    assert bool(((free - effect).abs() < 5.0 * std + 0.03 * effect.abs().max()).all())
+    # Hagen-Poiseuille at low heads: less flow than the square root law has, by up to a part of the flow itself.
+    assert bool((effect < 0.0).all()) and float(effect.min()) < -3e-6
+
+
+def test_arrays_of_all_models_are_there_for_the_page(answer: Answer) -> None:
+    arrays = answer.arrays
+    assert arrays["augmented"].shape == arrays["nominal"].shape == (1000, 3)
+    assert arrays["holdout_time"].shape == (500,) and arrays["holdout_2_read"].shape == (700, 3)
+    left = arrays["holdout_2_read"] - arrays["holdout_2_augmented"]
+    assert float(left.std()) == pytest.approx(2e-3, rel=0.1)
+
+
+def test_a_hold_out_of_another_rig_is_said_with_what_differs_there() -> None:
+    recording = recorded(LAMINAR, 3, samples=600)
+    same = replace(recorded(LAMINAR, 5, samples=600), source="same.csv")
+    other = replace(recorded({**LAMINAR, "P32.discharge_coefficient": 0.5}, 5, samples=600), source="other.csv")
+    answer = diagnose(believed(), recording, [same, other], Settings(("laminar_flow",)))
+    (remark,) = answer.remarks
+    needed = r"other.csv needs other constants than the recording \(P32.discharge_coefficient 0\.(49|50)"
+    assert re.match(needed, remark)
+    assert "of another rig" in remark
+
+
+def test_a_hold_out_on_which_something_else_acts_is_said() -> None:
+    recording = recorded(LAMINAR, 3, samples=600)
+    other = recorded({**LAMINAR, "h2.sensor_lag.time_constant": 60.0}, 5, samples=600)
+    answer = diagnose(believed(), recording, replace(other, source="other.csv"), Settings(("laminar_flow",)))
+    assert any("does not explain other.csv, whatever the constants" in remark for remark in answer.remarks)
+
+
+@pytest.mark.parametrize("same_object", [True, False])
+def test_the_recording_is_no_hold_out_of_its_own(same_object: bool) -> None:
+    recording = replace(recorded(LAMINAR, 3, samples=100), sha256="ab")
+    holdout = recording if same_object else replace(recording, source="copy.csv")
+    with pytest.raises(ValueError, match="expected a hold-out other than the recording"):
+        diagnose(believed(), recording, holdout)
+
+
+def short(recording: Recording, samples: int) -> Recording:
+    part = slice(0, samples)
+    kept = {name: getattr(recording, name)[part] for name in ("time", "inputs", "outputs", "mask")}
+    return replace(recording, **kept)
+
+
+def test_a_recording_too_short_is_refused_in_one_sentence() -> None:
+    recording = replace(recorded(LAMINAR, 3, samples=200), source="run.csv")
+    with pytest.raises(ValueError, match=r"run.csv: expected at least 60 readings of every sensor, got 40 of h1"):
+        diagnose(believed(), short(recording, 40))
+    with pytest.raises(ValueError, match="got 40 of h1"):
+        diagnose(believed(), recording, short(recording, 40), Settings(("leak@T1",)))
+
+
+def test_an_unknown_input_is_refused_in_one_sentence() -> None:
+    recording = recorded(LAMINAR, 3, samples=200)
+    inputs = recording.inputs.clone()
+    inputs[50:60, 1] = torch.nan
+    with pytest.raises(ValueError, match="expected known inputs, got an unknown one at 50 s"):
+        diagnose(believed(), replace(recording, inputs=inputs))
+
+
+def test_a_library_that_names_a_place_the_plant_lacks_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"expected one of T1, .*, got Q9"):
+        diagnose(believed(), recorded(LAMINAR, 3, samples=100), settings=Settings(("pump_lag@Q9",)))
+
+
+def test_a_plant_without_tolerances_is_said() -> None:
+    answer = diagnose(three_tank(), recorded(LAMINAR, 3, samples=300), settings=Settings(("laminar_flow",)))
+    assert any("lists no tolerances" in remark for remark in answer.remarks) and not answer.constants
+
+
+def test_constant_inputs_are_said_and_name_nothing_that_a_tolerance_explains_as_well() -> None:
+    recording = recorded({"OUT2.plugging.size": 0.06, "P13.discharge_coefficient": 0.6}, 3, samples=600, steady=True)
+    answer = diagnose(believed(), recording, settings=Settings(("plugging", "pump_gain", "leak", "sensor_bias")))
+    assert any("inputs never change" in remark for remark in answer.remarks)
+    assert answer.verdict in ("no_gap", "ambiguous")
+    assert answer.excitation["hidden"] or answer.excitation["inseparable"]
+
+
+def test_a_parameter_at_the_end_of_its_range_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    from fdi_torch.effects.laminar_flow import LaminarFlow
+
+    def narrow(self: LaminarFlow, place: str, plant: object) -> tuple[Parameter, ...]:
+        return (Parameter("transition_head", "m", 0.0, 0.0, 0.02),)
+
+    monkeypatch.setattr(LaminarFlow, "parameters", narrow)
+    answer = diagnose(
+        believed(), recorded({"P13.laminar_flow.transition_head": 0.05}, 3), settings=Settings(("laminar_flow@P13",))
+    )
+    assert any("would lie at the end of its sensible range (2 cm)" in remark for remark in answer.remarks)
