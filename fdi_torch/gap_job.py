@@ -1,44 +1,80 @@
-"""A gap diagnosis into a log: plant, recording, answer; all that a page, a viewer or a later reader needs."""
+"""The gap job: a diagnosis, and everything that a page, a viewer, a replay or a later reader needs, in its log."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from fdi_torch.config.plant_writer import dump_plant
-from fdi_torch.log_paths import free_path
+from fdi_torch.gap.answer import Answer
+from fdi_torch.gap.diagnose import Settings, Tell, diagnose
 from fdi_torch.logbook import RunLog
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
 
-def log_gap(
-    folder: Path,
+def run_gap(
+    path: Path,
     plant: PlantDescription,
     recording: Recording,
-    answer: Mapping[str, Any],
-    holdout: Recording | None = None,
-    settings: Mapping[str, Any] | None = None,
-) -> Path:
-    """Writes gap.mcap, or the next free name, into the folder. answer: as JSON. Returns the log's path."""
-    path = free_path(folder, "gap")
-    sources = [{"path": r.source, "sha256": r.sha256} for r in (recording, holdout) if r is not None]
-    config = {"settings": dict(settings or {})}
-    with RunLog(path, "gap", config_text=dump_plant(plant), config=config, data=sources) as log:
-        log.recording(
-            recording.time,
-            recording.inputs,
-            recording.outputs,
-            recording.input_names,
-            recording.output_names,
-            recording.input_units,
-            recording.output_units,
-            mask=recording.mask,
-            hold=recording.hold,
-        )
-        for place in answer.get("where", ()):
-            log.gap_where(place["location"], place["share"])
-        log.gap_verdict(answer)
-        log.result({"verdict": answer["verdict"], "closed": (answer.get("closure") or {}).get("closed")})
-    return path
+    holdouts: Sequence[Recording] = (),
+    settings: Settings | None = None,
+    tell: Tell = lambda share, text: None,
+    parent_run_id: str | None = None,
+) -> Answer:
+    """Diagnoses, and writes the log `path`: recordings first, then what is said on the way, then the answer."""
+    every, settings = (recording, *holdouts), settings or Settings()
+    sources = [{"path": r.source, "sha256": r.sha256} for r in every]
+    config = {"settings": asdict(settings)}
+    text = dump_plant(plant)
+    with RunLog(path, "gap", config_text=text, config=config, data=sources, parent_run_id=parent_run_id) as log:
+        for group, each in zip(groups(len(holdouts)), every, strict=True):
+            log_recording(log, each, group)
+        log.flush()
+
+        def say(share: float, text: str) -> None:
+            log.say(text)
+            tell(share, text)
+
+        with one_thread():
+            answer = diagnose(plant, recording, holdouts, settings, say)
+        log_answer(log, answer.to_dict(), answer.arrays)
+    return answer
+
+
+def groups(holdouts: int) -> tuple[str, ...]:
+    """Names of the recordings in the log: none for the diagnosed one, then the hold-outs'."""
+    return ("", *("holdout" if k == 0 else f"holdout_{k + 1}" for k in range(holdouts)))
+
+
+def log_recording(log: RunLog, recording: Recording, group: str) -> None:
+    """On /plant/input and /plant/output, or /plant/GROUP/..."""
+    r = recording
+    names = (r.input_names, r.output_names, r.input_units, r.output_units)
+    log.recording(r.time, r.inputs, r.outputs, *names, mask=r.mask, hold=r.hold, group=group)
+
+
+def log_answer(log: RunLog, answer: Mapping[str, Any], arrays: Mapping[str, Tensor]) -> None:
+    """answer: as JSON. arrays: see the page's predictions."""
+    for place in answer.get("where", ()):
+        log.gap_where(place["location"], place["share"])
+    log.gap_verdict(answer)
+    log.result({"verdict": answer["verdict"], "closed": (answer.get("closure") or {}).get("closed")})
+    log.result_arrays(**arrays)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Arrays of this size lose more by sharing work than they gain, and sums in another order have other last bits."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,4 +1,4 @@
-"""A logged run or study done again from its own recordings, configuration and seeds; `fdi replay` calls it."""
+"""A logged run, study or gap diagnosis done again from its own recordings and settings; `fdi replay` calls it."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from fdi_torch import study_job
 from fdi_torch.config.files import with_overrides
 from fdi_torch.config.logged import logged_mapping
 from fdi_torch.config.recordings import LoadedRecording
 from fdi_torch.config.run import Run, build_run
 from fdi_torch.config.study import build_study
-from fdi_torch.logbook import LogError, Message, RunLog, own_signals, series
+from fdi_torch.gap_replay import gap_again
+from fdi_torch.logbook import LogError, Message, RunLog, series
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook.replay import Select
+from fdi_torch.logged_recordings import recording_in
 from fdi_torch.main_job import Tell, estimate_logged, log_recordings, origin_of
-from fdi_torch.recording import Recording
 from fdi_torch.run_setup import fitting_of, wanted_space
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 from fdi_torch.study_job import TRIAL, concluded, log_trials
@@ -30,7 +29,9 @@ _DATA_KEYS = ("simulate", "recordings")
 def run_again(
     log: LoggedRun, path: Path, overrides: Iterable[str] = (), trials: Sequence[int] = (), tell: Tell | None = None
 ) -> Path:
-    """Does again what a log of `fdi train` or `fdi study` says, into a new log whose parent it is. Returns its path.
+    """Does again what a log of `fdi train`, `fdi study` or `fdi gap` says, into a new log whose parent it is.
+
+    Returns the new log's path.
 
     trials: of a study, only these; by default all that were logged.
     Raises LogError for other logs, ConfigError for a configuration that cannot be used, ValueError for overrides of
@@ -39,14 +40,17 @@ def run_again(
     about = log.metadata.get("fdi_torch.run", {})
     kind, parent = about.get("kind", ""), about.get("run_id", "")
     tell = tell or (lambda share, text: None)
+    if trials and kind != "study":
+        raise ValueError(f"--trial: expected a study's log, got one of fdi {kind}: {log.path}; leave --trial out")
     if kind == "study":
         study_again(log, path, overrides, trials, tell, parent)
-    elif kind != "train":
-        raise LogError(f"{log.path}: expected a log of fdi train or fdi study, got one of {kind or 'another program'}")
-    elif trials:
-        raise ValueError(f"--trial: expected a study's log, got one of fdi train: {log.path}; leave --trial out")
-    else:
+    elif kind == "gap":
+        gap_again(log, path, overrides, tell, parent)
+    elif kind == "train":
         estimate_again(log, path, overrides, tell, parent)
+    else:
+        wanted = "fdi train, fdi study or fdi gap"
+        raise LogError(f"{log.path}: expected a log of {wanted}, got one of {kind or 'another program'}")
     return path
 
 
@@ -129,25 +133,6 @@ def start_levels(run: Run, count: int, path: Path) -> list[Any]:
     tanks = [tank.name for tank in run.plant.tanks]
     wanted = [recording.start_levels for recording in run.config.recordings]
     return [{t: w.get(t, "free") if isinstance(w, dict) else w for t in tanks} for w in wanted]
-
-
-def recording_in(log: LoggedRun, group: str, number: int) -> Recording:
-    """A logged recording, with the name and the fingerprint of the file that it was read from."""
-    signals, about = own_signals(log, group), log.metadata.get("fdi_torch.data", {})
-    time, inputs, outputs = (torch.as_tensor(a) for a in (signals.time, signals.inputs, signals.outputs))
-    return Recording(
-        time=time,
-        inputs=inputs,
-        outputs=outputs,
-        input_names=signals.input_names,
-        output_names=signals.output_names,
-        input_units=signals.input_units,
-        output_units=signals.output_units,
-        mask=torch.as_tensor(signals.mask),
-        hold=signals.hold,  # type: ignore[arg-type]
-        source=about.get(f"{number}.path", str(log.path)),
-        sha256=about.get(f"{number}.sha256", ""),
-    )
 
 
 def logged_truth(log: LoggedRun) -> dict[str, float]:

@@ -19,8 +19,8 @@ LAYERS = (
     {"estimate", "logbook"},
     {"report", "gap", "study", "monitor"},
     {"config"},
-    {"run_setup", "log_paths"},
-    {"main_job", "study_job", "replay_job", "gap_job"},
+    {"run_setup", "log_paths", "logged_recordings"},
+    {"main_job", "study_job", "replay_job", "gap_job", "gap_replay"},
     {"paper"},
     {"cli", "train", "__main__", "__init__"},
 )

@@ -1,41 +1,140 @@
-"""The log of a gap diagnosis holds the recording bit for bit, the plant and the whole answer."""
+"""The log of a gap diagnosis holds all that was found, and the diagnosis comes out of it again."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 
+from fdi_torch import cli
 from fdi_torch.config import load_plant
 from fdi_torch.config.logged import logged_plant
-from fdi_torch.gap_job import log_gap
+from fdi_torch.config.plant_writer import dump_plant
+from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
+from fdi_torch.gap.diagnose import Settings
+from fdi_torch.gap_job import run_gap
 from fdi_torch.logbook import own_signals, read_run
-from fdi_torch.recording import Recording
+from fdi_torch.plant.constants import leak_pipe, nominal_capacity
+from fdi_torch.recording_csv import write_csv
 from fdi_torch.report.material import gather
 from fdi_torch.report.verdict import headline
+from tests.test_gap import believed, recorded
 
-ANSWER = {
-    "verdict": "named",
-    "alarm": {"p_value": 1e-9},
-    "where": [{"location": "Q1", "share": 0.9}, {"location": "T1", "share": 0.2}],
-    "causes": [{"effect": "pump_lag", "location": "Q1", "parameters": {}}],
-    "ambiguity_set": [[{"effect": "pump_lag", "location": "Q1"}]],
-    "posterior": [{"causes": [{"effect": "pump_lag", "location": "Q1"}], "probability": 1.0}],
-    "closure": {},
-}
+GAIN = {"Q2.pump_gain.factor": 1.12}
+LIBRARY = ("pump_gain", "sensor_bias@h1")
 
 
-def test_a_gap_log_says_all_that_was_found(tmp_path: Path) -> None:
-    plant = load_plant("three_tank")
-    generator = torch.Generator().manual_seed(0)
-    time = torch.arange(50.0, dtype=torch.float64)
-    inputs, outputs = (torch.rand(50, n, generator=generator, dtype=torch.float64) for n in (2, 3))
-    recording = Recording(time, inputs, outputs, ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
-    first, second = (log_gap(tmp_path, plant, recording, ANSWER) for _ in range(2))
-    assert (first.name, second.name) == ("gap.mcap", "gap_2.mcap")
-    log = read_run(first)
-    assert logged_plant(log) == plant
-    assert torch.equal(torch.as_tensor(own_signals(log).outputs), outputs)
-    found = gather(log, plant)
-    assert found.answer == ANSWER and headline(found) == "The gap comes from pump lag at Q1"
-    assert [m["location"] for m in found.of("/gap/where")] == ["Q1", "T1"]
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A diagnosis with one hold-out."""
+    path = tmp_path_factory.mktemp("logs") / "gap.mcap"
+    holdout = replace(recorded(GAIN, 5, samples=300), source="other.csv")
+    run_gap(path, believed(), recorded(GAIN, 3, samples=400), [holdout], Settings(LIBRARY))
+    return path
+
+
+def test_a_gap_log_says_all_that_was_found(logged: Path) -> None:
+    log = read_run(logged)
+    assert logged_plant(log) == believed()
+    recording, holdout = recorded(GAIN, 3, samples=400), recorded(GAIN, 5, samples=300)
+    assert torch.equal(torch.as_tensor(own_signals(log).outputs), recording.outputs)
+    assert torch.equal(torch.as_tensor(own_signals(log, "holdout").outputs), holdout.outputs)
+    found = gather(log, believed())
+    assert headline(found) == "The gap comes from pump gain at Q2"
+    assert found.of("/gap/where")[0]["location"] == found.answer["where"][0]["location"]
+    assert found.arrays["holdout_augmented"].shape == (300, 3)
+
+
+def test_a_verdict_replays_from_its_log_to_the_last_bit(logged: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["replay", str(logged), "--json", "--quiet"]) == cli.DONE
+    done = json.loads(capsys.readouterr().out)["replay"]
+    assert done["outcome"] == "bit-equal" and done["events"] > 1400 and done["largest"] == 0.0
+
+
+def test_a_replay_with_another_library_is_another_diagnosis(logged: Path, tmp_path: Path) -> None:
+    target = tmp_path / "without.mcap"
+    words = ["replay", str(logged), "--set", "library=sensor_bias@h1", "--out", str(target), "--quiet"]
+    assert cli.main(words) == cli.DONE
+    again = read_run(target)
+    assert gather(again, believed()).answer["causes"] != gather(read_run(logged), believed()).answer["causes"]
+    assert again.metadata["fdi_torch.run"]["parent_run_id"] == read_run(logged).metadata["fdi_torch.run"]["run_id"]
+
+
+def test_a_key_that_a_gap_diagnosis_lacks_is_refused(
+    logged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["replay", str(logged), "--set", "seed=3", "--out", str(tmp_path / "x.mcap"), "--quiet"]
+    assert cli.main(words) == cli.MISUSE
+    assert "expected one of library, leave_out, step, got seed" in capsys.readouterr().err
+
+
+def test_the_command_says_it_in_a_sentence_and_keeps_everything(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant, better = tmp_path / "rig.yaml", tmp_path / "new" / "better.yaml"
+    plant.write_text(dump_plant(believed()))
+    files = [str(write_csv(recorded(GAIN, k, samples=300), tmp_path / f"day{k}.csv")) for k in (3, 5, 7)]
+    words = ["gap", "--plant", str(plant), "--recording", files[0], "--holdout", *files[1:], "--library"]
+    words += [",".join(LIBRARY), "--out", str(tmp_path / "out"), "--adopt", str(better), "--with-constants", "--quiet"]
+    assert cli.main(words) == cli.DONE
+    shown = capsys.readouterr().out
+    assert shown.startswith("The gap comes from pump_gain at Q2 (over 99.9 % of all explanations weighed).")
+    assert "error of free runs on day5.csv, day7.csv, cm" in shown and "of the gap closes on data not used" in shown
+    assert "day7.csv: " in shown and "next: --adopt FILE" in shown
+    answer = json.loads((tmp_path / "out" / "gap.json").read_text())
+    found = load_plant(better)
+    assert found.effects[0].parameters["factor"] == answer["causes"][0]["parameters"]["factor"]["value"]
+    fitted = answer["constants"]["P13.discharge_coefficient"]["augmented"]
+    assert found.pipes[0].discharge_coefficient == fitted != 0.6
+    assert found.tolerances == believed().tolerances
+
+
+def test_rivals_leave_the_next_input_as_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recording = recorded({"Q1.pump_lag.time_constant": 4.0}, 9, samples=400, std=2e-3)
+    file = str(write_csv(recording, tmp_path / "run.csv"))
+    words = ["gap", "--plant", "three_tank", "--recording", file, "--library", "pump_lag,pump_delay", "--quiet"]
+    assert cli.main([*words, "--out", str(tmp_path)]) == cli.DONE
+    shown = capsys.readouterr().out
+    assert shown.startswith("There is a gap that ") and "next_input.csv; the two likeliest explanations" in shown
+    planned = (tmp_path / "next_input.csv").read_text().splitlines()
+    assert planned[0] == "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm" and len(planned) == 1501
+    assert cli.main([*words[:3], "--recording", str(tmp_path / "next_input.csv"), "--plan"]) == cli.DONE
+
+
+def test_nothing_to_adopt_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = str(write_csv(recorded({"P13.discharge_coefficient": 0.6}, 3, samples=200), tmp_path / "run.csv"))
+    words = ["gap", "--plant", "three_tank", "--recording", file, "--library", "pump_gain", "--out", str(tmp_path)]
+    assert cli.main([*words, "--adopt", str(tmp_path / "better.yaml"), "--quiet"]) == cli.DONE
+    told = capsys.readouterr()
+    assert told.out.startswith("No gap: the plant file explains the recording within noise and tolerances.")
+    assert "nothing to adopt: the verdict is no gap" in told.err and not (tmp_path / "better.yaml").exists()
+
+
+def test_a_step_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = str(write_csv(recorded(GAIN, 3, samples=100), tmp_path / "run.csv"))
+    words = ["gap", "--plant", "three_tank", "--recording", file, "--step", "0", "--out", str(tmp_path)]
+    assert cli.main(words) == cli.MISUSE
+    assert "--step: expected a positive number of seconds, got 0" in capsys.readouterr().err
+
+
+def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["gap", "--help"])
+    shown = capsys.readouterr().out
+    assert "examples:" in shown and "--holdout other.csv" in shown and "The answer is one of four" in shown
+
+
+def test_an_adopted_leak_flows_as_before_where_its_reference_was_recalibrated() -> None:
+    leak = Cause("leak", "T1", {"size": Amount(0.3, 0.01, "1")})
+    constants = {"P13.discharge_coefficient": {"augmented": 0.5}}
+    answer = Answer("named", 0.0, [], [leak], [], [], {}, {}, constants=constants)
+    plant = adopted(believed(), answer, constants=True)
+    flows = [
+        p.effects[0].parameters["size"] * nominal_capacity(p, leak_pipe(p, "T1"))
+        for p in (adopted(believed(), answer), plant)
+    ]
+    assert plant.pipes[0].discharge_coefficient == 0.5
+    assert flows[0] == pytest.approx(flows[1], rel=1e-12)

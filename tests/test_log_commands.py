@@ -242,4 +242,4 @@ def test_a_log_of_another_command_cannot_be_replayed(tmp_path: Path, capsys: pyt
     with RunLog(tmp_path / "m.mcap", "monitor", env={}, git={}):
         pass
     assert cli.main(["replay", str(tmp_path / "m.mcap"), "--quiet"]) == cli.MISUSE
-    assert "expected a log of fdi train or fdi study, got one of monitor" in capsys.readouterr().err
+    assert "expected a log of fdi train, fdi study or fdi gap, got one of monitor" in capsys.readouterr().err

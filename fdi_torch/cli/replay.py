@@ -1,4 +1,6 @@
-"""Run an estimation or a study again from its log alone and compare event by event; with --set, try another choice.
+"""Run an estimation, a study or a gap diagnosis again from its log alone, and compare event by event.
+
+With --set, try another choice.
 
 Exit code 3 where an event differs by more than the tolerance.
 """
@@ -18,7 +20,7 @@ DIFFERS = 3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", metavar="RUN.mcap", help="a log of fdi train or fdi study")
+    parser.add_argument("log", metavar="RUN.mcap", help="a log of fdi train, fdi study or fdi gap")
     parser.add_argument(
         "--relative", metavar="R", type=float, default=1e-9, help="tolerance of numbers (default: 1e-9)"
     )
@@ -27,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="what if: another objective, seed ...; may be repeated",
+        help="what if: another objective, seed, library ...; may be repeated",
     )
     parser.add_argument(
         "--trial", metavar="N", type=int, action="append", default=[], help="of a study, only this; may be repeated"

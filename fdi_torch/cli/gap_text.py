@@ -1,0 +1,185 @@
+"""The answer of `fdi gap` as people read it: one sentence, a few short tables with units, and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fdi_torch.cli import DONE
+from fdi_torch.cli.screen import Screen
+from fdi_torch.gap.answer import Answer, CauseName, Explanation, names
+from fdi_torch.gap.excitation import Excitation
+from fdi_torch.parameters import display_unit
+
+MOST_ROWS = 5
+LEAST_SHOWN = 1e-4  # of a probability
+MOVED = 2.0  # tolerances by which a constant has to move to be spoken of
+STAGES = {
+    "nominal": "as believed",
+    "recalibrated": "recalibrated",
+    "augmented": "with the causes",
+    "ceiling": "with free functions there",
+    "noise_floor": "noise",
+}
+
+
+def show(answer: Answer, screen: Screen) -> None:
+    """Everything but what to do next."""
+    screen.say(verdict_words(answer))
+    _causes(answer, screen)
+    _explanations(answer, screen)
+    rows = [[place, f"{100 * share:.1f} %"] for place, share in answer.where[:MOST_ROWS]]
+    if answer.verdict != "no_gap":
+        screen.table("where", ("place", "a free discrepancy there alone closes"), rows)
+    if answer.closure:
+        _closure(answer.closure, screen)
+    _constants(answer.constants, screen)
+    for remark in [*answer.remarks, *_impostors(answer.impostors)]:
+        screen.say(f"- {remark}")
+
+
+def verdict_words(answer: Answer) -> str:
+    """The verdict in one sentence."""
+    chance = answer.posterior[0].probability if answer.posterior else float("nan")
+    best = words(answer.posterior[0]) if answer.posterior else ""
+    if answer.verdict == "no_gap":
+        return "No gap: the plant file explains the recording within noise and tolerances."
+    if answer.verdict == "named":
+        return f"The gap comes from {best} ({percent(chance)} of all explanations weighed)."
+    if answer.verdict == "ambiguous":
+        count = len(answer.ambiguity_set)
+        return f"There is a gap that {count} explanations share at 95 %; the likeliest is {best} ({percent(chance)})."
+    place = answer.where[0][0] if answer.where else "an unknown place"
+    return f"There is a gap at {place} that no effect of the library explains; only its place and shape are known."
+
+
+def next_steps(answer: Answer, has_holdout: bool, library: Sequence[str] | None, planned: Path | None) -> list[str]:
+    """What a reader of this answer may do now."""
+    steps = []
+    if planned and answer.next_input:
+        samples = answer.next_input.get("parted_after_samples")
+        when = f"after some {samples} samples" if samples else "in a longer run"
+        steps.append(f"next: record the input {planned}; the two likeliest explanations should part {when}")
+    elif answer.verdict == "ambiguous":
+        steps.append("next: no input within the limits of pumps and levels parts the two likeliest explanations soon")
+    if answer.verdict == "unknown" and library is None:
+        steps.append("next: --library all searches further effects; the report draws the discrepancy's shape")
+    if answer.verdict in ("named", "ambiguous"):
+        steps.append(
+            "next: --adopt FILE writes the plant file with the causes; with it train and monitor no longer take "
+            "the gap for a fault"
+        )
+    if not has_holdout and answer.verdict != "no_gap":
+        steps.append("next: --holdout FILE, another recording of the same rig, measures how far the gap closes")
+    hidden, twins = answer.excitation.get("hidden", []), answer.excitation.get("inseparable", [])
+    if hidden:
+        shown = ", ".join(f"{c['effect']} at {c['location']}" for c in hidden[:3])
+        more = f" and {len(hidden) - 3} more" if len(hidden) > 3 else ""
+        steps.append(f"these inputs cannot show at their typical size: {shown}{more}")
+    if twins:
+        first = " and ".join(f"{c['effect']} at {c['location']}" for c in twins[0]["between"])
+        steps.append(f"these inputs cannot tell apart {len(twins)} pairs of effects, such as {first}")
+    return steps
+
+
+def show_plan(found: Excitation, screen: Screen) -> int:
+    """What the planned inputs hide and what they cannot tell apart."""
+    for name, place in found.hidden:
+        screen.say(f"does not show at its typical size: {name} at {place}")
+    for (a, at), (b, there), left in found.twins:
+        screen.say(f"cannot be told apart: {a} at {at} and {b} at {there} ({left:.1f} chi-square units between them)")
+    if not found.hidden and not found.twins:
+        screen.say("every effect of the library shows at its typical size and can be told from every other")
+    shown = {f"{place}.{name}": left for (name, place), left in found.shown.items()}
+    screen.result({"format": "fdi_torch.gap_plan/1", "hidden": found.hidden, "twins": found.twins, "shown": shown})
+    return DONE
+
+
+def words(explanation: Explanation) -> str:
+    if explanation.unknown_at:
+        return f"something unknown at {explanation.unknown_at}"
+    return " and ".join(f"{effect} at {place}" for effect, place in explanation.causes) or "nothing beyond tolerances"
+
+
+def percent(share: float) -> str:
+    """No more digits than tell something: 'over 99.9 %', '97.2 %'."""
+    if share >= 0.9995:
+        return "over 99.9 %"
+    return f"{100 * share:.1f} %" if share >= 0.001 else "under 0.1 %"
+
+
+def _causes(answer: Answer, screen: Screen) -> None:
+    rows = []
+    for cause in answer.causes:
+        for name, amount in cause.parameters.items():
+            unit, scale = display_unit(amount.unit)
+            numbers = [f"{scale * amount.value:.4g}", f"{scale * amount.std:.2g}"]
+            rows.append([cause.effect, cause.location, name, *numbers, unit])
+    if rows:
+        screen.table("causes", ("effect", "at", "parameter", "value", "std error", "unit"), rows, left=3)
+    for cause in answer.causes:
+        if cause.same_as:
+            screen.say(f"- {_listed([(cause.effect, cause.location)])} is the same thing as {_listed(cause.same_as)}")
+
+
+def _explanations(answer: Answer, screen: Screen) -> None:
+    rows = [[words(e), percent(e.probability)] for e in answer.posterior if e.probability >= LEAST_SHOWN]
+    if len(rows) > 1:
+        screen.table("explanations", ("causes", "probability"), rows[: MOST_ROWS + 3])
+
+
+def _closure(closure: Mapping[str, Any], screen: Screen) -> None:
+    """Free-run errors, a row a model and a column a sensor."""
+    sensors = list(closure["per_sensor"])
+    rows = []
+    for stage, name in STAGES.items():
+        each = [f"{closure['per_sensor'][s][stage]:.3g}" for s in sensors]
+        rows.append([name, f"{closure[stage]:.3g}", *each])
+    files = ", ".join(Path(source).name for source in closure["holdouts"])
+    screen.table(f"error of free runs on {files}, {closure['unit']}", ("plant", "all", *sensors), rows)
+    if closure["closed"] is None:
+        screen.say("The hold-out's gap is too small, against its standard error, to say how much of it closes.")
+    else:
+        low, high = closure["closed_ci95"]
+        between = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"
+        screen.say(f"{100 * closure['closed']:.1f} % of the gap closes on data not used for fitting ({between}).")
+    for one in closure.get("per_holdout", []):
+        closed = "undefined" if one["closed"] is None else f"{100 * one['closed']:.1f} %"
+        screen.say(
+            f"- {Path(one['source']).name}: {one['recalibrated']:.3g} to {one['augmented']:.3g}, closed {closed}"
+        )
+    if closure["augmented_with"] and closure["frozen"]["recalibrated"] > 1.5 * closure["augmented"]:
+        screen.say(
+            f"With the causes, but the constants as recalibrated without them, the error is "
+            f"{closure['frozen']['recalibrated']:.3g} {closure['unit']}: recalibration had taken up part of the gap."
+        )
+
+
+def _constants(constants: Mapping[str, Any], screen: Screen) -> None:
+    """Constants that recalibration moved far out of their tolerance."""
+    rows = []
+    for name, c in constants.items():
+        if max(abs(c[stage] - c["nominal"]) for stage in ("recalibrated", "augmented")) > MOVED * c["tolerance"]:
+            unit, scale = display_unit(c["unit"])
+            numbers = [c["nominal"], c["tolerance"], c["recalibrated"], c["augmented"], c["std"]]
+            rows.append([name, *(f"{scale * v:.4g}" for v in numbers[:4]), f"{scale * numbers[4]:.2g}", unit])
+    if rows:
+        header = ("constant", "believed", "tolerance", "recalibrated", "with the causes", "std error", "unit")
+        screen.table(f"constants more than {MOVED:g} tolerances off", header, rows)
+
+
+def _impostors(impostors: Mapping[str, Any] | None) -> list[str]:
+    """How much the name is worth under this excitation."""
+    told = impostors.get("simulated") if impostors else None
+    if not told:
+        return []
+    confused, passed, draws = told["confused"], told["passed"], told["draws"]
+    return [
+        f"had another of {told['rivals']} causes made a gap of this size, this one would have been named in "
+        f"{confused} of {draws} simulated recordings, and in {passed} if the library lacked the true one (first order)"
+    ]
+
+
+def _listed(causes: Sequence[CauseName]) -> str:
+    return " or ".join(f"{c['effect']} at {c['location']}" for c in names(causes))
