@@ -40,7 +40,7 @@ class ChannelSource:
 
 
 @dataclass(frozen=True)
-class _Bound:
+class Bound:
     """A channel tied to the file: position of its column (or a constant), factor into SI, SI unit."""
 
     name: str
@@ -64,18 +64,18 @@ def read_csv(
     is no number, time that does not increase, and a file without rows.
     """
     mapping = mapping or {}
-    with _open(path) as handle:
-        header, delimiter, line = _read_header(path, handle)
-        clock = _bind(path, header, "t", mapping.get("t") or _time_source(header), "s")
-        bound_inputs = [_bind(path, header, name, mapping.get(name)) for name in inputs]
-        bound_outputs = [_bind(path, header, name, mapping.get(name)) for name in outputs]
-        positions = _positions([clock, *bound_inputs, *bound_outputs])
+    with open_csv(path) as handle:
+        header, delimiter, line = header_of(path, handle)
+        clock = bind(path, header, "t", mapping.get("t") or time_source(header), "s")
+        bound_inputs = [bind(path, header, name, mapping.get(name)) for name in inputs]
+        bound_outputs = [bind(path, header, name, mapping.get(name)) for name in outputs]
+        positions = positions_of([clock, *bound_inputs, *bound_outputs])
         table = _read_table(path, handle, header, delimiter, line, positions)
     seconds = _clock(path, table[:, 0], clock, line)
     return Recording(
         time=torch.from_numpy(seconds),
-        inputs=torch.from_numpy(_channels(table, positions, bound_inputs)),
-        outputs=torch.from_numpy(_channels(table, positions, bound_outputs)),
+        inputs=torch.from_numpy(channels_in_si(table, positions, bound_inputs)),
+        outputs=torch.from_numpy(channels_in_si(table, positions, bound_outputs)),
         input_names=tuple(inputs),
         output_names=tuple(outputs),
         input_units=tuple(b.si_unit for b in bound_inputs),
@@ -88,8 +88,8 @@ def read_csv(
 
 def read_header(path: Path) -> list[str]:
     """The column names of a CSV file."""
-    with _open(path) as handle:
-        return _read_header(path, handle)[0]
+    with open_csv(path) as handle:
+        return header_of(path, handle)[0]
 
 
 def file_sha256(path: Path) -> str:
@@ -97,7 +97,7 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
-def _open(path: Path) -> TextIO:
+def open_csv(path: Path) -> TextIO:
     if not path.is_file():
         raise ValueError(f"{path}: expected a CSV file, got none there; check the path")
     if path.suffix == ".gz":
@@ -105,7 +105,7 @@ def _open(path: Path) -> TextIO:
     return path.open(encoding="utf-8-sig", newline="")
 
 
-def _read_header(path: Path, handle: TextIO) -> tuple[list[str], str, int]:
+def header_of(path: Path, handle: TextIO) -> tuple[list[str], str, int]:
     """Column names, delimiter, and the number of the header's line. Lines starting with # may stand above it."""
     try:
         for line_number, line in enumerate(handle, start=1):
@@ -117,7 +117,7 @@ def _read_header(path: Path, handle: TextIO) -> tuple[list[str], str, int]:
     raise ValueError(f"{path}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got an empty file")
 
 
-def _time_source(header: Sequence[str]) -> ChannelSource:
+def time_source(header: Sequence[str]) -> ChannelSource:
     """The column of time where the mapping names none: t_UNIT or time_UNIT."""
     for column in header:
         split = header_unit(column)
@@ -126,13 +126,11 @@ def _time_source(header: Sequence[str]) -> ChannelSource:
     return ChannelSource()
 
 
-def _bind(
-    path: Path, header: Sequence[str], name: str, source: ChannelSource | None, want: str | None = None
-) -> _Bound:
+def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | None, want: str | None = None) -> Bound:
     source = source or ChannelSource()
     if source.constant is not None:
         unit = source.unit or "1"
-        return _Bound(name, name, None, 1.0, unit, source.constant)
+        return Bound(name, name, None, 1.0, unit, source.constant)
     column = _find_column(path, header, name, source.column)
     unit = source.unit or _unit_in(path, column)
     try:
@@ -140,7 +138,7 @@ def _bind(
         factor = unit_factor(unit, si_unit)
     except ValueError as error:
         raise ValueError(f"{path}: column {column}: {error}") from error
-    return _Bound(name, column, header.index(column), factor, si_unit)
+    return Bound(name, column, header.index(column), factor, si_unit)
 
 
 def _find_column(path: Path, header: Sequence[str], name: str, column: str | None) -> str:
@@ -169,7 +167,7 @@ def _unit_in(path: Path, column: str) -> str:
     return split[1]
 
 
-def _positions(bounds: Sequence[_Bound]) -> list[int]:
+def positions_of(bounds: Sequence[Bound]) -> list[int]:
     """The columns of the file that are read, each once, in the order of their first use."""
     return list(dict.fromkeys(b.position for b in bounds if b.position is not None))
 
@@ -183,7 +181,7 @@ def _read_table(
         try:
             blocks.append(_parse_fast(lines, delimiter, positions, len(header)))
         except ValueError:
-            blocks.append(_parse_carefully(path, lines, header, delimiter, line, positions))
+            blocks.append(parse_carefully(path, lines, header, delimiter, line, positions))
         line += len(lines)
     table = np.concatenate(blocks) if blocks else np.empty((0, len(positions)))
     if len(table) < 2:
@@ -206,7 +204,7 @@ def _parse_fast(lines: list[str], delimiter: str, positions: list[int], width: i
     return np.loadtxt(lines, delimiter=delimiter, usecols=positions, ndmin=2, comments=None)
 
 
-def _parse_carefully(
+def parse_carefully(
     path: Path, lines: list[str], header: Sequence[str], delimiter: str, line: int, positions: list[int]
 ) -> np.ndarray:
     """Cell by cell: knows missing cells, and names the one that is wrong."""
@@ -232,7 +230,7 @@ def _number(path: Path, row: int, column: str, cell: str) -> float:
         ) from None
 
 
-def _clock(path: Path, seconds: np.ndarray, clock: _Bound, header_line: int) -> np.ndarray:
+def _clock(path: Path, seconds: np.ndarray, clock: Bound, header_line: int) -> np.ndarray:
     seconds = seconds * clock.factor
     if not np.isfinite(seconds).all():
         row = header_line + 1 + int(np.flatnonzero(~np.isfinite(seconds))[0])
@@ -247,7 +245,7 @@ def _clock(path: Path, seconds: np.ndarray, clock: _Bound, header_line: int) -> 
     return seconds
 
 
-def _channels(table: np.ndarray, positions: list[int], bounds: Sequence[_Bound]) -> np.ndarray:
+def channels_in_si(table: np.ndarray, positions: list[int], bounds: Sequence[Bound]) -> np.ndarray:
     """The bound channels in SI as (rows, channels); what is not finite becomes NaN."""
     channels = np.empty((len(table), len(bounds)))
     for i, bound in enumerate(bounds):

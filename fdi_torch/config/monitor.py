@@ -9,11 +9,14 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
-from fdi_torch.config.files import find_file, read_extended, with_overrides
+from fdi_torch.config.files import find_file, read_extended, with_overrides, write_yaml
 from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import explain
 from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.run import OutputConfig
 from fdi_torch.config.strict import Seconds, Strict
+from fdi_torch.monitor.prepare import GainWish
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.plant.description import PlantDescription
 
@@ -35,6 +38,18 @@ class WindowConfig(Strict):
         )
 
 
+class ObserverConfig(Strict):
+    time_constant: Seconds | None = Field(None, description="with which its slowest error decays, s")
+    gain: list[list[float]] | None = Field(
+        None, description="by hand: rows of tanks, columns of sensors, m per unit of the reading and sample"
+    )
+
+    def wish(self) -> GainWish | None:
+        if self.time_constant is None and self.gain is None:
+            return None
+        return GainWish(self.time_constant, tuple(tuple(row) for row in self.gain or ()))
+
+
 class MonitorConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
     recording: RecordingConfig = Field(description="what is followed")
@@ -47,26 +62,41 @@ class MonitorConfig(Strict):
     detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="what raises alarms")
     false_alarms_every: Seconds = Field(20000.0, description="mean time between false alarms, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
+    observer: ObserverConfig = Field(default_factory=ObserverConfig, description="by default by the noise")
     step: Seconds = Field(1.0, description="longest integration step, s")
+    output: OutputConfig = Field(default_factory=OutputConfig)
     seed: int = Field(0, ge=0, description="of the simulation that sets the threshold of the GLR")
 
 
 @dataclass(frozen=True)
 class MonitorRun:
-    """A monitor file understood. base: where its paths start."""
+    """A monitor file understood. base: where its paths start. text: YAML that gives the same run, plant included."""
 
     config: MonitorConfig
     plant: PlantDescription
     base: Path
+    source: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        return self.config.output.name or Path(self.source).stem
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """Every value, defaults included, as plain nested values."""
+        return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
 
 
 def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:
     """A monitor file with some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
     file = find_file(str(path), Path.cwd())
+    data = dict(with_overrides(read_extended(file), overrides))
     try:
-        config = MonitorConfig.model_validate(dict(with_overrides(read_extended(file), overrides)))
+        config = MonitorConfig.model_validate(data)
     except ValidationError as error:
         raise explain(error, str(file)) from None
     plant = config.plant
     known = build_plant(plant, str(file)) if isinstance(plant, dict) else load_plant(plant, file.parent)
-    return MonitorRun(config, known, file.parent)
+    text = write_yaml({**data, "plant": plant_mapping(known)})
+    return MonitorRun(config, known, file.parent, str(file), text)

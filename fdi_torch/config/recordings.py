@@ -99,9 +99,10 @@ def read_recording(config: RecordingConfig, plant: PlantDescription, base: Path 
     path = find_data(config.file, base or Path.cwd())
     channels, columns = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
     try:
-        mapping = _mapping(config, plant)
+        mapping = channel_mapping(config, plant)
         recording = _reader(path)(path, channels, columns, mapping, config.hold)
-        _expect_units(recording, plant)
+        names = (*recording.input_names, *recording.output_names)
+        expect_units(recording.source, names, (*recording.input_units, *recording.output_units), plant)
         start = -math.inf if config.start is None else config.start
         window = recording.window(start, math.inf if config.stop is None else config.stop)
         return window.masked(config.mask).every(config.every)
@@ -114,7 +115,7 @@ def _reader(path: Path) -> Callable[..., Recording]:
     return read_mcap if ".mcap" in path.suffixes else read_csv
 
 
-def _mapping(config: RecordingConfig, plant: PlantDescription) -> dict[str, ChannelSource]:
+def channel_mapping(config: RecordingConfig, plant: PlantDescription) -> dict[str, ChannelSource]:
     units = _units(plant)
     mapping = {}
     for name, column in config.columns.items():
@@ -136,13 +137,13 @@ def _units(plant: PlantDescription) -> dict[str, str]:
     return plant.channel_units() | {sensor.column: sensor.unit for sensor in plant.sensors}
 
 
-def _expect_units(recording: Recording, plant: PlantDescription) -> None:
+def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant: PlantDescription) -> None:
+    """Raises ValueError where a channel's unit (SI) is of another kind than the plant's."""
     expected = _units(plant)
-    names = (*recording.input_names, *recording.output_names)
-    for name, unit in zip(names, (*recording.input_units, *recording.output_units), strict=True):
+    for name, unit in zip(names, units, strict=True):
         if unit != expected[name]:
             raise ValueError(
-                f"{recording.source}: {name}: expected a unit of the kind {expected[name]} (plant {plant.name}), "
+                f"{source}: {name}: expected a unit of the kind {expected[name]} (plant {plant.name}), "
                 f"got one of the kind {unit}; correct the header, columns, or the gain in the plant file"
             )
 

@@ -12,7 +12,7 @@ from fdi_torch.logbook.reader import Message, Run, read_run
 from fdi_torch.logbook.recover import Recovery, recover
 from fdi_torch.logbook.replay import Replay, replay
 from fdi_torch.logbook.resume import last_state, set_aside, unfinished
-from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, own_signals, series
+from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, number_at, own_signals, series
 from fdi_torch.logbook.terminate import Terminated, exit_on_sigterm
 from fdi_torch.logbook.writer import Listener, RunLog
 
@@ -40,6 +40,7 @@ __all__ = [
     "inspect_log",
     "last_state",
     "mapped_signals",
+    "number_at",
     "own_signals",
     "read_run",
     "recover",

@@ -129,7 +129,7 @@ def _time(message: Message, payload: Mapping[str, Any]) -> float:
     return float(t) if isinstance(t, int | float) else message.t
 
 
-def _number(payload: Any, field: str) -> float:
+def number_at(payload: Any, field: str) -> float:
     """A field by its name or, where there is none of that name, its path; NaN where it is no number."""
     value = payload
     for step in [field] if field in payload else field_path(field):
@@ -141,7 +141,7 @@ def _number(payload: Any, field: str) -> float:
 
 
 def _numbers(payload: Any, fields: Iterable[str]) -> list[float]:
-    return [_number(payload, field) for field in fields]
+    return [number_at(payload, field) for field in fields]
 
 
 def _numeric_fields(run: Run, topic: str) -> list[str]:
@@ -207,7 +207,7 @@ def _mapped_table(
 
     def rows() -> Iterable[Sequence[float]]:
         for message, payload in _of(run, topic):
-            t = _number(payload, time_field) if time_field else (message.log_time - origin) * 1e-9
+            t = number_at(payload, time_field) if time_field else (message.log_time - origin) * 1e-9
             yield (t, *_numbers(payload, wanted.values()))
 
     table = _table(rows(), len(wanted) + 1)

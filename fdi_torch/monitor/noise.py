@@ -64,6 +64,23 @@ def learn_noise(
     return _noise(network, linear, best), best.seen
 
 
+def noise_of_gain(
+    network: TankNetwork,
+    gain: Gain,
+    fault_free: Samples,
+    space: ParameterSpace | None = None,
+    theta: Tensor | None = None,
+    longest_step: float = LONGEST_STEP,
+) -> tuple[Noise, Observation]:
+    """For an observer whose gain is given: the colour of its residual. What of it is process noise stays open (NaN)."""
+    seen = Observer(network, gain, space, theta, longest_step).run(fault_free)
+    settled = seen.last(max(len(fault_free) - len(gain.opening), len(fault_free) // 2))
+    whitening = score_whitenings(settled.steady_residual)[0][1]
+    unknown = network.nominal.new_full((len(network.description.tanks),), torch.nan)
+    std = settled.steady_residual.square().nanmean(dim=0).sqrt()
+    return Noise(unknown, std, float("nan"), whitening, gain), seen
+
+
 @dataclass(frozen=True)
 class _Attempt:
     """An observer for one ratio, 10^exponent: how likely what it saw is (less is more), and the colour left in it."""

@@ -6,7 +6,8 @@ white innovations, together with the moment of change.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -27,6 +28,15 @@ from fdi_torch.plant.network import TankNetwork
 
 RIVAL = 6.0  # difference in BIC below which another explanation stands beside the best
 MOST_AT_ONCE = 512  # samples that the observer is run along before the detector looks at them
+
+
+@dataclass(frozen=True)
+class Seen:
+    """time (S,) s, residual (S, sensors) in the readings' units, statistic (S,) that is held against the threshold."""
+
+    time: Tensor
+    residual: Tensor
+    statistic: Tensor
 
 
 class Monitor:
@@ -56,8 +66,13 @@ class Monitor:
         theta = self.space.nominal() if believed is None else believed
         return begin(self._observer, samples.stretch(0, 1), theta, levels)
 
-    def advance(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, list[Event]]:
-        """Takes the samples that have come since, in order; their clock may jump and readings or inputs may lack."""
+    def advance(
+        self, state: MonitorState, samples: Samples, show: Callable[[Seen], None] | None = None
+    ) -> tuple[MonitorState, list[Event]]:
+        """Takes the samples that have come since, in order; their clock may jump and readings or inputs may lack.
+
+        show is handed what the observer and the detector saw, sample by sample in order.
+        """
         events: list[Event] = []
         for stretch, notice in continuous(state.samples, samples):
             if notice:
@@ -65,34 +80,36 @@ class Monitor:
                 state = begin(self._observer, stretch.stretch(0, 1), state.believed)
                 stretch = stretch.stretch(1, len(stretch))
             while len(stretch):
-                state, taken, news = self._take(state, stretch)
+                state, taken, news = self._take(state, stretch, show)
                 events += news
                 stretch = stretch.stretch(taken, len(stretch))
         return state, events
 
-    def _take(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, int, list[Event]]:
+    def _take(
+        self, state: MonitorState, samples: Samples, show: Callable[[Seen], None] | None
+    ) -> tuple[MonitorState, int, list[Event]]:
         """As many samples as can be taken before something is to be done, and what then comes of it."""
         due = samples.time >= self._next_look(state)
         count = int(due.to(torch.int8).argmax()) + 1 if bool(due.any()) else len(samples)
         count = min(count, MOST_AT_ONCE)
-        moved = observe(self._observer, state, samples.stretch(0, count))
-        if state.alarm is None:
-            raised = self._first_alarm(moved, len(state.samples))
-            if raised is not None:
-                count = raised - len(state.samples) + 1
-                state, events = self._alarm(observe(self._observer, state, samples.stretch(0, count)))
-                return self._forgotten(state), count, events
-        state, events = moved, []
-        if state.now >= self._next_look(state):
+        before, moved = state, observe(self._observer, state, samples.stretch(0, count))
+        statistic = self._statistic(moved, count)
+        above = statistic > self.detector.threshold
+        raised = state.alarm is None and bool(above.any())
+        if raised:
+            count = int(above.to(torch.int8).argmax()) + 1
+            moved = observe(self._observer, before, samples.stretch(0, count))
+        if show is not None:
+            show(Seen(moved.samples.time[-count:], moved.residual[-count:], statistic[:count]))
+        state, events = self._alarm(moved) if raised else (moved, [])
+        if not raised and state.now >= self._next_look(state):
             state, events = self._look(state)
         return self._forgotten(state), count, events
 
-    def _first_alarm(self, state: MonitorState, fresh: int) -> int | None:
-        """The first of the samples from `fresh` on that raises an alarm."""
-        first = max(state.watched, fresh - self.detector.memory)
-        above = self.detector.statistic(state.white[first:]) > self.detector.threshold
-        above[: max(fresh - first, 0)] = False
-        return first + int(above.to(torch.int8).argmax()) if bool(above.any()) else None
+    def _statistic(self, state: MonitorState, fresh: int) -> Tensor:
+        """The detector's statistic at the last `fresh` samples, (fresh,)."""
+        first = max(state.watched, len(state.samples) - fresh - self.detector.memory)
+        return self.detector.statistic(state.white[first:])[-fresh:]
 
     def _alarm(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
         """An alarm; or only better sizes, where those of the last change explain the residual."""

@@ -12,14 +12,17 @@ from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
 from fdi_torch.monitor.detection import Chart, make_detector
-from fdi_torch.monitor.noise import Noise, learn_noise
+from fdi_torch.monitor.doubts import fault_doubts, residual_doubts
+from fdi_torch.monitor.gain import Gain, hand_gain, start_uncertainty, timed_gain
+from fdi_torch.monitor.noise import Noise, learn_noise, noise_of_gain, operating_point
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.online import Monitor
-from fdi_torch.monitor.samples import take
+from fdi_torch.monitor.samples import Samples, take
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.monitor.stepper import LONGEST_STEP
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 
 
@@ -32,6 +35,21 @@ class Prepared:
     noise: Noise
     calibrated: dict[str, float]
     radius: float
+    doubts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class GainWish:
+    """An observer's gain where it is not to follow from the noise: for a time constant in s, or by hand (tanks x
+    sensors, per sample: m per unit of the reading).
+    """
+
+    time_constant: float | None = None
+    by_hand: tuple[tuple[float, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.time_constant is None) == (not self.by_hand):
+            raise ValueError("expected either a time constant or a gain by hand, got both or none; give one")
 
 
 def prepare(
@@ -46,6 +64,7 @@ def prepare(
     seed: int = 0,
     start: StartLevels = "free",
     ranges: Mapping[str, tuple[float, float]] | None = None,
+    gain: GainWish | None = None,
 ) -> Prepared:
     """A monitor for `faults` (parameters such as 'T1.leak.size'; the usual ones where none is named).
 
@@ -60,13 +79,35 @@ def prepare(
         space = space.with_changes(name, low=low, high=high)
     believed = space.vector(values)
     samples = take(fault_free, plant)
-    noise, seen = learn_noise(network, samples, space, believed, longest_step=step)
-    radius = Observer(network, noise.gain, space, believed, step).check_stable(samples, seen)
+    if gain is None:
+        noise, seen = learn_noise(network, samples, space, believed, longest_step=step)
+        radius = Observer(network, noise.gain, space, believed, step).check_stable(samples, seen)
+    else:
+        wished = _wished(network, samples, space, believed, step, gain)
+        observer = Observer(network, wished, space, believed, step)
+        radius = observer.check_stable(samples, observer.run(samples))
+        noise, seen = noise_of_gain(network, wished, samples, space, believed, step)
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)
     detector = make_detector(chart, time_between_false_alarms, sampling, len(plant.sensors), generator)
     monitor = Monitor(network, space, noise, detector, settings, step, watched=len(watched))
-    return Prepared(monitor, believed, noise, values, radius)
+    doubts = (
+        *residual_doubts(plant, noise, detector, seen),
+        *fault_doubts(network, space, samples, believed, step, len(watched)),
+    )
+    return Prepared(monitor, believed, noise, values, radius, doubts)
+
+
+def _wished(
+    network: TankNetwork, samples: Samples, space: ParameterSpace, believed: Tensor, step: float, wish: GainWish
+) -> Gain:
+    if wish.by_hand:
+        return hand_gain(torch.tensor(wish.by_hand, dtype=network.nominal.dtype))
+    linear = operating_point(network, samples, space, believed, step)
+    unit = torch.linalg.vector_norm(linear.output, dim=-1)
+    span = float(torch.diff(samples.time).median())
+    assert wish.time_constant is not None
+    return timed_gain(linear, span, wish.time_constant, unit, start_uncertainty(network.description, unit))
 
 
 def calibration(

@@ -1,0 +1,124 @@
+"""Recordings that another program is still writing, as CSV or MCAP: their samples as they come."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from fdi_torch.config.files import find_data
+from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.recordings import RecordingConfig, channel_mapping, expect_units
+from fdi_torch.logbook import LogError, Message, follow, number_at
+from fdi_torch.parameters import si_unit_of, unit_factor
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording_csv import ChannelSource
+from fdi_torch.recording_csv_growing import GrowingCsv
+
+POLL = 0.1  # s
+
+Row = tuple[float, list[float], list[float]]
+"""Time in s, the plant's inputs and its readings in SI; NaN where unknown."""
+
+
+def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, idle: float) -> Iterator[Row | str]:
+    """Samples in the order in which they are written, and a sentence on what could not be read.
+
+    Ends when the file is finished, or when nothing came for `idle` s. Raises ConfigError for a file that cannot be
+    understood.
+    """
+    if config.mask or config.every != 1:
+        raise ConfigError([f"{config.file}: expected neither mask nor every for a file that is followed; leave them"])
+    path = _find(config.file, base)
+    rows = _mcap_rows if ".mcap" in path.suffixes else _csv_rows
+    start = -np.inf if config.start is None else config.start
+    stop = np.inf if config.stop is None else config.stop
+    try:
+        for row in rows(path, plant, channel_mapping(config, plant), idle):
+            if isinstance(row, str) or start <= row[0] <= stop:
+                yield row
+    except (ValueError, LogError) as error:
+        raise ConfigError([str(error)]) from error
+
+
+def _find(name: str, base: Path) -> Path:
+    """The file, or the one that it is while it is being written."""
+    try:
+        return find_data(name, base)
+    except ConfigError:
+        if not name.endswith(".mcap"):
+            raise
+        return find_data(f"{name}.partial", base)
+
+
+def _csv_rows(
+    path: Path, plant: PlantDescription, mapping: Mapping[str, ChannelSource], idle: float
+) -> Iterator[Row | str]:
+    inputs, outputs = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
+    file = GrowingCsv(path, inputs, outputs, mapping)
+    expect_units(str(path), (*inputs, *outputs), (*file.input_units, *file.output_units), plant)
+    quiet_since = time.monotonic()
+    while time.monotonic() - quiet_since <= idle:
+        seconds, commands, readings, troubles = file.new()
+        yield from (f"{trouble}; the row is left out" for trouble in troubles)
+        yield from zip(seconds.tolist(), commands.tolist(), readings.tolist(), strict=True)
+        if len(seconds):
+            quiet_since = time.monotonic()
+        else:
+            time.sleep(POLL)
+
+
+def _mcap_rows(
+    path: Path, plant: PlantDescription, mapping: Mapping[str, ChannelSource], idle: float
+) -> Iterator[Row | str]:
+    """Messages put together by their time: inputs are held, a reading that does not come is missing."""
+    inputs, outputs = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
+    sources = {name: mapping.get(name, ChannelSource()) for name in (*inputs, *outputs)}
+    places = {n: _place(n, source, n in inputs) for n, source in sources.items() if source.constant is None}
+    factors: dict[str, float] = {}
+    constants = {name: sources[name].constant for name in inputs}
+    known = {name: np.nan if value is None else value for name, value in constants.items()}
+    clock = mapping.get("t", ChannelSource())
+    scale = unit_factor(clock.unit, "s") if clock.unit else 1.0
+    now, read = None, dict.fromkeys(outputs, np.nan)
+    troubles: list[str] = []
+    topics = {topic for topic, _ in places.values()}
+    for message in follow(path, topics, idle, POLL, lambda damage: troubles.append(str(damage))):
+        yield from troubles
+        troubles.clear()
+        payload = message.payload
+        t = number_at(payload, clock.column or "t") * scale
+        t = message.t if np.isnan(t) else t
+        if now is not None and t != now:
+            if any(np.isfinite(list(read.values()))):
+                yield now, list(known.values()), list(read.values())
+            read = dict.fromkeys(outputs, np.nan)
+        now = t
+        for name, (topic, field) in places.items():
+            if topic == message.topic:
+                value = number_at(payload, field)
+                factor = factors.setdefault(name, _factor(message, name, field, mapping, plant))
+                counts = field not in payload.get("masked", ())
+                (known if name in known else read)[name] = value * factor if counts else np.nan
+    if now is not None and any(np.isfinite(list(read.values()))):
+        yield now, list(known.values()), list(read.values())
+
+
+def _place(name: str, source: ChannelSource, is_input: bool) -> tuple[str, str]:
+    """Topic and field of a channel: as mapped, or where our own logs have it."""
+    topic, _, field = (source.column or "").rpartition(":")
+    return (topic, field) if topic else ("/plant/input" if is_input else "/plant/output", source.column or name)
+
+
+def _factor(
+    message: Message, name: str, field: str, mapping: Mapping[str, ChannelSource], plant: PlantDescription
+) -> float:
+    """From the numbers of a message into SI. Raises ValueError where no unit is told, or one of another kind."""
+    source = mapping.get(name, ChannelSource())
+    unit = source.unit or dict(message.channel.metadata).get(f"unit.{field}", "")
+    if not unit:
+        raise ValueError(f"{message.topic}: {name}: expected a unit, got none; give it under columns: {name}")
+    expect_units(message.topic, (name,), (si_unit_of(unit),), plant)
+    return unit_factor(unit, si_unit_of(unit))

@@ -1,0 +1,75 @@
+"""What speaks against a part of a recording that was taken for fault-free, a sentence each."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fdi_torch.monitor.change import ChangedObserver, Window
+from fdi_torch.monitor.detection import Detector
+from fdi_torch.monitor.gain import kalman_gain, start_uncertainty
+from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.noise import Noise, operating_point
+from fdi_torch.monitor.observer import Observation
+from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.whitening import Whitening
+from fdi_torch.parameters import ParameterSpace, display_unit
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.network import TankNetwork
+
+# Levels that wander by so little, as a share of a reading's noise, do not wander.
+STILL = 1e-3
+# By how much a fault must explain more than none, in units of BIC; the rest must then be noise.
+CONVINCING = 30.0
+QUESTION = "does the recording start faulty? Name another fault_free part"
+
+
+def residual_doubts(plant: PlantDescription, noise: Noise, detector: Detector, seen: Observation) -> list[str]:
+    """Alarms within it, and readings that lie off the observer throughout."""
+    doubts = []
+    alarms = detector.alarms(noise.whitening(seen.steady_residual)).nonzero().flatten()
+    if len(alarms):
+        first = f"the first at {float(seen.time[alarms[0]]):g} s"
+        doubts.append(f"the part taken for fault-free raises {len(alarms)} alarms itself, {first}: {QUESTION}")
+    for sensor, mean in zip(plant.sensors, noise.whitening.mean.tolist(), strict=True):
+        if mean != 0.0:
+            unit, scale = display_unit(sensor.unit)
+            off = f"{sensor.name} lies {scale * mean:.3g} {unit} off the observer throughout"
+            doubts.append(f"in the fault-free part {off}; this is taken for the plant's own: calibrate a constant")
+    return doubts
+
+
+def fault_doubts(
+    network: TankNetwork, space: ParameterSpace, samples: Samples, believed: Tensor, step: float, watched: int
+) -> list[str]:
+    """A single fault within it that leaves nothing but the readings' own noise.
+
+    Noise is learnt as levels that wander where a fault moves them; here they stand still, and the noise of readings is
+    what changes from one sample to the next.
+    """
+    linear = operating_point(network, samples, space, believed, step)
+    std = sample_spread(samples.readings)
+    if not bool((std > 0.0).all()):
+        return []
+    start = start_uncertainty(network.description, std)
+    gain = kalman_gain(linear, STILL * float(std.min()) * torch.ones_like(start), std, start)
+    still = Whitening(torch.zeros_like(std), std.new_zeros(0, len(std), len(std)), torch.diag(1.0 / std), len(samples))
+    observer = ChangedObserver(network, space, gain, still, step)
+    first, _ = observer.first_state(samples, believed)
+    best = isolate(observer, Window(samples, first, 1), believed, range(watched), incipient=False, deepest=1)[0]
+    if not best.fits or best.score > -CONVINCING:
+        return []
+    [column] = best.hypothesis.columns
+    p = space.parameters[column]
+    unit, scale = display_unit(p.unit)
+    size = f"{scale * float(best.value[column]):.3g} {unit}".strip()
+    return [f"{p.name} = {size} since {best.onset:.0f} s explains the part taken for fault-free: {QUESTION}"]
+
+
+def sample_spread(readings: Tensor) -> Tensor:
+    """Standard deviation (sensors,) of the noise of readings (S, sensors), from their second differences.
+
+    White noise has a second difference of variance 6; what moves slowly has none. NaN readings are left out.
+    """
+    bend = readings[2:] - 2.0 * readings[1:-1] + readings[:-2]
+    return bend.square().nanmean(dim=0).div(6.0).sqrt()

@@ -1,0 +1,272 @@
+"""The monitor along a recording or a growing file: every sample, event and belief into a log as it comes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fdi_torch.config.growing import Row, growing_rows
+from fdi_torch.config.monitor import MonitorRun
+from fdi_torch.config.recordings import read_recording
+from fdi_torch.log_paths import free_path
+from fdi_torch.logbook import Listener, RunLog
+from fdi_torch.monitor.arrivals import Arrivals, Punctuality
+from fdi_torch.monitor.events import Event
+from fdi_torch.monitor.following import MonitorState
+from fdi_torch.monitor.online import Monitor, Seen
+from fdi_torch.monitor.prepare import Prepared, fault_free_part, prepare
+from fdi_torch.monitor.samples import Samples, take
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.recording import Recording
+
+CHUNK = 256  # samples of a recording that are taken at a time
+
+
+@dataclass(frozen=True)
+class Watched:
+    """events: how many. lasted, spent: seconds of recording, and of work. log: where all of it lies."""
+
+    events: int
+    lasted: float
+    spent: float
+    log: Path
+
+
+@dataclass(frozen=True)
+class Listening:
+    """Who hears what while it happens. tell(share, text): progress. event: each event. ready: what was learnt."""
+
+    tell: Callable[[float, str], None]
+    event: Callable[[Event], None]
+    ready: Callable[[Prepared], None]
+    log: Listener | None = None
+
+
+def watch(run: MonitorRun, listening: Listening, follow: bool = False, idle: float = 60.0) -> Watched:
+    """Prepares a monitor from the fault-free part and follows the recording, or with `follow` the file as it grows.
+
+    What was logged before an error or Ctrl-C stays. idle: s without a sample after which a growing file has ended.
+    """
+    listening.tell(0.0, "reading")
+    path = free_path(Path(run.config.output.folder), run.name)
+    whole = None if follow else read_recording(run.config.recording, run.plant, run.base)
+    data = [] if whole is None else [{"path": whole.source, "sha256": whole.sha256}]
+    seeds = {"seed": run.config.seed}
+    with RunLog(
+        path, "monitor", config_text=run.text, config=run.resolved, seeds=seeds, data=data, listener=listening.log
+    ) as log:
+        watcher = _Watcher(run, log, listening)
+        try:
+            if whole is None:
+                _follow(run, watcher, listening, idle)
+            else:
+                _along(run, watcher, listening, whole)
+        finally:
+            log.result({"events": watcher.events, "faults": watcher.faults()})
+    return Watched(watcher.events, watcher.lasted, watcher.spent, path)
+
+
+def _along(run: MonitorRun, watcher: _Watcher, listening: Listening, whole: Recording) -> None:
+    """A recording that is all there."""
+    watcher.begin(_prepared(run, whole))
+    samples = take(whole, run.plant)
+    lasts, reach = float(whole.time[-1] - whole.time[0]), run.config.window.longest
+    if reach > lasts:
+        watcher.say(f"windows may reach back {reach:g} s, the recording lasts {lasts:g} s: they end at its beginning")
+    for first in range(0, len(samples), CHUNK):
+        last = min(first + CHUNK, len(samples))
+        watcher.take(samples.stretch(first, last))
+        listening.tell(last / len(samples), f"{float(samples.time[last - 1]):g} s")
+
+
+def _follow(run: MonitorRun, watcher: _Watcher, listening: Listening, idle: float) -> None:
+    """As samples arrive; those until the end of the fault-free part are waited for first."""
+    arrivals = Arrivals(growing_rows(run.config.recording, run.plant, run.base, idle))
+    early: list[Row] = []
+    said: list[str] = []
+    for batch in arrivals:
+        early += [row for row in batch if not isinstance(row, str)]
+        said += [row for row in batch if isinstance(row, str)]
+        listening.tell(
+            0.0, f"{early[-1][0]:g} s, learning until {run.config.fault_free[1]:g} s" if early else "waiting"
+        )
+        if early and early[-1][0] >= run.config.fault_free[1]:
+            break
+    watcher.begin(_prepared(run, _recording_of(early, run)))
+    punctual = Punctuality(time.monotonic)
+    first: list[Row | str] = [*said, *early]
+    for batch in chain([first], arrivals):
+        rows = [row for row in batch if not isinstance(row, str)]
+        notices = [row for row in batch if isinstance(row, str)]
+        notices += punctual.arrived([row[0] for row in rows]) if rows else []
+        for notice in notices:
+            watcher.say(notice)
+        if rows:
+            if watcher.take(_samples_of(rows, run)):
+                punctual.restarted()
+            for notice in punctual.handled(rows[-1][0]):
+                watcher.say(notice)
+            listening.tell(0.5, f"{rows[-1][0]:g} s")
+
+
+class _Watcher:
+    """A monitor at work, its state, and the log of what it sees."""
+
+    monitor: Monitor
+    believed: Tensor
+
+    def __init__(self, run: MonitorRun, log: RunLog, listening: Listening) -> None:
+        self.run, self.plant, self.log, self.listening = run, run.plant, log, listening
+        self.state: MonitorState | None = None
+        self.events, self.spent = 0, 0.0
+        self._told: dict[str, float] = {}
+        self._began: float | None = None
+        self._now = run.config.fault_free[0]
+
+    def begin(self, prepared: Prepared) -> None:
+        """What was learnt is told, and so is what speaks against it."""
+        self.monitor, self.believed = prepared.monitor, prepared.believed
+        self.listening.ready(prepared)
+        for doubt in prepared.doubts:
+            self.say(doubt)
+
+    @property
+    def space(self) -> ParameterSpace:
+        return self.monitor.space
+
+    @property
+    def lasted(self) -> float:
+        """Seconds of plant time from the first sample to the last."""
+        return 0.0 if self._began is None else self._now - self._began
+
+    def take(self, samples: Samples) -> bool:
+        """Some further samples; whether the observer had to start afresh among them."""
+        start = time.monotonic()
+        self._log_samples(samples)
+        if self.state is None:
+            self.state, self._began = self.monitor.start(samples, self.believed), float(samples.time[0])
+            samples = samples.stretch(1, len(samples))
+        events: list[Event] = []
+        if len(samples):
+            self.state, events = self.monitor.advance(self.state, samples, self._log_seen)
+            self._now = float(samples.time[-1])
+        for event in events:
+            self._tell(event)
+        self.spent += time.monotonic() - start
+        return any(event.kind == "notice" for event in events)
+
+    def say(self, text: str) -> None:
+        """A notice that is not about the plant."""
+        self._tell(Event(self._now, "notice", text))
+
+    def faults(self) -> list[str]:
+        """What is believed to be off nominal now."""
+        return [] if self.state is None else list(self._off_nominal(self.state))
+
+    def _off_nominal(self, state: MonitorState) -> dict[str, float]:
+        values = zip(self.space, state.believed.tolist(), strict=True)
+        return {p.name: value for p, value in list(values)[: self.monitor.watched] if value != p.nominal}
+
+    def _tell(self, event: Event) -> None:
+        self.events += 1
+        numbers: dict[str, Any] = {
+            "faults": list(event.faults) or None,
+            "sizes": list(event.sizes) or None,
+            "stds": list(event.stds) or None,
+            "onset": event.onset,
+            "onset_std": event.onset_std,
+            "delay": event.delay,
+            "incipient": event.incipient if event.faults else None,
+            "rivals": list(event.rivals) or None,
+        }
+        self.log.alarm(event.time, event.kind, " + ".join(event.faults), event.text, **numbers)
+        if event.faults and self.state is not None:
+            self._log_beliefs(event, self.state)
+        self.log.flush()
+        self.listening.event(event)
+
+    def _log_beliefs(self, event: Event, state: MonitorState) -> None:
+        """Each fault that is believed in now, and each that no longer is."""
+        now, stds = self._off_nominal(state), dict(zip(event.faults, event.stds, strict=True))
+        for name in dict.fromkeys([*self._told, *now]):
+            place, _, fault = name.partition(".")
+            size = now.get(name, self.space[name].nominal)
+            numbers: dict[str, Any] = {"size": size, "size_std": stds.get(name), "unit": self.space[name].unit}
+            self.log.fault(fault, place, name in now, t=event.time, **numbers)
+        self._told.update(now)
+
+    def _log_samples(self, samples: Samples) -> None:
+        plant = self.plant
+        sensors = plant.sensors
+        self.log.recording(
+            samples.time,
+            samples.inputs,
+            torch.nan_to_num(samples.readings, nan=float("nan")),
+            plant.channels(),
+            [s.column for s in sensors],
+            list(plant.channel_units().values()),
+            [s.unit for s in sensors],
+            mask=torch.isfinite(samples.readings),
+            hold=samples.hold,
+        )
+
+    def _log_seen(self, seen: Seen) -> None:
+        """Residuals, and the one statistic of all channels beside its threshold."""
+        names, units = [s.column for s in self.plant.sensors], [s.unit for s in self.plant.sensors]
+        chart = self.monitor.detector.chart
+        limit = torch.full_like(seen.statistic, self.monitor.detector.threshold)
+        table = torch.cat([seen.residual, seen.statistic.unsqueeze(1), limit.unsqueeze(1)], dim=1)
+        names += [f"{chart}_statistic", f"{chart}_threshold"]
+        self.log.samples("/observer/residual", seen.time, table, names, [*units, "", ""])
+
+
+def _prepared(run: MonitorRun, whole: Recording) -> Prepared:
+    c = run.config
+    return prepare(
+        run.plant,
+        fault_free_part(whole, *c.fault_free),
+        c.faults,
+        c.calibrate,
+        c.detector,
+        c.false_alarms_every,
+        c.window.settings(),
+        c.step,
+        c.seed,
+        c.recording.start_levels,
+        c.ranges,
+        c.observer.wish(),
+    )
+
+
+def _samples_of(rows: Sequence[Row], run: MonitorRun) -> Samples:
+    time, inputs, readings = (torch.tensor(column, dtype=torch.float64) for column in zip(*rows, strict=True))
+    sensors = len(run.plant.sensors)
+    return Samples(time, inputs.reshape(len(time), -1), readings.reshape(-1, sensors), run.config.recording.hold)
+
+
+def _recording_of(rows: Sequence[Row], run: MonitorRun) -> Recording:
+    """Rows as a recording, from the last jump of their clock on."""
+    if len(rows) < 2:
+        raise ValueError(f"{run.config.recording.file}: expected samples to follow, got {len(rows)}")
+    once = [rows[0], *(after for before, after in pairwise(rows) if after[0] != before[0])]
+    jumps = [k for k in range(1, len(once)) if once[k][0] < once[k - 1][0]]
+    samples = _samples_of(once[jumps[-1] if jumps else 0 :], run)
+    plant = run.plant
+    blank = Recording(
+        samples.time,
+        samples.inputs,
+        samples.readings,
+        tuple(plant.channels()),
+        tuple(sensor.column for sensor in plant.sensors),
+        tuple(plant.channel_units().values()),
+        tuple(sensor.unit for sensor in plant.sensors),
+        hold=samples.hold,
+    )
+    return replace(blank, source=run.config.recording.file)

@@ -1,0 +1,268 @@
+"""The monitor on files that grow, in their logs, and on what users get wrong."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from fdi_torch.cli import INTERRUPTED, main
+from fdi_torch.config.plant import load_plant
+from fdi_torch.effects import build_network, placements_for
+from fdi_torch.logbook import RunLog, read_run
+from fdi_torch.monitor.arrivals import Arrivals, Punctuality
+from fdi_torch.monitor.observer import bound
+from fdi_torch.monitor.stepper import Stepper
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.simulate.equilibrium import equilibrium
+
+FAULT, ONSET, SAMPLES = "T3.leak.size", 200.0, 300
+HEADER = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n"
+
+
+@lru_cache
+def readings(size: float = 0.05, onset: float = ONSET) -> list[list[float]]:
+    """Levels of the three tanks in m, once a second, with 1 mm of noise and a leak from `onset` on."""
+    network = build_network(load_plant("three_tank"), placements_for([FAULT]))
+    space = ParameterSpace([network.constants[FAULT]])
+    inputs = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
+    stepper, sound = Stepper(network), bound(network, None, None)
+    leaking = bound(network, space, torch.tensor([size], dtype=torch.float64))
+    state, levels = stepper.start(equilibrium(network, inputs), inputs, sound), []
+    for k in range(SAMPLES):
+        levels.append(state.levels)
+        state = stepper.advance(state, lambda share: inputs, float(k), 1.0, sound if k < onset else leaking)
+    noise = torch.randn(SAMPLES, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    return (torch.stack(levels) + 1e-3 * noise).tolist()
+
+
+def row(t: float, levels: Sequence[float]) -> str:
+    return f"{t:g},50,50," + ",".join(f"{100 * h:.4f}" for h in levels) + "\n"
+
+
+def written(path: Path, size: float = 0.05, onset: float = ONSET) -> Path:
+    lines = [row(k, levels) for k, levels in enumerate(readings(size, onset))]
+    path.write_text(HEADER + "".join(lines))
+    return path
+
+
+def config(folder: Path, **changes: object) -> str:
+    """A monitor file for `rig.csv` in the folder."""
+    data = {
+        "plant": "three_tank",
+        "recording": {"file": "rig.csv"},
+        "fault_free": ["0 s", "150 s"],
+        "faults": ["T1.leak.size", "T3.leak.size", "h2.sensor_bias.bias"],
+        "window": {"lookback": "100 s", "confirm": "30 s", "longest": "200 s", "incipient": False, "together": 1},
+        "output": {"folder": str(folder / "logs")},
+    }
+    path = folder / "watch.yaml"
+    path.write_text(yaml.safe_dump(data | changes))
+    return str(path)
+
+
+def monitored(words: Sequence[str], capsys: pytest.CaptureFixture[str]) -> list[dict[str, object]]:
+    """The events that `fdi monitor` prints."""
+    assert main(["monitor", *words, "--json", "--quiet"]) == 0
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+
+def kinds(events: Sequence[dict[str, object]]) -> list[object]:
+    return [event["kind"] for event in events if event["kind"] != "notice"]
+
+
+def texts(events: Sequence[dict[str, object]]) -> str:
+    return " | ".join(str(event["text"]) for event in events if event["kind"] == "notice")
+
+
+def growing(write: Callable[[], None]) -> threading.Thread:
+    thread = threading.Thread(target=write)
+    thread.start()
+    return thread
+
+
+def test_a_growing_csv_file_is_followed_row_by_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In pieces that end within a row, with a row that is no row, one that comes twice, and a hole in the clock."""
+    file = tmp_path / "rig.csv"
+    file.write_text(HEADER)
+    rows = [row(k if k < 260 else k + 40, levels) for k, levels in enumerate(readings())]
+    rows.insert(50, "50,oops,50,1,2,3\n")
+    rows.insert(120, rows[119])
+    text = "".join(rows)
+
+    def write() -> None:
+        with file.open("a") as handle:
+            for first in range(0, len(text), 1500):
+                handle.write(text[first : first + 1500])
+                handle.flush()
+                time.sleep(0.02)
+
+    thread = growing(write)
+    events = monitored(["--config", config(tmp_path), "--follow", "--idle", "1.5"], capsys)
+    thread.join()
+    assert kinds(events)[:2] == ["alarm", "isolated"]
+    assert "expected a number or an empty cell, got 'oops'; the row is left out" in texts(events)
+    assert "no samples for 41 s" in texts(events)
+    whole = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
+    assert [e["time"] for e in events if e["kind"] == "alarm"] == [e["time"] for e in whole if e["kind"] == "alarm"]
+
+
+def test_a_growing_log_is_followed_until_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "rig.mcap"
+    started = threading.Event()
+
+    def write() -> None:
+        with RunLog(path, "rig", flush_seconds=0.05) as log:
+            for k, levels in enumerate(readings()):
+                log.sample("/plant/input", k, {"Q1": 50.0, "Q2": 50.0}, units={"Q1": "cm^3/s", "Q2": "cm^3/s"})
+                log.sample("/plant/output", k, dict(zip(("h1", "h2", "h3"), levels, strict=True)),
+                           units=dict.fromkeys(("h1", "h2", "h3"), "m"))  # fmt: skip
+                if k % 25 == 0:
+                    log.flush()
+                    started.set()
+                    time.sleep(0.02)
+
+    thread = growing(write)
+    started.wait(10.0)
+    events = monitored(["--config", config(tmp_path, recording={"file": "rig.mcap"}), "--follow"], capsys)
+    thread.join()
+    assert kinds(events)[:2] == ["alarm", "isolated"]
+    found = next(event for event in events if event["kind"] == "isolated")
+    assert found["faults"] == [FAULT]
+
+
+def test_every_event_lies_in_the_log_from_which_a_page_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path / "rig.csv")
+    events = monitored(["--config", config(tmp_path)], capsys)
+    [path] = (tmp_path / "logs").glob("*.mcap")
+    run = read_run(path)
+    logged = [message.payload for message in run.messages(["/observer/alarm"])]
+    assert [m["event"] for m in logged] == [e["kind"] for e in events]
+    assert [m["message"] for m in logged] == [e["text"] for e in events]
+    isolated = next(m for m in logged if m["event"] == "isolated")
+    assert isolated["faults"] == [FAULT] and isolated["sizes"][0] == pytest.approx(0.05, abs=4 * isolated["stds"][0])
+    fault = [message.payload for message in run.messages(["/diagnosis/fault"])][-1]
+    assert (fault["location"], fault["fault"], fault["present"]) == ("T3", "leak.size", True)
+    assert sum(1 for _ in run.messages(["/observer/residual"])) == SAMPLES - 1
+    assert main(["report", str(path), "--out", str(tmp_path), "--quiet"]) == 0
+    page = path.with_suffix(".html") if path.with_suffix(".html").exists() else next(tmp_path.rglob("*.html"))
+    assert "leak at T3" in page.read_text()
+
+
+def test_ctrl_c_keeps_what_was_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written(tmp_path / "rig.csv")
+    from fdi_torch.monitor.online import Monitor
+
+    advance = Monitor.advance
+
+    def interrupted(self, state, samples, show=None):  # type: ignore[no-untyped-def]
+        if float(samples.time[-1]) > 280.0:
+            raise KeyboardInterrupt
+        return advance(self, state, samples, show)
+
+    monkeypatch.setattr(Monitor, "advance", interrupted)
+    monkeypatch.setattr("fdi_torch.monitor_job.CHUNK", 20)
+    assert main(["monitor", "--config", config(tmp_path), "--quiet"]) == INTERRUPTED
+    [path] = (tmp_path / "logs").glob("*.mcap")
+    assert "alarm" in [message.payload["event"] for message in read_run(path).messages(["/observer/alarm"])]
+
+
+def test_a_gain_by_hand_that_is_unstable_is_refused_in_a_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path / "rig.csv")
+    gain = [[-0.1, 0, 0], [0, -0.1, 0], [0, 0, -0.1]]
+    assert main(["monitor", "--config", config(tmp_path, observer={"gain": gain}), "--quiet"]) == 2
+    assert "expected an observer gain that lets errors decay" in capsys.readouterr().err
+    assert main(["monitor", "--config", config(tmp_path, observer={"gain": gain, "time_constant": "9 s"})]) == 2
+    assert "expected either a time constant or a gain by hand" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("observer", [{"gain": [[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]}, {"time_constant": "15 s"}])
+def test_a_gain_by_hand_or_by_time_constant_finds_the_fault(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], observer: dict[str, object]
+) -> None:
+    written(tmp_path / "rig.csv", size=0.1)
+    events = monitored(["--config", config(tmp_path, observer=observer)], capsys)
+    assert next(event for event in events if event["kind"] == "isolated")["faults"] == [FAULT]
+
+
+def test_a_window_longer_than_the_recording_is_told_and_cut(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    written(tmp_path / "rig.csv")
+    window = {"lookback": "100 s", "confirm": "30 s", "longest": "5000 s", "incipient": False, "together": 1}
+    events = monitored(["--config", config(tmp_path, window=window)], capsys)
+    assert "windows may reach back 5000 s, the recording lasts 299 s" in texts(events)
+    assert "isolated" in kinds(events)
+
+
+def test_a_fault_within_the_part_taken_for_fault_free_is_suspected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path / "rig.csv", size=0.2, onset=60.0)
+    events = monitored(["--config", config(tmp_path)], capsys)
+    assert "does the recording start faulty?" in texts(events)
+
+
+def test_a_fault_that_was_there_before_the_recording_is_said_to_be(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Sound at first for learning, then a recording of another day that starts with the leak at its full size."""
+    levels = [*readings(onset=1e9)[:160], *readings(size=0.1, onset=0.0)[160:]]
+    times = [*range(160), *range(1000, 1000 + len(levels) - 160)]
+    lines = [row(t, values) for t, values in zip(times, levels, strict=True)]
+    (tmp_path / "rig.csv").write_text(HEADER + "".join(lines))
+    events = monitored(["--config", config(tmp_path)], capsys)
+    found = next(event for event in events if event["kind"] == "isolated")
+    assert found["faults"] == [FAULT] and "it may have been there before" in str(found["text"])
+
+
+def test_a_file_that_cannot_be_followed_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rig.csv").write_text(HEADER)
+    assert main(["monitor", "--config", config(tmp_path), "--follow", "--idle", "0.2", "--quiet"]) == 2
+    assert "expected samples to follow, got 0" in capsys.readouterr().err
+    thinned = config(tmp_path, recording={"file": "rig.csv", "every": 2})
+    assert main(["monitor", "--config", thinned, "--follow", "--quiet"]) == 2
+    assert "expected neither mask nor every" in capsys.readouterr().err
+    assert main(["monitor", "--config", config(tmp_path, recording={"file": "no.mcap"}), "--follow", "--quiet"]) == 2
+    with RunLog(tmp_path / "bare.mcap", "rig") as log:
+        log.sample("/plant/input", 0.0, {"Q1": 1.0, "Q2": 1.0})
+    assert main(["monitor", "--config", config(tmp_path, recording={"file": "bare.mcap"}), "--follow", "--quiet"]) == 2
+    assert "expected a unit, got none" in capsys.readouterr().err
+
+
+def test_arrivals_come_in_batches_and_with_their_errors() -> None:
+    def source():  # type: ignore[no-untyped-def]
+        yield from range(5)
+        raise ValueError("torn")
+
+    arrivals, got = Arrivals(source()), []
+    with pytest.raises(ValueError, match="torn"):
+        for batch in arrivals:
+            got += batch
+    assert got == list(range(5))
+    assert [item for batch in Arrivals(iter("abc")) for item in batch] == ["a", "b", "c"]
+
+
+def test_lateness_and_bursts_are_told_once_until_they_double() -> None:
+    wall = [100.0]
+    punctual = Punctuality(lambda: wall[0])
+    assert punctual.arrived([0.0, 1.0, 2.0]) == [] and punctual.handled(2.0) == []
+    wall[0] += 30.0
+    assert "31 samples came at once after 30.0 s of silence" in punctual.arrived([float(t) for t in range(3, 34)])[0]
+    assert punctual.handled(33.0) == []
+    wall[0] += 40.0
+    assert punctual.arrived([34.0]) == []
+    assert "39.0 s later than real time" in punctual.handled(34.0)[0]
+    wall[0] += 2.0
+    assert punctual.handled(35.0) == []
+    punctual.restarted()
+    assert punctual.handled(0.0) == []
