@@ -105,11 +105,15 @@ class Fitter:
 
     def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation:
         """The plant with the candidate's effects; its space holds the nuisances and what is free."""
-        known = {p.prefix for p in candidate.placements}
-        believed = [p for p in self.subject.believed if p.prefix not in known]
-        network = TankNetwork(self.subject.plant, _in_library_order([*believed, *candidate.placements]))
+        network = self.network(candidate.placements)
         names = [*self.subject.nuisance, *free]
         return Collocation(network, ParameterSpace(network.constants[n] for n in names), self.subject.experiment)
+
+    def network(self, placements: Sequence[Placement]) -> TankNetwork:
+        """The plant with further effects beside those it is believed to have, or in their stead."""
+        known = {p.prefix for p in placements}
+        believed = [p for p in self.subject.believed if p.prefix not in known]
+        return TankNetwork(self.subject.plant, _in_library_order([*believed, *placements]))
 
     def fit(
         self, candidate: Candidate, base: Fit | None = None, rounds: int = ROUNDS, target: float = -math.inf

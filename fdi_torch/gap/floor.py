@@ -41,21 +41,20 @@ class Noise:
 
         x_k - a x_{k-1}; the first sample, and one after a masked one, is scaled by sqrt(1 - a^2) instead.
         """
-        extra = x.dim() - mask.dim() - 1 if x.shape[-2:] != mask.shape else 0
-        ar, innovation, keep = self.ar, self.innovation, mask
-        if x.shape[-2:] != mask.shape:
-            ar, innovation, keep = ar.unsqueeze(-1), innovation.unsqueeze(-1), mask.unsqueeze(-1)
-            extra = 1
-        time = -2 - extra
-        x = torch.where(keep, x, torch.zeros_like(x))
-        before = torch.roll(x, 1, time)
-        follows = mask & torch.roll(mask, 1, 0)
-        follows[0] = False
-        if extra:
-            follows = follows.unsqueeze(-1)
-        fresh = torch.sqrt(1.0 - ar**2)
-        white = torch.where(follows, x - ar * before, fresh * x)
-        return torch.where(keep, white / innovation, torch.zeros_like(x))
+        columns = x.shape[-2:] != mask.shape
+        wide = (lambda t: t.unsqueeze(-1)) if columns else (lambda t: t)
+        ar, keep, time = wide(self.ar), wide(mask), -3 if columns else -2
+        whole = bool(mask.all())
+        scaled = (x if whole else torch.where(keep, x, 0.0)) / wide(self.innovation)
+        if not bool((ar != 0.0).any()):
+            return scaled
+        count, fresh = x.shape[time], torch.sqrt(1.0 - ar**2)
+        first, before = scaled.narrow(time, 0, 1), scaled.narrow(time, 0, count - 1)
+        after = scaled.narrow(time, 1, count - 1)
+        rest = after - ar * before
+        if not whole:
+            rest = torch.where(keep[1:], torch.where(keep[:-1], rest, fresh * after), 0.0)
+        return torch.cat([fresh * first, rest], dim=time)
 
 
 def slow_excess(white: Tensor) -> float:

@@ -1,8 +1,8 @@
 """What each effect would do to the readings, to first order along a trajectory, all effects and starts at once.
 
-An effect changes the rates by w_k = f(effect) - f(without) along the fitted trajectory, at the size of a start and not
-by a slope at zero, so that dead zones and thresholds show too. The linearised plant turns w into readings, and a
-regression beside the nuisances gives the chi-square that each could close.
+An effect changes the rates by w_k = f(effect) - f(without) along the fitted trajectory (`gap/forcing.py`), at the size
+of a start and not by a slope at zero, so that dead zones and thresholds show too. The linearised plant turns w into
+readings, and a regression beside the nuisances gives the chi-square that each could close.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.effect import Placement
+from fdi_torch.gap.fitting import Fit, Fitter
+from fdi_torch.gap.forcing import Forcing
+from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.plant.effect import Placement, Stage
+from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.reach import Reach
-from fdi_torch.simulate.scan import linear_scan
+from fdi_torch.simulate.scan import product, scan_in_time
 
 Start = Mapping[str, float]
 
@@ -37,13 +39,10 @@ class Option:
 
 @dataclass(frozen=True)
 class Screen:
-    """What options would close beside a fit. columns (N, M): whitened, less the nuisances' part; score (M,) = C'r.
-
-    gram (M, M) = C'C. residual (N,).
-    """
+    """What options would close beside a fit: with their columns C, less the nuisances' part, and what the fit leaves
+    r, score (M,) = C'r and gram (M, M) = C'C."""
 
     options: tuple[Option, ...]
-    columns: Tensor
     score: Tensor
     gram: Tensor
 
@@ -94,52 +93,70 @@ def against(fitter: Fitter, fit: Fit, options: Sequence[Option], columns: Tensor
     space, theta = fit.space, fit.theta
     scale = fitter.box(space)[2]
     pull = (scale / space.std(theta)).nan_to_num(0.0)
-    j = torch.cat([(jacobian[0] * scale).flatten(0, 1), torch.diag(pull)])
-    r = torch.cat([residual[0].flatten(), -(theta - space.nominal(theta)) / space.std(theta)])
-    c = torch.cat([columns.flatten(0, 1), columns.new_zeros(len(pull), columns.shape[-1])])
-    q, _ = torch.linalg.qr(torch.cat([j, 1e-6 * torch.eye(len(pull), dtype=j.dtype)]))
+    j = torch.cat([_by_column(jacobian[0] * scale), torch.diag(pull)], dim=1)
+    r = torch.cat([_by_column(residual[0].unsqueeze(-1))[0], -(theta - space.nominal(theta)) / space.std(theta)])
+    # The priors' rows of the columns are zero: no constant's tolerance speaks of an effect.
+    c = _by_column(columns)
+    seen = c.shape[1]
+    q, _ = torch.linalg.qr(torch.cat([j, 1e-6 * torch.eye(len(pull), dtype=j.dtype)], dim=1).T)
     q = q[: len(r)]
-    c, r = c - q @ (q.T @ c), r - q @ (q.T @ r)
-    return Screen(tuple(options), c, c.T @ r, c.T @ c)
+    shared, r = c @ q[:seen], r - q @ (q.T @ r)
+    return Screen(tuple(options), c @ r[:seen], c @ c.T - shared @ shared.T)
+
+
+def _by_column(x: Tensor) -> Tensor:
+    """(S, C, M) -> (M, C S): as time lies last in memory, no copy."""
+    return x.permute(2, 1, 0).flatten(1)
 
 
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:
     """(S, C, M): whitened changes of the readings at the size of each start."""
-    near, subject = fit.near, fitter.subject
-    middle = 0.5 * (near.levels[:, 1:] + near.levels[:, :-1])
-    own = fitter.engine(fit.candidate, [n for n in fit.space.names if n.count(".") == 2])
+    near, experiment = fit.near, fitter.subject.experiment
+    own = fitter.engine(fit.candidate, list(fit.effect_values))
     theta = fit.theta.unsqueeze(0)
-    rates, readings = own.rates(middle, theta), own.read(near.levels, theta)
-    forcing = middle.new_zeros(1, *middle.shape[1:], len(options))
-    direct = middle.new_zeros(1, *readings.shape[1:], len(options))
-    for lanes in _groups(options):
-        option = options[lanes[0]]
-        candidate = Candidate((*_others(fit, option), option.placement))
-        engine = fitter.engine(candidate, sorted({*_free(fit, candidate), *option.start}))
-        known = {n: v for n, v in fit.values.items() if n in engine.space}
-        rows = torch.stack([engine.space.vector({**known, **options[i].start}) for i in lanes])
-        forcing[..., lanes] = (engine.rates(middle, rows) - rates).movedim(0, -1).unsqueeze(0)
-        direct[..., lanes] = (engine.read(near.levels, rows) - readings).movedim(0, -1).unsqueeze(0)
-    pushed = (near.gain.unsqueeze(-1) * forcing.unsqueeze(-3)).sum(-2)
-    moving = forcing.abs().amax(dim=(0, 1, 2)) > 0
-    along = linear_scan(near.transition, pushed[..., moving], forcing.new_zeros(1, middle.shape[-1], int(moving.sum())))
-    if bool(moving.any()):
-        direct[..., moving] += own.read_along(near.levels, along, theta)
-    return fitter.noise.whiten(direct[0], subject.mask)
+    tried = {o.placement.prefix: o.placement for o in options}
+    union = fitter.network([*(p for p in fit.candidate.placements if p.prefix not in tried), *tried.values()])
+    known = {n: v for n, v in fit.values.items() if n in union.constants}
+    present = {p.prefix for p in own.network.placements} - tried.keys()
+    forced = Forcing(union, present, union.bind(*_named(union, known)), near.levels[0].T.contiguous(), experiment)
+    groups = _groups(options)
+    moving = [i for group in groups if options[group[0]].placement.effect.stage is not Stage.READING for i in group]
+    sensors, count = len(fitter.subject.plant.sensors), len(options)
+    columns = theta.new_zeros(sensors, count, len(experiment.sample_times))
+    forcing = theta.new_zeros(1, near.levels.shape[-1], len(moving), len(experiment.steps))
+    row = {option: k for k, option in enumerate(moving)}
+    for group in groups:
+        placement = options[group[0]].placement
+        starts = _starts([options[i] for i in group])
+        if placement.effect.stage is Stage.READING:
+            columns[:, group] = forced.readings(placement, starts)
+        else:
+            first = row[group[0]]
+            forcing[0, :, first : first + len(group)] = forced.rates(placement, starts)
+    if moving:
+        gain, transition = near.gain.permute(0, 2, 3, 1), near.transition.permute(0, 2, 3, 1)
+        still = forcing.new_zeros(1, forcing.shape[1], len(moving))
+        paths = scan_in_time(transition, product(gain, forcing), still)
+        columns[:, moving] = own.look(near.levels, theta).along(paths, [-1] * len(moving))[0]
+    return fitter.noise.whiten(columns.permute(2, 0, 1), fitter.subject.mask)
+
+
+def _named(network: TankNetwork, values: Mapping[str, float]) -> tuple[ParameterSpace, Tensor]:
+    space = ParameterSpace(network.constants[n] for n in values)
+    return space, space.vector(values).reshape(1, 1, -1)
+
+
+def _starts(options: Sequence[Option]) -> dict[str, Tensor]:
+    """The parameters of options of one form by their short names, each (M, 1)."""
+    return {
+        name.rpartition(".")[2]: torch.tensor([[o.start[name]] for o in options], dtype=torch.float64)
+        for name in options[0].start
+    }
 
 
 def _groups(options: Sequence[Option]) -> list[list[int]]:
-    """Options that share a network and free parameters."""
+    """Options that share a place, an effect and fitted parameters."""
     found: dict[tuple[str, ...], list[int]] = {}
     for i, option in enumerate(options):
         found.setdefault((option.placement.prefix, *sorted(option.start)), []).append(i)
     return list(found.values())
-
-
-def _others(fit: Fit, option: Option) -> list[Placement]:
-    return [p for p in fit.candidate.placements if p.prefix != option.placement.prefix]
-
-
-def _free(fit: Fit, candidate: Candidate) -> list[str]:
-    prefixes = {p.prefix for p in candidate.placements}
-    return [n for n in fit.space.names if n.count(".") == 2 and n.rpartition(".")[0] in prefixes]

@@ -6,7 +6,8 @@ runs these same lines. All numbers are SI; a tensor's leading dimensions are bat
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 
 import torch
@@ -43,9 +44,14 @@ class TankNetwork(nn.Module):
         self.register_buffer("nominal", self.constants.nominal())
         self._tank_index = {tank.name: i for i, tank in enumerate(description.tanks)}
         self._channel_index = {name: i for i, name in enumerate(description.channels())}
-        self._by_place: dict[tuple[str, Stage], list[Placement]] = {}
-        for placement in self.placements:
-            self._by_place.setdefault((placement.location, placement.effect.stage), []).append(placement)
+        self._by_place = _by_place(self.placements)
+
+    def showing(self, prefixes: Collection[str]) -> TankNetwork:
+        """The same plant with the same constants, of whose placements only some are there."""
+        other = copy(self)
+        other.placements = tuple(p for p in self.placements if p.prefix in prefixes)
+        other._by_place = _by_place(other.placements)
+        return other
 
     def bind(self, space: ParameterSpace, theta: Tensor) -> PlaceValues:
         """All constants by place and field: columns of theta (*batch, P) where `space` names them, else nominal."""
@@ -105,41 +111,47 @@ class TankNetwork(nn.Module):
     def pump_flows(
         self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> list[Tensor]:
-        """FLOW of each pump: gain x command within [0, max_flow], m^3/s."""
-        flows = []
-        for i, pump in enumerate(self.description.pumps):
-            own = values[pump.name]
-            flow = torch.minimum(torch.clamp(own["gain"] * commands[i], min=0.0), own["max_flow"])
-            local = replace(
-                self._tank_local(pump.target, levels, clock, values),
-                capacity=own["gain"],
-                command=commands[i],
-                constants=own,
-            )
-            for effect, p in self._effects(pump.name, Stage.FLOW, values):
-                flow = effect.flow(flow, local, p)
-            flows.append(flow)
-        return flows
+        """FLOW of each pump, m^3/s."""
+        return [self.pump_flow(i, levels, commands, clock, values) for i in range(len(self.description.pumps))]
+
+    def pump_flow(
+        self, which: int, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
+    ) -> Tensor:
+        """FLOW of one pump: gain x command within [0, max_flow], m^3/s."""
+        pump = self.description.pumps[which]
+        own, command = values[pump.name], commands[which]
+        flow = torch.minimum(torch.clamp(own["gain"] * command, min=0.0), own["max_flow"])
+        local = replace(
+            self._tank_local(pump.target, levels, clock, values), capacity=own["gain"], command=command, constants=own
+        )
+        for effect, p in self._effects(pump.name, Stage.FLOW, values):
+            flow = effect.flow(flow, local, p)
+        return flow
 
     def pipe_flows(
         self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> list[Tensor]:
-        """FLOW of each pipe and outlet by Torricelli's law, m^3/s, positive from source to target."""
-        flows = []
-        openings = iter(commands[len(self.description.pumps) :])
-        for pipe in self.description.pipes:
-            local = self._pipe_local(pipe, levels, clock, values)
-            if pipe.valve:
-                local = replace(local, command=torch.clamp(next(openings), 0.0, 1.0))
-            effects = self._effects(pipe.name, Stage.FLOW, values)
-            for effect, p in effects:
-                local = replace(local, head=effect.head(local.head, local, p))
-            head = torch.clamp(local.head, min=0.0) if pipe.is_outlet else local.head
-            flow = local.capacity * local.command * local.root(head)
-            for effect, p in effects:
-                flow = effect.flow(flow, local, p)
-            flows.append(flow)
-        return flows
+        """FLOW of each pipe and outlet, m^3/s, positive from source to target."""
+        return [self.pipe_flow(j, levels, commands, clock, values) for j in range(len(self.description.pipes))]
+
+    def pipe_flow(
+        self, which: int, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
+    ) -> Tensor:
+        """FLOW of one pipe or outlet by Torricelli's law, m^3/s, positive from source to target."""
+        pipe = self.description.pipes[which]
+        local = self._pipe_local(pipe, levels, clock, values)
+        if pipe.valve:
+            before = sum(1 for p in self.description.pipes[:which] if p.valve)
+            opening = commands[len(self.description.pumps) + before]
+            local = replace(local, command=torch.clamp(opening, 0.0, 1.0))
+        effects = self._effects(pipe.name, Stage.FLOW, values)
+        for effect, p in effects:
+            local = replace(local, head=effect.head(local.head, local, p))
+        head = torch.clamp(local.head, min=0.0) if pipe.is_outlet else local.head
+        flow = local.capacity * local.command * local.root(head)
+        for effect, p in effects:
+            flow = effect.flow(flow, local, p)
+        return flow
 
     def net_inflows(
         self,
@@ -150,19 +162,37 @@ class TankNetwork(nn.Module):
         values: PlaceValues,
     ) -> list[Tensor]:
         """BALANCE of each tank: pumps in, pipes through, faults, and what runs over the rim, m^3/s."""
+        return self.spilled(self.gathered(levels, pumps, pipes, clock, values), levels, clock, values)
+
+    def gathered(
+        self,
+        levels: Sequence[Tensor],
+        pumps: Sequence[Tensor],
+        pipes: Sequence[Tensor],
+        clock: Clock,
+        values: PlaceValues,
+    ) -> list[Tensor]:
+        """Net inflows before anything runs over a rim, m^3/s."""
         net = [torch.zeros_like(level) for level in levels]
         for pump, flow in zip(self.description.pumps, pumps, strict=True):
-            self._move(net, OUTSIDE, pump.target, flow)
+            self.move(net, OUTSIDE, pump.target, flow)
         for pipe, flow in zip(self.description.pipes, pipes, strict=True):
-            self._move(net, pipe.source, pipe.target, flow)
+            self.move(net, pipe.source, pipe.target, flow)
         for placement in self.placements:
             if placement.effect.stage is Stage.BALANCE:
-                self._move_by_effect(net, placement, levels, clock, values)
-        for tank, level, inflow in zip(self.description.tanks, levels, tuple(net), strict=True):
+                self.move_by_effect(net, placement, levels, clock, values)
+        return net
+
+    def spilled(
+        self, net: Sequence[Tensor], levels: Sequence[Tensor], clock: Clock, values: PlaceValues
+    ) -> list[Tensor]:
+        """Net inflows (m^3/s) less what runs over the rims."""
+        left = list(net)
+        for tank, level, inflow in zip(self.description.tanks, levels, net, strict=True):
             own = values[tank.name]
             spill = weir_flow(level - own["height"], inflow, own["area"], values[""]["gravity"], clock.resolution)
-            self._move(net, tank.name, tank.overflow_to, spill)
-        return net
+            self.move(left, tank.name, tank.overflow_to, spill)
+        return left
 
     def level_rates(
         self, levels: Sequence[Tensor], net: Sequence[Tensor], clock: Clock, values: PlaceValues
@@ -244,22 +274,24 @@ class TankNetwork(nn.Module):
     def _effects(self, location: str, stage: Stage, values: PlaceValues) -> list[Bound]:
         return [(p.effect, values[p.prefix]) for p in self._by_place.get((location, stage), ())]
 
-    def _move(self, net: list[Tensor], source: str, target: str, flow: Tensor) -> None:
+    def move(self, net: list[Tensor], source: str, target: str, flow: Tensor) -> None:
+        """Takes a flow (m^3/s) from one tank's net inflow and adds it to another's, in place; either may be outside."""
         for end, sign in ((source, -1.0), (target, 1.0)):
             if end != OUTSIDE:
                 i = self._tank_index[end]
                 net[i] = net[i] + sign * flow
 
-    def _move_by_effect(
+    def move_by_effect(
         self, net: list[Tensor], placement: Placement, levels: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> None:
+        """The same for what flows by a BALANCE effect."""
         ends = placement.location.split("-") if placement.location not in self._tank_index else [placement.location]
         local = self._tank_local(ends[0], levels, clock, values, ends[-1])
         local = replace(local, net=net[self._tank_index[ends[0]]])
         flow = placement.effect.inflow(local, values[placement.prefix])
-        self._move(net, *((ends[0], ends[1]) if len(ends) == 2 else (OUTSIDE, ends[0])), flow)
+        self.move(net, *((ends[0], ends[1]) if len(ends) == 2 else (OUTSIDE, ends[0])), flow)
         for tank, share in placement.effect.caught(values[placement.prefix]).items():
-            self._move(net, tank, OUTSIDE, share * flow)
+            self.move(net, tank, OUTSIDE, share * flow)
 
     def _pipe_local(self, pipe: Pipe, levels: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Local:
         own = values[pipe.name]
@@ -309,6 +341,13 @@ class TankNetwork(nn.Module):
     def _width(self, pipe: Pipe, clock: Clock) -> Tensor:
         rate = nominal_capacity(self.description, pipe) * inverse_areas(self.description, pipe)
         return regular_width(rate, clock.resolution)
+
+
+def _by_place(placements: Iterable[Placement]) -> dict[tuple[str, Stage], list[Placement]]:
+    found: dict[tuple[str, Stage], list[Placement]] = {}
+    for placement in placements:
+        found.setdefault((placement.location, placement.effect.stage), []).append(placement)
+    return found
 
 
 def placed_parameters(placement: Placement, plant: PlantDescription) -> list[Parameter]:

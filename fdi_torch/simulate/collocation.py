@@ -22,7 +22,7 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.actuation import Actuation, moved
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.pointwise import partials
-from fdi_torch.simulate.scan import scan_in_time
+from fdi_torch.simulate.scan import product, scan_in_time
 from fdi_torch.simulate.seen import Look, Sight
 
 
@@ -71,7 +71,7 @@ class Collocation:
         inverse = _inverse(one - 0.5 * step * by_level)
         transition, gain = 2.0 * inverse - one, inverse * step
         misfit = (step * rates - (path[..., 1:] - path[..., :-1])).unsqueeze(2)
-        forcing = torch.cat([_product(inverse, misfit), _product(gain, by_theta)], dim=2)
+        forcing = torch.cat([product(inverse, misfit), product(gain, by_theta)], dim=2)
         start, start_slopes = self._start(theta)
         first = torch.cat([(start - path[..., 0]).unsqueeze(-1), start_slopes], dim=-1)
         found = scan_in_time(transition, forcing, first)
@@ -110,11 +110,10 @@ class Collocation:
         path = levels.expand(len(theta), *levels.shape[1:]).movedim(1, 2)
         return self._sight.read(path, self.network.bind(self.space, theta.unsqueeze(-2))).movedim(1, 2)
 
-    def read_along(self, levels: Tensor, along: Tensor, theta: Tensor) -> Tensor:
-        """How readings (L, S, C, M) change where levels (L, K+1, tanks) move `along` (L, K+1, tanks, M)."""
+    def look(self, levels: Tensor, theta: Tensor) -> Look:
+        """The sensors about given levels (L, K+1, tanks), from which follows how readings change with the levels."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
-        look = self._sight.look(levels.movedim(1, 2), values, [theta[:, j, None] for j in self._moving])
-        return look.along(along.permute(0, 2, 3, 1), ()).permute(0, 3, 1, 2)
+        return self._sight.look(levels.movedim(1, 2), values, [theta[:, j, None] for j in self._moving])
 
     def constant_guess(self, theta: Tensor) -> Tensor:
         """Levels that stay where they start (L, K+1, tanks)."""
@@ -167,14 +166,6 @@ class Collocation:
                     for q, column in enumerate(columns):
                         by_theta[:, i, self._moving[column]] += slope * course[:, q]
         return torch.stack(found, dim=1), by_level, by_theta
-
-
-def _product(a: Tensor, x: Tensor) -> Tensor:
-    """a (L, n, n, K) times x (L, n, m, K), at every step, as an explicit sum."""
-    total = a[:, :, 0, None] * x[:, None, 0]
-    for j in range(1, a.shape[2]):
-        total += a[:, :, j, None] * x[:, None, j]
-    return total
 
 
 def _inverse(a: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-LENGTH = 16  # steps taken one after the other in each block, and in blocks of blocks
+LENGTH = 10  # steps taken one after the other in each block, and in blocks of blocks
 
 
 def linear_scan(transition: Tensor, forcing: Tensor, first: Tensor) -> Tensor:
@@ -31,7 +31,7 @@ def scan_in_time(a: Tensor, b: Tensor, first: Tensor) -> Tensor:
     inner = _side_by_side(_in_blocks(a, blocks, one=True), _in_blocks(b, blocks, one=False))
     ends = inner[-1][..., :-1]
     start = scan_in_time(ends[:, :, m:], ends[:, :, :m], first)
-    x = torch.stack([y[:, :, :m] + _times(y[:, :, m:], start) for y in inner], dim=-1)
+    x = torch.stack([y[:, :, :m] + product(y[:, :, m:], start) for y in inner], dim=-1)
     return torch.cat([first.unsqueeze(-1), x.flatten(-2)[..., :count]], dim=-1)
 
 
@@ -51,7 +51,7 @@ def _side_by_side(a: Tensor, b: Tensor) -> list[Tensor]:
     state = torch.cat([b[0], a[0]], dim=2)
     found = [state]
     for k in range(1, len(a)):
-        state = _times(a[k], state)
+        state = product(a[k], state)
         state[:, :, :m] += b[k]
         found.append(state)
     return found
@@ -60,12 +60,12 @@ def _side_by_side(a: Tensor, b: Tensor) -> list[Tensor]:
 def _one_by_one(a: Tensor, b: Tensor, first: Tensor) -> list[Tensor]:
     found = [first]
     for k in range(b.shape[-1]):
-        found.append(_times(a[..., k : k + 1], found[-1].unsqueeze(-1))[..., 0] + b[..., k])
+        found.append(product(a[..., k : k + 1], found[-1].unsqueeze(-1))[..., 0] + b[..., k])
     return found
 
 
-def _times(a: Tensor, x: Tensor) -> Tensor:
-    """a (L, n, n, B) times x (L, n, m, B) as an explicit sum: the same bits alone and in a batch."""
+def product(a: Tensor, x: Tensor) -> Tensor:
+    """a (L, n, n, K) times x (L, n, m, K) at every step, as an explicit sum: the same bits alone and in a batch."""
     total = a[:, :, 0, None] * x[:, None, 0]
     for j in range(1, a.shape[2]):
         total += a[:, :, j, None] * x[:, None, j]

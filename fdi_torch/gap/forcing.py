@@ -1,0 +1,110 @@
+"""What an effect at one place changes there along a given trajectory: the rates of the levels, or a reading.
+
+Only the component at which it sits is evaluated again. What its flow then does to the rates is the same for all
+effects, to first order: the whole library costs little more than one right-hand side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from fdi_torch.plant.description import OUTSIDE
+from fdi_torch.plant.effect import Placement, Stage
+from fdi_torch.plant.network import PlaceValues, TankNetwork
+from fdi_torch.simulate.actuation import Actuation
+from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.pointwise import Row, partials
+from fdi_torch.simulate.seen import Sight
+
+Starts = Mapping[str, Tensor]
+
+
+class Forcing:
+    """A trajectory of a plant, levels (tanks, K+1) m at the nodes, beside which effects are tried.
+
+    union: the plant with every effect that is tried. present: prefixes of those that are there. values: its constants
+    as bound to one lane.
+    """
+
+    def __init__(
+        self,
+        union: TankNetwork,
+        present: Iterable[str],
+        values: PlaceValues,
+        levels: Tensor,
+        experiment: Experiment,
+    ) -> None:
+        self.union, self.present, self.values, self.experiment = union, frozenset(present), values, experiment
+        self._path = levels.unsqueeze(0)
+        self._levels = list((0.5 * (levels[:, 1:] + levels[:, :-1])).unsqueeze(1).unbind(0))
+        network = union.showing(self.present)
+        actuation = Actuation(network, experiment, [])
+        self._clock = actuation.clock
+        self._commands = actuation.commands(values, 1)
+        self._pumps = network.pump_flows(self._levels, self._commands, self._clock, values)
+        self._pipes = network.pipe_flows(self._levels, self._commands, self._clock, values)
+        gathered = network.gathered(self._levels, self._pumps, self._pipes, self._clock, values)
+        self._gathered = [net.expand(self._levels[0].shape) for net in gathered]
+        self._net = network.spilled(self._gathered, self._levels, self._clock, values)
+        self._rates, self._by_inflow = self._inflow_slopes(network)
+        self._readings = Sight(network, experiment, []).read(self._path, values)[0]
+
+    def rates(self, placement: Placement, starts: Starts) -> Tensor:
+        """How the rates change with an effect, (tanks, M, K) in m/s. starts: its parameters, short names, (M, 1)."""
+        network, values, lanes = self._with(placement, starts)
+        shape = (lanes, self._levels[0].shape[-1])
+        if placement.effect.stage is Stage.STORAGE:
+            rates = network.level_rates(self._levels, self._net, self._clock, values)
+            return torch.stack([(a - b).expand(shape) for a, b in zip(rates, self._rates, strict=True)])
+        inflows = self._inflows(network, placement, values, lanes)
+        changed = []
+        for row in self._by_inflow:
+            total = inflows[0].new_zeros(shape)
+            for slope, inflow in zip(row, inflows, strict=True):
+                if slope is not None:
+                    total += slope * inflow
+            changed.append(total)
+        return torch.stack(changed)
+
+    def readings(self, placement: Placement, starts: Starts) -> Tensor:
+        """How the readings change with an effect, (C, M, S) in each sensor's unit."""
+        network, values, lanes = self._with(placement, starts)
+        seen = Sight(network, self.experiment, []).read(self._path.expand(lanes, -1, -1), values)
+        return (seen - self._readings).movedim(0, 1)
+
+    def _with(self, placement: Placement, starts: Starts) -> tuple[TankNetwork, PlaceValues, int]:
+        network = self.union.showing({*self.present, placement.prefix})
+        values = {**self.values, placement.prefix: {**self.values[placement.prefix], **starts}}
+        return network, values, max(len(s) for s in starts.values())
+
+    def _inflows(self, network: TankNetwork, placement: Placement, values: PlaceValues, lanes: int) -> Sequence[Tensor]:
+        """By how much more flows into each tank, (M, K) or (1, K) m^3/s."""
+        plant, place, commands = network.description, placement.location, self._commands
+        if placement.effect.stage is Stage.BALANCE:
+            net = list(self._gathered)
+            network.move_by_effect(net, placement, self._levels, self._clock, values)
+            return [a - b for a, b in zip(net, self._gathered, strict=True)]
+        if placement.effect.stage is Stage.COMMAND:
+            commands = Actuation(network, self.experiment, []).commands(values, lanes)
+        more = [torch.zeros_like(net) for net in self._gathered]
+        for i, pump in enumerate(plant.pumps):
+            if pump.name == place:
+                flow = network.pump_flow(i, self._levels, commands, self._clock, values)
+                network.move(more, OUTSIDE, pump.target, flow - self._pumps[i])
+        for j, pipe in enumerate(plant.pipes):
+            if pipe.name == place:
+                flow = network.pipe_flow(j, self._levels, commands, self._clock, values)
+                network.move(more, pipe.source, pipe.target, flow - self._pipes[j])
+        return more
+
+    def _inflow_slopes(self, network: TankNetwork) -> tuple[list[Tensor], list[Row]]:
+        """Rates, and by how much each tank's rate rises with what flows into each tank, 1/m^2."""
+
+        def rates(net: Sequence[Tensor]) -> Sequence[Tensor]:
+            left = network.spilled(net, self._levels, self._clock, self.values)
+            return network.level_rates(self._levels, left, self._clock, self.values)
+
+        return partials(rates, self._gathered, self._levels[0].shape)
