@@ -91,6 +91,7 @@ class Watch:
 
     def __init__(self, log: RunLog, space: ParameterSpace, settings: HybridSettings, tell: Tell) -> None:
         self.log, self.space, self.settings, self.tell = log, space, settings, tell
+        self.units = {p.name: p.unit for p in space}
         self.iterations = 0
 
     def generation(self, search: Search) -> None:
@@ -103,9 +104,10 @@ class Watch:
             best,
             mean_cost=float(state.cost[0].mean()),
             evaluations=state.evaluations,
-            units={p.name: p.unit for p in self.space},
+            units=self.units,
         )
-        self.log.population(state.generation, search.to_dict())
+        if state_is_due(state.generation):
+            self.log.population(state.generation, search.to_dict())
         share = 0.05 + 0.8 * state.evaluations / self.settings.search.evaluations
         self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {cost:.3g}")
 
@@ -121,9 +123,14 @@ class Watch:
                 accepted=bool(progress.accepted[k]),
                 problem=lane,
                 t=float(self.iterations),
-                units={p.name: p.unit for p in self.space},
+                units=self.units,
             )
         self.tell(0.9, f"refinement: iteration {progress.iteration}, cost {float(progress.cost.min()):.6g}")
+
+
+def state_is_due(generation: int) -> bool:
+    """Is the whole state of the search logged? So often that a resumed run repeats a sixteenth at most."""
+    return generation % (1 << max(0, generation.bit_length() - 5)) == 0
 
 
 def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[str, float]) -> None:

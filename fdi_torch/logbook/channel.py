@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -13,5 +13,5 @@ class Channel:
     encoding: str = "json"
     schema_name: str = ""
     schema_encoding: str = ""
-    schema_data: bytes = b""
-    metadata: tuple[tuple[str, str], ...] = ()
+    schema_data: bytes = field(default=b"", hash=False)  # long, and looked up for each message
+    metadata: tuple[tuple[str, str], ...] = field(default=(), hash=False)

@@ -6,7 +6,7 @@ the same topic, so that every message is described by a schema.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, plain
 from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, Topic, json_schema, named_kinds, topic_definition
 
 Named = Mapping[str, Any]
+Encoded = tuple[Channel, float, int, bytes]
+"""Channel, plant time in s, sequence number and payload of a message."""
 _RESERVED = ("t", NON_FINITE, WALL, "masked")
 _BLOCK = 4096
 
@@ -29,7 +31,7 @@ class Messages:
         self._described: dict[str, tuple[frozenset[str], Channel]] = {}
         self._sequence: dict[str, int] = {}
 
-    def put(self, channel: Channel, t: float, sequence: int, payload: bytes) -> None:
+    def put(self, messages: Iterable[Encoded]) -> None:
         raise NotImplementedError
 
     def wall(self) -> dict[str, int]:
@@ -58,8 +60,8 @@ class Messages:
         if wall:
             message[WALL] = self.wall()
         self._latest = max(self._latest, t)
-        channel = self._channel(topic, fields, message, {**units_of(units), **(about or {})})
-        self.put(channel, t, self._next(topic), orjson.dumps(message))
+        channel = self._channel(topic, fields, message, units, about)
+        self.put([(channel, t, self._next(topic), orjson.dumps(message))])
 
     def samples(
         self,
@@ -110,10 +112,18 @@ class Messages:
         for first in range(0, len(time), _BLOCK):
             clock = time[first : first + _BLOCK].astype(np.float64).tolist()
             encoded = [self._encode_block(signal, clock, first) for signal in signals]
-            for t, messages in zip(clock, zip(*encoded, strict=True), strict=True):
-                for (topic, *_), payload in zip(signals, messages, strict=True):
-                    self.put(self._described[topic][1], t, self._next(topic), payload)
+            self.put(self._in_turn([topic for topic, *_ in signals], clock, encoded))
         self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
+
+    def _in_turn(
+        self, topics: Sequence[str], clock: Sequence[float], encoded: Sequence[Sequence[bytes]]
+    ) -> Iterator[Encoded]:
+        """One message of each topic a sample."""
+        ready = [(self._described[topic][1], self._sequence.get(topic, 0)) for topic in topics]
+        for number, (t, payloads) in enumerate(zip(clock, zip(*encoded, strict=True), strict=True)):
+            for (channel, first), payload in zip(ready, payloads, strict=True):
+                yield channel, t, first + number, payload
+        self._sequence.update({topic: first + len(clock) for topic, (_, first) in zip(topics, ready, strict=True)})
 
     def follow_on(self, channel: Channel, sequence: int, t: float) -> None:
         """Number and describe what comes as if the message (channel, sequence, t) had just been written."""
@@ -127,19 +137,33 @@ class Messages:
         """One sample of a signal that arrives bit by bit, such as "/plant/output" or "/plant/truth"."""
         self.write(topic, values, t, units=units)
 
-    def _channel(self, topic: str, fields: Named, message: Named, metadata: Mapping[str, str]) -> Channel:
+    def _channel(
+        self,
+        topic: str,
+        fields: Named,
+        message: Named,
+        told_units: Mapping[str, str] | None,
+        about: Mapping[str, str] | None,
+    ) -> Channel:
         """The topic's channel; a new one where the message has fields that it does not describe."""
         known, channel = self._described.get(topic, (frozenset(), None))
-        present = {name: message.get(name) for name, value in fields.items() if value is not None}
+        present = [name for name, value in fields.items() if value is not None]
         if channel is not None and known.issuperset(present):
             return channel
         definition = topic_definition(topic)
         named = named_kinds(definition, channel.schema_data) if channel else {}
-        named.update({name: _kind(value) for name, value in present.items() if name not in definition.fields})
+        named.update({name: _kind(message.get(name)) for name in present if name not in definition.fields})
         _check_names(topic, definition, named)
         units = {f"unit.{name}": unit for name, (_, unit, _) in definition.fields.items() if unit}
         previous = dict(channel.metadata) if channel else {}
-        pairs = {"schema_version": FORMAT_VERSION, "unit.t": "s", **units, **previous, **metadata}
+        pairs = {
+            "schema_version": FORMAT_VERSION,
+            "unit.t": "s",
+            **units,
+            **previous,
+            **units_of(told_units),
+            **(about or {}),
+        }
         schema = json_schema(definition, named)
         channel = Channel(topic, "json", definition.schema, "jsonschema", schema, tuple(pairs.items()))
         self._described[topic] = (frozenset({"t", *definition.fields, *named}), channel)
@@ -154,8 +178,8 @@ class Messages:
         topic, values, names, units, mask, about = signal
         block = values[first : first + len(clock)].astype(np.float64)
         keys = ("t", *names)
-        metadata = {**units_of(dict(zip(names, units, strict=True))), **(about or {})}
-        self._channel(topic, dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0), metadata)
+        numbers = dict.fromkeys(names, 0.0)
+        self._channel(topic, numbers, numbers, dict(zip(names, units, strict=True)), about)
         rows = zip(clock, *block.T.tolist(), strict=True)
         uncounted = np.zeros(0) if mask is None else ~mask[first : first + len(clock)] & np.isfinite(block)
         if np.isfinite(block).all() and not uncounted.any():

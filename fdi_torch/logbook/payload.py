@@ -21,6 +21,8 @@ NON_FINITE = "non_finite"
 WALL = "wall"
 _EXACT = 2**53
 _ENTRY = re.compile(r"(?P<name>.+?)(\[(?P<index>\d+)\])?=(?P<value>nan|inf|-inf)")
+_PLAIN = frozenset({type(None), str, bool, float})
+_PACKED = {"f": "<f8", "i": "<i8", "u": "<i8", "b": "|b1"}
 _DTYPES = ("<f8", "<i8", "|u1", "|b1")
 
 
@@ -35,10 +37,10 @@ def plain(fields: Mapping[str, Any]) -> dict[str, Any]:
     lost: list[str] = []
     for name, value in fields.items():
         value = _plain_value(name, value)
-        if isinstance(value, float) and not math.isfinite(value):
+        if type(value) is float and not math.isfinite(value):
             lost.append(f"{name}={value}")
         elif value is not None:
-            message[name] = _finite_list(name, value, lost) if isinstance(value, list) else value
+            message[name] = _finite_list(name, value, lost) if type(value) is list else value
     if lost:
         message[NON_FINITE] = lost
     return message
@@ -57,12 +59,11 @@ def decode(data: bytes) -> dict[str, Any]:
 def pack(name: str, array: Any) -> dict[str, Any]:
     """An array of any shape as three flat fields: `name` (base64), `name_shape`, `name_dtype`."""
     values = as_array(array)
-    kind = {"f": "<f8", "i": "<i8", "u": "|u1" if values.dtype.itemsize == 1 else "<i8", "b": "|b1"}.get(
-        values.dtype.kind
-    )
+    kind = _PACKED.get(values.dtype.kind)
     if kind is None:
         raise ValueError(f"{name}: expected an array of numbers, got {values.dtype}; convert it")
-    text = base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
+    kind = "|u1" if values.dtype == np.uint8 else kind
+    text = base64.b64encode(values.astype(kind, copy=False).tobytes()).decode()
     return {name: text, f"{name}_shape": list(values.shape), f"{name}_dtype": kind}
 
 
@@ -74,9 +75,7 @@ def unpack(message: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 def as_array(value: Any) -> np.ndarray:
     """A numpy array of a number, list, array or tensor on any device."""
-    if hasattr(value, "detach"):
-        value = value.detach().cpu()
-    return np.asarray(value)
+    return np.asarray(value.numpy(force=True) if hasattr(value, "detach") else value)
 
 
 def _unpack_one(name: str, message: Mapping[str, Any]) -> np.ndarray:
@@ -88,7 +87,9 @@ def _unpack_one(name: str, message: Mapping[str, Any]) -> np.ndarray:
 
 
 def _plain_value(name: str, value: Any) -> Any:
-    if value is None or isinstance(value, str | bool | float):
+    if type(value) in _PLAIN:
+        return value
+    if isinstance(value, str | bool | float):
         return float(value) if isinstance(value, np.floating) else value
     if isinstance(value, int | np.integer):
         return _exact_integer(name, int(value))
@@ -96,6 +97,8 @@ def _plain_value(name: str, value: Any) -> Any:
         return plain(value)
     if isinstance(value, Sequence) and all(isinstance(item, str) for item in value):
         return list(value)
+    if type(value) is list and all(type(item) is int for item in value):
+        return [_exact_integer(name, item) for item in value]
     array = as_array(value)
     if array.dtype.kind not in "fiub":
         raise ValueError(f"{name}: expected numbers or text, got {type(value).__name__}; convert it")

@@ -16,23 +16,28 @@ PACKAGES = ("fdi_torch", "torch", "torchdiffeq", "numpy", "scipy", "mcap", "orjs
 def environment(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
     """Versions of Python, the system and the packages that shape a result; the number of threads."""
     versions = {"python": platform.python_version(), "system": platform.system(), "machine": platform.machine()}
-    for package in packages:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions[package] = "absent"
+    versions |= {package: version_of(package) for package in packages}
     torch = sys.modules.get("torch")
     if torch is not None:
         versions["threads"] = str(torch.get_num_threads())
     return versions
 
 
+def version_of(package: str) -> str:
+    """What is imported says it at once; of the others the installation knows it."""
+    told = getattr(sys.modules.get(package), "__version__", None)
+    try:
+        return told if isinstance(told, str) else metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "absent"
+
+
 def git_state(folder: Path | None = None) -> dict[str, str]:
     """Commit of the code and whether it was changed since; empty texts outside a repository."""
     folder = folder or Path(__file__).parent
-    commit = _git(folder, "rev-parse", "HEAD")
-    changed = _git(folder, "status", "--porcelain", "--untracked-files=no") if commit else ""
-    return {"commit": commit, "changed": "yes" if changed else "no" if commit else ""}
+    told = _git(folder, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+    commit = told.removesuffix("-dirty")
+    return {"commit": commit, "changed": "yes" if commit != told else "no" if commit else ""}
 
 
 def sha256_of(path: str | Path) -> str:

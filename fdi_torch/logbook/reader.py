@@ -199,7 +199,9 @@ class Directory:
         schema = self._schemas.get(record.schema_id) or Schema(0, b"", "", "")
         named = (schema.name, schema.encoding, bytes(schema.data))
         pairs = tuple(record.metadata.items())
-        self._channels[record.id] = Channel(record.topic, record.message_encoding, *named, pairs)
+        learnt = Channel(record.topic, record.message_encoding, *named, pairs)
+        if self._channels.get(record.id) != learnt:  # the same object each time is found faster
+            self._channels[record.id] = learnt
 
     def message(self, raw: scan.RawMessage) -> Message:
         channel = self._channels.get(raw.channel_id)

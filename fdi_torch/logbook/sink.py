@@ -1,60 +1,31 @@
 """The way into an MCAP file: one exclusive writer, channels registered at their first message, clear errors.
 
 A chunk ends where it exceeds 256 KiB, before a metadata record or an attachment, and where `flush` is called:
-files with equal contents and equal flushes are byte-identical.
+files with equal contents and equal flushes are byte-identical. The records are those of https://mcap.dev/spec; the
+chunks are put together here, because a run may have a million messages and the library takes its time over each.
 """
 
 from __future__ import annotations
 
-import fcntl
-import os
-from collections.abc import Mapping
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mcap import records
-from mcap.writer import CompressionType, Writer
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 
 from fdi_torch.logbook.channel import Channel
-from fdi_torch.logbook.errors import LogError, log_error
+from fdi_torch.logbook.chunk import Chunk, Described
+from fdi_torch.logbook.scan import MAGIC
+from fdi_torch.logbook.stream import Stream
 
 PROFILE = "fdi_torch"
 CHUNK_BYTES = 256 * 1024
 EPOCH_NS = 946_684_800 * 10**9  # 2000-01-01T00:00:00Z: plant time 0; leaves room for negative times
-
-
-class Stream:
-    """An unbuffered file that nobody else writes. Raises LogError where the path is taken or not writable."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.size = 0
-        try:
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except FileExistsError:
-            raise LogError(_taken(path)) from None
-        except OSError as error:
-            raise log_error(path, error) from error
-
-    def write(self, data: bytes) -> int:
-        rest = memoryview(data)
-        while rest:
-            done = os.write(self._file, rest)
-            rest, self.size = rest[done:], self.size + done
-        return len(data)
-
-    def tell(self) -> int:
-        return self.size
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def sync(self) -> None:
-        os.fsync(self._file)
-
-    def close(self) -> None:
-        os.close(self._file)
+_FOOTER = struct.Struct("<BQQQ")
 
 
 class Sink:
@@ -63,50 +34,69 @@ class Sink:
     def __init__(self, path: Path, library: str, profile: str = PROFILE, compress: bool = True) -> None:
         self._stream = Stream(path)
         self.path = path
-        self._channels: dict[Channel, int] = {}
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._records: dict[int, tuple[records.Schema | None, records.Channel]] = {}
-        self._told: set[int] = set()
-        self._chunk_start = 0
-        self._dead: LogError | None = None
-        output: Any = self._stream
-        self._writer = Writer(
-            output,
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType.ZSTD if compress else CompressionType.NONE,
-            enable_crcs=True,
-            enable_data_crcs=True,
-        )
-        self._guarded(self._writer.start, profile, library)
+        self._compress = compress
+        self._schemas: dict[tuple[str, str, bytes], records.Schema] = {}
+        self._channels: dict[Channel, Described] = {}
+        self._chunk = Chunk()
+        self._counts: dict[int, int] = {}
+        self._chunks: list[records.ChunkIndex] = []
+        self._metadata: list[records.MetadataIndex] = []
+        self._attachments: list[records.AttachmentIndex] = []
+        self._crc = 0
+        self._write(MAGIC)
+        self._write(_bytes(records.Header(profile, library)))
 
     @property
     def size(self) -> int:
         """Bytes on disk."""
-        return int(self._stream.size)
+        return self._stream.size
+
+    @property
+    def waiting(self) -> bool:
+        """Is there a message that is not on disk yet?"""
+        return self._chunk.size > 0
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         self.flush()
-        self._guarded(self._writer.add_metadata, name, dict(values))
+        data = _bytes(records.Metadata(name=name, metadata=dict(values)))
+        self._metadata.append(records.MetadataIndex(offset=self.size, length=len(data), name=name))
+        self._write(data)
 
     def attachment(self, name: str, media_type: str, data: bytes) -> None:
         self.flush()
-        self._guarded(self._writer.add_attachment, EPOCH_NS, EPOCH_NS, name, media_type, data)
+        told: dict[str, Any] = {"name": name, "media_type": media_type, "create_time": EPOCH_NS, "log_time": EPOCH_NS}
+        record = _bytes(records.Attachment(data=data, **told))
+        self._attachments.append(
+            records.AttachmentIndex(offset=self.size, length=len(record), data_size=len(data), **told)
+        )
+        self._write(record)
 
     def message(self, channel: Channel, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
-        if self._chunk_start != self.size:
-            self._chunk_start, self._told = self.size, set()
-        number = self._channels.get(channel) or self._register(channel)
-        self._repeat_in_chunk(number)
-        self._guarded(self._writer.add_message, number, log_time, data, publish_time, sequence)
+        if self._stream.dead:
+            self._stream.expect_alive()
+        told = self._channels.get(channel) or self._register(channel)
+        self._chunk.message(told, log_time, publish_time, sequence, data)
+        if self._chunk.size > CHUNK_BYTES:
+            self.flush()
 
     def flush(self) -> None:
-        self._guarded(self._writer.flush)
+        """What waits goes to disk as a chunk."""
+        counts = self._chunk.messages
+        if not counts:
+            return
+        data, index = self._chunk.record(self._compress, self.size)
+        self._chunk = Chunk()
+        self._chunks.append(index)
+        for number, count in counts.items():
+            self._counts[number] = self._counts.get(number, 0) + count
+        self._write(data)
 
     def finish(self) -> None:
         """Close the file as a whole one, on disk."""
         try:
-            self._guarded(self._writer.finish)
-            self._guarded(self._stream.sync)
+            self.flush()
+            self._stream.write(_bytes(records.DataEnd(self._crc)) + self._ending())
+            self._stream.sync()
         finally:
             self._stream.close()
 
@@ -114,68 +104,73 @@ class Sink:
         """Close the file as it is."""
         self._stream.close()
 
-    def _register(self, channel: Channel) -> int:
-        schema = (channel.schema_name, channel.schema_encoding, channel.schema_data)
-        number = 0
+    def _register(self, channel: Channel) -> Described:
+        schema = None
         if channel.schema_name:
-            number = self._schemas.get(schema) or self._guarded(self._writer.register_schema, *schema)
-            self._schemas[schema] = number
-        known = self._guarded(
-            self._writer.register_channel, channel.topic, channel.encoding, number, dict(channel.metadata)
+            key = (channel.schema_name, channel.schema_encoding, channel.schema_data)
+            number = len(self._schemas) + 1
+            schema = self._schemas.setdefault(
+                key, records.Schema(number, channel.schema_data, channel.schema_encoding, channel.schema_name)
+            )
+        told = records.Channel(
+            id=len(self._channels) + 1,
+            topic=channel.topic,
+            message_encoding=channel.encoding,
+            metadata=dict(channel.metadata),
+            schema_id=schema.id if schema else 0,
         )
-        self._channels[channel] = known
-        self._records[known] = _records(known, number, channel)
-        self._told.add(known)
-        return int(known)
+        self._channels[channel] = Described(schema, told)
+        return self._channels[channel]
 
-    def _repeat_in_chunk(self, number: int) -> None:
-        """Describe a channel in each chunk that uses it, so that no chunk needs another one to be read.
+    def _write(self, data: bytes) -> None:
+        """Bytes of the data section, over which its CRC runs."""
+        self._stream.write(data)
+        self._crc = zlib.crc32(data, self._crc)
 
-        The library has no public way to do so; should its inside change, only this repetition is lost.
-        """
-        if self._chunk_start != self.size:
-            self._chunk_start, self._told = self.size, set()
-        chunk = getattr(self._writer, "_Writer__chunk_builder", None)
-        if number in self._told or chunk is None:
-            return
-        self._told.add(number)
-        schema, channel = self._records[number]
-        if schema is not None:
-            chunk.add_schema(schema)
-        chunk.add_channel(channel)
+    def _ending(self) -> bytes:
+        """All that follows the end of the data: summary, where its parts begin, and the footer."""
+        start = self.size + len(_bytes(records.DataEnd(0)))
+        summary, offsets = b"", b""
+        for opcode, group in self._summary():
+            data = b"".join(map(_bytes, group))
+            if data:
+                offsets += _bytes(records.SummaryOffset(opcode, start + len(summary), len(data)))
+            summary += data
+        places = (start, start + len(summary))
+        footer = _FOOTER.pack(Opcode.FOOTER, 20, *places)
+        crc = zlib.crc32(summary + offsets + footer)
+        return summary + offsets + _bytes(records.Footer(places[0], places[1], crc)) + MAGIC
 
-    def _guarded(self, call: Any, *arguments: Any) -> Any:
-        if self._dead is not None:
-            raise LogError(f"{self._dead}; nothing more is logged")
-        try:
-            return call(*arguments)
-        except OSError as error:
-            self._dead = log_error(self.path, error)
-            raise self._dead from error
+    def _summary(self) -> list[tuple[Opcode, Sequence[Any]]]:
+        chunks = self._chunks
+        statistics = records.Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(chunks),
+            message_count=sum(self._counts.values()),
+            message_start_time=min((chunk.message_start_time for chunk in chunks), default=0),
+            message_end_time=max((chunk.message_end_time for chunk in chunks), default=0),
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+        return [
+            (Opcode.SCHEMA, list(self._schemas.values())),
+            (Opcode.CHANNEL, [told.channel for told in self._channels.values()]),
+            (Opcode.STATISTICS, [statistics]),
+            (Opcode.CHUNK_INDEX, chunks),
+            (Opcode.ATTACHMENT_INDEX, self._attachments),
+            (Opcode.METADATA_INDEX, self._metadata),
+        ]
 
 
-def _records(number: int, schema_id: int, channel: Channel) -> tuple[records.Schema | None, records.Channel]:
-    """A channel and its schema (number 0: none) as records of the format."""
-    schema = records.Schema(schema_id, channel.schema_data, channel.schema_encoding, channel.schema_name)
-    told = records.Channel(number, channel.topic, channel.encoding, dict(channel.metadata), schema_id)
-    return (schema if schema_id else None), told
+def _bytes(record: Any) -> bytes:
+    """A record of the format as it stands in the file."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
 
 
 def log_time_of(t: float) -> int:
     """Plant time in s as log time in ns."""
     return EPOCH_NS + round(t * 1e9)
-
-
-def _taken(path: Path) -> str:
-    """Why an existing file keeps us out: somebody writes it, or somebody was killed while writing it."""
-    try:
-        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError as error:
-        return str(log_error(path, error))
-    try:
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return f"{path}: another run is writing this file; choose another name"
-    finally:
-        os.close(file)
-    return f"{path}: left by a run that did not end; save it with `fdi recover {path}`, then delete it"

@@ -45,25 +45,16 @@ class Topics(Messages):
         best_cost: float,
         best: Named,
         *,
-        mean_cost: float | None = None,
-        spread: float | None = None,
-        evaluations: int | None = None,
         problem: int = 0,
         t: float | None = None,
         units: Mapping[str, str] | None = None,
         **numbers: Any,
     ) -> None:
-        """A generation of the search; best: parameter -> value of the best member."""
-        fields = {
-            "problem": problem,
-            "generation": generation,
-            "best_cost": best_cost,
-            "mean_cost": mean_cost,
-            "spread": spread,
-            "evaluations": evaluations,
-            **numbers,
-            **best,
-        }
+        """A generation of the search; best: parameter -> value of the best member.
+
+        numbers: mean_cost, spread, evaluations and others by name.
+        """
+        fields = {"problem": problem, "generation": generation, "best_cost": best_cost, **numbers, **best}
         self.write("/estimator/de/generation", fields, generation if t is None else t, units=units)
 
     def population(
@@ -80,27 +71,16 @@ class Topics(Messages):
         cost: float,
         parameters: Named,
         *,
-        step: float | None = None,
-        gradient: float | None = None,
-        damping: float | None = None,
-        accepted: bool | None = None,
         problem: int = 0,
         t: float | None = None,
         units: Mapping[str, str] | None = None,
         **numbers: Any,
     ) -> None:
-        """An iteration of the refinement; parameters: name -> value."""
-        fields = {
-            "problem": problem,
-            "iteration": iteration,
-            "cost": cost,
-            "step": step,
-            "gradient": gradient,
-            "damping": damping,
-            "accepted": accepted,
-            **numbers,
-            **parameters,
-        }
+        """An iteration of the refinement; parameters: name -> value.
+
+        numbers: step, gradient, damping, accepted and others by name.
+        """
+        fields = {"problem": problem, "iteration": iteration, "cost": cost, **numbers, **parameters}
         self.write("/estimator/refine/iteration", fields, iteration if t is None else t, units=units)
 
     def estimate(

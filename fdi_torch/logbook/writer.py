@@ -26,6 +26,7 @@ from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.copying import copy_log
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.flat import flatten
+from fdi_torch.logbook.messages import Encoded
 from fdi_torch.logbook.payload import as_array
 from fdi_torch.logbook.provenance import environment, git_state
 from fdi_torch.logbook.reader import Message
@@ -149,26 +150,28 @@ class RunLog(Topics):
             self._cut_by_clock = True
             self._note_progress()
 
-    def put(self, channel: Channel, t: float, sequence: int, payload: bytes) -> None:
-        """One encoded message; the methods of `Topics` end here."""
-        log_time = log_time_of(t)
-        self._put(channel, log_time, log_time, sequence, payload)
+    def put(self, messages: Iterable[Encoded]) -> None:
+        """Encoded messages; the methods of `Topics` end here."""
+        timed = ((channel, log_time_of(t), sequence, payload) for channel, t, sequence, payload in messages)
+        self._put((channel, time, time, sequence, payload) for channel, time, sequence, payload in timed)
 
     def carry_over(self, messages: Iterable[Message]) -> int:
         """Messages of an earlier log of the same run, as they were; what is logged next follows them. Their number."""
         count = 0
         for message in messages:
             self.follow_on(message.channel, message.sequence, message.t)
-            self._put(message.channel, message.log_time, message.publish_time, message.sequence, message.data)
+            self._put([(message.channel, message.log_time, message.publish_time, message.sequence, message.data)])
             count += 1
         return count
 
-    def _put(self, channel: Channel, log_time: int, publish_time: int, sequence: int, payload: bytes) -> None:
+    def _put(self, messages: Iterable[tuple[Channel, int, int, int, bytes]]) -> None:
         with self._lock:
-            self._open_sink().message(channel, log_time, publish_time, sequence, payload)
-            self._note_progress(waiting=True)
-        if self._listener is not None:
-            self._listener(channel, log_time, payload)
+            sink = self._open_sink()
+            for message in messages:
+                sink.message(*message)
+                if self._listener is not None:
+                    self._listener(message[0], message[1], message[4])
+            self._note_progress()
 
     def wall(self) -> dict[str, int]:
         """Wall time for a message's field `wall`."""
@@ -180,13 +183,14 @@ class RunLog(Topics):
             raise ValueError(f"{self.path}: expected an open log, got one outside its `with` block; write inside it")
         return self._sink
 
-    def _note_progress(self, waiting: bool = False) -> None:
-        """Remember since when messages wait in memory; nothing waits right after a write to disk."""
-        size = self._open_sink().size
-        if size != self._size:
-            self._size, self._waiting_since = size, None
-        elif waiting and self._waiting_since is None:
+    def _note_progress(self) -> None:
+        """Remember since when messages wait in memory, at the latest."""
+        sink = self._open_sink()
+        if not sink.waiting:
+            self._waiting_since = None
+        elif self._waiting_since is None or sink.size != self._size:
             self._waiting_since = time.monotonic()
+        self._size = sink.size
 
     def _flush_by_clock(self) -> None:
         while not self._stop.wait(self._flush_seconds / 2):

@@ -222,6 +222,7 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
         """
         import os, sys
         from fdi_torch.logbook import LogError, RunLog
+        RunLog(sys.argv[1] + "/b.mcap", "train")  # imports what it needs while that may be read
         os.chmod(sys.argv[1], 0o555)
         if os.geteuid() == 0:
             os.setgid(65534)
