@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -95,18 +95,15 @@ def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
 
 
 def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Tensor) -> tuple[float, float]:
-    """The steps of search and refinement: those asked for, or the longest whose error over the box is small enough.
-
-    Measured with the fastest engine whichever is asked for: they agree to 1e-10, and it is many simulations.
-    """
+    """The steps of search and refinement: those asked for, or the longest whose error over the box is small enough."""
     points = probe_points(low, high)
-    quick = replace(fitting, engine="auto")
     spans = [float(r.time[-1] - r.time[0]) for r in fitting.recordings]
     longest = max(min(spans) / 20.0, 1e-6)
     shortest = min(range(len(spans)), key=spans.__getitem__)
 
     def engine_at(step: float):  # type: ignore[no-untyped-def]
-        return quick.engines(step)[shortest]
+        own = fitting.engines(step)
+        return own[shortest]
 
     columns = fitting.columns[shortest]
     own_points = points[:, columns]

@@ -86,7 +86,8 @@ def lbfgs(
     for iteration in range(settings.iterations + 1):
         expected = -0.5 * dot(members.gradient, members.direction * members.size)
         status = _status(members, expected, iteration, settings)
-        result = _filed(result, members, status, expected, iteration)
+        found = {"theta": members.theta, "cost": members.cost, "gradient": members.gradient, "promised": expected}
+        result = result.filed(members.lanes, status, iteration, (members.low, members.high), **found)
         members = members[status == RUNNING]
         if not len(members.lanes):
             break
@@ -201,21 +202,4 @@ def _learned(members: _Members, step: Tensor, change: Tensor, accepted: Tensor) 
         steps=pushed(members.steps, step),
         changes=pushed(members.changes, change),
         inverse=pushed(members.inverse, inverse),
-    )
-
-
-def _filed(result: Refined, members: _Members, status: Tensor, expected: Tensor, iteration: int) -> Refined:
-    done = status != RUNNING
-    if not bool(done.any()):
-        return result
-    left = members[done]
-    return result.file(
-        left.lanes,
-        theta=left.theta,
-        cost=left.cost,
-        gradient=left.gradient,
-        promised=expected[done],
-        held=held_back(left.theta, left.gradient, left.low, left.high),
-        status=status[done],
-        iterations=torch.full_like(left.lanes, iteration),
     )

@@ -133,7 +133,8 @@ def levenberg_marquardt(
         step = _step(members)
         members = replace(members, promised=torch.where(_trusted(members, step), step.promised, members.promised))
         status = _status(members, step, iteration, settings)
-        result = _filed(result, members, status, iteration)
+        found = {"theta": members.theta, "promised": members.promised, **vars(members.model)}
+        result = result.filed(members.lanes, status, iteration, (members.low, members.high), **found)
         members, step = members[status == RUNNING], step[status == RUNNING]
         if not len(members.lanes):
             break
@@ -233,23 +234,4 @@ def _chosen(first: Tensor, a: Linearisation, b: Linearisation) -> Linearisation:
         torch.where(first, a.cost, b.cost),
         torch.where(first[:, None], a.gradient, b.gradient),
         torch.where(first[:, None, None], a.curvature, b.curvature),
-    )
-
-
-def _filed(result: Refined, members: _Members, status: Tensor, iteration: int) -> Refined:
-    """The result with the members that have finished."""
-    done = status != RUNNING
-    if not bool(done.any()):
-        return result
-    left = members[done]
-    return result.file(
-        left.lanes,
-        theta=left.theta,
-        cost=left.model.cost,
-        gradient=left.model.gradient,
-        curvature=left.model.curvature,
-        promised=left.promised,
-        held=held_back(left.theta, left.model.gradient, left.low, left.high),
-        status=status[done],
-        iterations=torch.full_like(left.lanes, iteration),
     )

@@ -44,6 +44,20 @@ class Refined:
         changed = {name: getattr(self, name).index_copy(0, lanes, value) for name, value in values.items()}
         return replace(self, **changed)
 
+    def filed(
+        self, lanes: Tensor, status: Tensor, iteration: int, box: tuple[Tensor, Tensor], **found: Tensor
+    ) -> Refined:
+        """The same with what has become of those of the members `lanes` (L,) that are no longer running.
+
+        box: low and high (L, P), from which follows what was held back. found: the other fields, (L, ...) each.
+        """
+        done = status != RUNNING
+        if not bool(done.any()):
+            return self
+        found["held"] = held_back(found["theta"], found["gradient"], *box)
+        found |= {"status": status, "iterations": torch.full_like(lanes, iteration)}
+        return self.file(lanes[done], **{name: value[done] for name, value in found.items()})
+
 
 def unfinished(start: Tensor, with_curvature: bool) -> Refined:
     """To be filled in: start (B, P), nothing known."""

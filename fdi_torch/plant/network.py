@@ -6,7 +6,7 @@ runs these same lines. All numbers are SI; a tensor's leading dimensions are bat
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -14,13 +14,13 @@ import torch
 from torch import Tensor, nn
 
 from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.plant.chain import PlaceValues, SignalChain
 from fdi_torch.plant.constants import constant_parameters, inverse_areas, leak_pipe, nominal_capacity
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Sensor
 from fdi_torch.plant.effect import Effect, Local, Memory, Placement, Stage, Values, fits
 from fdi_torch.plant.orifice import orifice_capacity, regular_width, weir_flow
 from fdi_torch.plant.signals import Clock
 
-PlaceValues = Mapping[str, Mapping[str, Tensor]]
 Bound = tuple[Effect, Values]
 
 
@@ -36,22 +36,29 @@ class TankNetwork(nn.Module):
     def __init__(self, description: PlantDescription, placements: Iterable[Placement] = ()) -> None:
         super().__init__()
         self.description = description
-        self.placements = tuple(placements)
+        self._channel_index = {name: i for i, name in enumerate(description.channels())}
+        self._place(tuple(placements))
         for placement in self.placements:
             _expect_fit(description, placement)
         effect_parameters = [p for placement in self.placements for p in placed_parameters(placement, description)]
         self.constants = ParameterSpace([*constant_parameters(description), *effect_parameters])
         self.register_buffer("nominal", self.constants.nominal())
         self._tank_index = {tank.name: i for i, tank in enumerate(description.tanks)}
-        self._channel_index = {name: i for i, name in enumerate(description.channels())}
-        self._by_place = _by_place(self.placements)
 
     def showing(self, prefixes: Collection[str]) -> TankNetwork:
         """The same plant with the same constants, of whose placements only some are there."""
         other = copy(self)
-        other.placements = tuple(p for p in self.placements if p.prefix in prefixes)
-        other._by_place = _by_place(other.placements)
+        other._place(tuple(p for p in self.placements if p.prefix in prefixes))
         return other
+
+    def _place(self, placements: tuple[Placement, ...]) -> None:
+        self.placements = placements
+        self._by_place: dict[tuple[str, Stage], list[Placement]] = {}
+        for placement in placements:
+            self._by_place.setdefault((placement.location, placement.effect.stage), []).append(placement)
+        sensors = [sensor.name for sensor in self.description.sensors]
+        self._command_chain = SignalChain(Stage.COMMAND, [name for name, _ in self.actuators()], placements)
+        self._reading_chain = SignalChain(Stage.READING, sensors, placements)
 
     def bind(self, space: ParameterSpace, theta: Tensor) -> PlaceValues:
         """All constants by place and field: columns of theta (*batch, P) where `space` names them, else nominal."""
@@ -83,30 +90,15 @@ class TankNetwork(nn.Module):
         self, channels: Sequence[Tensor], memory: Memory, clock: Clock, values: PlaceValues
     ) -> tuple[list[Tensor], Memory]:
         """COMMAND: the channel of each actuator, averaged over a step -> what it makes of it, and the memories."""
-        actual: list[Tensor] = []
-        remembered: list[Tensor] = []
-        rest = list(memory)
-        for (place, _), value in zip(self.actuators(), channels, strict=True):
-            for effect, p in self._effects(place, Stage.COMMAND, values):
-                value, kept = effect.command(value, tuple(rest[: effect.memory]), clock, p)
-                del rest[: effect.memory]
-                remembered.extend(kept)
-            actual.append(value)
-        return actual, tuple(remembered)
+        return self._command_chain.through(channels, memory, clock, values)
 
     def remember_commands(self, channels: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Memory:
         """The actuators' memories after the channels have long been what they are."""
-        remembered: list[Tensor] = []
-        for (place, _), value in zip(self.actuators(), channels, strict=True):
-            for effect, p in self._effects(place, Stage.COMMAND, values):
-                memory = effect.remember(value, p)
-                value, _ = effect.command(value, memory, clock, p)
-                remembered.extend(memory)
-        return tuple(remembered)
+        return self._command_chain.settled(channels, clock, values)
 
     def command_delays(self, values: PlaceValues) -> dict[int, Tensor]:
         """By how many seconds an actuator (index into `actuators`) is late; only those that can be."""
-        return self._delays([place for place, _ in self.actuators()], Stage.COMMAND, values)
+        return self._command_chain.delays(values)
 
     def pump_flows(
         self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
@@ -212,36 +204,18 @@ class TankNetwork(nn.Module):
         self, levels: Sequence[Tensor], memory: Memory, clock: Clock, values: PlaceValues
     ) -> tuple[list[Tensor], Memory]:
         """READING: the level at each sensor, late where it is late -> readings in sensor units, and the memories."""
-        readings: list[Tensor] = []
-        remembered: list[Tensor] = []
-        rest = list(memory)
-        for sensor, level in zip(self.description.sensors, levels, strict=True):
-            own = values[sensor.name]
-            value = own["gain"] * level + own["offset"]
-            for effect, p in self._effects(sensor.name, Stage.READING, values):
-                value, kept = effect.reading(value, tuple(rest[: effect.memory]), clock, p)
-                del rest[: effect.memory]
-                remembered.extend(kept)
-            if sensor.low is not None or sensor.high is not None:
-                value = torch.clamp(value, sensor.low, sensor.high)
-            readings.append(value)
-        return readings, tuple(remembered)
+        signals = self._signals(levels, values)
+        readings, remembered = self._reading_chain.through(signals, memory, clock, values)
+        sensors = self.description.sensors
+        return [_clipped(sensor, value) for sensor, value in zip(sensors, readings, strict=True)], remembered
 
     def remember_readings(self, levels: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Memory:
         """The sensors' memories after the levels have long been what they are."""
-        remembered: list[Tensor] = []
-        for sensor, level in zip(self.description.sensors, levels, strict=True):
-            own = values[sensor.name]
-            value = own["gain"] * level + own["offset"]
-            for effect, p in self._effects(sensor.name, Stage.READING, values):
-                memory = effect.remember(value, p)
-                value, _ = effect.reading(value, memory, clock, p)
-                remembered.extend(memory)
-        return tuple(remembered)
+        return self._reading_chain.settled(self._signals(levels, values), clock, values)
 
     def reading_delays(self, values: PlaceValues) -> dict[int, Tensor]:
         """By how many seconds a sensor (index) is late; only those that can be."""
-        return self._delays([s.name for s in self.description.sensors], Stage.READING, values)
+        return self._reading_chain.delays(values)
 
     def actuators(self) -> list[tuple[str, int]]:
         """Each pump, then each pipe with a valve: its name and its input channel."""
@@ -255,21 +229,15 @@ class TankNetwork(nn.Module):
         return [values[tank.name]["start_level"] for tank in self.description.tanks]
 
     def command_memory(self) -> int:
-        return self._memory(Stage.COMMAND)
+        return self._command_chain.memory
 
     def reading_memory(self) -> int:
-        return self._memory(Stage.READING)
+        return self._reading_chain.memory
 
-    def _memory(self, stage: Stage) -> int:
-        return sum(p.effect.memory for p in self.placements if p.effect.stage is stage)
-
-    def _delays(self, places: Sequence[str], stage: Stage, values: PlaceValues) -> dict[int, Tensor]:
-        delays: dict[int, Tensor] = {}
-        for i, place in enumerate(places):
-            for effect, p in self._effects(place, stage, values):
-                if effect.delays:
-                    delays[i] = delays[i] + effect.delay(p) if i in delays else effect.delay(p)
-        return delays
+    def _signals(self, levels: Sequence[Tensor], values: PlaceValues) -> list[Tensor]:
+        """The level at each sensor in the sensor's unit."""
+        owns = [values[sensor.name] for sensor in self.description.sensors]
+        return [own["gain"] * level + own["offset"] for own, level in zip(owns, levels, strict=True)]
 
     def _effects(self, location: str, stage: Stage, values: PlaceValues) -> list[Bound]:
         return [(p.effect, values[p.prefix]) for p in self._by_place.get((location, stage), ())]
@@ -343,11 +311,8 @@ class TankNetwork(nn.Module):
         return regular_width(rate, clock.resolution)
 
 
-def _by_place(placements: Iterable[Placement]) -> dict[tuple[str, Stage], list[Placement]]:
-    found: dict[tuple[str, Stage], list[Placement]] = {}
-    for placement in placements:
-        found.setdefault((placement.location, placement.effect.stage), []).append(placement)
-    return found
+def _clipped(sensor: Sensor, value: Tensor) -> Tensor:
+    return value if sensor.low is None and sensor.high is None else torch.clamp(value, sensor.low, sensor.high)
 
 
 def placed_parameters(placement: Placement, plant: PlantDescription) -> list[Parameter]:

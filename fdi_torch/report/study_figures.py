@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.report.style import INK, MARK, MODEL
 
-SPREAD, BOUND, TRUTH = "#1d4ed8", "#c2410c", "#111827"
 _REACH = 1.96
 
 
@@ -41,7 +41,7 @@ def error_figure(
         errors = [np.asarray(values)[:, i] - float(truth[i]) for values in estimates]
         _boxes(ax, snr_db, [e / np.asarray(bound)[i] for e, bound in zip(errors, bounds, strict=True)])
         for line in (-_REACH, 0.0, _REACH):
-            ax.axhline(line, lw=0.8, color=BOUND if line else TRUTH)
+            ax.axhline(line, lw=0.8, color=MARK if line else INK)
         ax.set_title(p.name.removesuffix(".size"))
         ax.set_xlabel("SNR [dB]")
     axes[0].set_ylabel("(estimate - truth) / bound [1]")
@@ -64,10 +64,10 @@ def _boxes(ax: Any, places: Sequence[float], values: Sequence[Any]) -> None:
         whis=(2.5, 97.5),
         showfliers=False,
         manage_ticks=False,
-        boxprops={"color": SPREAD},
-        whiskerprops={"color": SPREAD},
-        capprops={"color": SPREAD},
-        medianprops={"color": TRUTH},
+        boxprops={"color": MODEL},
+        whiskerprops={"color": MODEL},
+        capprops={"color": MODEL},
+        medianprops={"color": INK},
     )
     ax.set_xticks(list(places))
     ax.grid(alpha=0.25)

@@ -8,15 +8,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from fdi_torch.simulate.expression import Graph
 
-Partials = Callable[["Graph", int, tuple[int, ...]], tuple[int | None, ...]]
+class Graph(Protocol):
+    """Where derivatives are written down: a node for a number, a node for an operation, the number of a node."""
+
+    def literal(self, value: float) -> int: ...
+
+    def apply(self, operation: str, *arguments: int) -> int: ...
+
+    def value(self, node: int) -> float | None: ...
+
+
+Partials = Callable[[Graph, int, tuple[int, ...]], tuple[int | None, ...]]
 
 
 @dataclass(frozen=True)
