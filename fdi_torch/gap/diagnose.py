@@ -21,7 +21,7 @@ from fdi_torch.gap.where import Suspect, refit, suspects
 from fdi_torch.gap.which import Search, search
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import Reach, reach_of
+from fdi_torch.plant.reach import Reach, reach_of, with_levels
 from fdi_torch.recording import Recording
 
 CONTENT = 0.95
@@ -57,7 +57,7 @@ def diagnose(
     subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recording, *holdouts))
     tell(0.05, "noise floor and recalibration")
     fitter, null, lattice = _recalibrated(subject)
-    reach = reach_of(recording, plant)
+    reach = with_levels(reach_of(recording, plant), plant, null.near.levels[0])
     tell(0.2, "which effect")
     options = options_of([p for p in library if not p.effect.rounds], fitter, reach)
     found = search(fitter, null, options)

@@ -1,10 +1,12 @@
 """The noise floor: level and AR(1) colour of each channel's noise from the fast part of its residuals, and lattices.
 
-What a model gets wrong is slow beside the sampling, noise is not: the spectrum of an AR(1) noise,
+What a model gets wrong is slow beside the sampling, noise is not: the spectrum of an AR(1) noise and of a model's
+error whose slope jumps (levels are integrals of flows),
 
-    S(w) = s^2 / |1 - a exp(-i w)|^2,
+    S(w) = s^2 (1 / |1 - a exp(-i w)|^2 + m / |1 - exp(-i w)|^4),
 
-is fitted to the periodogram above a corner frequency only (Whittle, 1953), so that a gap does not pass for colour.
+is fitted to the periodogram above a corner frequency only (Whittle, 1953), so that a gap does not pass for colour,
+not even where the samples are so far apart that the error reaches beyond the corner.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import torch
 from torch import Tensor
 
 DECAY_SHARE = 0.3  # of a rounding step, over which its error is forgotten
+MOST_BINS = 512  # of a spectrum
 FAST_PERIOD = 30.0  # samples; slower parts of a residual may be the model's
 
 
@@ -77,10 +80,14 @@ def estimate_noise(residual: Tensor, mask: Tensor, rounded: Sequence[bool] = ())
     """
     spectra = [_fast_spectrum(residual[mask[:, c], c]) for c in range(residual.shape[1])]
     say = [not r for r in rounded] if rounded and not all(rounded) else [True] * len(spectra)
-    likelihoods = torch.stack([_likelihood(*s) for s in spectra])
-    common = _chosen(likelihoods[torch.tensor(say)].sum(dim=0), int(mask.sum()))
-    chosen = [common if ours else _chosen(likelihoods[c], int(mask[:, c].sum())) for c, ours in enumerate(say)]
-    level = torch.stack([_levels(*s)[i] for s, i in zip(spectra, chosen, strict=True)])
+    likelihoods = torch.stack([_likelihood(*s) for s in spectra])  # (C, colours, errors)
+    counts = [int(mask[:, c].sum()) for c in range(residual.shape[1])]
+    likelihoods = likelihoods + torch.stack([_cost_of_error(n) for n in counts]).unsqueeze(1)
+    best = likelihoods.min(dim=-1).values
+    common = _chosen(best[torch.tensor(say)].sum(dim=0), int(mask.sum()))
+    chosen = [common if ours else _chosen(best[c], counts[c]) for c, ours in enumerate(say)]
+    errors = [int(x[i].argmin()) for x, i in zip(likelihoods, chosen, strict=True)]
+    level = torch.stack([_levels(*s)[i, j] for s, i, j in zip(spectra, chosen, errors, strict=True)])
     return Noise(
         torch.sqrt(torch.clamp(level, min=torch.finfo(level.dtype).tiny)), _COLOURS.to(level)[torch.tensor(chosen)]
     )
@@ -88,32 +95,47 @@ def estimate_noise(residual: Tensor, mask: Tensor, rounded: Sequence[bool] = ())
 
 _COLOURS = torch.cat([torch.linspace(-0.5, 0.9, 281), torch.linspace(0.901, 0.98, 80)])
 _WHITE = int(_COLOURS.abs().argmin())
+_ERRORS = torch.cat([torch.zeros(1), torch.logspace(-4, 2, 25)])  # of the model, as shares of the innovation
 
 
-def _fast_spectrum(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Tapered periodogram of x (S,) above the corner frequency, and the cosine of each frequency."""
+def _fast_spectrum(x: Tensor) -> tuple[Tensor, Tensor, int]:
+    """Tapered periodogram of x (S,) above the corner frequency, and the cosine of each frequency.
+
+    Of a long recording in bins, each the mean of so many neighbours (the third item): spectra here are smooth.
+    """
     count = len(x)
     taper = torch.hann_window(count, periodic=False, dtype=x.dtype)
     power = torch.fft.rfft((x - x.mean()) * taper).abs() ** 2 / (taper**2).sum()
     frequency = torch.arange(len(power), dtype=x.dtype) / count
     fast = frequency > 1.0 / FAST_PERIOD
-    return power[fast], torch.cos(2 * math.pi * frequency[fast])
+    width = -(-int(fast.sum()) // MOST_BINS)
+    power, frequency = (b[fast][: int(fast.sum()) // width * width] for b in (power, frequency))
+    power, frequency = (b.reshape(-1, width).mean(dim=1) for b in (power, frequency))
+    return power, torch.cos(2 * math.pi * frequency), width
 
 
 def _shape(cosine: Tensor) -> Tensor:
-    a = _COLOURS.to(cosine).unsqueeze(1)
-    return 1.0 / (1.0 - 2.0 * a * cosine + a * a)
+    """(colours, errors, frequencies)"""
+    a, error = _COLOURS.to(cosine).reshape(-1, 1, 1), _ERRORS.to(cosine).reshape(-1, 1)
+    return 1.0 / (1.0 - 2.0 * a * cosine + a * a) + error / (2.0 - 2.0 * cosine) ** 2
 
 
-def _levels(power: Tensor, cosine: Tensor) -> Tensor:
-    """Innovation variance for each colour."""
-    return (power / _shape(cosine)).mean(dim=1)
+def _levels(power: Tensor, cosine: Tensor, width: int) -> Tensor:
+    """Innovation variance for each colour and error, (colours, errors)."""
+    return (power / _shape(cosine)).mean(dim=-1)
 
 
-def _likelihood(power: Tensor, cosine: Tensor) -> Tensor:
-    """Twice the negative log-likelihood for each colour; the taper leaves one frequency in 1.94 independent."""
-    level = torch.log(torch.clamp(_levels(power, cosine), min=torch.finfo(power.dtype).tiny))
-    return 2.0 * (level + torch.log(_shape(cosine)).mean(dim=1)) * len(power) / 1.94
+def _likelihood(power: Tensor, cosine: Tensor, width: int) -> Tensor:
+    """Twice the negative log-likelihood for each colour and error; the taper leaves one frequency in 1.94
+    independent.
+    """
+    level = torch.log(torch.clamp(_levels(power, cosine, width), min=torch.finfo(power.dtype).tiny))
+    return 2.0 * (level + torch.log(_shape(cosine)).mean(dim=-1)) * len(power) * width / 1.94
+
+
+def _cost_of_error(count: int) -> Tensor:
+    """Twice what the BIC asks for one more parameter: an error of the model that matters is worth far more."""
+    return torch.where(_ERRORS > 0.0, 2.0 * math.log(count), 0.0)
 
 
 def _chosen(likelihood: Tensor, count: int) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -46,6 +46,14 @@ def reach_of(recording: Recording, plant: PlantDescription) -> Reach:
         readings=readings,
         levels=levels,
     )
+
+
+def with_levels(reach: Reach, plant: PlantDescription, levels: Tensor) -> Reach:
+    """The same, with the levels of the tanks that no sensor sees as a model has them: levels (K, tanks), m."""
+    unseen = {t.name: _range(levels[:, i]) for i, t in enumerate(plant.tanks)}
+    for sensor in plant.sensors:
+        unseen.pop(sensor.tank, None)
+    return replace(reach, levels={**reach.levels, **unseen})
 
 
 def bounded(space: ParameterSpace, duration: float) -> ParameterSpace:

@@ -1,0 +1,36 @@
+"""Recordings whose samples lie far apart, and tanks that no sensor sees."""
+
+import pytest
+import torch
+
+from fdi_torch.config.plant import load_plant
+from fdi_torch.gap.floor import estimate_noise
+from fdi_torch.plant.reach import reach_of, with_levels
+from fdi_torch.recording import Recording
+
+
+@pytest.mark.parametrize(("ar", "count"), [(0.0, 1024), (0.0, 6000), (0.7, 6000)])
+def test_an_error_of_the_model_faster_than_the_corner_does_not_pass_for_colour(ar: float, count: int) -> None:
+    generator = torch.Generator().manual_seed(1)
+    fresh = torch.randn(count, 2, dtype=torch.float64, generator=generator)
+    noise, slope, level = fresh[:, 0].clone(), fresh[:, 1].clone(), torch.zeros(count, dtype=torch.float64)
+    for k in range(1, count):
+        noise[k] += ar * noise[k - 1]
+        slope[k] += 0.9 * slope[k - 1]  # flows that are wrong for some ten samples at a time
+        level[k] = 0.98 * level[k - 1] + slope[k]
+    found = estimate_noise((noise + level).unsqueeze(1), torch.ones(count, 1, dtype=torch.bool))
+    assert float(found.ar[0]) == pytest.approx(ar, abs=0.25)
+    assert float(found.std[0]) == pytest.approx(float(noise.std()), rel=0.35)
+
+
+def test_a_tank_without_a_sensor_reaches_as_far_as_the_model_has_it() -> None:
+    plant = load_plant("cascaded_tanks")
+    time = torch.arange(3, dtype=torch.float64)
+    readings = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
+    recording = Recording(time, readings, readings, ("u_pump",), ("y_lower_level",), ("V",), ("V",))
+    plain = reach_of(recording, plant)
+    assert plain.levels["upper"] == (0.0, pytest.approx(0.14))
+    levels = torch.tensor([[0.05, 0.5], [0.08, 0.6]], dtype=torch.float64)
+    found = with_levels(plain, plant, levels)
+    assert found.levels["upper"] == (0.05, 0.08)
+    assert found.levels["lower"] == plain.levels["lower"]
