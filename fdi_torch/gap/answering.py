@@ -142,9 +142,12 @@ def _causes(found: Finding) -> tuple[Cause, ...]:
             if name.rpartition(".")[0] == p.prefix:
                 amounts[name.rpartition(".")[2]] = Amount(value, stds[name], fit.space[name].unit)
         causes.append(Cause(p.effect.name, p.location, amounts, twins((p.effect.name, p.location), plant)))
-    steps = {s.name: (step, s.unit) for s, step in zip(plant.sensors, found.lattice, strict=True)}
+    steps = {s.name: ("step", step) for s, step in zip(plant.sensors, found.lattice, strict=True)}
+    limits = {(p.effect.name, p.location): ("limit", (p.values or {})["limit"]) for p in found.told}
+    units = {s.name: s.unit for s in plant.sensors}
     for name, place in found.rounded:
-        causes.append(Cause(name, place, {"step": Amount(steps[place][0], 0.0, steps[place][1])}))
+        parameter, value = limits.get((name, place), steps[place])
+        causes.append(Cause(name, place, {parameter: Amount(value, 0.0, units[place])}))
     return tuple(causes)
 
 

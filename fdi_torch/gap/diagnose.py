@@ -15,6 +15,7 @@ from fdi_torch.gap.finding import UNEXPLAINED, Finding, Weighed, in_order, left_
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_rounding
 from fdi_torch.gap.library import canonical, library_of, possible_places
+from fdi_torch.gap.limits import told_limits
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.usable import expect_another, laid_out
 from fdi_torch.gap.where import Suspect, refit, suspects
@@ -54,22 +55,28 @@ def diagnose(
         expect_another(one, recording)
     library = library_of(plant, settings.library, settings.leave_out)
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    told = told_limits(plant, recording, believed, library)
+    believed += told
     subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recording, *holdouts))
     tell(0.05, "noise floor and recalibration")
     fitter, null, lattice = _recalibrated(subject)
     reach = with_levels(reach_of(recording, plant), plant, null.near.levels[0])
     tell(0.2, "which effect")
-    options = options_of([p for p in library if not p.effect.rounds], fitter, reach)
+    known = {p.prefix for p in told}
+    options = options_of([p for p in library if not p.effect.rounds and p.prefix not in known], fitter, reach)
     found = search(fitter, null, options)
     tell(0.6, "where")
     places, refits = _places(fitter, found, plant, reach)
     rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
     rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]
+    rounded += [(p.effect.name, p.location) for p in told]
     weighed = _weighed(fitter, found, len(library), plant)
     unknown = _unnamed(fitter, weighed.fits[0], found, refits)
     standing = _content(weighed.explanations)
     verdict: Verdict = "unknown" if unknown else _verdict(standing, rounded)
-    finding = Finding(fitter, library, reach, found, places, weighed, standing, unknown, verdict, rounded, lattice)
+    finding = Finding(
+        fitter, library, reach, found, places, weighed, standing, unknown, verdict, rounded, lattice, told
+    )
     tell(0.8, "hold-out")
     return answered(finding, held)
 

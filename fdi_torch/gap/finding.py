@@ -28,7 +28,7 @@ class Weighed:
 class Finding:
     """library: what was searched. standing: the explanations that hold 95 % together. unnamed: the free discrepancy
     that closes what no effect does, if there is one. rounded: what the values themselves tell; lattice (C,): the step
-    of each rounded sensor, or 0.
+    of each rounded sensor, or 0; told: the limits of sensors, with their values.
     """
 
     fitter: Fitter
@@ -42,6 +42,7 @@ class Finding:
     verdict: Verdict
     rounded: Sequence[CauseName]
     lattice: Sequence[float]
+    told: Sequence[Placement] = ()
 
     @property
     def null(self) -> Fit:
