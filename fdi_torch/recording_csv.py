@@ -238,9 +238,10 @@ def _clock(path: Path, seconds: np.ndarray, clock: Bound, header_line: int) -> n
     back = np.flatnonzero(np.diff(seconds) <= 0)
     if len(back):
         before, after = seconds[back[0]], seconds[back[0] + 1]
+        rows = "one such row" if len(back) == 1 else f"{len(back)} such rows"
         raise ValueError(
             f"{path}: row {header_line + 2 + int(back[0])}, column {clock.header}: expected time that increases, got "
-            f"{after:g} s after {before:g} s ({len(back)} such rows); sort the rows or drop the repeated ones"
+            f"{after:g} s after {before:g} s ({rows}); sort the rows or drop the repeated ones"
         )
     return seconds
 

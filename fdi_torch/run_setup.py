@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 
 from fdi_torch.config.estimation import EstimationConfig, estimated_space, parameter_values, placements_of
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recordings import LoadedRecording, load_recordings
 from fdi_torch.config.run import Run
 from fdi_torch.config.simulation import noise_std, planned_recording
@@ -60,7 +61,10 @@ def wanted_space(run: Run) -> ParameterSpace:
         raise ValueError(
             f"{run.source}: estimate.parameters: expected at least one, got none; name some, as in T1.leak"
         )
-    network = build_network(run.plant, placements_of([p.name for p in config.parameters], run.plant))
+    try:
+        network = build_network(run.plant, placements_of([p.name for p in config.parameters], run.plant))
+    except ValueError as error:
+        raise ConfigError([f"{run.source}: estimate.parameters: {error}"]) from error
     return estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
 
 
@@ -82,13 +86,14 @@ def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording
     """These parameters on these recordings, with all tensors on the device that the run file asks for."""
     device = usable_device(run.config.device)
     recordings = [part.recording.to(device) for part in loaded]
-    expect_enough_samples(recordings, space)
     with tensors_on(device):
-        return set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
+        fitting = set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
+    expect_enough_samples(recordings, fitting.space)
+    return fitting
 
 
 def expect_enough_samples(recordings: Sequence[Recording], space: ParameterSpace) -> None:
-    """Raises ValueError where there are fewer readings than parameters."""
+    """Raises ValueError where there are fewer readings than parameters, start levels among them."""
     readings = sum(int(r.mask.sum()) for r in recordings)
     if readings <= len(space):
         source = recordings[0].source

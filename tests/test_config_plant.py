@@ -149,7 +149,12 @@ def test_a_plant_file_is_found_by_shipped_name_by_folder_and_by_path(tmp_path: P
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
-    [("tanks: [", "line 1: expected YAML"), ("- 1", "expected keys and values, got list"), ("", "got NoneType")],
+    [
+        ("tanks: [", "line 1: expected YAML"),
+        ("tanks: {}\nsensors: {h1: {tank: T1}, h1: {tank: T2}}", "line 2: expected each key once, got h1 twice"),
+        ("- 1", "expected keys and values, got list"),
+        ("", "got NoneType"),
+    ],
 )
 def test_a_file_without_a_mapping_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
     (tmp_path / "p.yaml").write_text(text)

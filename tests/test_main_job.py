@@ -14,7 +14,7 @@ import torch
 from fdi_torch.cli import DONE, MISUSE, main
 from fdi_torch.config.run import Run, load_run
 from fdi_torch.logbook import content_hash, read_run
-from fdi_torch.main_job import train
+from fdi_torch.main_job import TrainResult, train
 
 QUICK = ("simulate.duration=400 s", "estimate.search.evaluations=1500", "estimate.step.refine=0.5 s")
 
@@ -96,6 +96,7 @@ def test_the_command_prints_a_table_with_units(tmp_path: Path, capsys: pytest.Ca
         ("device=cuda:99", "device: expected one that torch can use here, such as cpu, got 'cuda:99'"),
         ("estimate.parameters=[]", "estimate.parameters: expected at least one, got none"),
         ("estimate.parameters=[T1.leek]", "the nearest is 'T1.leak'"),
+        ("estimate.parameters=[T9.leak]", "estimate.parameters: plant three_tank: expected one of T1, T2"),
     ],
 )
 def test_misuse_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str], change: str, sentence: str) -> None:
@@ -128,6 +129,55 @@ def test_simulate_writes_a_recording_that_train_takes(tmp_path: Path, capsys: py
     assert float(done.result.estimate.value[0]) == pytest.approx(0.3, abs=0.02)
 
 
+OWN = """
+plant: three_tank
+recordings: [{file: default.csv}]
+estimate:
+  parameters: [T1.leak, P13.plugging]
+  search: {population: 40, evaluations: 400}
+  step: {search: 10 s, refine: 2 s}
+"""
+
+
+@pytest.fixture(scope="module")
+def own_recording(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Lines of a short recording as a CSV file."""
+    folder = tmp_path_factory.mktemp("own")
+    changes = ["simulate.duration=200 s", "simulate.faults={T1.leak: 0.3}"]
+    main(["simulate", "--quiet", "--out", str(folder), *(word for c in changes for word in ("--set", c))])
+    return (folder / "default.csv").read_text().splitlines()
+
+
+def train_on(lines: list[str], folder: Path, *changes: str) -> TrainResult:
+    (folder / "default.csv").write_text("\n".join(lines))
+    (folder / "own.yaml").write_text(OWN)
+    return train(load_run(folder / "own.yaml", [f"output.folder={folder}", *changes]))
+
+
+def test_a_recording_with_an_unknown_input_is_cut_there(own_recording: list[str], tmp_path: Path) -> None:
+    """Two stretches with start levels of their own: one leak, found from both."""
+    header, *rows = own_recording
+    cells = [row.split(",") for row in rows]
+    for row in cells[90:110]:
+        row[1] = ""
+    done = train_on([header, *map(",".join, cells)], tmp_path)
+    assert len(done.fitting.recordings) == 2 and "T1.start_level@1" in done.fitting.space
+    leak = done.result.diagnosis.faults[0]
+    assert leak.present and leak.flow is not None and leak.value == pytest.approx(0.3, abs=0.05)
+
+
+def test_a_sensor_that_stands_still_is_named(own_recording: list[str], tmp_path: Path) -> None:
+    header, *rows = own_recording
+    stuck = [",".join([*row.split(",")[:-1], "50"]) for row in rows]
+    with pytest.raises(ValueError, match=r"default.csv: h3: expected readings that vary, got 0.5 throughout"):
+        train_on([header, *stuck], tmp_path)
+
+
+def test_two_samples_are_fewer_than_faults_and_start_levels(own_recording: list[str], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected more readings than parameters, got 6 readings for 8 parameters"):
+        train_on(own_recording[:3], tmp_path)
+
+
 def killed_in_generation(number: int, run: Run, folder: Path) -> None:
     """Leaves in the folder what kill -9 leaves: a .partial that was never finished."""
     done = subprocess.run([sys.executable, "-c", KILLED, run.text, str(number)], check=False, cwd=folder)
@@ -139,7 +189,7 @@ import os, signal, sys, time
 import yaml
 from pathlib import Path
 from fdi_torch.config.run import build_run
-from fdi_torch.main_job import train
+from fdi_torch.main_job import TrainResult, train
 def tell(share, text):
     if f"generation {sys.argv[2]}," in text:
         time.sleep(1.2)

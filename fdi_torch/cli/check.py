@@ -8,7 +8,7 @@ from pathlib import Path
 from fdi_torch.cli.options import add_config
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant import load_plant
-from fdi_torch.config.recordings import RecordingConfig, load_recordings, read_recording
+from fdi_torch.config.recordings import RecordingConfig, known_parts, read_recording
 from fdi_torch.config.run import load_run
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         recording = read_recording(config, plant, base)
         checks.append(check_recording(recording, plant))
         _show(checks[-1], screen)
-        stretches = load_recordings([config], plant, base)
+        stretches = known_parts(recording, config, plant)
         if len(stretches) > 1 or len(stretches[0].recording) < len(recording):
             spans = ", ".join(f"{p.recording.time[0]:g} to {p.recording.time[-1]:g} s" for p in stretches)
             screen.say(f"usable with all inputs known: {spans}")

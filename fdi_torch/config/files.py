@@ -27,11 +27,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def parse_yaml(text: bytes, source: str) -> dict[str, Any]:
     """The mapping in YAML text of plain values. Raises ConfigError, naming `source`, where it is none."""
     try:
-        data = yaml.safe_load(text.decode("utf-8"))
+        data = yaml.load(text.decode("utf-8"), _Loader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         where = getattr(error, "problem_mark", None)
         line = f"line {where.line + 1}: " if where else ""
-        raise ConfigError([f"{source}: {line}expected YAML, got {getattr(error, 'problem', None) or error}"]) from error
+        problem = getattr(error, "problem", None) or str(error)
+        told = problem if problem.startswith("expected each key") else f"expected YAML, got {problem}"
+        raise ConfigError([f"{source}: {line}{told}"]) from error
     if not isinstance(data, dict):
         raise ConfigError([f"{source}: expected keys and values, got {type(data).__name__}"])
     return data
@@ -52,6 +54,20 @@ def _merged(below: Any, above: Any) -> Any:
     if not (isinstance(below, dict) and isinstance(above, dict)):
         return above
     return below | {key: _merged(below.get(key), value) for key, value in above.items()}
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain values only. A key that stands twice is refused: the first would be lost without a word."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                if key.value in seen:
+                    told = f"expected each key once, got {key.value} twice; rename or remove one"
+                    raise yaml.constructor.ConstructorError(None, None, told, key.start_mark)
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
 def write_yaml(data: dict[str, Any]) -> str:
@@ -96,6 +112,9 @@ def find_file(name: str, base: Path, also: Sequence[Path] = ()) -> Path:
     for folder in folders:
         if (folder / name).is_file():
             return folder / name
+    for folder in folders:
+        if (folder / name).is_dir():
+            raise ConfigError([f"{folder / name}: expected a file, got a folder; name a file in it"])
     looked = ", ".join(dict.fromkeys(str(folder) for folder in folders))
     raise ConfigError([f"{name}: expected a file, got none there (looked in {looked}){_similar(name, folders)}"])
 

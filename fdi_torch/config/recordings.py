@@ -77,21 +77,18 @@ class LoadedRecording:
 def load_recordings(
     configs: Sequence[RecordingConfig], plant: PlantDescription, base: Path | None = None
 ) -> list[LoadedRecording]:
-    """Every recording, cut where an input is unknown; the levels at the start of a later stretch are free."""
-    loaded: list[LoadedRecording] = []
-    for config in configs:
-        whole = read_recording(config, plant, base)
-        stretches = [part for part in whole.known_stretches() if len(part) > 1]
-        if not stretches:
-            raise ConfigError(
-                [f"{whole.source}: expected a stretch with all inputs known, got none; {GIVE_A_CONSTANT}"]
-            )
-        for part in stretches:
-            from_the_start = float(part.time[0]) == float(whole.time[0])
-            loaded.append(
-                LoadedRecording(part, _levels(config.start_levels if from_the_start else "free", plant, config))
-            )
-    return loaded
+    """Every recording, cut where an input is unknown."""
+    return [part for config in configs for part in known_parts(read_recording(config, plant, base), config, plant)]
+
+
+def known_parts(whole: Recording, config: RecordingConfig, plant: PlantDescription) -> list[LoadedRecording]:
+    """A recording cut where an input is unknown; the levels at the start of a later stretch are free."""
+    stretches = [part for part in whole.known_stretches() if len(part) > 1]
+    if not stretches:
+        raise ConfigError([f"{whole.source}: expected a stretch with all inputs known, got none; {GIVE_A_CONSTANT}"])
+    first = float(whole.time[0])
+    starts = [config.start_levels if float(part.time[0]) == first else "free" for part in stretches]
+    return [LoadedRecording(part, _levels(start, plant, config)) for part, start in zip(stretches, starts, strict=True)]
 
 
 def read_recording(config: RecordingConfig, plant: PlantDescription, base: Path | None = None) -> Recording:

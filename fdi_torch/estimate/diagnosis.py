@@ -109,8 +109,9 @@ def fault_flow(
     placement = next(p for p in network.placements if name.startswith(p.prefix + "."))
     if placement.effect.stage not in (Stage.FLOW, Stage.BALANCE):
         return None, None
-    own = [i for i, n in enumerate(space.names) if n.split("@")[0] in network.constants]
-    part = ParameterSpace([network.constants[space.names[i].split("@")[0]] for i in own])
+    # Start levels of further recordings (T1.start_level@1) are no constants of the plant, and change no flow at these.
+    own = [i for i, n in enumerate(space.names) if n in network.constants]
+    part = ParameterSpace([network.constants[space.names[i]] for i in own])
     theta = value[own]
     without = theta.clone()
     without[own.index(which)] = space.parameters[which].nominal

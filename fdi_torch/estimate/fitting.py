@@ -63,6 +63,9 @@ class Fitting:
         ]
 
     def problem(self, step: float, objective: Objective = "likelihood") -> Problem:
+        """Raises ValueError where the objective is correlation and readings that count stand still."""
+        for recording in self.recordings if objective == "correlation" else ():
+            _expect_variation(recording, self.plant)
         terms = [
             Term(engine, readings_of(recording, self.plant), columns)
             for engine, recording, columns in zip(self.engines(step), self.recordings, self.columns, strict=True)
@@ -147,6 +150,18 @@ def first_level(plant: PlantDescription, tank: str, recording: Recording) -> flo
             if len(valid):
                 return (float(valid.median()) - sensor.offset) / sensor.gain
     return None
+
+
+def _expect_variation(recording: Recording, plant: PlantDescription) -> None:
+    for name in (sensor.column for sensor in plant.sensors if sensor.column in recording.output_names):
+        column = recording.output_names.index(name)
+        seen = recording.outputs[recording.mask[:, column], column]
+        if len(seen) and bool((seen == seen[0]).all()):
+            raise ValueError(
+                f"{recording.source}: {name}: expected readings that vary, got {float(seen[0]):g} throughout, whose "
+                f"correlation is undefined; set estimate.objective.search to likelihood, or leave the sensor out: "
+                f"columns: {{{name}: {{recorded: false}}}}"
+            )
 
 
 def readings_of(recording: Recording, plant: PlantDescription) -> Readings:
