@@ -22,19 +22,20 @@ from fdi_torch.recording import Recording
 def run_gap(
     path: Path,
     plant: PlantDescription,
-    recording: Recording,
+    recording: Recording | Sequence[Recording],
     holdouts: Sequence[Recording] = (),
     settings: Settings | None = None,
     tell: Tell = lambda share, text: None,
     parent_run_id: str | None = None,
 ) -> Answer:
     """Diagnoses, and writes the log `path`: recordings first, then what is said on the way, then the answer."""
-    every, settings = (recording, *holdouts), settings or Settings()
+    recordings = (recording,) if isinstance(recording, Recording) else tuple(recording)
+    every, settings = (*recordings, *holdouts), settings or Settings()
     sources = [{"path": r.source, "sha256": r.sha256} for r in every]
-    config = {"settings": asdict(settings)}
+    config = {"settings": asdict(settings), "recordings": len(recordings)}
     text = dump_plant(plant)
     with RunLog(path, "gap", config_text=text, config=config, data=sources, parent_run_id=parent_run_id) as log:
-        for group, each in zip(groups(len(holdouts)), every, strict=True):
+        for group, each in zip(groups(len(holdouts), len(recordings)), every, strict=True):
             log_recording(log, each, group)
         log.flush()
 
@@ -43,14 +44,15 @@ def run_gap(
             tell(share, text)
 
         with one_thread():
-            answer = diagnose(plant, recording, holdouts, settings, say)
+            answer = diagnose(plant, recordings, holdouts, settings, say)
         log_answer(log, answer.to_dict(), answer.arrays)
     return answer
 
 
-def groups(holdouts: int) -> tuple[str, ...]:
-    """Names of the recordings in the log: none for the diagnosed one, then the hold-outs'."""
-    return ("", *("holdout" if k == 0 else f"holdout_{k + 1}" for k in range(holdouts)))
+def groups(holdouts: int, recordings: int = 1) -> tuple[str, ...]:
+    """Names of the recordings in the log: none for the diagnosed one (the first of them), then the hold-outs'."""
+    further = (f"recording_{k + 1}" for k in range(1, recordings))
+    return ("", *further, *("holdout" if k == 0 else f"holdout_{k + 1}" for k in range(holdouts)))
 
 
 def log_recording(log: RunLog, recording: Recording, group: str) -> None:

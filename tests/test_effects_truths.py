@@ -132,6 +132,10 @@ def test_valves() -> None:
     assert through(effect("valve_dead_zone"), [0.1, 0.6, 1.0], 1.0, values(dead_zone=0.2)) == pytest.approx(
         [0.0, 0.5, 1.0]
     )
+    # Three quarters of the head lost outside: half open, flow ratios of 0.5 / sqrt(1/4 + 3/16).
+    assert through(effect("valve_authority"), [0.0, 0.5, 1.0], 1.0, values(series=0.75)) == pytest.approx(
+        [0.0, 0.5 / (7 / 16) ** 0.5, 1.0]
+    )
     assert through(effect("valve_characteristic"), [0.0, 0.5, 1.0], 1.0, values(bend=1.0)) == pytest.approx(
         [0.0, 0.25, 1.0]
     )

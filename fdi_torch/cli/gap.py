@@ -16,15 +16,15 @@ from fdi_torch.cli.gap_text import next_steps, show, show_plan
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant import load_plant
 from fdi_torch.config.plant_writer import dump_plant
-from fdi_torch.config.recordings import RecordingConfig, read_recording
+from fdi_torch.config.recordings import named_recordings
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.next_input import planned
 from fdi_torch.gap.plan import plan
+from fdi_torch.gap.which import DEEPEST
 from fdi_torch.gap_job import one_thread, run_gap
 from fdi_torch.log_paths import free_path
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recording import Recording
 from fdi_torch.recording_csv import write_csv
 
 EXAMPLES = """
@@ -33,6 +33,7 @@ examples:
   fdi gap --plant three_tank --recording run.csv --holdout other.csv   also how far the gap closes on other.csv
   fdi gap --plant rig.yaml --recording run.csv --adopt better.yaml     write the plant file with the causes in it
   fdi gap --plant rig.yaml --recording run.csv --library pump_lag,leak@T1
+  fdi gap --plant rig.yaml --recording runs.yaml --most 8               several recordings as one, many causes
   fdi gap --plant rig.yaml --recording planned.csv --plan              before any reading: what the inputs cannot tell
 
 CSV headers are name_unit, as in t_s,Q1_cm3_s,h1_cm. `fdi report LOG` makes a page of the answer, `fdi replay LOG` does
@@ -44,13 +45,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EXAMPLES
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
-    parser.add_argument("--recording", metavar="FILE", required=True, help="CSV or MCAP file to diagnose")
+    parser.add_argument(
+        "--recording", metavar="FILE", required=True, help="CSV or MCAP file, or a YAML file with `recordings`"
+    )
     parser.add_argument(
         "--holdout", metavar="FILE", nargs="+", default=[], help="other recordings of the same rig, for closure only"
     )
     parser.add_argument("--library", metavar="EFFECT,...", help="effects to search (EFFECT@PLACE for one), or all")
     parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="effects to deny the diagnosis")
     parser.add_argument("--step", metavar="S", type=float, help="of the simulation, s (the sampling interval)")
+    parser.add_argument("--most", metavar="N", type=int, default=DEEPEST, help=f"effects at once, at most ({DEEPEST})")
     parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the causes found among its effects")
     parser.add_argument(
         "--with-constants", action="store_true", help="--adopt also writes the constants as fitted beside the causes"
@@ -62,19 +66,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant = load_plant(arguments.plant)
-    recording = _read(arguments.recording, plant)
+    recordings = named_recordings(arguments.recording, plant, Path.cwd())
     library = tuple(arguments.library.split(",")) if arguments.library else None
     if arguments.plan:
         with one_thread():
-            return show_plan(plan(plant, recording, arguments.noise, library), screen)
+            return show_plan(plan(plant, recordings[0], arguments.noise, library), screen)
     if arguments.step is not None and not arguments.step > 0.0:
         raise ValueError(f"--step: expected a positive number of seconds, got {arguments.step:g}")
-    holdouts = [_read(name, plant) for name in arguments.holdout]
+    if arguments.most < 1:
+        raise ValueError(f"--most: expected at least one effect, got {arguments.most}")
+    holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
     left_out = tuple(name for name in arguments.leave_out.split(",") if name)
     folder = Path(arguments.out)
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
-        answer = run_gap(log, plant, recording, holdouts, Settings(library, left_out, arguments.step), advance)
+        settings = Settings(library, left_out, arguments.step, arguments.most)
+        answer = run_gap(log, plant, recordings, holdouts, settings, advance)
         advance(1.0, "done")
     written = _keep(arguments, plant, answer, screen)
     show(answer, screen)
@@ -83,10 +90,6 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     screen.say(f"log: {log} (fdi report {log} makes the page)")
     screen.result(answer.to_dict())
     return DONE
-
-
-def _read(name: str, plant: PlantDescription) -> Recording:
-    return read_recording(RecordingConfig(file=name), plant, Path.cwd())
 
 
 def _keep(arguments: argparse.Namespace, plant: PlantDescription, answer: Answer, screen: Screen) -> Path | None:
@@ -103,6 +106,9 @@ def _keep(arguments: argparse.Namespace, plant: PlantDescription, answer: Answer
             "as fitted beside them" if arguments.with_constants else "as they were (--with-constants: as fitted)"
         )
         screen.note(f"plant file with the causes, its constants {constants}: {target}")
+    elif arguments.adopt and arguments.with_constants and answer.verdict == "no_gap":
+        Path(arguments.adopt).write_text(dump_plant(adopted(plant, answer, True)), encoding="utf-8")
+        screen.note(f"plant file with its constants as fitted, for no cause was found: {arguments.adopt}")
     elif arguments.adopt:
         screen.complain(f"fdi gap: nothing to adopt: the verdict is {answer.verdict.replace('_', ' ')}")
     if not answer.next_input:

@@ -77,7 +77,11 @@ class PlantConfig(Strict):
     sensors: dict[str, SensorConfig] = Field(default_factory=dict)
     tolerances: dict[str, Amount] = Field(
         default_factory=dict,
-        description="one standard deviation of a constant as a share of it (of an offset: in its unit); * is any name",
+        description="one standard deviation of a constant as a share of it (of an offset, or a parameter of an effect: "
+        "in its unit); * is any name",
+    )
+    varying: list[str] = Field(
+        default_factory=list, description="constants with a tolerance that are others in each recording; * is any name"
     )
     effects: list[EffectConfig] = Field(default_factory=list, description="what the plant is known to have")
 
@@ -109,10 +113,11 @@ def _description(config: PlantConfig) -> PlantDescription:
         pipes=tuple(Pipe(name, **dict(pipe)) for name, pipe in config.pipes.items()),
         pumps=tuple(_pump(name, pump) for name, pump in config.pumps.items()),
         sensors=sensors,
-        tolerances=_tolerances(config, sensors),
         gravity=config.gravity,
     )
-    return replace(plant, effects=tuple(_effect(i, e, plant) for i, e in enumerate(config.effects)))
+    plant = replace(plant, effects=tuple(_effect(i, e, plant) for i, e in enumerate(config.effects)))
+    tolerances = _tolerances(config, plant)
+    return replace(plant, tolerances=tolerances, varying=_varying(config.varying, tolerances))
 
 
 def _pump(name: str, pump: PumpConfig) -> Pump:
@@ -153,14 +158,17 @@ def effect_parameters(name: str, location: str, plant: PlantDescription) -> dict
     return {p.name: p for p in found.parameters(location, plant)}
 
 
-def _tolerances(config: PlantConfig, sensors: Sequence[Sensor]) -> dict[str, float]:
-    """Patterns such as *.discharge_coefficient spelled out for every constant that they match; later ones win."""
-    units = {f"{sensor.name}.offset": sensor.unit for sensor in sensors}
-    known = _constants(config)
+def _tolerances(config: PlantConfig, plant: PlantDescription) -> dict[str, float]:
+    """Patterns such as *.discharge_coefficient spelled out for every constant that they match; later ones win.
+
+    A pattern for parameters of effects has two dots.
+    """
+    units = {f"{sensor.name}.offset": sensor.unit for sensor in plant.sensors} | effect_units(plant)
+    known = [*_constants(config), *effect_units(plant)]
     tolerances: dict[str, float] = {}
     for pattern, value in config.tolerances.items():
         place = f"tolerances.{pattern}"
-        matched = [name for name in known if fnmatchcase(name, pattern)]
+        matched = [n for n in known if fnmatchcase(n, pattern) and n.count(".") == max(pattern.count("."), 1)]
         if not matched:
             raise ValueError(f"{place}: {unknown('a constant', pattern, known)}")
         for name in matched:
@@ -168,6 +176,27 @@ def _tolerances(config: PlantConfig, sensors: Sequence[Sensor]) -> dict[str, flo
             if not tolerances[name] > 0:
                 raise ValueError(f"{place}: expected a positive tolerance such as 3 %, got {value}")
     return tolerances
+
+
+def _varying(patterns: Sequence[str], tolerances: dict[str, float]) -> tuple[str, ...]:
+    """Raises ValueError for what matches no constant with a tolerance: how much would it vary?"""
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        matched = [name for name in tolerances if fnmatchcase(name, pattern)]
+        if not matched:
+            known = list(tolerances) or ["none there are"]
+            raise ValueError(f"varying: {unknown('a constant with a tolerance', pattern, known)}")
+        found |= dict.fromkeys(matched)
+    return tuple(found)
+
+
+def effect_units(plant: PlantDescription) -> dict[str, str]:
+    """Units of all parameters of the plant's effects, by their full names."""
+    return {
+        f"{e.location}.{e.effect}.{name}": parameter.unit
+        for e in plant.effects
+        for name, parameter in effect_parameters(e.effect, e.location, plant).items()
+    }
 
 
 def _constants(config: PlantConfig) -> list[str]:

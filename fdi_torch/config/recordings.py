@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, ValidationError
 
-from fdi_torch.config.files import find_data
-from fdi_torch.config.problems import ConfigError, unknown
+from fdi_torch.config.files import find_data, find_file, read_extended
+from fdi_torch.config.problems import ConfigError, explain, unknown
 from fdi_torch.config.recording_mcap import read_mcap
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
 from fdi_torch.logbook import LogError
@@ -89,6 +89,23 @@ def known_parts(whole: Recording, config: RecordingConfig, plant: PlantDescripti
     first = float(whole.time[0])
     starts = [config.start_levels if float(part.time[0]) == first else "free" for part in stretches]
     return [LoadedRecording(part, _levels(start, plant, config)) for part, start in zip(stretches, starts, strict=True)]
+
+
+def named_recordings(name: str, plant: PlantDescription, base: Path) -> list[Recording]:
+    """What stands for recordings on a command line: a CSV or MCAP file, or a YAML file with a list under `recordings`,
+    as in a run file; each of the latter in stretches whose inputs are known.
+    """
+    if Path(name).suffix not in (".yaml", ".yml"):
+        return [read_recording(RecordingConfig(file=name), plant, base)]
+    path = find_file(name, base)
+    listed = read_extended(path).get("recordings")
+    if not listed:
+        raise ConfigError([f"{path}: recordings: expected at least one, got none; list files under it"])
+    try:
+        configs = [RecordingConfig.model_validate(entry) for entry in listed]
+    except ValidationError as error:
+        raise explain(error, f"{path}: recordings") from None
+    return [loaded.recording for loaded in load_recordings(configs, plant, path.parent)]
 
 
 def read_recording(config: RecordingConfig, plant: PlantDescription, base: Path | None = None) -> Recording:

@@ -43,6 +43,7 @@ from fdi_torch.effects.sensor_quantization import SensorQuantization
 from fdi_torch.effects.sensor_saturation import SensorSaturation
 from fdi_torch.effects.sensor_stuck import SensorStuck
 from fdi_torch.effects.unmetered_flow import UnmeteredFlow
+from fdi_torch.effects.valve_authority import ValveAuthority
 from fdi_torch.effects.valve_characteristic import ValveCharacteristic
 from fdi_torch.effects.valve_dead_zone import ValveDeadZone
 from fdi_torch.effects.valve_lag import ValveLag
@@ -61,6 +62,7 @@ EFFECTS: tuple[Effect, ...] = (
     ValveLag(),
     ValveDeadZone(),
     ValveCharacteristic(),
+    ValveAuthority(),
     ValveLeak(),
     PumpGain(),
     PumpCurve(),

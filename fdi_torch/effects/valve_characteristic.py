@@ -24,7 +24,7 @@ class ValveCharacteristic(Effect):
     name = "valve_characteristic"
     stage = Stage.COMMAND
     places = ("valve",)
-    mistaken_for = ("valve_dead_zone", "valve_leak", "actuator_stuck", "plugging")
+    mistaken_for = ("valve_dead_zone", "valve_leak", "actuator_stuck", "valve_authority", "plugging")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("bend", "1", 0.0, -0.8, 4.0, meaning="exponent of the opening less 1"),)

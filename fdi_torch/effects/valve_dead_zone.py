@@ -22,7 +22,7 @@ class ValveDeadZone(Effect):
     name = "valve_dead_zone"
     stage = Stage.COMMAND
     places = ("valve",)
-    mistaken_for = ("valve_leak", "actuator_stuck", "valve_characteristic", "plugging")
+    mistaken_for = ("valve_leak", "actuator_stuck", "valve_characteristic", "valve_authority", "plugging")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("dead_zone", "1", 0.0, 0.0, 0.9, meaning="opening at which it begins to pass"),)

@@ -13,6 +13,7 @@ from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 
 FORMAT = "fdi_torch.gap/1"
+OPEN_SHARE, OPEN_ERRORS = 0.2, 3.0  # of the value, and standard errors
 Verdict = Literal["no_gap", "named", "ambiguous", "unknown"]
 CauseName = tuple[str, str]
 # Effects of a tank whose size is a share of what flows through its leak reference.
@@ -96,15 +97,34 @@ def adopted(plant: PlantDescription, answer: Answer, constants: bool = False) ->
     """The plant as the answer says it is: its file with the causes among its effects.
 
     constants: also with the calibration constants as they were fitted beside the causes. Their tolerances stay what the
-    file says: how far they may lie off another day, the fit does not know.
+    file says: how far they may lie off another day, the fit does not know. The causes get a tolerance, so that a later
+    diagnosis refits them beside whatever else it finds.
     """
     placed = [PlacedEffect(c.effect, c.location, {n: a.value for n, a in c.parameters.items()}) for c in answer.causes]
     known = {(p.effect, p.location) for p in placed}
     effects = (*(e for e in plant.effects if (e.effect, e.location) not in known), *placed)
     if not constants:
         return replace(plant, effects=effects)
-    fitted = with_constants(plant, {n: c["augmented"] for n, c in answer.constants.items()})
-    return replace(fitted, effects=tuple(_same_flow(e, plant, fitted) for e in effects))
+    values = {n: c["augmented"] for n, c in answer.constants.items() if n not in plant.varying}
+    fitted = with_constants(plant, {n: v for n, v in values.items() if n.count(".") == 1})
+    effects = tuple(_same_flow(_refitted(e, values), plant, fitted) for e in effects)
+    return replace(fitted, effects=effects, tolerances=plant.tolerances | _open(answer))
+
+
+def _refitted(placed: PlacedEffect, values: Mapping[str, float]) -> PlacedEffect:
+    """An effect that the plant file has, with those of its parameters that have a tolerance as they were fitted."""
+    prefix = f"{placed.location}.{placed.effect}"
+    return replace(placed, parameters={n: values.get(f"{prefix}.{n}", v) for n, v in placed.parameters.items()})
+
+
+def _open(answer: Answer) -> dict[str, float]:
+    """How far the parameters of the causes may still move when another diagnosis refits them beside what it finds."""
+    return {
+        f"{cause.location}.{cause.effect}.{name}": max(OPEN_SHARE * abs(amount.value), OPEN_ERRORS * amount.std)
+        for cause in answer.causes
+        for name, amount in cause.parameters.items()
+        if amount.std > 0.0  # what was read off the values themselves is what it is
+    }
 
 
 def _same_flow(placed: PlacedEffect, before: PlantDescription, after: PlantDescription) -> PlacedEffect:

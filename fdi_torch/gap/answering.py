@@ -71,8 +71,8 @@ def _held_out(found: Finding, holdouts: Sequence[Subject]) -> list[HeldOut]:
 
 
 def _curves(found: Finding) -> list[dict[str, Any]]:
-    """The discrepancy at every guilty place."""
-    if found.verdict == "no_gap":
+    """The discrepancy at every guilty place; not drawn for several recordings at once."""
+    if found.verdict == "no_gap" or found.fitter.subject.further:
         return []
     heat = temperature(found.null.cost - found.search.best.cost)
     places = guilty_places(found)

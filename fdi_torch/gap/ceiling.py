@@ -34,8 +34,12 @@ def models_of(found: Finding) -> dict[str, Model]:
 
 
 def constants_of(fit: Fit) -> dict[str, float]:
-    """The calibration constants of a fit, without its start levels."""
-    return {n: v for n, v in fit.values.items() if n.count(".") == 1 and not n.endswith(".start_level")}
+    """The calibration constants of a fit and what it refitted of effects that the plant file has, without start levels
+    and what further recordings have for themselves.
+    """
+    new = {p.prefix for p in fit.candidate.placements}
+    lasting_names = [n for n in fit.space.names if "@" not in n and not n.endswith(".start_level")]
+    return {n: fit.values[n] for n in lasting_names if n.rpartition(".")[0] not in new}
 
 
 def ceiling_of(found: Finding) -> Model:

@@ -92,6 +92,8 @@ def free_run(subject: Subject, noise: Noise, model: Model, guess: Tensor | None 
     fitter = Fitter(replace(subject, mask=_first(subject.mask)), noise)
     network = fitter.engine(Candidate(model.placements), [n for n in values if n.count(".") == 2]).network
     for name, value in values.items():
+        if name.partition("@")[0] in subject.plant.varying or "@" in name:
+            continue  # what another recording had for itself
         # A free course in time belongs to the recording's own clock and tells nothing of another day.
         timed = name.rpartition(".")[2].startswith("time_") and ".free_" in name
         network.nominal[network.constants.index(name)] = 0.0 if timed else value

@@ -19,10 +19,10 @@ from fdi_torch.gap.limits import told_limits
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.usable import expect_another, laid_out
 from fdi_torch.gap.where import Suspect, refit, suspects
-from fdi_torch.gap.which import Search, search
+from fdi_torch.gap.which import DEEPEST, Search, search
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import Reach, reach_of, with_levels
+from fdi_torch.plant.reach import Reach, reach_of_all, with_levels
 from fdi_torch.recording import Recording
 
 CONTENT = 0.95
@@ -35,36 +35,44 @@ Tell = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class Settings:
-    """library, leave_out: as in `library_of`. step: of the simulation, s; None for the sampling interval."""
+    """library, leave_out: as in `library_of`. step: of the simulation, s; None for the sampling interval.
+
+    most: effects that one explanation may have.
+    """
 
     library: tuple[str, ...] | None = None
     leave_out: tuple[str, ...] = ()
     step: float | None = None
+    most: int = DEEPEST
 
 
 def diagnose(
     plant: PlantDescription,
-    recording: Recording,
+    recording: Recording | Sequence[Recording],
     holdout: Recording | Sequence[Recording] | None = None,
     settings: Settings = Settings(),
     tell: Tell = lambda share, text: None,
 ) -> Answer:
-    """What keeps the plant file from explaining the recording; hold-outs only measure how far the gap closes."""
+    """What keeps the plant file from explaining the recording, or several recordings by the same causes.
+
+    Hold-outs only measure how far the gap closes.
+    """
+    recordings = (recording,) if isinstance(recording, Recording) else tuple(recording)
     holdouts = () if holdout is None else (holdout,) if isinstance(holdout, Recording) else tuple(holdout)
     for one in holdouts:
-        expect_another(one, recording)
+        expect_another(one, recordings)
     library = library_of(plant, settings.library, settings.leave_out)
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
-    told = told_limits(plant, recording, believed, library)
+    told = told_limits(plant, recordings[0], believed, library) if len(recordings) == 1 else []
     believed += told
-    subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recording, *holdouts))
+    subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recordings, *((h,) for h in holdouts)))
     tell(0.05, "noise floor and recalibration")
     fitter, null, lattice = _recalibrated(subject)
-    reach = with_levels(reach_of(recording, plant), plant, null.near.levels[0])
+    reach = with_levels(reach_of_all(recordings, plant), plant, null.near.levels[0])
     tell(0.2, "which effect")
-    known = {p.prefix for p in told}
+    known = {p.prefix for p in told} | {name.rpartition(".")[0] for name in subject.nuisance}
     options = options_of([p for p in library if not p.effect.rounds and p.prefix not in known], fitter, reach)
-    found = search(fitter, null, options)
+    found = search(fitter, null, options, settings.most)
     tell(0.6, "where")
     places, refits = _places(fitter, found, plant, reach)
     rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
@@ -117,10 +125,10 @@ def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
     first = Fitter(subject, Noise(1e-2 * spread, torch.zeros(channels, dtype=spread.dtype)))
     null = first.fit(Candidate(), rounds=PATIENT)
     residual = subject.readings - null.near.readings[0]
-    noise = estimate_noise(residual, subject.mask)
+    noise = estimate_noise(residual, subject.mask, rows=subject.rows)
     values = [subject.readings[subject.mask[:, c], c] for c in range(channels)]
     lattice = [lattice_step(v, float(noise.std[c])) for c, v in enumerate(values)]
-    noise = estimate_noise(residual, subject.mask, [step > 0.0 for step in lattice])
+    noise = estimate_noise(residual, subject.mask, [step > 0.0 for step in lattice], subject.rows)
     fitter = Fitter(subject, with_rounding(noise, lattice, null.near.readings[0]))
     return fitter, fitter.fit(Candidate(), null, rounds=PATIENT), lattice
 

@@ -19,6 +19,7 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.experiment import Experiment, lay_out
+from fdi_torch.simulate.joint import Joint, own_name
 
 ROUNDS = 14
 SETTLED = 0.05  # chi-square units; smaller gains decide nothing
@@ -27,8 +28,21 @@ Key = frozenset[tuple[str, str]]
 
 
 @dataclass(frozen=True)
+class Part:
+    """One recording of what is diagnosed: laid out, its sensors (S, C) in the plant's order."""
+
+    recording: Recording
+    experiment: Experiment
+    readings: Tensor
+    mask: Tensor
+
+
+@dataclass(frozen=True)
 class Subject:
-    """What is diagnosed: a plant (with the effects it is believed to have) and one recording of it."""
+    """What is diagnosed: a plant (with the effects it is believed to have) and one or several recordings of it.
+
+    recording, experiment: of the first. readings, mask (S, C): of all, one blank sample between recordings.
+    """
 
     plant: PlantDescription
     believed: tuple[Placement, ...]
@@ -36,17 +50,64 @@ class Subject:
     experiment: Experiment
     readings: Tensor
     mask: Tensor
+    further: tuple[Part, ...] = ()
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        first = len(self.recording)
+        return (Part(self.recording, self.experiment, self.readings[:first], self.mask[:first]), *self.further)
+
+    @property
+    def rows(self) -> tuple[slice, ...]:
+        """Where each recording's samples stand among all."""
+        found, first = [], 0
+        for part in self.parts:
+            found.append(slice(first, first + len(part.recording)))
+            first += len(part.recording) + 1
+        return tuple(found)
+
+    def alone(self, recording: int) -> Subject:
+        """One of the recordings without the others."""
+        part = self.parts[recording]
+        return replace(
+            self,
+            recording=part.recording,
+            experiment=part.experiment,
+            readings=part.readings,
+            mask=part.mask,
+            further=(),
+        )
+
+    @cached_property
+    def own(self) -> tuple[str, ...]:
+        """What each recording has for itself: start levels, and constants that vary from recording to recording."""
+        return (*self.plant.varying, *(f"{t.name}.start_level" for t in self.plant.tanks))
 
     @cached_property
     def nuisance(self) -> tuple[str, ...]:
-        """Calibration constants with a tolerance, and start levels: refitted with every candidate."""
-        constants = TankNetwork(self.plant, ()).constants
-        tolerated = [p.name for p in constants if math.isfinite(p.std)]
-        return (*tolerated, *(f"{t.name}.start_level" for t in self.plant.tanks))
+        """Constants and effects' parameters with a tolerance, and start levels: refitted with every candidate."""
+        constants = TankNetwork(self.plant, self.believed).constants
+        common = [p.name for p in constants if math.isfinite(p.std) and p.name not in self.own]
+        own = [own_name(n, k) for k in range(len(self.further) + 1) for n in self.own]
+        return (*common, *own)
 
 
-def subject_of(plant: PlantDescription, believed: Sequence[Placement], recording: Recording, step: float) -> Subject:
-    """Lays a recording out; its sensors in the plant's order. Raises ValueError where one is missing."""
+def subject_of(
+    plant: PlantDescription, believed: Sequence[Placement], recordings: Recording | Sequence[Recording], step: float
+) -> Subject:
+    """Lays recordings out; their sensors in the plant's order. Raises ValueError where one is missing."""
+    each = [recordings] if isinstance(recordings, Recording) else recordings
+    first, *further = [_part(plant, recording, step) for recording in each]
+    readings, mask = [first.readings], [first.mask]
+    for part in further:
+        readings += [torch.zeros_like(part.readings[:1]), part.readings]
+        mask += [torch.zeros_like(part.mask[:1]), part.mask]
+    return Subject(
+        plant, tuple(believed), first.recording, first.experiment, torch.cat(readings), torch.cat(mask), tuple(further)
+    )
+
+
+def _part(plant: PlantDescription, recording: Recording, step: float) -> Part:
     names = [s.column for s in plant.sensors]
     missing = [n for n in names if n not in recording.output_names]
     if missing:
@@ -54,7 +115,7 @@ def subject_of(plant: PlantDescription, believed: Sequence[Placement], recording
         raise ValueError(f"{recording.source}: expected a sensor '{missing[0]}', got {known}; map the column to it")
     order = [recording.output_names.index(n) for n in names]
     experiment = lay_out(recording, plant.channels(), step)
-    return Subject(plant, tuple(believed), recording, experiment, recording.outputs[:, order], recording.mask[:, order])
+    return Part(recording, experiment, recording.outputs[:, order], recording.mask[:, order])
 
 
 @dataclass(frozen=True)
@@ -101,13 +162,16 @@ class Fitter:
 
     def __init__(self, subject: Subject, noise: Noise) -> None:
         self.subject, self.noise = subject, noise
-        self._engines: dict[tuple[str, ...], Collocation] = {}
 
-    def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation:
+    def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation | Joint:
         """The plant with the candidate's effects; its space holds the nuisances and what is free."""
         network = self.network(candidate.placements)
-        names = [*self.subject.nuisance, *free]
-        return Collocation(network, ParameterSpace(network.constants[n] for n in names), self.subject.experiment)
+        names = tuple(dict.fromkeys([*self.subject.nuisance, *free]))
+        space = ParameterSpace(network.constants[n] for n in names if "@" not in n)
+        if not self.subject.further:
+            return Collocation(network, space, self.subject.experiment)
+        parts = [Collocation(network, space, part.experiment) for part in self.subject.parts]
+        return Joint(parts, ParameterSpace(replace(space[n.partition("@")[0]], name=n) for n in names))
 
     def network(self, placements: Sequence[Placement]) -> TankNetwork:
         """The plant with further effects beside those it is believed to have, or in their stead."""
@@ -144,7 +208,7 @@ class Fitter:
         return Fit(candidate, engine.space, theta[best], float(cost[best]), near.lanes(torch.tensor([best])))
 
     def _begin(
-        self, engine: Collocation, starts: Sequence[Mapping[str, float]], base: Fit | None
+        self, engine: Collocation | Joint, starts: Sequence[Mapping[str, float]], base: Fit | None
     ) -> tuple[Tensor, Tensor]:
         known = base.values if base else self.first_levels()
         rows = [engine.space.vector({n: v for n, v in {**known, **s}.items() if n in engine.space}) for s in starts]
@@ -157,14 +221,16 @@ class Fitter:
     def first_levels(self) -> dict[str, float]:
         """Start levels from the mean of the first few readings."""
         found = {}
-        for i, sensor in enumerate(self.subject.plant.sensors):
-            seen = self.subject.readings[:5, i][self.subject.mask[:5, i]]
-            if len(seen):
-                found[f"{sensor.tank}.start_level"] = max(float(seen.mean() - sensor.offset) / sensor.gain, 0.0)
+        for k, part in enumerate(self.subject.parts):
+            for i, sensor in enumerate(self.subject.plant.sensors):
+                seen = part.readings[:5, i][part.mask[:5, i]]
+                if len(seen):
+                    level = max(float(seen.mean() - sensor.offset) / sensor.gain, 0.0)
+                    found[own_name(f"{sensor.tank}.start_level", k)] = level
         return found
 
     def descend(
-        self, engine: Collocation, theta: Tensor, levels: Tensor, rounds: int, target: float = -math.inf
+        self, engine: Collocation | Joint, theta: Tensor, levels: Tensor, rounds: int, target: float = -math.inf
     ) -> tuple[Tensor, Tensor, Linearised]:
         """theta (L, P), levels (L, K+1, n) -> where Levenberg-Marquardt ends, its cost (L,) and neighbourhood."""
         low, high, scale = self.box(engine.space)
@@ -222,7 +288,7 @@ class Fitter:
 
     def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]:
         """Bounds, and the scale on which each parameter varies."""
-        duration = float(self.subject.experiment.nodes[-1])
+        duration = max(float(part.experiment.nodes[-1]) for part in self.subject.parts)
         low, high, scale = [], [], []
         for p in space:
             timed = p.unit == "s"

@@ -20,6 +20,7 @@ from torch import Tensor
 
 DECAY_SHARE = 0.3  # of a rounding step, over which its error is forgotten
 MOST_BINS = 512  # of a spectrum
+LEAST_SAMPLES = 20  # in a stretch that has a say in level and colour
 FAST_PERIOD = 30.0  # samples; slower parts of a residual may be the model's
 
 
@@ -72,13 +73,15 @@ def slow_excess(white: Tensor) -> float:
     return float((power[slow].sum(dim=0) - (float(slow.sum()) - 0.5) * level).sum())
 
 
-def estimate_noise(residual: Tensor, mask: Tensor, rounded: Sequence[bool] = ()) -> Noise:
+def estimate_noise(
+    residual: Tensor, mask: Tensor, rounded: Sequence[bool] = (), rows: Sequence[slice] = (slice(None),)
+) -> Noise:
     """residual (S, C), mask (S, C) -> level and colour of each channel's noise.
 
     One colour for all channels: they are read by one system. rounded (C,): channels that have no say in it, for
-    what rounding adds has a colour of its own.
+    what rounding adds has a colour of its own. rows: the stretches that follow each other without a jump.
     """
-    spectra = [_fast_spectrum(residual[mask[:, c], c]) for c in range(residual.shape[1])]
+    spectra = [_spectrum_of_all([residual[r][mask[r][:, c], c] for r in rows]) for c in range(residual.shape[1])]
     say = [not r for r in rounded] if rounded and not all(rounded) else [True] * len(spectra)
     likelihoods = torch.stack([_likelihood(*s) for s in spectra])  # (C, colours, errors)
     counts = [int(mask[:, c].sum()) for c in range(residual.shape[1])]
@@ -98,17 +101,27 @@ _WHITE = int(_COLOURS.abs().argmin())
 _ERRORS = torch.cat([torch.zeros(1), torch.logspace(-4, 2, 25)])  # of the model, as shares of the innovation
 
 
-def _fast_spectrum(x: Tensor) -> tuple[Tensor, Tensor, int]:
+def _spectrum_of_all(stretches: Sequence[Tensor]) -> tuple[Tensor, Tensor, int]:
+    """Frequencies of several stretches side by side; too short ones have no say."""
+    if len(stretches) == 1:
+        return _fast_spectrum(stretches[0], MOST_BINS)
+    told = [x for x in stretches if len(x) >= LEAST_SAMPLES] or [max(stretches, key=len)]
+    found = [_fast_spectrum(x, len(x)) for x in told]
+    return torch.cat([power for power, _, _ in found]), torch.cat([cosine for _, cosine, _ in found]), 1
+
+
+def _fast_spectrum(x: Tensor, bins: int) -> tuple[Tensor, Tensor, int]:
     """Tapered periodogram of x (S,) above the corner frequency, and the cosine of each frequency.
 
-    Of a long recording in bins, each the mean of so many neighbours (the third item): spectra here are smooth.
+    Of a long recording in that many bins, each the mean of so many neighbours (the third item): spectra here are
+    smooth.
     """
     count = len(x)
     taper = torch.hann_window(count, periodic=False, dtype=x.dtype)
     power = torch.fft.rfft((x - x.mean()) * taper).abs() ** 2 / (taper**2).sum()
     frequency = torch.arange(len(power), dtype=x.dtype) / count
     fast = frequency > 1.0 / FAST_PERIOD
-    width = -(-int(fast.sum()) // MOST_BINS)
+    width = -(-int(fast.sum()) // bins)
     power, frequency = (b[fast][: int(fast.sum()) // width * width] for b in (power, frequency))
     power, frequency = (b.reshape(-1, width).mean(dim=1) for b in (power, frequency))
     return power, torch.cos(2 * math.pi * frequency), width

@@ -9,7 +9,7 @@ from fdi_torch.gap.answer import CauseName
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.plant.effect import Placement, fits
 
-# The protocol's vocabulary. Further effects of the library are searched when they are named.
+# The protocol's vocabulary, and what valves do. Further effects of the library are searched when they are named.
 STANDARD = (
     "pump_gain",
     "pump_dead_zone",
@@ -35,6 +35,11 @@ STANDARD = (
     "sensor_quantization",
     "sensor_delay",
     "sensor_saturation",
+    "valve_dead_zone",
+    "valve_characteristic",
+    "valve_authority",
+    "valve_lag",
+    "valve_leak",
 )
 
 

@@ -99,7 +99,8 @@ def _separation(fitter: Fitter, first: Fit, second: Fit, recording: Recording) -
 def _run(there: Fitter, fit: Fit) -> tuple[Tensor, Tensor, Tensor]:
     """Readings (S, C), slopes by the nuisances (S, C, P) and levels of a fit under the planned input."""
     engine = there.engine(fit.candidate, list(fit.effect_values))
-    theta = fit.theta.unsqueeze(0)
+    known = {n: v for n, v in fit.values.items() if n in engine.space}
+    theta = engine.space.vector(known).unsqueeze(0)
     near = engine.settle(theta, engine.constant_guess(theta), rounds=30)
     columns = [engine.space.index(n) for n in there.subject.nuisance]
     return near.readings[0], near.jacobian[0][..., columns], near.levels[0]

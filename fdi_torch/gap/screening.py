@@ -19,6 +19,8 @@ from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.reach import Reach
+from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.joint import Joint, with_blanks
 from fdi_torch.simulate.scan import product, scan_in_time
 
 Start = Mapping[str, float]
@@ -111,12 +113,22 @@ def _by_column(x: Tensor) -> Tensor:
 
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:
     """(S, C, M): whitened changes of the readings at the size of each start."""
-    near, experiment = fit.near, fitter.subject.experiment
     own = fitter.engine(fit.candidate, list(fit.effect_values))
-    theta = fit.theta.unsqueeze(0)
+    pieces = own.apart(fit.theta.unsqueeze(0), fit.near) if isinstance(own, Joint) else [(own, fit.theta, fit.near)]
+    columns = with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
+    return fitter.noise.whiten(columns, fitter.subject.mask)
+
+
+def _columns(
+    fitter: Fitter, fit: Fit, options: Sequence[Option], own: Collocation, theta: Tensor, near: Linearised
+) -> Tensor:
+    """(S, C, M) of one recording."""
+    experiment = own.experiment
     tried = {o.placement.prefix: o.placement for o in options}
     union = fitter.network([*(p for p in fit.candidate.placements if p.prefix not in tried), *tried.values()])
-    known = {n: v for n, v in fit.values.items() if n in union.constants}
+    values = zip(own.space.names, theta.flatten().tolist(), strict=True)
+    known = {n: v for n, v in values if n in union.constants}
+    theta = theta.reshape(1, -1)
     present = {p.prefix for p in own.network.placements} - tried.keys()
     forced = Forcing(union, present, union.bind(*_named(union, known)), near.levels[0].T.contiguous(), experiment)
     groups = _groups(options)
@@ -138,7 +150,7 @@ def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tenso
         still = forcing.new_zeros(1, forcing.shape[1], len(moving))
         paths = scan_in_time(transition, product(gain, forcing), still)
         columns[:, moving] = own.look(near.levels, theta).along(paths, [-1] * len(moving))[0]
-    return fitter.noise.whiten(columns.permute(2, 0, 1), fitter.subject.mask)
+    return columns.permute(2, 0, 1)
 
 
 def _named(network: TankNetwork, values: Mapping[str, float]) -> tuple[ParameterSpace, Tensor]:

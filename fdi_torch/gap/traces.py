@@ -17,13 +17,16 @@ KEPT = ("nominal", "recalibrated", "augmented", "ceiling")
 def traces(found: Finding, held: Sequence[HeldOut]) -> dict[str, Tensor]:
     """Arrays by name, SI, sensors in the order of the recording; hold-outs from the second on carry their number."""
     fitter = found.fitter
-    subject = fitter.subject
-    arrays = {
-        "nominal": free_run(subject, fitter.noise, Model(), found.null.near.levels)[0],
-        "recalibrated": found.null.near.readings[0],
-        "augmented": found.best.near.readings[0],
-    }
-    arrays = {name: _as_recorded(subject, values) for name, values in arrays.items()}
+    arrays: dict[str, Tensor] = {}
+    for k, rows in enumerate(fitter.subject.rows):
+        subject = fitter.subject.alone(k)
+        predicted = {
+            "nominal": free_run(subject, fitter.noise, Model())[0],
+            "recalibrated": found.null.near.readings[0, rows],
+            "augmented": found.best.near.readings[0, rows],
+        }
+        prefix = "" if k == 0 else f"recording_{k + 1}_"
+        arrays |= {f"{prefix}{name}": _as_recorded(subject, values) for name, values in predicted.items()}
     for k, one in enumerate(held):
         prefix = "holdout" if k == 0 else f"holdout_{k + 1}"
         arrays[f"{prefix}_time"] = one.subject.recording.time

@@ -16,21 +16,27 @@ LEAST = 60
 that still count as noise."""
 
 
-def expect_another(holdout: Recording, recording: Recording) -> None:
-    """Raises ValueError where a hold-out is the very recording that is diagnosed."""
-    same_file = bool(holdout.sha256) and holdout.sha256 == recording.sha256
-    if same_file or holdout is recording:
+def expect_another(holdout: Recording, recordings: Sequence[Recording]) -> None:
+    """Raises ValueError where a hold-out is one of the recordings that are diagnosed."""
+    same_file = bool(holdout.sha256) and any(_overlap(holdout, r) for r in recordings)
+    if same_file or any(holdout is r for r in recordings):
         raise ValueError(
             f"{holdout.source}: expected a hold-out other than the recording, got the same data; what was used for the "
             "fits says nothing of how far the gap closes"
         )
 
 
+def _overlap(a: Recording, b: Recording) -> bool:
+    """Whether both are stretches of one file that have time in common."""
+    return a.sha256 == b.sha256 and bool(a.time[0] < b.time[-1]) and bool(b.time[0] < a.time[-1])
+
+
 def laid_out(
-    plant: PlantDescription, believed: Sequence[Placement], recording: Recording, step: float | None
+    plant: PlantDescription, believed: Sequence[Placement], recordings: Sequence[Recording], step: float | None
 ) -> Subject:
-    """The recording on the grid of its simulation. step: s; None for the sampling interval."""
-    subject = subject_of(plant, believed, recording, step or float(torch.median(torch.diff(recording.time))))
+    """The recordings on the grid of their simulation. step: s; None for the sampling interval of the first."""
+    interval = float(torch.median(torch.diff(recordings[0].time)))
+    subject = subject_of(plant, believed, recordings, step or interval)
     expect_usable(subject)
     return subject
 

@@ -32,15 +32,15 @@ class Search:
         return self.fits[0]
 
 
-def search(fitter: Fitter, null: Fit, options: Sequence[Option]) -> Search:
-    """Fits singles, then pairs and more about the best ones, while another effect promises something."""
+def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEEPEST) -> Search:
+    """Fits singles, then pairs and more (`most`) about the best ones, while another effect promises something."""
     fits: dict[Key, Fit] = {null.key: null}
     screens = {null.key: screen(fitter, null, options)}
     for candidate in _further(null, screens[null.key], SINGLES, PROMISE):
         if not _outdone(fitter, null, _best(fits), candidate.promise):
             _keep(fits, fitter.fit(candidate, null, target=_best(fits)))
     _polish(fitter, fits, 1)
-    for depth in range(2, DEEPEST + 1):
+    for depth in range(2, most + 1):
         before = len(fits)
         worth = PROMISE * temperature(null.cost - _best(fits))
         for parent in _parents(fits.values(), depth - 1, PARENTS if depth == 2 else 2):

@@ -11,7 +11,7 @@ from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Sensor
 
 def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
     """Every constant of the plant; std from its tolerances, box of a tenth to ten times where it must be positive."""
-    tolerances = dict(plant.tolerances)
+    tolerances = {name: std for name, std in plant.tolerances.items() if name.count(".") == 1}
     for tank in plant.tanks:
         yield _positive(tank.name, "area", "m^2", tank.area, tolerances)
         yield _positive(tank.name, "height", "m", tank.height, tolerances)

@@ -103,8 +103,9 @@ class PlacedEffect:
 
 @dataclass(frozen=True)
 class PlantDescription:
-    """A rig. tolerances: one standard deviation of a constant ('P13.discharge_coefficient'), as a share of it;
-    of an offset, in the reading's unit.
+    """A rig. tolerances: one standard deviation of a constant ('P13.discharge_coefficient'), as a share of it; of an
+    offset or of an effect's parameter ('Q1.pump_lag.time_constant'), in its unit. varying: constants that are others
+    in each recording, such as the offset of a sensor that is zeroed before each run.
     """
 
     name: str
@@ -114,6 +115,7 @@ class PlantDescription:
     sensors: tuple[Sensor, ...] = ()
     effects: tuple[PlacedEffect, ...] = ()
     tolerances: dict[str, float] = field(default_factory=dict)
+    varying: tuple[str, ...] = ()
     gravity: float = 9.81
 
     def __post_init__(self) -> None:

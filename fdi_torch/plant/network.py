@@ -322,7 +322,9 @@ def placed_parameters(placement: Placement, plant: PlantDescription) -> list[Par
     for p in placement.effect.parameters(placement.location, plant):
         nominal = believed.pop(p.name, p.nominal)
         low, high = min(p.low, nominal), max(p.high, nominal)
-        parameters.append(replace(p, name=f"{placement.prefix}.{p.name}", nominal=nominal, low=low, high=high))
+        name = f"{placement.prefix}.{p.name}"
+        std = plant.tolerances.get(name, p.std)
+        parameters.append(replace(p, name=name, nominal=nominal, low=low, high=high, std=std))
     if believed:
         known = ", ".join(p.name for p in placement.effect.parameters(placement.location, plant))
         raise ValueError(f"{placement.prefix}: expected parameters of {known}, got {', '.join(believed)}")

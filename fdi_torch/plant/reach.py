@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -54,6 +54,20 @@ def with_levels(reach: Reach, plant: PlantDescription, levels: Tensor) -> Reach:
     for sensor in plant.sensors:
         unseen.pop(sensor.tank, None)
     return replace(reach, levels={**reach.levels, **unseen})
+
+
+def reach_of_all(recordings: Sequence[Recording], plant: PlantDescription) -> Reach:
+    """The same over several recordings: the longest, and the lowest and highest of all."""
+    each = [reach_of(recording, plant) for recording in recordings]
+
+    def widest(kind: str) -> dict[str, Range]:
+        found: dict[str, list[Range]] = {}
+        for reach in each:
+            for name, ends in getattr(reach, kind).items():
+                found.setdefault(name, []).append(ends)
+        return {name: (min(low for low, _ in r), max(high for _, high in r)) for name, r in found.items()}
+
+    return Reach(max(r.duration for r in each), widest("commands"), widest("readings"), widest("levels"))
 
 
 def bounded(space: ParameterSpace, duration: float) -> ParameterSpace:
