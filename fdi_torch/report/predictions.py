@@ -8,6 +8,7 @@
 | `holdout_time` | (S,) | clock of the hold-out in s |
 | `holdout_read` | (S, N) | its readings, NaN where one does not count |
 | `holdout_nominal`, `holdout_recalibrated`, `holdout_augmented`, `holdout_ceiling` | (S, N) | its predictions |
+| `holdout_K_...` | (S, N) | the same for the K-th of several hold-outs, from 2 |
 """
 
 from __future__ import annotations
@@ -29,8 +30,14 @@ MODELS = {
 
 def predicted(arrays: Mapping[str, np.ndarray], number: int, several: bool, shape: Sequence[int]) -> np.ndarray | None:
     """Readings of the recording with this number (from 0) at the estimate; None where there are none."""
-    for name in (f"predicted_{number + 1}", *(() if several else ("predicted", "augmented"))):
+    holdout = f"{holdout_prefix(number - 1)}_augmented" if number else "augmented"
+    for name in (f"predicted_{number + 1}", *(() if several else ("predicted",)), holdout):
         found = arrays.get(name)
         if found is not None and found.dtype.kind == "f" and found.shape == tuple(shape):
             return found
     return None
+
+
+def holdout_prefix(number: int) -> str:
+    """Of the arrays of the hold-out with this number (from 0)."""
+    return "holdout" if number == 0 else f"holdout_{number + 1}"

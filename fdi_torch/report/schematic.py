@@ -217,7 +217,7 @@ class _Drawing:
         if location not in pairs:
             return
         (x, y), (to_x, to_y) = (self.corner(name) for name in pairs[location])
-        points = [(x, y + 0.6), (to_x, to_y + 0.6)]
+        points = [(x, y + 0.42), (to_x, to_y + 0.42)]
         alpha = 1.0 if location in self.overlay.marks else strength(self.overlay.heat.get(location, 0.0))
         self.axes.plot(*np.array(points).T, color=MARK, lw=1.8, ls="--", alpha=alpha, zorder=1)
         if location in self.overlay.marks:

@@ -100,6 +100,11 @@ GAP_ANSWER: dict[str, Any] = {
         "closed": 0.998,
         "closed_ci95": [0.99, 1.0],
         "per_sensor": {"h1": {"nominal": 2.0, "recalibrated": 0.9, "augmented": 0.1}},
+        "frozen": {"recalibrated": 0.5, "nominal": 0.12},
+        "per_holdout": [
+            {"source": f"day{k}.csv", "recalibrated": 0.8, "augmented": 0.1, "noise_floor": 0.1, "closed": closed}
+            for k, closed in enumerate((0.99, None))
+        ],
     },
     "shape": {
         "location": "Q1",
@@ -118,7 +123,38 @@ GAP_ANSWER: dict[str, Any] = {
         },
     },
     "remarks": ["Two input steps can never separate lag from delay."],
-    "impostors": {"rate": 0.04, "of": "60 simulated rivals"},
+    "impostors": {
+        "best": [_DELAY],
+        "left_open": 0.03,
+        "would_pass": False,
+        "simulated": {"draws": 2400, "rivals": 60, "confused": 3, "passed": 41, "passed_for": [_DELAY]},
+    },
+    "excitation": {"hidden": [_DELAY], "inseparable": [{"between": [_LAG, _DELAY], "parted_by": 3.0}]},
+    "constants": {
+        f"{pipe}.discharge_coefficient": {
+            "nominal": 0.6,
+            "tolerance": 0.018,
+            "recalibrated": 0.52,
+            "augmented": 0.601,
+            "std": 2e-4,
+            "unit": "1",
+        }
+        for pipe in ("P13", "P32", "OUT2")
+    },
+    "curves": [
+        {
+            "location": "Q1",
+            "variable": variable,
+            "unit": unit,
+            "quantity": "flow",
+            "quantity_unit": "m^3/s",
+            "at": [0.0, 0.5 * end, end],
+            "free": [-1e-6, 1e-6, 3e-6],
+            "free_std": [2e-7, 1e-7, 2e-7],
+            "effect": [-1.1e-6, 1e-6, 2.9e-6],
+        }
+        for variable, unit, end in (("Q1 commanded", "m^3/s", 8e-5), ("level of T1", "m", 0.5), ("time", "s", 1800.0))
+    ],
 }
 
 

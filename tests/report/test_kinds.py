@@ -33,22 +33,24 @@ def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> No
     made = report(write_gap, tmp_path)
     text = page([made])
     assert headline(made.material) == "The gap comes from pump lag at Q1"
-    assert titles(made)[:8] == [
+    assert titles(made)[:10] == [
         "The rig",
         "What causes it",
         "Where the gap lies",
+        "The discrepancy",
         "How far it closes",
         "Before and after",
-        "The discrepancy",
+        "Calibration constants",
         "What the gap depends on",
         "What to run next",
+        "What these inputs cannot tell",
     ]
     assert {
         "gap_where",
         "gap_posterior",
         "gap_closure",
         "holdout_3",
-        "gap_shape_2",
+        "gap_curve_2",
         "gap_by_8",
         "gap_next_input_1",
     } <= names(made)

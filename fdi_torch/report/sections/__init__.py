@@ -3,13 +3,10 @@
 from fdi_torch.report.section import Maker
 from fdi_torch.report.sections.before_after import holdout_section, profile_section
 from fdi_torch.report.sections.estimate import estimate_section, posterior_section
-from fdi_torch.report.sections.gap import (
-    causes_section,
-    closure_section,
-    next_input_section,
-    shape_section,
-    where_section,
-)
+from fdi_torch.report.sections.gap import causes_section, where_section
+from fdi_torch.report.sections.gap_closure import closure_section, constants_section
+from fdi_torch.report.sections.gap_curves import curves_section, shape_section
+from fdi_torch.report.sections.gap_next import limits_section, next_input_section
 from fdi_torch.report.sections.monitor import event_section, residual_section
 from fdi_torch.report.sections.origin import configuration_section, health_section, provenance_section
 from fdi_torch.report.sections.rig import rig_section
@@ -21,11 +18,14 @@ SECTIONS: tuple[Maker, ...] = (
     rig_section,
     causes_section,
     where_section,
+    curves_section,
+    shape_section,
     closure_section,
     holdout_section,
-    shape_section,
+    constants_section,
     profile_section,
     next_input_section,
+    limits_section,
     estimate_section,
     event_section,
     residual_section,

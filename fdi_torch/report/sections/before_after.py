@@ -10,7 +10,7 @@ from fdi_torch.logbook import Signals
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.panels import Line, line_panel
-from fdi_torch.report.predictions import MODELS
+from fdi_torch.report.predictions import MODELS, holdout_prefix
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import SOFT
 
@@ -18,28 +18,35 @@ BINS = 24
 
 
 def holdout_section(material: Material) -> Section | None:
-    """What is left of the hold-out's readings by each model, sensor by sensor."""
-    time, read = material.arrays.get("holdout_time"), material.arrays.get("holdout_read")
-    if time is None or read is None or not material.recordings:
+    """What is left of the hold-outs' readings by each model, sensor by sensor."""
+    if not material.recordings:
         return None
-    recording = material.recordings[0]
-    pictures = []
+    blocks: list[str | list[Picture]] = []
+    count = 0
+    while f"{holdout_prefix(count)}_time" in material.arrays:
+        pictures = _holdout_panels(material, holdout_prefix(count))
+        blocks += [pictures] if pictures else []
+        count += 1
+    words = "What each model leaves of readings that were not used for fitting."
+    return Section("Before and after", [words, *blocks]) if blocks else None
+
+
+def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
+    arrays, recording, pictures = material.arrays, material.recordings[0], []
+    time, read, title = arrays[f"{prefix}_time"], arrays[f"{prefix}_read"], prefix.replace("holdout", "hold-out")
     for i, name in enumerate(recording.output_names):
         unit, scale = shown_unit(recording.output_units[i])
         lines: list[Line] = []
         for model in ("recalibrated", "augmented"):
-            said = material.arrays.get(f"holdout_{model}")
+            said = arrays.get(f"{prefix}_{model}")
             if said is not None:
                 words, colour = MODELS[model]
                 lines.append((words, time, scale * (read[:, i] - said[:, i]), colour))
         if lines:
-            figure = line_panel(f"{name}, hold-out", "time, s", axis("read − model", unit), lines)
-            pictures.append(Picture(f"holdout_{i + 1}", figure))
-    return (
-        Section("Before and after", ["What each model leaves on data not used for fitting.", pictures])
-        if pictures
-        else None
-    )
+            title_here = f"{name}, {title.replace('_', ' ')}"
+            figure = line_panel(title_here, "time, s", axis("read − model", unit), lines)
+            pictures.append(Picture(f"{prefix}_{i + 1}", figure))
+    return pictures
 
 
 def profile_section(material: Material) -> Section | None:

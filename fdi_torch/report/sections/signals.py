@@ -23,7 +23,7 @@ def fit_section(material: Material) -> Section | None:
         several = len(material.recordings) > 1
         model = predicted(material.arrays, k, several, recording.outputs.shape)
         fitted |= model is not None
-        blocks += [f"Recording {material.groups[k]}"] if several else []
+        blocks += [f"Recording {material.groups[k] or 'diagnosed'}".replace("_", " ")] if several else []
         blocks.append(_output_panels(recording, model, f"_{k + 1}" if several else ""))
         if model is not None:
             blocks += [_misfit_table(recording, model)]

@@ -1,0 +1,109 @@
+"""How far a gap closes on data that no fit has seen, and what its calibration constants became."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import PurePath
+from typing import Any
+
+from fdi_torch.report.html import table
+from fdi_torch.report.loose import as_float
+from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import axis, number, percent, shown_unit, with_error
+from fdi_torch.report.panels import bar_panel
+from fdi_torch.report.section import Picture, Section
+
+STAGES = {
+    "nominal": "as believed",
+    "recalibrated": "recalibrated",
+    "augmented": "with the cause",
+    "ceiling": "with free functions",
+    "noise_floor": "noise",
+}
+FROZEN = {"recalibrated": "constants as recalibrated without it", "nominal": "constants as believed"}
+
+
+def closure_section(material: Material) -> Section | None:
+    """Errors on data that no fit has seen."""
+    closure = material.answer.get("closure") or {}
+    stages = [name for name in STAGES if isinstance(closure.get(name), int | float)]
+    if not stages:
+        return None
+    unit = str(closure.get("unit", ""))
+    words = STAGES | ({"augmented": "with the free form"} if material.answer.get("verdict") == "unknown" else {})
+    stages = [m for m in stages if m != "ceiling" or material.answer.get("verdict") != "unknown"]
+    names = [words[name] for name in stages]
+    values = [float(closure[name]) for name in stages]
+    frozen, named = closure.get("frozen") or {}, words["augmented"]
+    extra = [(f"{named}, {other}", as_float(frozen.get(key))) for key, other in FROZEN.items() if key in frozen]
+    texts = [f"{number(v, 3)} {unit}".rstrip() for v in values]
+    label = axis("free-run root mean square error", unit)
+    figure = bar_panel("Hold-out", label, names, values, texts, [name == "augmented" for name in stages])
+    header = [f"plant{', error in ' + unit if unit else ''}", "all", *_sensors(closure)]
+    rows = [[words[m], number(float(closure[m]), 3), *_by_sensor(closure, m)] for m in stages]
+    rows += [[name, number(value, 3), *[""] * (len(header) - 2)] for name, value in extra]
+    blocks: list[Any] = [_closed(closure), [Picture("gap_closure", figure)], table(header, rows)]
+    blocks += _each_holdout(closure, unit)
+    if extra and "ceiling" in closure:
+        blocks.append(
+            "Free functions of the guilty component's own variables, added to the cause, are what a better equation of "
+            "it could reach at most. Far larger errors with other constants show what recalibration without the cause "
+            "had taken for it: with both, the gap is counted twice."
+        )
+    return Section("How far it closes", blocks)
+
+
+def constants_section(material: Material) -> Section | None:
+    """What each calibration constant is believed to be, and what it became without and with the cause."""
+    constants = material.answer.get("constants") or {}
+    rows = []
+    for name, c in constants.items():
+        unit, scale = shown_unit(str(c.get("unit", "1")))
+        values = {key: scale * as_float(c.get(key)) for key in ("nominal", "tolerance", "recalibrated", "augmented")}
+        off = [(values[m] - values["nominal"]) / values["tolerance"] for m in ("recalibrated", "augmented")]
+        fitted = with_error(values["augmented"], scale * as_float(c.get("std")))
+        believed = with_error(values["nominal"], values["tolerance"])
+        rows.append([str(name), believed, number(values["recalibrated"]), number(off[0], 2), fitted, number(off[1], 2)])
+        rows[-1].append(unit)
+    if not rows:
+        return None
+    header = ["constant", "believed", "recalibrated", "tolerances off", "with the cause", "tolerances off", "unit"]
+    if not any(row[-1] for row in rows):
+        header, rows = header[:-1], [row[:-1] for row in rows]
+    words = "Constants with a tolerance are refitted throughout; far out of it they stand in for what the model lacks."
+    return Section("Calibration constants", [words, table(header, rows)])
+
+
+def _closed(closure: Mapping[str, Any]) -> str:
+    share, interval = closure.get("closed"), list(closure.get("closed_ci95") or [])
+    if isinstance(share, int | float) and share < 0.0:
+        return "The gap does not close on data not used for fitting: what was found does not carry over to it."
+    if not isinstance(share, int | float):
+        return "How much of the gap closes is undefined: it is too small against its own standard error."
+    between = f" (95 % interval {percent(interval[0])} to {percent(interval[1])})" if _is_interval(interval) else ""
+    return f"{percent(share)} of the gap is closed on data not used for fitting{between}."
+
+
+def _is_interval(interval: Any) -> bool:
+    return len(interval) == 2 and all(isinstance(end, int | float) for end in interval)
+
+
+def _sensors(closure: Mapping[str, Any]) -> list[str]:
+    return [str(sensor) for sensor in closure.get("per_sensor") or {}]
+
+
+def _by_sensor(closure: Mapping[str, Any], stage: str) -> list[str]:
+    return [number(as_float(errors.get(stage)), 3) for errors in (closure.get("per_sensor") or {}).values()]
+
+
+def _each_holdout(closure: Mapping[str, Any], unit: str) -> list[Any]:
+    """One row a file, where there are several."""
+    rows = []
+    for one in closure.get("per_holdout") or []:
+        share = one.get("closed")
+        closed = percent(share) if isinstance(share, int | float) else "undefined"
+        stages: Sequence[str] = ("recalibrated", "augmented", "noise_floor")
+        name = PurePath(str(one.get("source", ""))).name
+        rows.append([name, *(number(as_float(one.get(m)), 3) for m in stages), closed])
+    header = (f"hold-out, error in {unit}", "recalibrated", "with the cause", "noise", "closed")
+    return [table(header, rows)] if rows else []

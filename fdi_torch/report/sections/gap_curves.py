@@ -1,0 +1,75 @@
+"""The discrepancy at the guilty component against its own variables: what a free form finds, what the cause does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from fdi_torch.report.html import short
+from fdi_torch.report.loose import as_float, as_vector
+from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import axis, shown_unit
+from fdi_torch.report.panels import line_panel
+from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, panel
+
+MOST_CURVES = 12
+QUANTITIES = {"flow": "flow added", "area": "cross-section added", "reading": "added to the reading"}
+# SI units of the variables that a free-form discrepancy may depend on.
+_VARIABLE_UNITS = {"level": "m", "head": "m", "difference": "m", "time": "s", "period": "s"}
+
+
+def curves_section(material: Material) -> Section | None:
+    """One panel for each variable of each guilty component."""
+    curves = [c for c in material.answer.get("curves") or [] if isinstance(c, dict)][:MOST_CURVES]
+    if not curves:
+        return None
+    pictures = [Picture(f"gap_curve_{k + 1}", curve_panel(curve)) for k, curve in enumerate(curves)]
+    words = "What the component does beyond the plant file, averaged where its variable has the same value. "
+    if any("effect" in curve for curve in curves):
+        words += (
+            "Blue: a free function with two standard errors, which knows no library; orange: the cause that was named. "
+            "Where both agree, the cause's equation is right; a free function knows no memory, so that it sees little "
+            "of a lag or a delay."
+        )
+    else:
+        words += "A free function with two standard errors: what a cause that has no name yet would have to do."
+    return Section("The discrepancy", [words, pictures])
+
+
+def curve_panel(curve: Mapping[str, Any]) -> Figure:
+    """Free form with its band, and the effect over it."""
+    unit, scale = shown_unit(str(curve.get("unit", "")))
+    quantity = str(curve.get("quantity", ""))
+    y_unit, y_scale = ("%", 100.0) if quantity == "area" else shown_unit(str(curve.get("quantity_unit", "")))
+    x, free, std = scale * as_vector(curve["at"]), y_scale * as_vector(curve["free"]), as_vector(curve["free_std"])
+    name = short(curve.get("variable", ""), 30)
+    label = axis(QUANTITIES.get(quantity, "added"), y_unit)
+    figure, axes = panel(f"{short(curve.get('location', ''), 20)}: by {name}", axis(name, unit), label)
+    axes.axhline(0.0, color=SOFT, lw=0.8)
+    axes.fill_between(x, free - 2.0 * y_scale * std, free + 2.0 * y_scale * std, color=MODEL, alpha=0.2, lw=0.0)
+    axes.plot(x, free, color=MODEL, lw=1.4, label="free function")
+    if "effect" in curve:
+        axes.plot(x, y_scale * as_vector(curve["effect"]), color=MARK, lw=1.4, ls="--", label="cause")
+        label_lines(axes)
+    return figure
+
+
+def shape_section(material: Material) -> Section | None:
+    """The free-form discrepancy as tables, of logs that have no curves."""
+    shape = material.answer.get("shape")
+    if material.answer.get("curves") or not isinstance(shape, dict) or not shape.get("tables"):
+        return None
+    pictures = []
+    for k, (name, curve) in enumerate(shape["tables"].items()):
+        variable = str(name).rpartition(".")[2]
+        unit, scale = shown_unit(_VARIABLE_UNITS.get(variable, "SI"))
+        x, y = scale * as_vector(curve["at"]), as_float(curve.get("scale", 1.0)) * as_vector(curve["share"])
+        title = f"{shape.get('location', '')}: by {variable}"
+        figure = line_panel(title, axis(variable, unit), "discrepancy, SI", [("discrepancy", x, y, MARK)])
+        figure.axes[0].axhline(0.0, color=SOFT, lw=0.8)
+        pictures.append(Picture(f"gap_shape_{k + 1}", figure))
+    words = "What has to be added at this place so that the readings are met, whatever its cause."
+    return Section("The discrepancy", [words, pictures])
