@@ -13,7 +13,8 @@ from torch import Tensor
 
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Answer
-from fdi_torch.gap.diagnose import Settings, Tell, diagnose
+from fdi_torch.gap.case import PLAIN, Settings, case_of
+from fdi_torch.gap.diagnose import Tell, solved
 from fdi_torch.logbook import RunLog
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -24,13 +25,13 @@ def run_gap(
     plant: PlantDescription,
     recording: Recording | Sequence[Recording],
     holdouts: Sequence[Recording] = (),
-    settings: Settings | None = None,
+    settings: Settings = PLAIN,
     tell: Tell = lambda share, text: None,
     parent_run_id: str | None = None,
 ) -> Answer:
     """Diagnoses, and writes the log `path`: recordings first, then what is said on the way, then the answer."""
     recordings = (recording,) if isinstance(recording, Recording) else tuple(recording)
-    every, settings = (*recordings, *holdouts), settings or Settings()
+    every, case = (*recordings, *holdouts), case_of(plant, recordings, holdouts, settings)
     sources = [{"path": r.source, "sha256": r.sha256} for r in every]
     config = {"settings": asdict(settings), "recordings": len(recordings)}
     text = dump_plant(plant)
@@ -44,7 +45,7 @@ def run_gap(
             tell(share, text)
 
         with one_thread():
-            answer = diagnose(plant, recordings, holdouts, settings, say)
+            answer = solved(case, say)
         log_answer(log, answer.to_dict(), answer.arrays)
     return answer
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from fdi_torch.effects import effect
+from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.excitation import excitation
 from fdi_torch.gap.fitting import Candidate, Fitter
@@ -15,7 +16,6 @@ from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.impostors import DRAWS, simulated_impostors
 from fdi_torch.gap.next_input import HIGH, next_input, planned
 from fdi_torch.gap.screening import Option, Screen
-from fdi_torch.gap.usable import laid_out
 from fdi_torch.plant.effect import Placement
 from tests.test_gap import believed, recorded
 
@@ -31,7 +31,7 @@ def made_up(columns: torch.Tensor) -> Screen:
         size = parameters[0]
         start = {f"{place}.{name}.{size.name}": size.nominal + 1e-3 * (size.high - size.nominal)}
         options.append(Option(Placement(kind, place), start, parameters))
-    return Screen(tuple(options), columns, torch.zeros(3, dtype=torch.float64), columns.T @ columns)
+    return Screen(tuple(options), torch.zeros(3, dtype=torch.float64), columns.T @ columns)
 
 
 def test_a_twin_passes_when_the_true_cause_is_missing_and_half_the_time_when_it_is_not() -> None:
@@ -73,7 +73,7 @@ def rivals() -> Fitter:
     """A recording under steady inputs: lag and delay of a pump are one there."""
     recording = recorded({"Q1.pump_lag.time_constant": 10.0}, 9, samples=300, steady=True)
     white = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    return Fitter(laid_out(believed(), (), recording, None), white)
+    return Fitter(laid_out(believed(), (), [recording], None), white)
 
 
 def test_the_next_input_parts_what_the_recording_cannot(rivals: Fitter) -> None:

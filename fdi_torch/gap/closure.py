@@ -88,15 +88,13 @@ def free_run(subject: Subject, noise: Noise, model: Model, guess: Tensor | None 
     """Readings (S, C) and levels (1, K+1, tanks) of a run with constants as the model has them and start levels from
     the first samples. guess (1, K+1, tanks): levels to begin with.
     """
-    values = model.values or {}
+    values = carried_over(model.values or {})
     fitter = Fitter(replace(subject, mask=_first(subject.mask)), noise)
     network = fitter.engine(Candidate(model.placements), [n for n in values if n.count(".") == 2]).network
     for name, value in values.items():
         if name.partition("@")[0] in subject.plant.varying or "@" in name:
             continue  # what another recording had for itself
-        # A free course in time belongs to the recording's own clock and tells nothing of another day.
-        timed = name.rpartition(".")[2].startswith("time_") and ".free_" in name
-        network.nominal[network.constants.index(name)] = 0.0 if timed else value
+        network.nominal[network.constants.index(name)] = value
     starts = [f"{t.name}.start_level" for t in subject.plant.tanks]
     engine = Collocation(network, ParameterSpace(network.constants[n] for n in starts), subject.experiment)
     theta = engine.space.vector(fitter.first_levels()).unsqueeze(0)
@@ -104,6 +102,29 @@ def free_run(subject: Subject, noise: Noise, model: Model, guess: Tensor | None 
     theta, _, near = fitter.descend(engine, theta, levels, START_ROUNDS)
     settled = engine.settle(theta, near.levels)
     return settled.readings[0], settled.levels
+
+
+def carried_over(values: Mapping[str, float]) -> dict[str, float]:
+    """What of a model holds on another day: of a free form's course in time its mean, of its waves, whose phase belongs
+    to the recording's own clock, nothing.
+    """
+    courses: dict[str, list[float]] = {}
+    for name, value in values.items():
+        if _free_part(name).startswith("time_"):
+            courses.setdefault(name.rpartition(".")[0], []).append(value)
+    carried = dict(values)
+    for name in values:
+        course = courses.get(name.rpartition(".")[0], [0.0])
+        if _free_part(name).startswith("time_"):
+            carried[name] = sum(course) / len(course)
+        elif _free_part(name).startswith(("sine_", "cosine_")):
+            carried[name] = 0.0
+    return carried
+
+
+def _free_part(name: str) -> str:
+    """The coefficient of a free form, '' for the parameter of anything else."""
+    return name.rpartition(".")[2] if ".free_" in name else ""
 
 
 def _first(mask: Tensor) -> Tensor:

@@ -51,7 +51,7 @@ def coefficients_of(
     columns = effect_columns(fitter, fit, options) / UNIT
     residual = fitter.white(fit.near)[0][0]
     if returned:
-        residual = residual - effect_columns(fitter, fit, [neutral_option(fitter, p) for p in returned]).sum(-1)
+        residual = residual + effect_columns(fitter, fit, [_as_fitted(fitter, fit, p) for p in returned]).sum(-1)
     columns, residual = _beside_starts(fitter, fit, columns, residual)
     prior = torch.tensor([o.parameters[0].std for o in options], dtype=columns.dtype)
     spectrum, basis = torch.linalg.eigh((columns * prior).T @ (columns * prior) / heat)
@@ -81,7 +81,7 @@ def _beside_starts(fitter: Fitter, fit: Fit, columns: Tensor, residual: Tensor) 
     """Columns (N, M) and residual (N,) less what the start levels can take. All else stays as it was fitted: a free
     function of a pipe's head would share its coefficient's part with the constant, and could be compared with nothing.
     """
-    kept = [i for i, n in enumerate(fit.space.names) if n.endswith(".start_level")]
+    kept = [i for i, n in enumerate(fit.space.names) if ".start_level" in n]
     j = fitter.white(fit.near)[1][0][..., kept].flatten(0, 1)
     q, _ = torch.linalg.qr(j / j.norm(dim=0).clamp(min=1e-300))
     c, r = columns.flatten(0, 1), residual.flatten()
@@ -96,7 +96,7 @@ def fitted_coefficients(fitter: Fitter, fit: Fit, free: Sequence[Placement]) -> 
     return Coefficients(tuple(fit.space.names[i] for i in kept), fit.theta[kept], spread)
 
 
-def neutral_option(fitter: Fitter, placement: Placement) -> Option:
-    """The placement with its size nominal: as if it were not there."""
-    parameters = placement.effect.parameters(placement.location, fitter.subject.plant)
-    return Option(placement, {f"{placement.prefix}.{parameters[0].name}": parameters[0].nominal}, parameters)
+def _as_fitted(fitter: Fitter, fit: Fit, placement: Placement) -> Option:
+    """The placement with its parameters as the fit has them."""
+    values = {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] == placement.prefix}
+    return Option(placement, values, placement.effect.parameters(placement.location, fitter.subject.plant))

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.coefficients import coefficients_of, fitted_coefficients, neutral_option
+from fdi_torch.gap.coefficients import coefficients_of, fitted_coefficients
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter
 from fdi_torch.gap.freeform import UNIT, free_form
 from fdi_torch.plant.description import Pipe, Pump, Sensor, Tank
@@ -64,7 +64,7 @@ def curves_at(fitter: Fitter, fit: Fit, place: str, reach: Reach, heat: float) -
     units = _local(fitter, fit, place, [_unit(free, name, coefficients.names) for name in coefficients.names]) / UNIT
     quantity, quantity_unit = _quantity(fitter, free, place)
     curves = []
-    for variable, unit, x in _variables(fitter, fit, place):
+    for variable, unit, x in (*_variables(fitter, fit, place), *_phases(fitter, free, place)):
         at, mean = _bins(x)
         free_mean = mean @ units.T
         error = torch.sqrt(torch.einsum("km,mn,kn->k", free_mean, coefficients.covariance, free_mean).clamp(min=0.0))
@@ -76,8 +76,12 @@ def curves_at(fitter: Fitter, fit: Fit, place: str, reach: Reach, heat: float) -
 
 
 def _neutral(fitter: Fitter, placements: Sequence[Placement]) -> tuple[tuple[Placement, ...], Mapping[str, float]]:
-    options = [neutral_option(fitter, p) for p in placements]
-    return tuple(placements), {name: value for o in options for name, value in o.start.items()}
+    """Placements with their sizes nominal: as if they were not there."""
+    plant, sizes = fitter.subject.plant, {}
+    for p in placements:
+        size = p.effect.parameters(p.location, plant)[0]
+        sizes[f"{p.prefix}.{size.name}"] = size.nominal
+    return tuple(placements), sizes
 
 
 def _effect(fitter: Fitter, fit: Fit, place: str, here: tuple[Placement, ...]) -> Tensor:
@@ -169,7 +173,8 @@ def _variables(fitter: Fitter, fit: Fit, place: str) -> list[tuple[str, str, Ten
     component = plant.component(place) if place in _names(fitter) else None
     if isinstance(component, Sensor):
         index = [s.name for s in plant.sensors].index(place)
-        return [("reading", component.unit, near.readings[0, :, index]), ("time", "s", experiment.sample_times)]
+        read = (f"{component.name} read", component.unit, near.readings[0, :, index])
+        return [read, ("time", "s", experiment.sample_times)]
     if isinstance(component, Pump):
         channel = plant.channels().index(component.channel)
         command = (f"{component.channel} commanded", component.command_unit, experiment.inputs[:, channel])
@@ -184,9 +189,21 @@ def _variables(fitter: Fitter, fit: Fit, place: str) -> list[tuple[str, str, Ten
     return [(f"{first} − {second}", "m", tanks[first] - tanks[second]), clock]
 
 
+def _phases(fitter: Fitter, free: Sequence[Placement], place: str) -> list[tuple[str, str, Tensor]]:
+    """The time within one period, for a free form that comes and goes by itself."""
+    periods = [period for p in free for period in getattr(p.effect, "periods", ())]
+    if not periods:
+        return []
+    experiment, sensors = fitter.subject.experiment, {s.name for s in fitter.subject.plant.sensors}
+    middle = experiment.nodes[:-1] + 0.5 * experiment.steps
+    clock = experiment.sample_times if place in sensors else middle
+    return [(f"time within {periods[0]:.3g} s", "s", torch.remainder(clock, periods[0]))]
+
+
 def _bins(x: Tensor) -> tuple[Tensor, Tensor]:
     """Centres (K,) and averaging weights (K, X) of values grouped by equal counts, or one by one where they are few."""
-    values, which = torch.unique(x, return_inverse=True)
+    grain = 1e-6 * float(x.max() - x.min())
+    values, which = torch.unique(torch.round(x / grain) if grain > 0.0 else x, return_inverse=True)
     if len(values) > BINS:
         edges = torch.quantile(x, torch.linspace(0.0, 1.0, BINS + 1, dtype=x.dtype)[1:-1])
         which = torch.searchsorted(edges, x.contiguous())

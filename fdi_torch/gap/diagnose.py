@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import torch
 
-from fdi_torch.effects import effect
 from fdi_torch.gap.answer import Answer, CauseName, Explanation, Verdict
 from fdi_torch.gap.answering import answered
+from fdi_torch.gap.case import PLAIN, Case, Settings, case_of
 from fdi_torch.gap.evidence import log_evidence, posterior, temperature
 from fdi_torch.gap.finding import UNEXPLAINED, Finding, Weighed, in_order, left_open, whole_gap
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_rounding
-from fdi_torch.gap.library import canonical, library_of, possible_places
-from fdi_torch.gap.limits import told_limits
+from fdi_torch.gap.library import canonical, possible_places
 from fdi_torch.gap.screening import options_of
-from fdi_torch.gap.usable import expect_another, laid_out
 from fdi_torch.gap.where import Suspect, refit, suspects
-from fdi_torch.gap.which import DEEPEST, Search, search
+from fdi_torch.gap.which import Search, search
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.reach import Reach, reach_of_all, with_levels
 from fdi_torch.recording import Recording
 
@@ -33,24 +29,11 @@ FAR_BETTER = 0.35
 Tell = Callable[[float, str], None]
 
 
-@dataclass(frozen=True)
-class Settings:
-    """library, leave_out: as in `library_of`. step: of the simulation, s; None for the sampling interval.
-
-    most: effects that one explanation may have.
-    """
-
-    library: tuple[str, ...] | None = None
-    leave_out: tuple[str, ...] = ()
-    step: float | None = None
-    most: int = DEEPEST
-
-
 def diagnose(
     plant: PlantDescription,
     recording: Recording | Sequence[Recording],
     holdout: Recording | Sequence[Recording] | None = None,
-    settings: Settings = Settings(),
+    settings: Settings = PLAIN,
     tell: Tell = lambda share, text: None,
 ) -> Answer:
     """What keeps the plant file from explaining the recording, or several recordings by the same causes.
@@ -59,20 +42,19 @@ def diagnose(
     """
     recordings = (recording,) if isinstance(recording, Recording) else tuple(recording)
     holdouts = () if holdout is None else (holdout,) if isinstance(holdout, Recording) else tuple(holdout)
-    for one in holdouts:
-        expect_another(one, recordings)
-    library = library_of(plant, settings.library, settings.leave_out)
-    believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
-    told = told_limits(plant, recordings[0], believed, library) if len(recordings) == 1 else []
-    believed += told
-    subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recordings, *((h,) for h in holdouts)))
+    return solved(case_of(plant, recordings, holdouts, settings), tell)
+
+
+def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
+    """The diagnosis, stage by stage."""
+    subject, library, plant, told = case.subject, case.library, case.subject.plant, case.told
     tell(0.05, "noise floor and recalibration")
     fitter, null, lattice = _recalibrated(subject)
-    reach = with_levels(reach_of_all(recordings, plant), plant, null.near.levels[0])
+    reach = with_levels(reach_of_all(case.recordings, plant), plant, null.near.levels[0])
     tell(0.2, "which effect")
     known = {p.prefix for p in told} | {name.rpartition(".")[0] for name in subject.nuisance}
     options = options_of([p for p in library if not p.effect.rounds and p.prefix not in known], fitter, reach)
-    found = search(fitter, null, options, settings.most)
+    found = search(fitter, null, options, case.most)
     tell(0.6, "where")
     places, refits = _places(fitter, found, plant, reach)
     rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
@@ -86,7 +68,7 @@ def diagnose(
         fitter, library, reach, found, places, weighed, standing, unknown, verdict, rounded, lattice, told
     )
     tell(0.8, "hold-out")
-    return answered(finding, held)
+    return answered(finding, case.held)
 
 
 def _places(fitter: Fitter, found: Search, plant: PlantDescription, reach: Reach) -> tuple[list[Suspect], list[Fit]]:

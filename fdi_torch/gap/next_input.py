@@ -1,7 +1,8 @@
 """What next: of many step inputs within the pumps' limits, the one under which two rival explanations part soonest.
 
-Both are simulated with what was fitted; what their difference keeps beside the first one's constants and start levels,
-over the noise, is the chi-square by which they part.
+Both are simulated with what was fitted. What the first one's parameters cannot take up of their difference, within what
+the recording so far and the tolerances say of them and from free start levels, is over the noise the chi-square by
+which the new run parts them.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from fdi_torch.simulate.experiment import lay_out
 DESIGNS, DURATION, SEED = 6, 1500.0, 0
 HOLDS = (60.0, 120.0, 250.0)  # s
 PARTED = 20.0  # chi-square units: odds of 20000 to 1
-HIGH = 0.8  # of a pump's limit, and of a tank's height
+HIGH, FULL = 0.8, 0.95  # of a pump's limit, and of a tank's height
+TINY = 1e-10
 
 
 def next_input(fitter: Fitter, first: Fit, second: Fit) -> Mapping[str, Any] | None:
@@ -82,27 +84,52 @@ def _separation(fitter: Fitter, first: Fit, second: Fit, recording: Recording) -
         experiment=lay_out(recording, subject.plant.channels(), step),
     )
     there = Fitter(planned, fitter.noise)
-    runs = [_run(there, fit) for fit in (first, second)]
+    (seen, slopes, levels), (other, _, other_levels) = (_run(there, fit) for fit in (first, second))
     heights = torch.tensor([t.height for t in subject.plant.tanks], dtype=torch.float64)
-    if any(bool((levels > 0.95 * heights).any()) for _, _, levels in runs):
+    if bool((levels > FULL * heights).any()) or bool((other_levels > FULL * heights).any()):
         return None
-    difference = there.noise.whiten(runs[0][0] - runs[1][0], planned.mask)
-    slopes = there.noise.whiten(runs[0][1], planned.mask).flatten(0, 1)
-    slopes = slopes / slopes.norm(dim=0).clamp(min=1e-300)
-    q, _ = torch.linalg.qr(slopes)
-    rest = difference.flatten() - q @ (q.T @ difference.flatten())
-    grown = torch.cumsum((rest.reshape(difference.shape) ** 2).sum(dim=1), dim=0)
+    difference = there.noise.whiten(seen - other, planned.mask)
+    grown = _grown(difference, there.noise.whiten(slopes, planned.mask), _known(fitter, first))
     enough = (grown > PARTED).nonzero().flatten()
     return float(grown[-1]), float(recording.time[enough[0]]) if len(enough) else None
 
 
+def _known(fitter: Fitter, fit: Fit) -> Tensor:
+    """(P, P): what tolerances and the recordings so far say of a fit's parameters in a new run; nothing of its start
+    levels, nor of what varies from run to run.
+    """
+    scale = fitter.box(fit.space)[2]
+    curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.near, scale)[2][0] / (scale * scale.unsqueeze(1))
+    kept = [fit.space.index(n) for n in _in_one_run(fit)]
+    own = fitter.subject.own
+    lasting = torch.tensor([n not in own for n in _in_one_run(fit)])
+    return torch.where(lasting & lasting.unsqueeze(1), curvature[kept][:, kept], 0.0)
+
+
+def _in_one_run(fit: Fit) -> list[str]:
+    """The parameters of a fit that one recording has; '@' marks what belongs to further ones."""
+    return [n for n in fit.space.names if "@" not in n]
+
+
+def _grown(difference: Tensor, slopes: Tensor, known: Tensor) -> Tensor:
+    """(S,): of whitened differences (S, C), up to each sample, what the parameters with slopes (S, C, P) cannot take up
+    within what is known of them, (P, P).
+    """
+    scale = torch.sqrt((slopes**2).sum(dim=(0, 1)) + torch.diagonal(known)).clamp(min=1e-300)
+    j, prior = slopes / scale, known / (scale * scale.unsqueeze(1))
+    curvature = torch.cumsum(torch.einsum("scp,scq->spq", j, j), dim=0) + prior
+    pull = torch.cumsum(torch.einsum("scp,sc->sp", j, difference), dim=0)
+    taken = (pull * torch.linalg.solve(curvature + TINY * torch.eye(len(scale)).to(j), pull)).sum(dim=1)
+    return torch.cumsum((difference**2).sum(dim=1), dim=0) - taken
+
+
 def _run(there: Fitter, fit: Fit) -> tuple[Tensor, Tensor, Tensor]:
-    """Readings (S, C), slopes by the nuisances (S, C, P) and levels of a fit under the planned input."""
+    """Readings (S, C), slopes (S, C, P) and levels of a fit under the planned input."""
     engine = there.engine(fit.candidate, list(fit.effect_values))
     known = {n: v for n, v in fit.values.items() if n in engine.space}
     theta = engine.space.vector(known).unsqueeze(0)
     near = engine.settle(theta, engine.constant_guess(theta), rounds=30)
-    columns = [engine.space.index(n) for n in there.subject.nuisance]
+    columns = [engine.space.index(n) for n in _in_one_run(fit)]
     return near.readings[0], near.jacobian[0][..., columns], near.levels[0]
 
 

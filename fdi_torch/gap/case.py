@@ -1,12 +1,17 @@
-"""Can this recording be diagnosed at all? Asked before any fit, answered in one sentence where it cannot."""
+"""What is to be diagnosed, examined before any fit: what cannot be diagnosed is said in one sentence."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 
+from fdi_torch.effects import effect
 from fdi_torch.gap.fitting import Subject, subject_of
+from fdi_torch.gap.library import library_of
+from fdi_torch.gap.limits import told_limits
+from fdi_torch.gap.which import DEEPEST
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
@@ -14,6 +19,52 @@ from fdi_torch.recording import Recording
 LEAST = 60
 """Readings of a sensor below which its noise cannot be told from what a model gets wrong: two of the slowest periods
 that still count as noise."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """library, leave_out: as in `library_of`. step: of the simulation, s; None for the sampling interval.
+
+    most: effects that one explanation may have.
+    """
+
+    library: tuple[str, ...] | None = None
+    leave_out: tuple[str, ...] = ()
+    step: float | None = None
+    most: int = DEEPEST
+
+
+PLAIN = Settings()
+
+
+@dataclass(frozen=True)
+class Case:
+    """library: the effects at places to search. subject: the recordings, for the plant with the limits of its sensors
+    that their values tell (`told`); held: the hold-outs. most: effects that one explanation may have.
+    """
+
+    library: tuple[Placement, ...]
+    recordings: tuple[Recording, ...]
+    told: list[Placement]
+    subject: Subject
+    held: tuple[Subject, ...]
+    most: int
+
+
+def case_of(
+    plant: PlantDescription, recordings: Sequence[Recording], holdouts: Sequence[Recording], settings: Settings
+) -> Case:
+    """Raises ValueError for what cannot be diagnosed: effects or places that there are not, sensors or inputs that the
+    recordings lack, too few readings, a hold-out that is the recording itself.
+    """
+    for one in holdouts:
+        expect_another(one, recordings)
+    library = library_of(plant, settings.library, settings.leave_out)
+    believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    told = told_limits(plant, recordings[0], believed, library) if len(recordings) == 1 else []
+    believed += told
+    subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recordings, *((h,) for h in holdouts)))
+    return Case(library, tuple(recordings), told, subject, tuple(held), settings.most)
 
 
 def expect_another(holdout: Recording, recordings: Sequence[Recording]) -> None:

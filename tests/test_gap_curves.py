@@ -1,0 +1,43 @@
+"""The free curve at every kind of component finds what the effect does there, though it knows no effect."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from fdi_torch.effects import effect
+from fdi_torch.gap.case import laid_out
+from fdi_torch.gap.curves import curves_at
+from fdi_torch.gap.fitting import Candidate, Fitter
+from fdi_torch.gap.floor import Noise
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.reach import reach_of
+from tests.test_gap import believed, recorded
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "values", "quantity", "variable"),
+    [
+        ("pump_gain", "Q1", {"factor": 1.15}, "flow", "Q1 commanded"),
+        ("leak", "T3", {"size": 0.15}, "flow", "level of T3"),
+        ("cross_flow", "T1-T2", {"size": 0.2}, "flow", "T1 − T2"),
+        ("outlet_drop", "OUT2", {"drop": 0.05}, "flow", "level of T2"),
+        ("area_taper", "T1", {"taper": 0.4}, "area", "level of T1"),
+        ("sensor_gain", "h1", {"factor": 1.05}, "reading", "h1 read"),
+    ],
+)
+def test_the_free_curve_agrees_with_the_effect_that_is_there(
+    name: str, place: str, values: dict[str, float], quantity: str, variable: str
+) -> None:
+    truth = {f"{place}.{name}.{key}": value for key, value in values.items()}
+    recording = recorded(truth, 13, samples=600)
+    white = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    fitter = Fitter(laid_out(believed(), (), [recording], None), white)
+    fit = fitter.fit(Candidate((Placement(effect(name), place),), (truth,)))
+    first, *_, last = curves_at(fitter, fit, place, reach_of(recording, believed()), 1.0)
+    assert (first.quantity, first.variable, last.variable) == (quantity, variable, "time")
+    for curve in (first, last):
+        assert curve.effect is not None
+        apart = (curve.free - curve.effect).abs()
+        assert bool((apart < 5.0 * curve.free_std + 0.1 * curve.effect.abs().max()).all()), curve.variable
+        assert float(curve.effect.abs().max()) > 3.0 * float(curve.free_std.median())
