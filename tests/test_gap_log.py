@@ -83,7 +83,7 @@ def test_the_command_says_it_in_a_sentence_and_keeps_everything(
     shown = capsys.readouterr().out
     assert shown.startswith("The gap comes from pump_gain at Q2 (over 99.9 % of all explanations weighed).")
     assert "error of free runs on day5.csv, day7.csv, cm" in shown and "of the gap closes on data not used" in shown
-    assert "day7.csv: " in shown and "next: --adopt FILE" in shown
+    assert "day7.csv: " in shown and f"next: with {better} as their plant, train and monitor" in shown
     answer = json.loads((tmp_path / "out" / "gap.json").read_text())
     found = load_plant(better)
     assert found.effects[0].parameters["factor"] == answer["causes"][0]["parameters"]["factor"]["value"]
@@ -119,6 +119,15 @@ def test_a_step_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
     words = ["gap", "--plant", "three_tank", "--recording", file, "--step", "0", "--out", str(tmp_path)]
     assert cli.main(words) == cli.MISUSE
     assert "--step: expected a positive number of seconds, got 0" in capsys.readouterr().err
+
+
+def test_what_cannot_be_diagnosed_leaves_no_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = str(write_csv(recorded(GAIN, 3, samples=30), tmp_path / "run.csv"))
+    assert (
+        cli.main(["gap", "--plant", "three_tank", "--recording", file, "--out", str(tmp_path / "logs")]) == cli.MISUSE
+    )
+    assert "expected at least 60 readings of every sensor, got 30 of h1" in capsys.readouterr().err
+    assert not (tmp_path / "logs").exists()
 
 
 def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:

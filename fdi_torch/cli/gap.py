@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         advance(1.0, "done")
     written = _keep(arguments, plant, answer, screen)
     show(answer, screen)
-    for sentence in next_steps(answer, bool(holdouts), library, written):
+    for sentence in next_steps(answer, bool(holdouts), library, written, arguments.adopt):
         screen.say(f"- {sentence}")
     screen.say(f"log: {log} (fdi report {log} makes the page)")
     screen.result(answer.to_dict())

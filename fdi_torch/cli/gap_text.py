@@ -54,8 +54,10 @@ def verdict_words(answer: Answer) -> str:
     return f"There is a gap at {place} that no effect of the library explains; only its place and shape are known."
 
 
-def next_steps(answer: Answer, has_holdout: bool, library: Sequence[str] | None, planned: Path | None) -> list[str]:
-    """What a reader of this answer may do now."""
+def next_steps(
+    answer: Answer, has_holdout: bool, library: Sequence[str] | None, planned: Path | None, adopted: str | None
+) -> list[str]:
+    """What a reader of this answer may do now. planned: the next input; adopted: the plant file, as far as written."""
     steps = []
     if planned and answer.next_input:
         samples = answer.next_input.get("parted_after_samples")
@@ -66,10 +68,9 @@ def next_steps(answer: Answer, has_holdout: bool, library: Sequence[str] | None,
     if answer.verdict == "unknown" and library is None:
         steps.append("next: --library all searches further effects; the report draws the discrepancy's shape")
     if answer.verdict in ("named", "ambiguous"):
-        steps.append(
-            "next: --adopt FILE writes the plant file with the causes; with it train and monitor no longer take "
-            "the gap for a fault"
-        )
+        no_longer = "train and monitor no longer take the gap for a fault"
+        written = f"with {adopted} as their plant, {no_longer}" if adopted else ""
+        steps.append(f"next: {written or f'--adopt FILE writes the plant file with the causes; with it {no_longer}'}")
     if not has_holdout and answer.verdict != "no_gap":
         steps.append("next: --holdout FILE, another recording of the same rig, measures how far the gap closes")
     hidden, twins = answer.excitation.get("hidden", []), answer.excitation.get("inseparable", [])
@@ -140,6 +141,8 @@ def _closure(closure: Mapping[str, Any], screen: Screen) -> None:
     screen.table(f"error of free runs on {files}, {closure['unit']}", ("plant", "all", *sensors), rows)
     if closure["closed"] is None:
         screen.say("The hold-out's gap is too small, against its standard error, to say how much of it closes.")
+    elif closure["closed"] < 0.0:
+        screen.say("The gap does not close on data not used for fitting: what was found does not carry over to it.")
     else:
         low, high = closure["closed_ci95"]
         between = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"
