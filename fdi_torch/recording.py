@@ -101,6 +101,8 @@ class Recording:
         """
         if step < 1:
             raise ValueError(f"{self.source}: expected every to be a whole number from 1, got {step}")
+        if step == 1:
+            return self
         inputs = self._held_means(step) if self.hold == "zero_order" else self.inputs[::step]
         return replace(
             self, time=self.time[::step], inputs=inputs, outputs=self.outputs[::step], mask=self.mask[::step]
