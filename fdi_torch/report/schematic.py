@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from textwrap import wrap
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,6 +21,7 @@ from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
 INCH = 0.8  # per unit of the drawing; a tank is one unit wide
 TALL = 1.4
 COLUMN, ROW = 1.95, 3.1
+LETTER = 0.1  # at most, of a word beside a sensor
 Point = tuple[float, float]
 
 
@@ -50,7 +52,8 @@ class _Drawing:
         columns = 1 + max(column for _, column in self.places.values())
         longest = max((len(words) for name in plant.locations() for words in self.said(name)), default=0)
         margin = max(1.0, 0.058 * longest)
-        left, right = -margin, (columns - 1) * COLUMN + margin
+        beside = max((len(w) for s in plant.sensors for w in (short(s.name, 16), *self.said(s.name))), default=0)
+        left, right = -margin, (columns - 1) * COLUMN + max(margin, 0.65 + LETTER * beside)
         words = 0.2 * max((len(self.said(name)) for name in plant.locations()), default=0)
         bottom, top = -(rows - 1) * ROW - 0.85 - words, TALL + 1.05 + words
         self.figure = Figure(figsize=((right - left) * INCH, (top - bottom) * INCH))
@@ -88,12 +91,13 @@ class _Drawing:
         marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
         return [*marks, f"{100 * share:.0f} %"] if share >= 0.005 else marks
 
-    def words(self, name: str, point: Point, ha: str, va: str) -> None:
-        """A component's name, and below it in colour what is wrong with it."""
+    def words(self, name: str, point: Point, ha: str, va: str, width: int = 26) -> None:
+        """A component's name, and below it in colour what is wrong with it, in lines of so many letters."""
         x, y = point
         step = 0.2 if va == "top" else -0.2
         marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
         shares = self.said(name)[len(marks) :]
+        marks = [line for text in marks for line in wrap(text, width, break_long_words=False)]
         lines = [(short(name, 16), INK, "normal"), *((text, MARK, "bold") for text in marks)]
         lines += [(text, INK, "bold") for text in shares]
         for k, (text, colour, weight) in enumerate(lines if va == "top" else reversed(lines)):
@@ -127,7 +131,7 @@ class _Drawing:
             )
         walls = [(x - 0.5, y + TALL), (x - 0.5, y), (x + 0.5, y), (x + 0.5, y + TALL)]
         self.axes.plot(*np.array(walls).T, color=self.colour(tank.name), lw=2.0, zorder=5, solid_joinstyle="miter")
-        self.words(tank.name, (x, y + TALL - 0.08), "center", "top")
+        self.words(tank.name, (x, y + TALL - 0.08), "center", "top", width=9)
 
     def pump(self, pump: Pump) -> None:
         x, y = self.corner(pump.target)

@@ -92,8 +92,9 @@ def test_a_monitor_page_shows_residuals_thresholds_and_events(tmp_path: Path) ->
 def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
     made = report(write_study, tmp_path)
     assert headline(made.material) == "40 trials in 2 settings"
-    assert titles(made)[1:4] == ["Settings", "Errors", "Trials"]
-    assert {"trials_1", "errors_2"} <= names(made) and ">T1.leak<" in page([made])
+    assert titles(made)[1:4] == ["Settings", "Isolation", "Errors"]
+    assert {"trials_1", "errors_2", "isolation"} <= names(made) and ">T1.leak<" in page([made])
+    assert "38 of 40 modes stated as they are; 2 faults missed" in page([made]) and "none (10 %)" in page([made])
 
 
 def test_several_runs_share_a_page(tmp_path: Path) -> None:

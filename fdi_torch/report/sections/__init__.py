@@ -7,6 +7,7 @@ from fdi_torch.report.sections.gap import causes_section, where_section
 from fdi_torch.report.sections.gap_closure import closure_section, constants_section
 from fdi_torch.report.sections.gap_curves import curves_section, shape_section
 from fdi_torch.report.sections.gap_next import limits_section, next_input_section
+from fdi_torch.report.sections.isolation import isolation_section
 from fdi_torch.report.sections.monitor import event_section, residual_section
 from fdi_torch.report.sections.origin import configuration_section, health_section, provenance_section
 from fdi_torch.report.sections.rig import rig_section
@@ -30,6 +31,7 @@ SECTIONS: tuple[Maker, ...] = (
     event_section,
     residual_section,
     summary_section,
+    isolation_section,
     error_section,
     trials_section,
     fit_section,

@@ -47,7 +47,7 @@ def posterior_section(material: Material) -> Section | None:
     pictures = [_ellipse(material, final, covariance, pair, k) for k, pair in enumerate(ranked)]
     words = "Regions that hold 50 % and 95 % of the probability, the most correlated pairs first."
     words += " The green cross is what was simulated." if material.truth else ""
-    rows = [[names[i], *(f"{correlation[i, j]:.2f}" for j in known)] for i in known]
+    rows = [[names[i], *(f"{correlation[i, j]:z.2f}" for j in known)] for i in known]
     grid = table(["correlation", *(str(names[j]) for j in known)], rows)
     return Section("Uncertainty", [words, pictures, grid]) if pictures else None
 
@@ -112,4 +112,4 @@ def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: t
     known = all(name in material.truth for name in names)
     truth = (scales[0] * material.truth[names[0]], scales[1] * material.truth[names[1]]) if known else None
     rho = part[0, 1] / np.sqrt(part[0, 0] * part[1, 1])
-    return Picture(f"ellipse_{k + 1}", ellipse_panel(names, units, centre, part, truth), f"correlation {rho:.2f}")
+    return Picture(f"ellipse_{k + 1}", ellipse_panel(names, units, centre, part, truth), f"correlation {rho:z.2f}")

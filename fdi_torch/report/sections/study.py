@@ -52,6 +52,7 @@ def error_section(material: Material) -> Section | None:
         figure = group_panel(name, "size of the error, SI", groups, errors)
         if all(np.nanmax(e, initial=0.0) > 0 for e in errors):
             figure.axes[0].set_yscale("log")
+            figure.axes[0].yaxis.set_major_formatter(lambda value, place: f"{value:g}")
         figure.axes[0].plot(range(len(groups)), bounds, "_", color=MARK, ms=22, mew=2.0)
         pictures.append(Picture(f"errors_{i + 1}", figure))
     words = f"Estimator: {estimator}. Each point is a trial, blue is the median, orange the Cramér-Rao bound."
