@@ -25,7 +25,7 @@ COMMANDS = {
     "diagnosability": "what an experiment can tell: which faults show, which can be told apart",
     "report": "make one HTML page of one or more logs",
     "inspect": "what a log is about, whether it is sound, and its messages for other tools",
-    "replay": "run a logged estimation again and compare, or try what another choice gives",
+    "replay": "run a logged estimation or study again and compare, or try what another choice gives",
     "compare": "what differs between runs, and whether their results agree",
     "recover": "save what is whole of a broken or unfinished log",
     "gap": "where a plant file falls short of a recording, by which effect, and how far the gap closes",
