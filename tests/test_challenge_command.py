@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from pathlib import Path
 
@@ -13,7 +14,10 @@ from fdi_torch.cli import DONE, main
 @pytest.mark.slow
 def test_a_sound_rig_is_called_sound(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["challenge", "--cases", "1", "--kinds", "null", "--out", str(tmp_path), "--json", "--quiet"]
-    assert main(words) == DONE
+    assert main([*words, "--plant", "three_tank"]) == DONE
     scores = json.loads(capsys.readouterr().out)["scores"]
     assert scores["fdi"]["null"]["right"]["share"] == 1.0
-    assert (tmp_path / "key.jsonl").is_file()
+    assert set(scores) == {"always_null", "random", "one_at_a_time_bic", "fdi"}
+    key = json.loads((tmp_path / "manifest.jsonl").read_text())["key"]
+    with gzip.open(tmp_path / "cases" / "case0001_recording.csv.gz", "rt") as recording:
+        assert recording.readline() == f"# SHA-256 of the sealed key: {key}\n"

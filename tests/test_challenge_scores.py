@@ -114,6 +114,7 @@ def test_scores_and_baselines_of_a_small_challenge(tmp_path: Path) -> None:
     assert scores["shy"]["all"]["right"] == scores["always_null"]["all"]["right"]
     assert scores["random"]["all"]["right"]["of"] == 3
     assert json.loads((tmp_path / "scores.json").read_text())["fdi"]["single"]["cases"] == 2
+    assert "| single | 1/2 (1 .. 99 %) |" in (tmp_path / "scores.md").read_text()
 
 
 def test_an_interrupted_challenge_resumes(tmp_path: Path) -> None:
@@ -125,6 +126,13 @@ def test_an_interrupted_challenge_resumes(tmp_path: Path) -> None:
     scores = run(tmp_path, second)
     assert second.calls == 1
     assert scores["fdi"]["all"]["cases"] == 3
+
+
+def test_out_of_time_it_scores_what_is_answered_and_goes_on_later(tmp_path: Path) -> None:
+    first = Counting()
+    scores = run(sealed(tmp_path), first, minutes=0.0)
+    assert first.calls == 0 and scores["fdi"] == {"all": {"cases": 0}, "by_effect": {}}
+    assert run(tmp_path, first)["fdi"]["all"]["cases"] == first.calls == 3
 
 
 def test_a_crash_is_a_wrong_answer_and_ends_nothing(tmp_path: Path) -> None:

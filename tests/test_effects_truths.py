@@ -209,3 +209,34 @@ def test_times_that_may_be_endless_are_bounded_by_the_recording() -> None:
     assert space["T1.unmetered_flow.begin"].high == 900.0
     assert bounded(network.constants, 60.0)["T1.unmetered_flow.duration"].high == 600.0, "never below nominal"
     assert space["Q1.pump_lag.time_constant"].high == 60.0
+
+
+def test_a_taper_measured_at_the_floor_is_a_cone_from_there() -> None:
+    taper = PlacedEffect("area_taper", "T1", {"taper": 0.8, "reference": 0.0})
+    level = float(filled((taper,), height=3.0)[0])
+    assert 160e-4 * (level + 0.8 * level**2 / 6.0) == pytest.approx(30e-3, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settling", "expected"),
+    [
+        (0.0, 1 + 1e-4 * 1000),
+        (2e-3, 1 + 1e-4 * (1 - math.exp(-2)) / 2e-3),
+        (-4e-4, 1 + 1e-4 * (math.exp(0.4) - 1) / 4e-4),
+    ],
+)
+def test_a_coefficient_drifts_steadily_to_rest_or_away(settling: float, expected: float) -> None:
+    there = replace(local(0.5), clock=Clock(number(999.5), number(1.0), number(1.0)))
+    drift = effect("coefficient_drift")
+    drifted = drift.flow(number(2e-5), there, values(rate=1e-4, settling=settling))
+    assert float(drifted) == pytest.approx(2e-5 * expected, rel=1e-12)
+    almost = drift.flow(number(2e-5), there, values(rate=1e-4, settling=settling + 1e-12))
+    assert float(almost) == pytest.approx(float(drifted), rel=1e-9)
+
+
+def test_a_drooping_pump_loses_with_a_power_of_the_level() -> None:
+    for droop, expected in ((1.0, 1 - 0.4 * 0.5), (2.0, 1 - 0.4 * 0.25)):
+        pumped = effect("pump_back_pressure").flow(number(5e-5), local(0.5), values(loss=0.4, droop=droop))
+        assert float(pumped) == pytest.approx(5e-5 * expected, rel=1e-12)
+    empty = effect("pump_back_pressure").flow(number(5e-5), local(0.0, 0.0), values(loss=0.4, droop=1.5))
+    assert float(empty) == pytest.approx(5e-5, rel=1e-6)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from fdi_torch.config.study import load_study
-from fdi_torch.study.cluster import connected, run_on_cluster, run_with
+from fdi_torch.study.cluster import connected, each_on, run_on_cluster, run_with
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 from fdi_torch.study.plan import Plan
 
@@ -56,3 +56,12 @@ def test_without_dask_it_says_what_to_install(plan: Plan, monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ValueError, match=r"pip install 'fdi_torch\[cluster\]'"):
         next(run_on_cluster(plan, plan.blocks(), "local"))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_any_work_is_done_once_an_item() -> None:
+    with connected("local", workers=1) as client:
+        assert sorted(each_on(client, abs, range(-5, 1))) == [0, 1, 2, 3, 4, 5]
+        with pytest.raises(ZeroDivisionError):
+            list(each_on(client, (1).__truediv__, [0]))

@@ -7,6 +7,7 @@ The workers of a cluster have to see that folder.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -23,6 +24,7 @@ from fdi_torch.gap.challenge.exercise import exercised
 from fdi_torch.gap.challenge.kinds import KINDS, STANDARD
 from fdi_torch.gap.challenge.plants import RIGS, Rig
 from fdi_torch.gap.challenge.run import Each
+from fdi_torch.gap.challenge.table import SHOWN, in_words
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.library import STANDARD as LIBRARY
 from fdi_torch.gap.one_at_a_time import one_at_a_time
@@ -30,13 +32,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.study.cluster import connected, each_on
 
-SHOWN = {
-    "right": "right",
-    "in_set": "truth in the set",
-    "place": "right place",
-    "named_wrong": "named and wrong",
-    "utility": "utility",
-}
+COLUMNS = ("right", "in_set", "place", "named_wrong", "utility")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kinds", metavar="KIND,...", help=f"of {', '.join(KINDS)}; by default {', '.join(STANDARD)}")
     parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="deny these, one a case: 'all' in turn")
     parser.add_argument("--no-bic", action="store_true", help="spare the one-at-a-time BIC winner, the dear baseline")
+    parser.add_argument("--minutes", metavar="M", type=float, default=math.inf, help="begin no case after so long")
     parser.add_argument("--cluster", metavar="local|ADDRESS", help="diagnose on Dask: local, or tcp://host:8786")
 
 
@@ -67,6 +64,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             leave_out=denied,
             rivals={} if arguments.no_bic else {"one_at_a_time_bic": partial(_textbook, rig.plant)},
             each=each,
+            minutes=arguments.minutes,
             tell=screen.note,
         )
     show(scores, rig, screen)
@@ -100,18 +98,9 @@ def show(scores: Mapping[str, Any], rig: Rig, screen: Screen) -> None:
     """Stratum by stratum what the diagnosis got right, and beside it what the baselines did."""
     strata = [stratum for stratum in scores["fdi"] if stratum != "by_effect"]
     rows = [
-        [s, str(scores["fdi"][s]["cases"]), *(_score(scores["fdi"][s].get(name)) for name in SHOWN)] for s in strata
+        [s, str(scores["fdi"][s]["cases"]), *(in_words(scores["fdi"][s].get(name)) for name in COLUMNS)] for s in strata
     ]
-    screen.table(f"{rig.plant.name}, with 95 % intervals", ("kind", "cases", *SHOWN.values()), rows)
-    rows = [[s, *(_score(scores[name].get(s, {}).get("right")) for name in scores)] for s in strata]
+    header = ("kind", "cases", *(SHOWN[name] for name in COLUMNS))
+    screen.table(f"{rig.plant.name}, with 95 % intervals", header, rows)
+    rows = [[s, *(in_words(scores[name].get(s, {}).get("right")) for name in scores)] for s in strata]
     screen.table("right answers, and those of the baselines", ("kind", *scores), rows)
-
-
-def _score(score: Any) -> str:
-    """A share in %, or a mean, with its interval."""
-    if not score:
-        return ""
-    low, high = (100 * x if "share" in score else x for x in score["ci95"])
-    if "share" in score:
-        return f"{100 * score['share']:.0f} % ({low:.0f} .. {high:.0f})"
-    return f"{score['mean']:.3f} ({low:.3f} .. {high:.3f})"

@@ -8,13 +8,15 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.reach import Reach
 
 
 class AreaTaper(Effect):
-    """The cross-section is A (1 + s (h/H - 1/2)): s is its change from floor to rim as a share of the mean, so that
-    it stays apart from A.
+    """The cross-section is A (1 + s (h/H - r)): s is its change from floor to rim as a share of A, which holds at the
+    level r H: at half height, unless A was measured elsewhere, as at the floor.
 
-    Typical: s of -0.5 to 0.5. It changes how fast levels move, never where they come to rest, like an internal body.
+    Typical: s of -0.5 to 0.5, r of 0 or 1/2. It changes how fast levels move, never where they come to rest, like an
+    internal body.
     """
 
     name = "area_taper"
@@ -23,7 +25,15 @@ class AreaTaper(Effect):
     mistaken_for = ("internal_body", "sensor_curvature")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("taper", "1", 0.0, -1.6, 1.6, meaning="change of area from floor to rim, over the mean"),)
+        return (
+            Parameter("taper", "1", 0.0, -1.6, 1.6, meaning="change of area from floor to rim, as a share of it"),
+            Parameter(
+                "reference", "1", 0.5, 0.0, 1.0, meaning="level at which the area is as believed, over the height"
+            ),
+        )
+
+    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+        return [{"taper": s, "reference": r} for r in (0.5, 0.0) for s in (0.16, -0.16)]
 
     def area(self, area: Tensor, local: Local, p: Values) -> Tensor:
-        return area * torch.clamp(1.0 + p["taper"] * (local.level / local.height - 0.5), min=0.05)
+        return area * torch.clamp(1.0 + p["taper"] * (local.level / local.height - p["reference"]), min=0.05)

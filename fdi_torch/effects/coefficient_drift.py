@@ -9,11 +9,15 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
 
+SMALL = 1e-4
+
 
 class CoefficientDrift(Effect):
-    """The flow is q (1 + r t), t on the recording's own clock: growth of deposits, warming water.
+    """The flow is q (1 + r (1 - exp(-b t))/b), which is q (1 + r t) for b = 0; t on the recording's own clock: growth
+    of deposits, warming water, at a steady pace, coming to rest (b > 0) or gathering speed.
 
-    Typical: r of 2 to 30 % an hour, either sign. Over a short recording the same as plugging.
+    Typical: r of 2 to 30 % an hour, either sign; b up to a few over the recording's length. Over a short recording the
+    same as plugging.
     """
 
     name = "coefficient_drift"
@@ -22,7 +26,18 @@ class CoefficientDrift(Effect):
     mistaken_for = ("unmetered_flow", "plugging", "sensor_drift", "flow_exponent")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("rate", "1/s", 0.0, -3e-4, 3e-4, meaning="share of the flow gained each second"),)
+        return (
+            Parameter("rate", "1/s", 0.0, -3e-4, 3e-4, meaning="share of the flow gained each second, at first"),
+            Parameter("settling", "1/s", 0.0, -5e-4, 1e-2, meaning="how fast the change comes to rest"),
+        )
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
-        return flow * torch.clamp(1.0 + p["rate"] * local.clock.middle, min=0.0)
+        return flow * torch.clamp(1.0 + p["rate"] * _elapsed(local.clock.middle, p["settling"]), min=0.0)
+
+
+def _elapsed(time: Tensor, settling: Tensor) -> Tensor:
+    """(1 - exp(-b t))/b, s; t (1 - b t/2 + (b t)^2/6) where b t is so small that the difference would cancel."""
+    x = settling * time
+    small = x.abs() < SMALL
+    safe = torch.where(small, torch.ones_like(x), x)
+    return time * torch.where(small, 1.0 - 0.5 * x + x * x / 6.0, (1.0 - torch.exp(-safe)) / safe)

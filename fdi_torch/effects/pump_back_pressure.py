@@ -9,12 +9,14 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
 
+DRY = 1e-6  # share of the height below which a tank counts as empty
+
 
 class PumpBackPressure(Effect):
-    """The flow is q (1 - c h / H): a centrifugal pump's curve, linear about its working point (Gülich, 2014,
-    "Centrifugal Pumps", ch. 4), for a pump that feeds its tank from below.
+    """The flow is q (1 - c (h / H)^n): a centrifugal pump's curve, about its working point linear or drooping (Gülich,
+    2014, "Centrifugal Pumps", ch. 4), for a pump that feeds its tank from below.
 
-    Typical: c of 0.05 to 0.5 at the rim. While the level hardly moves it is the same as a lower gain.
+    Typical: c of 0.05 to 0.5 at the rim, n of 1 to 2. While the level hardly moves it is the same as a lower gain.
     """
 
     name = "pump_back_pressure"
@@ -23,7 +25,11 @@ class PumpBackPressure(Effect):
     mistaken_for = ("pump_gain", "actuator_stuck", "pump_saturation", "flow_exponent", "leak")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("loss", "1", 0.0, -0.5, 1.0, meaning="share of the flow that is lost when the tank is full"),)
+        return (
+            Parameter("loss", "1", 0.0, -0.5, 1.0, meaning="share of the flow that is lost when the tank is full"),
+            Parameter("droop", "1", 1.0, 1.0, 3.0, meaning="power of the level with which it is lost"),
+        )
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
-        return flow * torch.clamp(1.0 - p["loss"] * local.level / local.height, min=0.0)
+        share = torch.clamp(local.level / local.height, min=DRY)
+        return flow * torch.clamp(1.0 - p["loss"] * torch.exp(p["droop"] * torch.log(share)), min=0.0)

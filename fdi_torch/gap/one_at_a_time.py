@@ -25,6 +25,7 @@ from fdi_torch.plant.reach import reach_of
 from fdi_torch.recording import Recording
 
 FITTED, STARTS = 14, 2
+PATIENT = 40  # rounds for the recalibration, beside which all others are judged
 
 
 def one_at_a_time(
@@ -42,7 +43,7 @@ def one_at_a_time(
     null = Fitter(subject, _white(1e-2 * spread)).fit(Candidate())
     residual = torch.where(subject.mask, subject.readings - null.near.readings[0], 0.0)
     fitter = Fitter(subject, _white(residual.std(dim=0).clamp(min=1e-12)))
-    null = fitter.fit(Candidate(), null)
+    null = fitter.fit(Candidate(), null, rounds=PATIENT)
     options = options_of([p for p in found if not p.effect.rounds], fitter, reach_of(recording, plant))
     fits = [null, *(fitter.fit(c, null) for c in _singles(screen(fitter, null, options)))]
     winner = min(fits, key=lambda fit: _bic(fitter, fit))

@@ -7,6 +7,7 @@ readings, and a regression beside the nuisances gives the chi-square that each c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -83,22 +84,26 @@ def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Reach) ->
     ]
 
 
-def screen(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Screen:
-    """Columns of all options about a fit, beside its own parameters."""
+def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], heat: float = 1.0) -> Screen:
+    """Columns of all options about a fit, beside its own parameters. heat: as in `against`."""
     columns = effect_columns(fitter, fit, options)
-    return against(fitter, fit, options, columns)
+    return against(fitter, fit, options, columns, heat)
 
 
-def against(fitter: Fitter, fit: Fit, options: Sequence[Option], columns: Tensor) -> Screen:
-    """Regresses whitened columns (S, C, M) beside the fit's own parameters with their priors."""
-    residual, jacobian = fitter.white(fit.near)
+def against(fitter: Fitter, fit: Fit, options: Sequence[Option], columns: Tensor, heat: float = 1.0) -> Screen:
+    """Regresses whitened columns (S, C, M) beside the fit's own parameters with their priors.
+
+    heat: by which the data's chi-square is divided, as in the evidence; what a tolerance says is no data and stays, so
+    that an effect which relieves a constant far out of its tolerance shows, however large the gap.
+    """
+    residual, jacobian = (x / math.sqrt(heat) for x in fitter.white(fit.near))
     space, theta = fit.space, fit.theta
     scale = fitter.box(space)[2]
     pull = (scale / space.std(theta)).nan_to_num(0.0)
     j = torch.cat([_by_column(jacobian[0] * scale), torch.diag(pull)], dim=1)
     r = torch.cat([_by_column(residual[0].unsqueeze(-1))[0], -(theta - space.nominal(theta)) / space.std(theta)])
     # The priors' rows of the columns are zero: no constant's tolerance speaks of an effect.
-    c = _by_column(columns)
+    c = _by_column(columns / math.sqrt(heat))
     seen = c.shape[1]
     q, _ = torch.linalg.qr(torch.cat([j, 1e-6 * torch.eye(len(pull), dtype=j.dtype)], dim=1).T)
     q = q[: len(r)]

@@ -15,7 +15,7 @@ SINGLES, STARTS = 14, 2
 PARENTS, PARTNERS = 3, 5
 DEEPEST = 4
 POLISH = 20
-PROMISE = 10.0  # chi-square units that an effect has to promise, to first order, to be fitted
+PROMISE = 10.0  # chi-square units, of the evidence, that an effect has to promise, to first order, to be fitted
 SETTLED_SHARE = 0.02  # of the gap left open by the best single, below which lesser promises are not followed
 
 
@@ -42,10 +42,10 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEE
     _polish(fitter, fits, 1)
     for depth in range(2, most + 1):
         before = len(fits)
-        worth = PROMISE * temperature(null.cost - _best(fits))
+        heat = temperature(null.cost - _best(fits))
         for parent in _parents(fits.values(), depth - 1, PARENTS if depth == 2 else 2):
-            screens[parent.key] = screen(fitter, parent, _beside(parent, options))
-            for candidate in _further(parent, screens[parent.key], PARTNERS if depth == 2 else 3, worth):
+            screens[parent.key] = screen(fitter, parent, _beside(parent, options), heat)
+            for candidate in _further(parent, screens[parent.key], PARTNERS if depth == 2 else 3, PROMISE):
                 if candidate.key not in fits:
                     _keep(fits, fitter.fit(candidate, parent, target=_best(fits)))
         if depth == 2 and len(fits) > before:

@@ -24,6 +24,7 @@ from fdi_torch.gap.challenge.files import (
 from fdi_torch.gap.challenge.kinds import STANDARD
 from fdi_torch.gap.challenge.plants import Rig, three_tank
 from fdi_torch.gap.challenge.score import Row, by_effect, judge, summary
+from fdi_torch.gap.challenge.table import markdown
 
 Line = Mapping[str, Any]
 Each = Callable[[Callable[[Line], dict[str, Any]], Iterable[Line]], Iterable[dict[str, Any]]]
@@ -42,6 +43,7 @@ def challenge(
     leave_out: Sequence[str] = (),
     rivals: Mapping[str, Diagnosis] | None = None,
     each: Each = map,
+    minutes: float = math.inf,
     tell: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Scores `diagnose` and its rivals on `cases` recordings, kinds in turn; resumes where it was interrupted.
@@ -50,14 +52,16 @@ def challenge(
     library: effects that `diagnose` can name; those are not drawn as unknown.
     leave_out: effects to deny it, one a case.
     rivals: further diagnoses scored beside the two without skill. each: map over cases, for example an executor's.
-    Returns {diagnosis: {stratum: scores}}; the same is in out/scores.json, a row a case in out/rows_NAME.jsonl.
+    minutes: after which no further case is begun; what is answered by then is scored.
+    Returns {diagnosis: {stratum: scores}}; the same is in out/scores.json and .md, a row a case in out/rows_NAME.jsonl.
     """
     rig, out = rig or three_tank(), Path(out)
     kinds = ("left_out",) if leave_out else tuple(kinds)
     seal(cases, seed, out, rig, kinds, library, leave_out, tell)
-    diagnoses = {"always_null": always_null, "random": random_pair(rig.plant, seed), **(rivals or {}), "fdi": diagnose}
+    stop = time.perf_counter() + 60 * minutes
+    diagnoses = {"always_null": always_null, "random": random_pair(rig.plant, seed), "fdi": diagnose, **(rivals or {})}
     for name, each_diagnosis in diagnoses.items():
-        answer_all(name, each_diagnosis, cases, out, rig, each, tell)
+        answer_all(name, each_diagnosis, cases, out, rig, each, stop, tell)
     return score_all(tuple(diagnoses), cases, out, rig)
 
 
@@ -102,15 +106,19 @@ def answer_all(
     out: Path,
     rig: Rig,
     each: Each,
+    stop: float,
     tell: Callable[[str], None],
 ) -> None:
-    """Diagnoses what has no answer yet, a JSON line a case. The key stays shut."""
+    """Diagnoses what has no answer yet, a JSON line a case, until the clock says `stop`. The key stays shut."""
     path = out / f"answers_{name}.jsonl"
     done = {line["case"] for line in lines_of(path)}
     todo = [line for line in list(manifest(out).values())[:cases] if line["case"] not in done]
+    todo = todo if time.perf_counter() < stop else []
     for n, line in enumerate(each(partial(answer, diagnose, out, rig), todo)):
         append(path, json.dumps(line))
         tell(f"{name} {len(done) + n + 1}/{cases} {line['case']} {line['answer'].get('verdict')} {line['sec']:.1f} s")
+        if time.perf_counter() > stop:
+            break
 
 
 def answer(diagnose: Diagnosis, out: Path, rig: Rig, line: Line) -> dict[str, Any]:
@@ -147,6 +155,7 @@ def score_all(names: Sequence[str], cases: int, out: Path, rig: Rig) -> dict[str
         (out / f"rows_{name}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         scores[name] = summary(rows) | {"by_effect": by_effect(rows)}
     (out / "scores.json").write_text(json.dumps(without_nan(scores), indent=1) + "\n")
+    (out / "scores.md").write_text(markdown(scores) + "\n")
     return scores
 
 

@@ -1,0 +1,23 @@
+"""The textbook baseline names what is plain and alone, and knows no pairs."""
+
+from __future__ import annotations
+
+import pytest
+
+from fdi_torch.gap.one_at_a_time import one_at_a_time
+from tests.test_gap import SMALL, believed, recorded
+
+
+@pytest.mark.parametrize(
+    ("changed", "ar", "named"),
+    [
+        ({"Q1.pump_gain.factor": 0.8}, 0.0, [("pump_gain", "Q1")]),
+        ({}, 0.0, []),
+        ({"Q1.pump_gain.factor": 0.8, "h3.sensor_bias.offset": 0.05}, 0.0, [("pump_gain", "Q1")]),
+    ],
+)
+def test_the_winner_is_one_effect_or_none(changed: dict[str, float], ar: float, named: list[tuple[str, str]]) -> None:
+    answer = one_at_a_time(believed(), recorded(changed, 4, samples=600, ar=ar), SMALL)
+    assert [(c["effect"], c["location"]) for c in answer["causes"]] == named
+    assert answer["verdict"] == ("named" if named else "no_gap")
+    assert answer["posterior"][0]["probability"] == 1.0
