@@ -9,15 +9,15 @@ from tests.test_gap import SMALL, believed, recorded
 
 
 @pytest.mark.parametrize(
-    ("changed", "ar", "named"),
+    ("changed", "named"),
     [
-        ({"Q1.pump_gain.factor": 0.8}, 0.0, [("pump_gain", "Q1")]),
-        ({}, 0.0, []),
-        ({"Q1.pump_gain.factor": 0.8, "h3.sensor_bias.offset": 0.05}, 0.0, [("pump_gain", "Q1")]),
+        ({"Q1.pump_gain.factor": 0.8}, [("pump_gain", "Q1")]),
+        ({}, []),
+        ({"Q1.pump_gain.factor": 0.8, "h3.sensor_bias.bias": 0.01}, [("pump_gain", "Q1")]),
     ],
 )
-def test_the_winner_is_one_effect_or_none(changed: dict[str, float], ar: float, named: list[tuple[str, str]]) -> None:
-    answer = one_at_a_time(believed(), recorded(changed, 4, samples=600, ar=ar), SMALL)
+def test_the_winner_is_one_effect_or_none(changed: dict[str, float], named: list[tuple[str, str]]) -> None:
+    answer = one_at_a_time(believed(), recorded(changed, 5, samples=600), SMALL)
     assert [(c["effect"], c["location"]) for c in answer["causes"]] == named
     assert answer["verdict"] == ("named" if named else "no_gap")
     assert answer["posterior"][0]["probability"] == 1.0
