@@ -11,7 +11,7 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.monitor.change import ChangedObserver, Window
 from fdi_torch.monitor.detection import make_detector
-from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.isolation import Fault, isolate
 from fdi_torch.monitor.noise import Noise, learn_noise
 from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.prepare import usual_faults
@@ -43,7 +43,8 @@ def measure(seconds: float) -> list[dict[str, Any]]:
 def isolation(observer: ChangedObserver, window: Window, slow: bool) -> dict[str, Any]:
     """Every fault alone, sudden; or sudden and slow, alone and in pairs."""
     believed, count = observer.space.nominal(), len(observer.space)
-    spent = best_seconds(lambda: isolate(observer, window, believed, range(count), slow, 2 if slow else 1))
+    faults = [Fault(column) for column in range(count)]
+    spent = best_seconds(lambda: isolate(observer, window, believed, faults, slow, 2 if slow else 1))
     what = "sudden or slow, one or two" if slow else "sudden, one"
     return {"what": f"isolation, {count} faults, {what}", "samples": len(window), "seconds": spent}
 

@@ -23,6 +23,7 @@ from fdi_torch.monitor.following import MonitorState
 from fdi_torch.monitor.online import Monitor, Seen
 from fdi_torch.monitor.prepare import Prepared, fault_free_part, prepare
 from fdi_torch.monitor.samples import Samples, take
+from fdi_torch.monitor.windows import WindowMonitor, WindowState
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 
@@ -78,6 +79,11 @@ def _along(run: MonitorRun, watcher: _Watcher, listening: Listening, whole: Reco
     watcher.begin(_prepared(run, whole))
     samples = take(whole, run.plant)
     lasts, reach = float(whole.time[-1] - whole.time[0]), run.config.window.longest
+    if reach > lasts and run.config.mode != "changes":
+        raise ValueError(
+            f"expected a recording of at least one window ({reach:g} s) for the mode '{run.config.mode}', "
+            f"got {lasts:g} s; shorten window.longest"
+        )
     if reach > lasts:
         watcher.say(f"windows may reach back {reach:g} s, the recording lasts {lasts:g} s: they end at its beginning")
     for first in range(0, len(samples), CHUNK):
@@ -119,12 +125,12 @@ def _follow(run: MonitorRun, watcher: _Watcher, listening: Listening, idle: floa
 class _Watcher:
     """A monitor at work, its state, and the log of what it sees."""
 
-    monitor: Monitor
+    monitor: Monitor | WindowMonitor
     believed: Tensor
 
     def __init__(self, run: MonitorRun, log: RunLog, listening: Listening) -> None:
         self.run, self.plant, self.log, self.listening = run, run.plant, log, listening
-        self.state: MonitorState | None = None
+        self.state: Any = None
         self.events, self.spent = 0, 0.0
         self._told: dict[str, float] = {}
         self._began: float | None = None
@@ -132,7 +138,13 @@ class _Watcher:
 
     def begin(self, prepared: Prepared) -> None:
         """What was learnt is told, and so is what speaks against it."""
-        self.monitor, self.believed = prepared.monitor, prepared.believed
+        inner, config = prepared.monitor, self.run.config
+        self.monitor, self.believed = inner, prepared.believed
+        if config.mode != "changes":
+            window = config.window
+            self.monitor = WindowMonitor(
+                inner.observer, inner.detector, inner.watched, config.mode, window.longest, window.stride
+            )
         self.listening.ready(prepared)
         for doubt in prepared.doubts:
             self.say(doubt)
@@ -170,7 +182,7 @@ class _Watcher:
         """What is believed to be off nominal now."""
         return [] if self.state is None else list(self._off_nominal(self.state))
 
-    def _off_nominal(self, state: MonitorState) -> dict[str, float]:
+    def _off_nominal(self, state: MonitorState | WindowState) -> dict[str, float]:
         values = zip(self.space, state.believed.tolist(), strict=True)
         return {p.name: value for p, value in list(values)[: self.monitor.watched] if value != p.nominal}
 
@@ -192,7 +204,7 @@ class _Watcher:
         self.log.flush()
         self.listening.event(event)
 
-    def _log_beliefs(self, event: Event, state: MonitorState) -> None:
+    def _log_beliefs(self, event: Event, state: MonitorState | WindowState) -> None:
         """Each fault that is believed in now, and each that no longer is."""
         now, stds = self._off_nominal(state), dict(zip(event.faults, event.stds, strict=True))
         for name in dict.fromkeys([*self._told, *now]):

@@ -22,7 +22,7 @@ from fdi_torch.monitor.continuity import continuous
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.following import MonitorState
-from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.isolation import Fault, isolate
 from fdi_torch.monitor.noise import Noise, learn_noise
 from fdi_torch.monitor.observer import bound
 from fdi_torch.monitor.online import Monitor
@@ -38,6 +38,7 @@ PLACES = [("leak", "T1"), ("leak", "T3"), ("plugging", "P13"), ("pump_gain", "Q2
 NETWORK = build_network(PLANT, [place(*p) for p in PLACES])
 NAMES = ["T1.leak.size", "T3.leak.size", "P13.plugging.size", "Q2.pump_gain.factor", "h3.sensor_bias.bias"]
 SPACE = ParameterSpace([NETWORK.constants[name] for name in NAMES])
+FAULTS = [Fault(column) for column in range(5)]
 INPUTS = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
 REST = equilibrium(NETWORK, INPUTS)
 STD = 1e-3
@@ -128,7 +129,7 @@ def test_a_slowly_growing_fault_is_told_from_a_sudden_one() -> None:
 
     samples = recorded(truth, 260)
     watch = ChangedObserver(NETWORK, SPACE, noise().gain, noise().whitening)
-    best = isolate(watch, from_rest(samples), SPACE.nominal(), range(5), incipient=True, deepest=1)[0]
+    best = isolate(watch, from_rest(samples), SPACE.nominal(), FAULTS, incipient=True, deepest=1)[0]
     assert best.hypothesis.columns == (4,) and best.hypothesis.incipient
     assert float(best.value[4]) == pytest.approx(1e-4 * 159.0, rel=0.05)
     assert abs(best.onset - 100.0) < 10.0
@@ -139,7 +140,7 @@ def test_two_faults_at_once_are_found_together() -> None:
         return SPACE.vector({"T1.leak.size": 0.05, "h3.sensor_bias.bias": 0.01} if time > 100.0 else {})
 
     watch = ChangedObserver(NETWORK, SPACE, noise().gain, noise().whitening)
-    best = isolate(watch, from_rest(recorded(truth, 260)), SPACE.nominal(), range(5), incipient=False, deepest=2)[0]
+    best = isolate(watch, from_rest(recorded(truth, 260)), SPACE.nominal(), FAULTS, incipient=False, deepest=2)[0]
     assert best.hypothesis.columns == (0, 4)
     for column, size in ((0, 0.05), (4, 0.01)):
         assert abs(float(best.value[column]) - size) < 4 * float(best.std[column])
@@ -150,7 +151,7 @@ def test_standard_errors_are_those_of_repeated_runs() -> None:
     pulls = []
     for seed in range(8):
         samples = recorded(step_to("T3.leak.size", 0.05, 60.0), 140, seed=seed)
-        best = isolate(watch, from_rest(samples), SPACE.nominal(), [1], incipient=False, deepest=1)[0]
+        best = isolate(watch, from_rest(samples), SPACE.nominal(), FAULTS[1:2], incipient=False, deepest=1)[0]
         pulls.append((float(best.value[1]) - 0.05) / float(best.std[1]))
     assert 0.5 < float(torch.tensor(pulls).square().mean().sqrt()) < 1.7  # 8 runs: 95 % within 0.5 to 1.5
 

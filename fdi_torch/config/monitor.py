@@ -25,6 +25,9 @@ class WindowConfig(Strict):
     lookback: Seconds = Field(300.0, description="how far before an alarm a change is sought, s")
     confirm: Seconds = Field(60.0, description="how long after an alarm the faults are told apart, s")
     longest: Seconds = Field(1000.0, description="no window reaches further back, s")
+    stride: Seconds | None = Field(
+        None, description="between windows that are fitted one by one, s; by default longest"
+    )
     incipient: bool = Field(True, description="whether faults may also grow slowly")
     together: int = Field(2, ge=1, description="how many faults may come at once")
 
@@ -58,6 +61,9 @@ class MonitorConfig(Strict):
     faults: list[str] = Field(default_factory=list, description="parameters that may change; by default the usual ones")
     ranges: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="of faults whose usual range does not suit, SI"
+    )
+    mode: Literal["changes", "hybrid", "evolution", "least_squares", "multi_start"] = Field(
+        "changes", description="single changes after alarms, or all faults window after window by that estimator"
     )
     detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="what raises alarms")
     false_alarms_every: Seconds = Field(20000.0, description="mean time between false alarms, s")

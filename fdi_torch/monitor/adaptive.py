@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.gain import Gain
+from fdi_torch.monitor.gain import Gain, Linear, hand_gain, riccati
 from fdi_torch.monitor.observer import bound
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import LONGEST_STEP, PlantState, Stepper, slopes
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
+
+FORGET = 1e-3  # share of a parameter's deviation that the design of (15) forgets in a sample
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,27 @@ def adaptive_observer(
     return Adapted(path[..., : model.tanks], found, nothing, torch.stack(residuals, dim=-2))
 
 
+def designed_rate(
+    model: JointModel, samples: Samples, levels: Tensor, theta: Tensor, wander: Tensor, reading_std: Tensor
+) -> tuple[Gain, Tensor]:
+    """Gains of (15) about one operating point: L of the levels, and K_theta (P, sensors) per second.
+
+    The steady joint Kalman gain for parameters that wander by `wander` (P,) a sample and forget a little, so that
+    combinations which the readings do not determine there stay bounded. levels (tanks,), theta (P,).
+    """
+    z = torch.cat([levels, theta])
+    transition = slopes(lambda x: model.moved(x, samples, 0), z)
+    output = slopes(lambda x: model.read(x, float(samples.time[1])), z)
+    keep = torch.ones_like(z)
+    keep[model.tanks :] = 1.0 - FORGET
+    process = torch.diag(torch.cat([torch.full_like(levels, 1e-6), wander]) ** 2)
+    linear, reading = Linear(keep * transition, output), torch.diag(reading_std**2)
+    predicted = riccati(linear, process, reading)
+    gain = torch.linalg.solve(output @ predicted @ output.mT + reading, output @ predicted).mT
+    span = float(samples.time[1] - samples.time[0])
+    return hand_gain(gain[: model.tanks]), gain[model.tanks :] / span
+
+
 def joint_filter(
     model: JointModel,
     samples: Samples,
@@ -95,6 +118,7 @@ def joint_filter(
     """Extended Kalman filter of levels and parameters (Jazwinski 1970, ch. 8), slopes by forward-mode differentiation.
 
     start_std and wander (tanks + P): how uncertain each is at the start, and how far it wanders in a sample.
+    reading_std (*batch, sensors).
     """
     z = torch.cat([levels, theta], dim=-1)
     covariance = torch.diag(start_std**2).expand(*z.shape[:-1], -1, -1)
@@ -109,7 +133,7 @@ def joint_filter(
         known = torch.isfinite(residual)
         output = torch.where(known.unsqueeze(-1), output, 0.0)
         across = _product(covariance, output.mT)
-        spread = _product(output, across) + torch.diag(reading_std**2)
+        spread = _product(output, across) + torch.diag_embed(reading_std**2)
         gain = torch.linalg.solve(spread, across.mT).mT
         z = model.kept(z + _times(gain, torch.where(known, residual, 0.0)))
         covariance = covariance - _product(gain, across.mT)

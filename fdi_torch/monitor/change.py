@@ -104,9 +104,9 @@ class ChangedObserver:
         white[:, : self.whitening.order] = 0.0
         return torch.nan_to_num(white, nan=0.0)
 
-    def blocks(self, window: Window, changes: Changes) -> list[Changes]:
-        """The hypotheses in parts that fit into memory side by side."""
-        size = max(MOST_READINGS // (len(window) * len(self.network.description.sensors)), 1)
+    def blocks(self, window: Window, changes: Changes, even: int = 1) -> list[Changes]:
+        """The hypotheses in parts that fit into memory side by side, each of a multiple of `even`."""
+        size = even * max(MOST_READINGS // (even * len(window) * len(self.network.description.sensors)), 1)
         return [changes.part(first, first + size) for first in range(0, len(changes), size)]
 
     def follow(self, window: Window, believed: Tensor, changes: Changes) -> tuple[Tensor, Tensor]:

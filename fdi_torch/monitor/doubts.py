@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from fdi_torch.monitor.change import ChangedObserver, Window
 from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.gain import kalman_gain, start_uncertainty
-from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.isolation import Fault, isolate
 from fdi_torch.monitor.noise import Noise, operating_point
 from fdi_torch.monitor.observer import Observation
 from fdi_torch.monitor.samples import Samples
@@ -40,7 +42,12 @@ def residual_doubts(plant: PlantDescription, noise: Noise, detector: Detector, s
 
 
 def fault_doubts(
-    network: TankNetwork, space: ParameterSpace, samples: Samples, believed: Tensor, step: float, watched: int
+    network: TankNetwork,
+    space: ParameterSpace,
+    samples: Samples,
+    believed: Tensor,
+    step: float,
+    faults: Sequence[Fault],
 ) -> list[str]:
     """A single fault within it that leaves nothing but the readings' own noise.
 
@@ -55,8 +62,9 @@ def fault_doubts(
     gain = kalman_gain(linear, STILL * float(std.min()) * torch.ones_like(start), std, start)
     still = Whitening(torch.zeros_like(std), std.new_zeros(0, len(std), len(std)), torch.diag(1.0 / std), len(samples))
     observer = ChangedObserver(network, space, gain, still, step)
+    steady = [fault for fault in faults if not fault.shape]
     first, _ = observer.first_state(samples, believed)
-    best = isolate(observer, Window(samples, first, 1), believed, range(watched), incipient=False, deepest=1)[0]
+    best = isolate(observer, Window(samples, first, 1), believed, steady, incipient=False, deepest=1)[0]
     if not best.fits or best.score > -CONVINCING:
         return []
     [column] = best.hypothesis.columns

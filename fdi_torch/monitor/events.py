@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-Kind = Literal["alarm", "isolated", "revised", "recovered", "unexplained", "notice"]
+Kind = Literal["alarm", "isolated", "revised", "recovered", "unexplained", "estimate", "notice"]
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,8 @@ class MonitorState:
 
     samples: what came lately; for each, state (S, tanks + M) of the observer after it, residual and white (S, sensors).
     watched: how many of them the detector no longer looks at. number: samples since the observer's start. believed
-    (P,). reachable: no window starts before it, s. alarm: one that is being looked into, s. change: the latest.
+    (P,). reachable: no window starts before it, s. alarm: one that is being looked into, s; looks: how often it was, in
+    vain. change: the latest.
     """
 
     samples: Samples
@@ -41,6 +42,7 @@ class MonitorState:
     believed: Tensor
     reachable: float
     alarm: float | None = None
+    looks: int = 0
     change: Change | None = None
 
     @property
@@ -95,6 +97,7 @@ def believe(observer: ChangedObserver, state: MonitorState, change: Change, beli
         residual=torch.cat([state.residual[:first], residual[0]]),
         watched=len(state.samples),
         alarm=None,
+        looks=0,
         change=change,
     )
     return _whitened(observer, moved, first)

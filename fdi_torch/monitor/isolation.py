@@ -17,15 +17,43 @@ ONSETS = 24  # moments tried in a window before the fit makes them continuous
 SIZE_STEP = 1e-4  # of a parameter's range: for slopes
 TRIAL_SIZE = 0.02  # of a parameter's range: for signatures
 ITERATIONS = 12
+MOST_PERIODS, SWING_ONSETS = 48, 6  # tried for an oscillation
 DEEPEST = 2  # faults that may come at once
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Which columns of the space change together, and whether at once or little by little."""
+    """Which columns of the space change together, and whether at once or little by little.
+
+    shape: those of them that say how (period and phase of an oscillation), not how much.
+    """
 
     columns: tuple[int, ...]
     incipient: bool = False
+    shape: tuple[int, ...] = ()
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The columns that say how much."""
+        return tuple(c for c in self.columns if c not in self.shape)
+
+    def beside(self, fault: Fault) -> Hypothesis:
+        """With another fault that comes at the same time."""
+        return Hypothesis(
+            tuple(sorted({*self.columns, *fault.columns})), self.incipient, tuple(sorted({*self.shape, *fault.shape}))
+        )
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault of the list: the column of its size, and of its period and phase where it swings."""
+
+    size: int
+    shape: tuple[int, ...] = ()
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        return (self.size, *self.shape)
 
 
 @dataclass(frozen=True)
@@ -55,27 +83,29 @@ def isolate(
     observer: ChangedObserver,
     window: Window,
     believed: Tensor,
-    columns: Sequence[int],
+    faults: Sequence[Fault],
     incipient: bool = True,
     deepest: int = DEEPEST,
 ) -> list[Finding]:
-    """All single changes of `columns`, then of the best ones together with another; best first.
+    """All single changes of `faults`, then of the best ones together with another; best first.
 
     One change a window: faults that come together share their onset.
     """
-    shapes = (False, True) if incipient else (False,)
-    singles = [Hypothesis((c,), late) for late in shapes for c in columns]
+    ways = (False, True) if incipient else (False,)
+    steady = [Hypothesis((f.size,), late) for late in ways for f in faults if not f.shape]
+    swinging = [Hypothesis(f.columns, shape=f.shape) for f in faults if f.shape]
+    singles = [*steady, *swinging]
     base = observer.white(window, believed, unchanged(believed))
-    starts = signatures(observer, window, believed, singles, base)
+    starts = torch.cat(
+        [
+            signatures(observer, window, believed, steady, base),
+            *(swing_start(observer, window, believed, h, base) for h in swinging),
+        ]
+    )
     found = fit(observer, window, believed, singles, starts, _misfit(base))
     for _ in range(1, deepest):
         best = sorted(found, key=lambda finding: finding.score)[:2]
-        wider = {
-            Hypothesis(tuple(sorted({*b.hypothesis.columns, c})), b.hypothesis.incipient): b
-            for b in best
-            for c in columns
-            if c not in b.hypothesis.columns
-        }
+        wider = {b.hypothesis.beside(f): b for b in best for f in faults if f.size not in b.hypothesis.columns}
         kept = [h for h in wider if h not in {f.hypothesis for f in found}]
         if not kept:
             break
@@ -99,6 +129,8 @@ def signatures(
     Generalised likelihood ratio over faults and onsets (Willsky & Jones 1976): the residual's shape of a small fault,
     scaled to fit. base (1, S, sensors): the white innovations without a change.
     """
+    if not hypotheses:
+        return believed.new_zeros(0, len(believed) + 1)
     first, last = float(window.samples.time[0]), float(window.samples.time[-1])
     onsets = first + (last - first) * (torch.arange(ONSETS, dtype=believed.dtype) + 0.5) / ONSETS
     theta = believed.repeat(len(hypotheses), ONSETS, 1)
@@ -120,6 +152,43 @@ def signatures(
     value = believed + (theta[rows, best] - believed) * scale
     low, high = observer.space.low(believed), observer.space.high(believed)
     return torch.cat([value.clamp(low, high), onsets[best].unsqueeze(-1)], dim=-1)
+
+
+def swing_start(
+    observer: ChangedObserver, window: Window, believed: Tensor, hypothesis: Hypothesis, base: Tensor
+) -> Tensor:
+    """The same (1, P+1) for an oscillation: its period from a grid half a swing of the window apart, amplitude and
+    phase by least squares on the signatures of a sine and a cosine.
+    """
+    size, period, phase = hypothesis.columns[0], *hypothesis.shape
+    first, last = float(window.samples.time[0]), float(window.samples.time[-1])
+    sampling, bounds = float(torch.diff(window.samples.time).median()), observer.space.parameters[period]
+    fastest, slowest = max(4.0 * sampling, bounds.low), min(2.0 * (last - first), bounds.high)
+    count = min(max(int(2.0 * (last - first) / fastest), 2), MOST_PERIODS)
+    periods = 1.0 / torch.linspace(1.0 / slowest, 1.0 / fastest, count, dtype=believed.dtype)
+    onsets = first + (last - first) * (torch.arange(SWING_ONSETS, dtype=believed.dtype) + 0.5) / SWING_ONSETS
+    grid = torch.cartesian_prod(periods, onsets, believed.new_tensor([0.0, 0.5 * torch.pi]))
+    theta = believed.repeat(len(grid), 1)
+    trial = TRIAL_SIZE * float(observer.space_width()[size])
+    theta[:, size], theta[:, period], theta[:, phase] = trial, grid[:, 0], grid[:, 2]
+    changes = Changes(theta, grid[:, 1], torch.zeros(len(grid), dtype=torch.bool))
+    products = []
+    for part in observer.blocks(window, changes, even=2):
+        shape = (base - observer.white(window, believed, part)).flatten(1).reshape(len(part) // 2, 2, -1)
+        columns = torch.cat([shape, base.flatten(1).expand(len(shape), 1, -1)], dim=1)
+        products.append(columns @ columns.mT)
+    gram = torch.cat(products)
+    normal = gram[:, :2, :2] + 1e-12 * gram[:, :2, :2].diagonal(dim1=1, dim2=2).amax(1).clamp(min=1e-30)[
+        :, None, None
+    ] * torch.eye(2, dtype=gram.dtype)
+    scale = torch.linalg.solve(normal, gram[:, :2, 2:])[..., 0]
+    best = int((scale * gram[:, :2, 2]).sum(1).argmax())
+    sine, cosine = scale[best].tolist()
+    start = believed.clone()
+    amplitude = trial * float(scale[best].norm())
+    start[size] = min(amplitude, observer.space.parameters[size].high)
+    start[period], start[phase] = grid[2 * best, 0], math.atan2(cosine, sine)
+    return torch.cat([start, grid[2 * best, 1][None]])[None]
 
 
 def fit(

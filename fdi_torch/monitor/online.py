@@ -6,7 +6,7 @@ white innovations, together with the moment of change.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,7 +17,7 @@ from fdi_torch.monitor.continuity import continuous
 from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.following import Change, MonitorState, begin, believe, forget, observe
-from fdi_torch.monitor.isolation import Finding, isolate, refit
+from fdi_torch.monitor.isolation import Fault, Finding, isolate, refit
 from fdi_torch.monitor.noise import Noise
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.settings import MonitorSettings
@@ -27,6 +27,7 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 
 RIVAL = 6.0  # difference in BIC below which another explanation stands beside the best
+SHAPE = ("period", "phase")
 MOST_AT_ONCE = 512  # samples that the observer is run along before the detector looks at them
 
 
@@ -59,12 +60,13 @@ class Monitor:
         self.network, self.space, self.noise, self.detector = network, space, noise, detector
         self.settings = settings or MonitorSettings()
         self.watched = len(space) if watched is None else watched
-        self._observer = ChangedObserver(network, space, noise.gain, noise.whitening, longest_step)
+        self.faults = faults_of(space.names[: self.watched])
+        self.observer = ChangedObserver(network, space, noise.gain, noise.whitening, longest_step)
 
     def start(self, samples: Samples, believed: Tensor | None = None, levels: Tensor | None = None) -> MonitorState:
         """The state after the first of some samples."""
         theta = self.space.nominal() if believed is None else believed
-        return begin(self._observer, samples.stretch(0, 1), theta, levels)
+        return begin(self.observer, samples.stretch(0, 1), theta, levels)
 
     def advance(
         self, state: MonitorState, samples: Samples, show: Callable[[Seen], None] | None = None
@@ -77,7 +79,7 @@ class Monitor:
         for stretch, notice in continuous(state.samples, samples):
             if notice:
                 events.append(Event(float(stretch.time[0]), "notice", notice))
-                state = begin(self._observer, stretch.stretch(0, 1), state.believed)
+                state = begin(self.observer, stretch.stretch(0, 1), state.believed)
                 stretch = stretch.stretch(1, len(stretch))
             while len(stretch):
                 state, taken, news = self._take(state, stretch, show)
@@ -92,13 +94,13 @@ class Monitor:
         due = samples.time >= self._next_look(state)
         count = int(due.to(torch.int8).argmax()) + 1 if bool(due.any()) else len(samples)
         count = min(count, MOST_AT_ONCE)
-        before, moved = state, observe(self._observer, state, samples.stretch(0, count))
+        before, moved = state, observe(self.observer, state, samples.stretch(0, count))
         statistic = self._statistic(moved, count)
         above = statistic > self.detector.threshold
         raised = state.alarm is None and bool(above.any())
         if raised:
             count = int(above.to(torch.int8).argmax()) + 1
-            moved = observe(self._observer, before, samples.stretch(0, count))
+            moved = observe(self.observer, before, samples.stretch(0, count))
         if show is not None:
             show(Seen(moved.samples.time[-count:], moved.residual[-count:], statistic[:count]))
         state, events = self._alarm(moved) if raised else (moved, [])
@@ -119,11 +121,11 @@ class Monitor:
             if revised.change.finding.fits:
                 return revised, events
         alarm = Event(state.now, "alarm", "the residual leaves its fault-free range")
-        return replace(state, alarm=state.now), [alarm]
+        return replace(state, alarm=state.now, looks=0), [alarm]
 
     def _next_look(self, state: MonitorState) -> float:
         if state.alarm is not None:
-            return state.alarm + self.settings.confirm
+            return state.alarm + self.settings.confirm * self.settings.revise**state.looks
         return state.change.next_look if state.change is not None else float("inf")
 
     def _forgotten(self, state: MonitorState) -> MonitorState:
@@ -148,11 +150,18 @@ class Monitor:
         start = max(state.alarm - self.settings.lookback, state.reachable)
         finding, rivals = self._best(state, start, state.believed)
         if finding.score >= 0.0:
-            text = "no fault of the list explains the alarm better than noise does"
-            event = Event(state.now, "unexplained", text)
-            return replace(state, alarm=None, watched=len(state.samples)), [event]
+            return self._unexplained(state)
         change = Change(state.believed, finding, state.alarm, self._look_again(finding, state.now))
         return self._believe(state, change), [self._tell(state, change, rivals, "isolated")]
+
+    def _unexplained(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
+        """Said once; looked at again when more has been seen, until the longest window is full."""
+        text = "no fault of the list explains the alarm better than noise does"
+        events = [] if state.looks else [Event(state.now, "unexplained", text)]
+        waiting = replace(state, looks=state.looks + 1)
+        if self._next_look(waiting) - (state.alarm or 0.0) <= self.settings.longest:
+            return waiting, events
+        return replace(state, alarm=None, looks=0, watched=len(state.samples)), events
 
     def _revise(
         self, state: MonitorState, change: Change, kind: Kind, only: tuple[Finding, ...] = ()
@@ -179,9 +188,9 @@ class Monitor:
         """The best explanation of what came since `start`, and the names of those that fit nearly as well."""
         window = state.window(start)
         if only:
-            return refit(self._observer, window, believed, only)[0], ()
-        columns = range(self.watched)
-        found = isolate(self._observer, window, believed, columns, self.settings.incipient, self.settings.together)
+            return refit(self.observer, window, believed, only)[0], ()
+        s = self.settings
+        found = isolate(self.observer, window, believed, self.faults, s.incipient, s.together)
         best = found[0]
         near = [f for f in found[1:] if f.score - best.score < RIVAL]
         rivals = [f for f in near if not set(best.hypothesis.columns) <= set(f.hypothesis.columns)]
@@ -189,7 +198,18 @@ class Monitor:
 
     def _believe(self, state: MonitorState, change: Change) -> MonitorState:
         """Feeds the newest parameters back."""
-        return believe(self._observer, state, change, with_nominals(self.space, change.finding))
+        return believe(self.observer, state, change, with_nominals(self.space, change.finding))
 
     def _tell(self, state: MonitorState, change: Change, rivals: tuple[str, ...], kind: Kind) -> Event:
         return tell(self.space, change, rivals, state.now, kind, state.reachable)
+
+
+def faults_of(names: Sequence[str]) -> list[Fault]:
+    """The faults that parameters make up: an oscillation's period and phase belong to its amplitude."""
+    faults = []
+    for column, name in enumerate(names):
+        effect, _, field = name.rpartition(".")
+        if field not in SHAPE:
+            shape = tuple(names.index(f"{effect}.{s}") for s in SHAPE if f"{effect}.{s}" in names)
+            faults.append(Fault(column, shape))
+    return faults

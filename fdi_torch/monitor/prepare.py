@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -16,7 +17,7 @@ from fdi_torch.monitor.doubts import fault_doubts, residual_doubts
 from fdi_torch.monitor.gain import Gain, hand_gain, start_uncertainty, timed_gain
 from fdi_torch.monitor.noise import Noise, learn_noise, noise_of_gain, operating_point
 from fdi_torch.monitor.observer import Observer
-from fdi_torch.monitor.online import Monitor
+from fdi_torch.monitor.online import SHAPE, Monitor, faults_of
 from fdi_torch.monitor.samples import Samples, take
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.monitor.stepper import LONGEST_STEP
@@ -71,10 +72,13 @@ def prepare(
     calibrate: constants fitted to the fault-free recording first, their tolerances as priors. start: what is known of
     the levels then. ranges: of faults whose usual range does not suit. Raises ValueError.
     """
-    watched = list(faults) or usual_faults(plant)
+    watched = with_shapes(list(faults) or usual_faults(plant), plant)
     network = build_network(plant, placements_for(watched))
     values = calibration(plant, fault_free, calibrate, step, start) if calibrate else {}
     space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate)])
+    for name in watched:
+        if name.endswith(".phase"):  # once round in either direction, so that no fit ends at a seam
+            space = space.with_changes(name, low=-2.0 * math.pi, high=2.0 * math.pi)
     for name, (low, high) in (ranges or {}).items():
         space = space.with_changes(name, low=low, high=high)
     believed = space.vector(values)
@@ -93,7 +97,7 @@ def prepare(
     monitor = Monitor(network, space, noise, detector, settings, step, watched=len(watched))
     doubts = (
         *residual_doubts(plant, noise, detector, seen),
-        *fault_doubts(network, space, samples, believed, step, len(watched)),
+        *fault_doubts(network, space, samples, believed, step, faults_of(watched)),
     )
     return Prepared(monitor, believed, noise, values, radius, doubts)
 
@@ -108,6 +112,16 @@ def _wished(
     span = float(torch.diff(samples.time).median())
     assert wish.time_constant is not None
     return timed_gain(linear, span, wish.time_constant, unit, start_uncertainty(network.description, unit))
+
+
+def with_shapes(faults: Sequence[str], plant: PlantDescription) -> list[str]:
+    """The faults, and after each oscillation its period and phase."""
+    known = build_network(plant, placements_for(faults)).constants
+    wider = []
+    for name in faults:
+        effect = name.rpartition(".")[0]
+        wider += [name, *(f"{effect}.{s}" for s in SHAPE if f"{effect}.{s}" in known and f"{effect}.{s}" not in faults)]
+    return wider
 
 
 def calibration(

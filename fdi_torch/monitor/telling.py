@@ -17,11 +17,15 @@ def tell(space: ParameterSpace, change: Change, rivals: tuple[str, ...], now: fl
     """
     finding, names = change.finding, names_of(space, change.finding)
     columns = finding.hypothesis.columns
-    back = [c for c in columns if is_nominal(space, finding, c) and float(change.before[c]) != _nominal(space, c)]
+    back = [
+        c
+        for c in finding.hypothesis.sizes
+        if is_nominal(space, finding, c) and float(change.before[c]) != _nominal(space, c)
+    ]
     sizes = tuple(float(finding.value[c]) for c in columns)
     stds = tuple(float(finding.std[c]) for c in columns)
     units = tuple(space.parameters[c].unit for c in columns)
-    told: Kind = "recovered" if len(back) == len(columns) else kind
+    told: Kind = "recovered" if len(back) == len(finding.hypothesis.sizes) else kind
     return Event(
         now, told, _text(finding, names, sizes, stds, units, rivals, start), names, sizes, stds, units, finding.onset,
         finding.onset_std, finding.hypothesis.incipient, change.alarm - finding.onset, rivals,
@@ -40,7 +44,7 @@ def is_nominal(space: ParameterSpace, finding: Finding, column: int) -> bool:
 def with_nominals(space: ParameterSpace, finding: Finding) -> Tensor:
     """Values (P,) to believe in: what is nominal within its error is taken for nominal."""
     believed = finding.value.clone()
-    for c in finding.hypothesis.columns:
+    for c in finding.hypothesis.sizes:
         if is_nominal(space, finding, c):
             believed[c] = _nominal(space, c)
     return believed
