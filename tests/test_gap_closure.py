@@ -64,6 +64,14 @@ def test_the_free_curve_finds_the_effect_that_is_there(answer: Answer) -> None:
     assert bool((effect < 0.0).all()) and float(effect.min()) < -3e-6
 
 
+def test_what_has_no_name_closes_a_gap_elsewhere_too_as_far_as_it_depends_on_local_variables() -> None:
+    recording, holdout = recorded(LAMINAR, 3), recorded(LAMINAR, 5)
+    answer = diagnose(believed(), recording, holdout, Settings(("pump_lag", "sensor_gain@h2")))
+    assert answer.verdict == "unknown" and answer.where[0][0] == "P13"
+    assert answer.closure["closed"] > 0.8
+    assert answer.closure["ceiling"] == pytest.approx(answer.closure["augmented"])
+
+
 def test_arrays_of_all_models_are_there_for_the_page(answer: Answer) -> None:
     arrays = answer.arrays
     assert arrays["augmented"].shape == arrays["nominal"].shape == (1000, 3)
@@ -149,3 +157,13 @@ def test_a_parameter_at_the_end_of_its_range_is_said(monkeypatch: pytest.MonkeyP
         believed(), recorded({"P13.laminar_flow.transition_head": 0.05}, 3), settings=Settings(("laminar_flow@P13",))
     )
     assert any("would lie at the end of its sensible range (2 cm)" in remark for remark in answer.remarks)
+
+
+def test_an_unknown_oscillation_is_said_with_its_period() -> None:
+    truth = {"Q1.pump_oscillation.amplitude": 0.1, "Q1.pump_oscillation.period": 90.0}
+    answer = diagnose(believed(), recorded(truth, 3), settings=Settings(("sensor_gain@h2",)))
+    assert answer.verdict == "unknown" and answer.where[0][0] == "Q1"
+    (remark,) = [r for r in answer.remarks if "comes and goes" in r]
+    period = float(remark.split("period of ")[1].split(" s")[0])
+    assert period == pytest.approx(90.0, rel=0.03)  # the grid of periods is 5 % wide
+    assert answer.curves[0]["variable"].startswith("time within each")

@@ -64,7 +64,7 @@ def curves_at(fitter: Fitter, fit: Fit, place: str, reach: Reach, heat: float) -
     units = _local(fitter, fit, place, [_unit(free, name, coefficients.names) for name in coefficients.names]) / UNIT
     quantity, quantity_unit = _quantity(fitter, free, place)
     curves = []
-    for variable, unit, x in (*_variables(fitter, fit, place), *_phases(fitter, free, place)):
+    for variable, unit, x in (*_phases(fitter, free, place), *_variables(fitter, fit, place)):
         at, mean = _bins(x)
         free_mean = mean @ units.T
         error = torch.sqrt(torch.einsum("km,mn,kn->k", free_mean, coefficients.covariance, free_mean).clamp(min=0.0))
@@ -197,7 +197,7 @@ def _phases(fitter: Fitter, free: Sequence[Placement], place: str) -> list[tuple
     experiment, sensors = fitter.subject.experiment, {s.name for s in fitter.subject.plant.sensors}
     middle = experiment.nodes[:-1] + 0.5 * experiment.steps
     clock = experiment.sample_times if place in sensors else middle
-    return [(f"time within {periods[0]:.3g} s", "s", torch.remainder(clock, periods[0]))]
+    return [(f"time within each {periods[0]:.3g} s", "s", torch.remainder(clock, periods[0]))]
 
 
 def _bins(x: Tensor) -> tuple[Tensor, Tensor]:

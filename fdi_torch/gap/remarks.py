@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 
+from fdi_torch.gap.ceiling import guilty_places
 from fdi_torch.gap.closure import HeldOut
 from fdi_torch.gap.finding import Finding
+from fdi_torch.gap.freeform import shape_of
 from fdi_torch.gap.same_rig import other_rig
 from fdi_torch.parameters import display_unit
 
 AT_END = 1e-3  # of a parameter's range
+SWINGS = 0.03  # amplitude of an oscillation worth a word, as a share of the free form's scale
 
 
 def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
@@ -29,8 +33,21 @@ def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
             "the plant file lists no tolerances, so that every constant is taken to be exact and what is a little off "
             "looks like an effect; list them under tolerances, as in P13.discharge_coefficient: 3 %"
         )
-    remarks += _at_their_ends(found)
+    remarks += [*_at_their_ends(found), *_period(found)]
     return remarks + [sentence for h in held if (sentence := other_rig(found, h))]
+
+
+def _period(found: Finding) -> list[str]:
+    """Whether what has no name comes and goes by itself."""
+    shape: Any = shape_of(found.unnamed)["tables"] if found.unnamed else {}
+    waves = [(t["at"][0], t["share"][0]) for name, t in shape.items() if name.endswith(".period")]
+    return [
+        f"what is unknown at {place} comes and goes with a period of {period:.3g} s; its phase belongs to each "
+        "recording's own clock, so that it closes nothing on a hold-out"
+        for place in guilty_places(found)
+        for period, share in waves
+        if share > SWINGS
+    ]
 
 
 def _at_their_ends(found: Finding) -> list[str]:

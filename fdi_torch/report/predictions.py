@@ -8,7 +8,7 @@
 | `holdout_time` | (S,) | clock of the hold-out in s |
 | `holdout_read` | (S, N) | its readings, NaN where one does not count |
 | `holdout_nominal`, `holdout_recalibrated`, `holdout_augmented`, `holdout_ceiling` | (S, N) | its predictions |
-| `holdout_K_...` | (S, N) | the same for the K-th of several hold-outs, from 2 |
+| `holdout_K_...`, `recording_K_...` | (S, N) | the same for the K-th of several hold-outs or recordings, from 2 |
 """
 
 from __future__ import annotations
@@ -28,10 +28,15 @@ MODELS = {
 }
 
 
-def predicted(arrays: Mapping[str, np.ndarray], number: int, several: bool, shape: Sequence[int]) -> np.ndarray | None:
-    """Readings of the recording with this number (from 0) at the estimate; None where there are none."""
-    holdout = f"{holdout_prefix(number - 1)}_augmented" if number else "augmented"
-    for name in (f"predicted_{number + 1}", *(() if several else ("predicted",)), holdout):
+def predicted(
+    arrays: Mapping[str, np.ndarray], number: int, several: bool, shape: Sequence[int], group: str = ""
+) -> np.ndarray | None:
+    """Readings of the recording with this number (from 0) at the estimate; None where there are none.
+
+    group: the recording's name in the log of a gap diagnosis.
+    """
+    of_gap = f"{group}_augmented" if group else "augmented"
+    for name in (f"predicted_{number + 1}", *(() if several else ("predicted",)), of_gap):
         found = arrays.get(name)
         if found is not None and found.dtype.kind == "f" and found.shape == tuple(shape):
             return found

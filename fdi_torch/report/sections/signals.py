@@ -21,7 +21,7 @@ def fit_section(material: Material) -> Section | None:
     fitted = False
     for k, recording in enumerate(material.recordings):
         several = len(material.recordings) > 1
-        model = predicted(material.arrays, k, several, recording.outputs.shape)
+        model = predicted(material.arrays, k, several, recording.outputs.shape, material.groups[k])
         fitted |= model is not None
         blocks += [f"Recording {material.groups[k] or 'diagnosed'}".replace("_", " ")] if several else []
         blocks.append(_output_panels(recording, model, f"_{k + 1}" if several else ""))
