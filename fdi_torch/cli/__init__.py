@@ -29,6 +29,7 @@ COMMANDS = {
     "compare": "what differs between runs, and whether their results agree",
     "recover": "save what is whole of a broken or unfinished log",
     "gap": "where a plant file falls short of a recording, by which effect, and how far the gap closes",
+    "predict": "run a plant freely along a recording, and how far off it gets",
     "challenge": "check the gap diagnosis on hidden rigs whose causes are sealed",
     "study": "many trials at once: errors against their bounds, coverage, failures",
     "paper": "make the 2020 paper's tables and figures again",

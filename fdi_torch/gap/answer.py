@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from fdi_torch.effects import effect
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 
@@ -107,7 +108,7 @@ def adopted(plant: PlantDescription, answer: Answer, constants: bool = False) ->
         return replace(plant, effects=effects)
     values = {n: c["augmented"] for n, c in answer.constants.items() if n not in plant.varying}
     fitted = with_constants(plant, {n: v for n, v in values.items() if n.count(".") == 1})
-    effects = tuple(_same_flow(_refitted(e, values), plant, fitted) for e in effects)
+    effects = tuple(_same_flow(_same_shape(_refitted(e, values), plant, fitted), plant, fitted) for e in effects)
     return replace(fitted, effects=effects, tolerances=plant.tolerances | _open(answer))
 
 
@@ -125,6 +126,13 @@ def _open(answer: Answer) -> dict[str, float]:
         for name, amount in cause.parameters.items()
         if amount.std > 0.0  # what was read off the values themselves is what it is
     }
+
+
+def _same_shape(placed: PlacedEffect, before: PlantDescription, after: PlantDescription) -> PlacedEffect:
+    """The effect with what was not fitted of it as it was, where that follows from constants that have changed."""
+    old, new = (effect(placed.effect).parameters(placed.location, plant) for plant in (before, after))
+    moved = {a.name: a.nominal for a, b in zip(old, new, strict=True) if a.nominal != b.nominal}
+    return replace(placed, parameters={**moved, **placed.parameters})
 
 
 def _same_flow(placed: PlacedEffect, before: PlantDescription, after: PlantDescription) -> PlacedEffect:
@@ -166,7 +174,7 @@ def finite(value: Any) -> Any:
 
 def names(causes: Iterable[CauseName]) -> list[dict[str, str]]:
     """Causes as they stand in the JSON."""
-    return [{"effect": effect, "location": location} for effect, location in causes]
+    return [{"effect": name, "location": location} for name, location in causes]
 
 
 def _cause(cause: Cause) -> dict[str, Any]:

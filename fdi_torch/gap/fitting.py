@@ -24,6 +24,7 @@ from fdi_torch.simulate.joint import Joint, own_name
 ROUNDS = 14
 SETTLED = 0.05  # chi-square units; smaller gains decide nothing
 PATIENCE, ENOUGH = 1, 4.0  # a start is given up that gains less than a quarter of its arrears after two rounds
+CORRECTIONS, FAR = 6, 1e-3  # of a trajectory that a step of the parameters moved; m from which it is worth one
 Key = frozenset[tuple[str, str]]
 
 
@@ -234,8 +235,7 @@ class Fitter:
     ) -> tuple[Tensor, Tensor, Linearised]:
         """theta (L, P), levels (L, K+1, n) -> where Levenberg-Marquardt ends, its cost (L,) and neighbourhood."""
         low, high, scale = self.box(engine.space)
-        near = engine.linearise(theta, levels)
-        near = engine.linearise(theta, near.levels)
+        near = _settled(engine, theta, engine.linearise(theta, levels))
         cost, gradient, curvature = self.normal(engine.space, theta, near, scale)
         damping = torch.full_like(cost, 1e-3)
         active = torch.isfinite(cost)
@@ -247,7 +247,7 @@ class Fitter:
             moved = torch.minimum(torch.maximum(theta[lanes] + step, low), high)
             moves = (moved - theta[lanes]).unsqueeze(1).unsqueeze(1)
             guess = near.levels[lanes] + (near.slopes[lanes] * moves).sum(-1)
-            tried = engine.linearise(moved, guess)
+            tried = _settled(engine, moved, engine.linearise(moved, guess))
             new_cost, new_gradient, new_curvature = self.normal(engine.space, moved, tried, scale)
             better = new_cost < cost[lanes]
             gain = torch.where(better, cost[lanes] - new_cost, torch.zeros_like(new_cost))
@@ -299,6 +299,16 @@ class Fitter:
             span = top - p.low
             scale.append(p.std if finite else 0.1 * (span if math.isfinite(span) else max(abs(p.nominal), 1.0)))
         return tuple(torch.tensor(x, dtype=torch.float64) for x in (low, high, scale))  # type: ignore[return-value]
+
+
+def _settled(engine: Collocation, theta: Tensor, near: Linearised) -> Linearised:
+    """The lanes whose trajectories were still far from the model's corrected until they are not, or no more."""
+    for _ in range(CORRECTIONS):
+        lanes = (near.defect > FAR).nonzero().flatten()
+        if not len(lanes):
+            break
+        near = _replaced(near, lanes, engine.linearise(theta[lanes], near.levels[lanes]))
+    return near
 
 
 def _bounded_step(

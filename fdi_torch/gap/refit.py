@@ -1,0 +1,111 @@
+"""All effects of a plant file fitted anew together, with its constants: the last step after causes were adopted in turn.
+
+A cause that was adopted early was fitted while others were still missing. No effect is searched here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import torch
+
+from fdi_torch.effects import effect
+from fdi_torch.gap.answer import with_constants
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter
+from fdi_torch.gap.floor import Noise, estimate_noise
+from fdi_torch.gap.limits import limits_of
+from fdi_torch.gap.standard_errors import standard_errors
+from fdi_torch.gap.usable import laid_out
+from fdi_torch.plant.description import PlacedEffect, PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.reach import reach_of
+from fdi_torch.recording import Recording
+
+ROUNDS = 60
+TURNS = 3  # of the noise and the fit under it
+WIDE = 0.5  # of a range
+
+
+@dataclass(frozen=True)
+class Refit:
+    """plant: with effects and constants as fitted. rmse: by sensor, in SI; before: of the plant as it was, its
+    constants and start levels fitted. parameters: how many were fitted, start levels included.
+    """
+
+    plant: PlantDescription
+    before: Mapping[str, float]
+    rmse: Mapping[str, float]
+    parameters: int
+
+
+def refit(
+    plant: PlantDescription, recording: Recording, leave_out: Collection[str] = (), step: float | None = None
+) -> Refit:
+    """step: of the simulation, s; None for half the sampling interval. leave_out: effects that the plant is to lose."""
+    kept = tuple(e for e in plant.effects if e.effect not in leave_out)
+    placed = [Placement(effect(e.effect), e.location, e.parameters) for e in kept]
+    bare = replace(plant, effects=kept, tolerances={n: v for n, v in plant.tolerances.items() if n.count(".") == 1})
+    step = step or 0.5 * float(torch.median(torch.diff(recording.time)))
+    subject = laid_out(bare, placed, [recording], step)
+    start = _start(kept, plant, recording)
+    free = [p for p in placed if any(n.startswith(f"{p.prefix}.") for n in start)]
+    spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+    fitter = Fitter(subject, Noise(1e-2 * spread, torch.zeros_like(spread)))
+    null = fitter.fit(Candidate(), rounds=ROUNDS)
+    fit = null
+    for _ in range(TURNS):
+        fitter = Fitter(subject, estimate_noise(subject.readings - fit.near.readings[0], subject.mask))
+        fit = fitter.fit(Candidate(tuple(free), (start,)), fit, rounds=ROUNDS)
+        start = {n: v for n, v in fit.effect_values.items() if n not in _undetermined(fitter, fit)}
+    return Refit(_with(bare, fit), _rmse(fitter, null), _rmse(fitter, fit), len(fit.space))
+
+
+def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
+    """Parameters whose standard error, misfit included, is a good part of their range: the recording does not show them
+    and a typical value is better than the end of the range.
+    """
+    low, high, _ = fitter.box(fit.space)
+    misfit = max(1.0, (fit.cost / float(fitter.subject.mask.sum())) ** 0.5)
+    stds = standard_errors(fitter, fit)
+    widths = dict(zip(fit.space.names, (high - low).tolist(), strict=True))
+    return {n for n in fit.effect_values if misfit * stds[n] > WIDE * widths[n]}
+
+
+def _start(kept: Collection[PlacedEffect], plant: PlantDescription, recording: Recording) -> dict[str, float]:
+    """Where each effect has what a fit may move of it; a limit that the values themselves tell is not fitted."""
+    reach, start = reach_of(recording, plant), {}
+    for placed in kept:
+        movable = {n for s in effect(placed.effect).starts(placed.location, plant, reach) for n in s}
+        if not effect(placed.effect).rounds and not _told(placed, plant, recording):
+            values = {n: v for n, v in placed.parameters.items() if n in movable}
+            start |= {f"{placed.location}.{placed.effect}.{n}": v for n, v in values.items()}
+    return start
+
+
+def _told(placed: PlacedEffect, plant: PlantDescription, recording: Recording) -> bool:
+    for sensor in plant.sensors:
+        if sensor.name == placed.location and sensor.column in recording.output_names:
+            i = recording.output_names.index(sensor.column)
+            found = limits_of(recording.outputs[recording.mask[:, i], i])
+            return found.get(placed.effect) == placed.parameters.get("limit", float("nan"))
+    return False
+
+
+def _with(plant: PlantDescription, fit: Fit) -> PlantDescription:
+    """Constants and effects as fitted; start levels belong to the recording and stay as they were."""
+    constants = {n: v for n, v in fit.values.items() if n.count(".") == 1 and not n.endswith(".start_level")}
+    found = fit.effect_values
+    effects = []
+    for placed in plant.effects:
+        prefix = f"{placed.location}.{placed.effect}"
+        fitted = {n.rpartition(".")[2]: v for n, v in found.items() if n.rpartition(".")[0] == prefix}
+        effects.append(replace(placed, parameters={**placed.parameters, **fitted}))
+    return replace(with_constants(plant, constants), effects=tuple(effects))
+
+
+def _rmse(fitter: Fitter, fit: Fit) -> dict[str, float]:
+    mask = fitter.subject.mask
+    squares = torch.where(mask, (fitter.subject.readings - fit.near.readings[0]) ** 2, 0.0)
+    each = torch.sqrt(squares.sum(dim=0) / mask.sum(dim=0)).tolist()
+    return dict(zip((s.name for s in fitter.subject.plant.sensors), each, strict=True))
