@@ -301,7 +301,7 @@ class Fitter:
         return tuple(torch.tensor(x, dtype=torch.float64) for x in (low, high, scale))  # type: ignore[return-value]
 
 
-def _settled(engine: Collocation, theta: Tensor, near: Linearised) -> Linearised:
+def _settled(engine: Collocation | Joint, theta: Tensor, near: Linearised) -> Linearised:
     """The lanes whose trajectories were still far from the model's corrected until they are not, or no more."""
     for _ in range(CORRECTIONS):
         lanes = (near.defect > FAR).nonzero().flatten()

@@ -1,4 +1,4 @@
-"""A plant file on trial: its free run along a recording, of which only the first samples are used, for the start levels."""
+"""A plant file on trial: its free run along a recording, whose first samples alone are used, for the start levels."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""All effects of a plant file fitted anew together, with its constants: the last step after causes were adopted in turn.
+"""All effects of a plant file fitted anew together, with its constants: the last step after causes were adopted.
 
 A cause that was adopted early was fitted while others were still missing. No effect is searched here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,7 +19,7 @@ from fdi_torch.gap.standard_errors import standard_errors
 from fdi_torch.gap.usable import laid_out
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import reach_of
+from fdi_torch.plant.reach import reach_of_all
 from fdi_torch.recording import Recording
 
 ROUNDS = 60
@@ -40,15 +40,19 @@ class Refit:
 
 
 def refit(
-    plant: PlantDescription, recording: Recording, leave_out: Collection[str] = (), step: float | None = None
+    plant: PlantDescription,
+    recordings: Recording | Sequence[Recording],
+    leave_out: Collection[str] = (),
+    step: float | None = None,
 ) -> Refit:
     """step: of the simulation, s; None for half the sampling interval. leave_out: effects that the plant is to lose."""
     kept = tuple(e for e in plant.effects if e.effect not in leave_out)
     placed = [Placement(effect(e.effect), e.location, e.parameters) for e in kept]
     bare = replace(plant, effects=kept, tolerances={n: v for n, v in plant.tolerances.items() if n.count(".") == 1})
-    step = step or 0.5 * float(torch.median(torch.diff(recording.time)))
-    subject = laid_out(bare, placed, [recording], step)
-    start = _start(kept, plant, recording)
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    step = step or 0.5 * float(torch.median(torch.diff(recordings[0].time)))
+    subject = laid_out(bare, placed, recordings, step)
+    start = _start(kept, plant, recordings)
     free = [p for p in placed if any(n.startswith(f"{p.prefix}.") for n in start)]
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     fitter = Fitter(subject, Noise(1e-2 * spread, torch.zeros_like(spread)))
@@ -62,8 +66,8 @@ def refit(
 
 
 def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
-    """Parameters whose standard error, misfit included, is a good part of their range: the recording does not show them
-    and a typical value is better than the end of the range.
+    """Parameters whose standard error, misfit included, is a good part of their range: the recording does not show
+    them, and what the plant file says is better than an end of the range.
     """
     low, high, _ = fitter.box(fit.space)
     misfit = max(1.0, (fit.cost / float(fitter.subject.mask.sum())) ** 0.5)
@@ -72,12 +76,15 @@ def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
     return {n for n in fit.effect_values if misfit * stds[n] > WIDE * widths[n]}
 
 
-def _start(kept: Collection[PlacedEffect], plant: PlantDescription, recording: Recording) -> dict[str, float]:
+def _start(
+    kept: Collection[PlacedEffect], plant: PlantDescription, recordings: Sequence[Recording]
+) -> dict[str, float]:
     """Where each effect has what a fit may move of it; a limit that the values themselves tell is not fitted."""
-    reach, start = reach_of(recording, plant), {}
+    reach = reach_of_all(recordings, plant)
+    start: dict[str, float] = {}
     for placed in kept:
         movable = {n for s in effect(placed.effect).starts(placed.location, plant, reach) for n in s}
-        if not effect(placed.effect).rounds and not _told(placed, plant, recording):
+        if not effect(placed.effect).rounds and not any(_told(placed, plant, r) for r in recordings):
             values = {n: v for n, v in placed.parameters.items() if n in movable}
             start |= {f"{placed.location}.{placed.effect}.{n}": v for n, v in values.items()}
     return start
