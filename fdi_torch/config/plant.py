@@ -163,7 +163,7 @@ def _tolerances(config: PlantConfig, plant: PlantDescription) -> dict[str, float
 
     A pattern for parameters of effects has two dots.
     """
-    units = {f"{sensor.name}.offset": sensor.unit for sensor in plant.sensors} | effect_units(plant)
+    units = absolute_units(plant)
     known = [*_constants(config), *effect_units(plant)]
     tolerances: dict[str, float] = {}
     for pattern, value in config.tolerances.items():
@@ -190,6 +190,12 @@ def _varying(patterns: Sequence[str], tolerances: dict[str, float]) -> tuple[str
     return tuple(found)
 
 
+def absolute_units(plant: PlantDescription) -> dict[str, str]:
+    """Tolerances that are no shares: of offsets, start levels and the parameters of effects, with their units."""
+    offsets = {f"{sensor.name}.offset": sensor.unit for sensor in plant.sensors}
+    return offsets | {f"{tank.name}.start_level": "m" for tank in plant.tanks} | effect_units(plant)
+
+
 def effect_units(plant: PlantDescription) -> dict[str, str]:
     """Units of all parameters of the plant's effects, by their full names."""
     return {
@@ -201,7 +207,7 @@ def effect_units(plant: PlantDescription) -> dict[str, str]:
 
 def _constants(config: PlantConfig) -> list[str]:
     fields: Sequence[tuple[dict[str, Any], tuple[str, ...]]] = (
-        (config.tanks, ("area", "height")),
+        (config.tanks, ("area", "height", "start_level")),
         (config.pipes, ("area", "discharge_coefficient")),
         (config.pumps, ("gain", "max_flow")),
         (config.sensors, ("gain", "offset")),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fdi_torch.config.files import write_yaml
-from fdi_torch.config.plant import SENSOR_UNITS, effect_parameters, effect_units
+from fdi_torch.config.plant import SENSOR_UNITS, effect_parameters, absolute_units
 from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 
@@ -22,7 +22,7 @@ def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
     data["pipes"] = {p.name: _pipe_mapping(p) for p in plant.pipes}
     data["pumps"] = {p.name: _pump_mapping(p) for p in plant.pumps}
     data["sensors"] = {s.name: _sensor_mapping(s) for s in plant.sensors}
-    units = {f"{s.name}.offset": s.unit for s in plant.sensors} | effect_units(plant)
+    units = absolute_units(plant)
     data["tolerances"] = {
         name: _text(v, units.get(name, "1"), units.get(name, "1")) for name, v in plant.tolerances.items()
     }

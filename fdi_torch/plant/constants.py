@@ -17,7 +17,9 @@ def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
         yield _positive(tank.name, "height", "m", tank.height, tolerances)
         start = 0.5 * tank.height if tank.start_level is None else tank.start_level
         low, high = min(0.0, start), max(tank.height, start)
-        yield Parameter(f"{tank.name}.start_level", "m", start, low, high, meaning="level at t = 0")
+        name = f"{tank.name}.start_level"
+        std = tolerances.pop(name, math.inf)  # as far as it is known at all; m
+        yield Parameter(name, "m", start, low, high, std, "level at t = 0")
         capacity = nominal_capacity(plant, leak_pipe(plant, tank.name))
         yield Parameter(f"{tank.name}.leak_capacity", "m^2.5/s", capacity, meaning="flow of a leak of size 1 at 1 m")
     for pipe in plant.pipes:

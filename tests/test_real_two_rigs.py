@@ -1,0 +1,74 @@
+"""The cascaded tanks and the three tanks with a leak: real recordings, looked for beside the project."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from fdi_torch.config.plant import load_plant
+from fdi_torch.config.recordings import RecordingConfig, named_recordings, read_recording
+from fdi_torch.gap.answer import adopted
+from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.prediction import predict
+from fdi_torch.gap.refit import refit
+from fdi_torch.recording import Recording
+
+ROOT = Path(__file__).parents[1]
+DATA = Path(os.environ.get("FDI_TORCH_DATA") or ROOT.parent / "shared" / "data")
+CASCADE = DATA / "cascaded_tanks" / "cascaded_tanks_estimation.csv"
+LEAK = DATA / "three_tank_leak" / "three_tank_leak_1Hz.csv"
+REAL = ROOT / "configs" / "real"
+
+pytestmark = [pytest.mark.data, pytest.mark.skipif(not DATA.is_dir(), reason="no real recordings here")]
+QUARTERS = [(0, 1020), (1024, 2044), (2048, 3068), (3072, 4092)]  # s
+
+
+def cascade(**stretch: object) -> Recording:
+    plant = load_plant(REAL / "cascaded_tanks_found.yaml")
+    return read_recording(RecordingConfig.model_validate({"file": str(CASCADE), **stretch}), plant, ROOT)
+
+
+def test_the_cascade_as_found_runs_freely_along_its_record() -> None:
+    found = predict(load_plant(REAL / "cascaded_tanks_found.yaml"), cascade())
+    assert found.settled
+    assert found.rmse["level"] < 0.16  # V; 0.57 V without what was found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quarter", [0, 3])
+def test_the_cascade_predicts_a_quarter_that_its_numbers_never_saw(quarter: int) -> None:
+    first, last = QUARTERS[quarter]
+    rest = {"start": f"{last + 4} s"} if quarter == 0 else {"stop": f"{first - 4} s"}
+    fitted = refit(load_plant(REAL / "cascaded_tanks_found.yaml"), cascade(**rest)).plant
+    held_out = predict(fitted, cascade(start=f"{first} s", stop=f"{last} s"))
+    assert held_out.rmse["level"] < 0.25
+
+
+@pytest.mark.slow
+def test_overflow_and_clip_of_the_cascade_are_found() -> None:
+    plant = load_plant(REAL / "cascaded_tanks_nominal.yaml")
+    answer = diagnose(plant, cascade(), settings=Settings(library=("all",)))
+    causes = {(c.effect, c.location): c for c in answer.causes}
+    assert causes["sensor_saturation", "level"].parameters["limit"].value == 10.0
+    assert 0.3 < causes["overflow", "upper"].parameters["to_lower"].value < 1.0
+    assert predict(adopted(plant, answer, constants=True), cascade()).rmse["level"] < 0.25
+
+
+@pytest.mark.slow
+def test_offsets_and_rounding_of_the_leak_rig_are_named_and_its_leak_is_found() -> None:
+    plant = load_plant(REAL / "three_tank_leak_nominal.yaml")
+    calm = named_recordings(str(REAL / "three_tank_leak_calm.yaml"), plant, DATA)
+    first = diagnose(plant, calm, settings=Settings(most=6))
+    offsets = {c.location: c.parameters["bias"] for c in first.causes if c.effect == "sensor_bias"}
+    assert set(offsets) == {"p1", "p2", "p3"}
+    # At rest and empty they read 0.156, 0.103 and 0.161 V, to a step of 10.2 mV.
+    for name, reading in (("p1", 0.156), ("p2", 0.103), ("p3", 0.161)):
+        assert offsets[name].value == pytest.approx(reading, abs=0.0102)
+    whole = read_recording(RecordingConfig(file=str(LEAK)), plant, ROOT)
+    second = diagnose(adopted(plant, first, constants=True), whole)
+    causes = {(c.effect, c.location): c for c in second.causes}
+    for sensor in ("p1", "p2", "p3"):
+        assert causes["sensor_quantization", sensor].parameters["step"].value == pytest.approx(0.0102, rel=0.01)
+    draw = causes["unmetered_flow", "T2"]
+    assert draw.parameters["begin"].value == pytest.approx(61.0, abs=2.0)
+    assert draw.parameters["flow"].value < 0.0
