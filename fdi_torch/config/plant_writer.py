@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fdi_torch.config.files import write_yaml
-from fdi_torch.config.plant import SENSOR_UNITS, effect_parameters, absolute_units
+from fdi_torch.config.plant import SENSOR_UNITS, absolute_units, effect_parameters
 from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 

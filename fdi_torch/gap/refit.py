@@ -12,11 +12,11 @@ import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import with_constants
+from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter
 from fdi_torch.gap.floor import Noise, estimate_noise
 from fdi_torch.gap.limits import limits_of
 from fdi_torch.gap.standard_errors import standard_errors
-from fdi_torch.gap.case import laid_out
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.reach import reach_of_all
