@@ -64,3 +64,16 @@ def test_levels_and_slopes_are_those_of_the_reference_and_of_finite_differences(
         slope = (ends[0].readings - ends[1].readings) / (2 * step)
         error = (slope - found.jacobian[..., j]).norm() / slope.norm()
         assert float(error) < 1e-3, name
+
+
+def test_what_runs_over_a_rim_is_the_references() -> None:
+    low = three_tank(start=(0.38, 0.2, 0.3), tank_height=0.4)
+    recording = replace(stepped(), inputs=stepped().inputs * 1.1)
+    network = build_network(low, [])
+    space = ParameterSpace([network.constants["T1.start_level"]])
+    theta = space.nominal().unsqueeze(0)
+    engine = Collocation(network, space, lay_out(recording, low.channels(), 1.0))
+    found = engine.settle(theta, engine.constant_guess(theta), rounds=40)
+    exact = ReferenceEngine(network, space, lay_out(recording, low.channels(), 0.25)).readings(theta)
+    assert float(exact.max()) > 0.4
+    assert float((found.readings - exact).abs().max()) < 1e-3  # m

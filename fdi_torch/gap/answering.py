@@ -15,8 +15,8 @@ from fdi_torch.gap.closure_answer import closure_in_full
 from fdi_torch.gap.curves import curves_at
 from fdi_torch.gap.evidence import temperature
 from fdi_torch.gap.excitation import excitation
-from fdi_torch.gap.finding import Finding, in_order, left_open
-from fdi_torch.gap.fitting import Fitter, Subject
+from fdi_torch.gap.finding import Finding, in_order
+from fdi_torch.gap.fitting import Fitter, Subject, left_open
 from fdi_torch.gap.freeform import shape_of
 from fdi_torch.gap.impostors import PASSES, simulated_impostors
 from fdi_torch.gap.library import twins

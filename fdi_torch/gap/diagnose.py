@@ -9,9 +9,9 @@ import torch
 from fdi_torch.gap.answer import Answer, CauseName, Explanation, Verdict
 from fdi_torch.gap.answering import answered
 from fdi_torch.gap.case import PLAIN, Case, Settings, case_of
-from fdi_torch.gap.evidence import log_evidence, posterior, temperature
-from fdi_torch.gap.finding import UNEXPLAINED, Finding, Weighed, in_order, left_open, whole_gap
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject
+from fdi_torch.gap.evidence import opinions, temperature
+from fdi_torch.gap.finding import UNEXPLAINED, Finding, Weighed, in_order, whole_gap
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject, left_open
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_rounding
 from fdi_torch.gap.library import canonical, possible_places
 from fdi_torch.gap.screening import options_of
@@ -26,6 +26,7 @@ REFITS = 3
 PATIENT = 40  # rounds for the recalibration, on which all else rests
 LEFT_SHARE, LEFT_LEAST = 2e-3, 150.0  # share of the gap, and chi-square units, worth asking the free forms about
 FAR_BETTER = 0.35
+ALONE = 0.9  # share of the gap that one place closes to first order, at which it is tried alone
 Tell = Callable[[float, str], None]
 
 
@@ -56,11 +57,11 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
     options = options_of([p for p in library if not p.effect.rounds and p.prefix not in known], fitter, reach)
     found = search(fitter, null, options, case.most)
     tell(0.6, "where")
-    places, refits = _places(fitter, found, plant, reach)
+    weighed = _weighed(fitter, found, len(library), plant)
+    places, refits = _places(fitter, found, weighed.fits[0], plant, reach)
     rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
     rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]
     rounded += [(p.effect.name, p.location) for p in told]
-    weighed = _weighed(fitter, found, len(library), plant)
     unknown = _unnamed(fitter, weighed.fits[0], found, refits)
     standing = _content(weighed.explanations)
     verdict: Verdict = "unknown" if unknown else _verdict(standing, rounded)
@@ -71,13 +72,15 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
     return answered(finding, case.held)
 
 
-def _places(fitter: Fitter, found: Search, plant: PlantDescription, reach: Reach) -> tuple[list[Suspect], list[Fit]]:
+def _places(
+    fitter: Fitter, found: Search, named: Fit, plant: PlantDescription, reach: Reach
+) -> tuple[list[Suspect], list[Fit]]:
     """Every place with what it could close; the likeliest refitted in full where the library leaves something open."""
     gap, left = whole_gap(fitter, found), left_open(fitter, found.best)
     heat = temperature(found.null.cost - found.best.cost)
-    everywhere = possible_places(plant)
-    places = suspects(fitter, found.null, everywhere, reach, heat, waves=left > UNEXPLAINED * gap > 0.0)
-    if left < max(LEFT_SHARE * gap, LEFT_LEAST):
+    places = suspects(fitter, found.null, possible_places(plant), reach, heat, waves=left > UNEXPLAINED * gap > 0.0)
+    alone = any(s.closes > ALONE * gap for s in places[:REFITS])
+    if left < max(LEFT_SHARE * gap, LEFT_LEAST) and not (_scattered(named) and alone):
         return places, []
     return places, [refit(fitter, found.null, s, reach) for s in places[:REFITS]]
 
@@ -86,7 +89,8 @@ def _unnamed(fitter: Fitter, named: Fit, found: Search, refits: Sequence[Fit]) -
     """The free discrepancy of one place that closes what no effect of the library does, if there is one.
 
     Equations that differ a little leave a little open, and a free discrepancy at the same place cannot do much
-    better; where one place alone does far better than all that has a name, or nothing named does, it has no name.
+    better; where one place alone does far better than all that has a name, or nothing named does, it has no name. So
+    too where one place alone does what otherwise takes effects at several.
     """
     if not refits:
         return None
@@ -97,7 +101,15 @@ def _unnamed(fitter: Fitter, named: Fit, found: Search, refits: Sequence[Fit]) -
     free = left_open(fitter, best)
     nothing_named = left > UNEXPLAINED * gap
     far_better = free < FAR_BETTER * left and left - free > max(LEFT_SHARE * gap, LEFT_LEAST)
-    return best if nothing_named or far_better else None
+    little = 0.5 * max(LEFT_SHARE * gap, LEFT_LEAST)
+    single = min((left_open(fitter, f) for f in found.fits if len(f.key) == 1), default=gap)
+    one_for_many = _scattered(named) and free < left + little and single > left + 4.0 * little
+    return best if nothing_named or far_better or one_for_many else None
+
+
+def _scattered(fit: Fit) -> bool:
+    """Whether it takes effects at more than one place."""
+    return len({place for _, place in fit.key}) > 1
 
 
 def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
@@ -116,18 +128,16 @@ def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
 
 
 def _weighed(fitter: Fitter, found: Search, choices: int, plant: PlantDescription) -> Weighed:
-    """All fits of the search by their evidence; names of one thing count once."""
-    heat = temperature(found.null.cost - found.best.cost)
-    scores: dict[frozenset[CauseName], tuple[float, Fit]] = {}
+    """All fits of the search by their probabilities; names of one thing count once."""
+    heat = temperature(found.null.cost - found.best.cost, left_open(fitter, found.best))
+    best: dict[frozenset[CauseName], Fit] = {}
     for fit in found.fits:
         key = frozenset(canonical(c, plant) for c in fit.key)
-        score = log_evidence(fitter, fit, heat, choices)
-        if key not in scores or score > scores[key][0]:
-            scores[key] = (score, fit)
-    ranked = sorted(scores.values(), key=lambda item: -item[0])
-    weights = posterior([score for score, _ in ranked])
-    pairs = zip(ranked, weights, strict=True)
-    return Weighed(tuple(Explanation(in_order(f), w) for (_, f), w in pairs), tuple(f for _, f in ranked))
+        if key not in best or fit.cost < best[key].cost:
+            best[key] = fit
+    weights = opinions(fitter, list(best.values()), heat, choices)
+    ranked = sorted(zip(weights, best.values(), strict=True), key=lambda item: -item[0])
+    return Weighed(tuple(Explanation(in_order(f), w) for w, f in ranked), tuple(f for _, f in ranked))
 
 
 def _content(explanations: Sequence[Explanation]) -> list[Explanation]:

@@ -3,8 +3,10 @@
     log E = -J / (2 T) - log det(H / T) / 2 + sum of the log prior densities of the effects' parameters
 
 J is the fit's chi-square with the tolerances' share, H its curvature. No library has the true equations: an effect with
-a slightly other formula leaves a share of the gap that grows with the gap, so T = 1 + G / 4000 for a gap of G
-chi-square units: every further thousandth of the gap left open costs two nats, however many samples there are.
+a slightly other formula leaves a share of the gap that grows with the gap, so T = 1 + min(G / 4000, R / 20) for a gap
+of G chi-square units of which the best explanation leaves R open: every further thousandth of the gap left open costs
+two nats, however many samples there are; but where the best leaves next to nothing, its equations are right, and what
+counts is how many times as much the others leave.
 """
 
 from __future__ import annotations
@@ -16,16 +18,19 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.fitting import Fit, Fitter
+from fdi_torch.gap.folds import held_out_cost
 
-MISMATCH = 4000.0
+MISMATCH, MULTIPLES = 4000.0, 20.0
+SECOND = 0.1  # weight of the second opinion: enough to keep a cause from being named against it
+HEARD = 25.0  # nats of evidence behind the best beyond which no second opinion is asked for
 LOG_PRIOR_EFFECT = math.log(0.1)  # odds of one more thing being wrong, before the data
 # Two effects at one place are mostly one effect there with another equation than the library's.
 LOG_PRIOR_SAME_PLACE = math.log(1e-4)
 
 
-def temperature(gap: float) -> float:
-    """gap: chi-square between the recalibrated plant and the best explanation."""
-    return 1.0 + max(gap, 0.0) / MISMATCH
+def temperature(gap: float, left: float = math.inf) -> float:
+    """gap: chi-square between the recalibrated plant and the best explanation. left: what that leaves open."""
+    return 1.0 + min(max(gap, 0.0) / MISMATCH, max(left, 0.0) / MULTIPLES)
 
 
 def log_evidence(fitter: Fitter, fit: Fit, heat: float, choices: int) -> float:
@@ -39,9 +44,30 @@ def log_evidence(fitter: Fitter, fit: Fit, heat: float, choices: int) -> float:
     cost = (fit.cost - _prior_cost(fit)) / heat + _prior_cost(fit)
     widths = torch.tensor([_log_width(fitter, fit, i) for i in range(len(space))], dtype=torch.float64)
     occam = -0.5 * _log_det(hessian) + float((torch.log(scale) - widths).sum())
+    return -0.5 * cost + occam + log_prior(fit, choices)
+
+
+def log_prior(fit: Fit, choices: int) -> float:
+    """Before the data: how many effects there are, and which of the choices."""
     causes, places = len(fit.key), len({place for _, place in fit.key})
-    prior = causes * (LOG_PRIOR_EFFECT - math.log(choices)) + (causes - places) * LOG_PRIOR_SAME_PLACE
-    return -0.5 * cost + occam + prior + math.lgamma(causes + 1)
+    each = causes * (LOG_PRIOR_EFFECT - math.log(choices)) + (causes - places) * LOG_PRIOR_SAME_PLACE
+    return each + math.lgamma(causes + 1)
+
+
+def opinions(fitter: Fitter, fits: Sequence[Fit], heat: float, choices: int) -> list[float]:
+    """The probability of each fit by its evidence, and to a tenth by what it predicts of stretches unseen.
+
+    Both count the same prior; the second knows no widths of priors and is of less power, but where it is against what
+    the evidence says, nothing is beyond doubt.
+    """
+    evidence = [log_evidence(fitter, fit, heat, choices) for fit in fits]
+    top = max(evidence)
+    heard = [i for i, e in enumerate(evidence) if e > top - HEARD]
+    predicted = [-0.5 * held_out_cost(fitter, fits[i]) / heat + log_prior(fits[i], choices) for i in heard]
+    weights = [(1.0 - SECOND) * w for w in posterior(evidence)]
+    for i, w in zip(heard, posterior(predicted), strict=True):
+        weights[i] += SECOND * w
+    return weights
 
 
 def _prior_cost(fit: Fit) -> float:

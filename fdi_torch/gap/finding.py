@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fdi_torch.gap.answer import CauseName, Explanation, Verdict
-from fdi_torch.gap.fitting import Fit, Fitter
-from fdi_torch.gap.floor import slow_excess
+from fdi_torch.gap.fitting import Fit, Fitter, left_open
 from fdi_torch.gap.where import Suspect
 from fdi_torch.gap.which import Search
 from fdi_torch.plant.effect import Placement
@@ -67,11 +66,6 @@ class Finding:
     def explained(self) -> bool:
         """Whether the best explanation leaves little of the gap, or little beside the noise."""
         return left_open(self.fitter, self.best) < UNEXPLAINED * max(self.gap, float(self.fitter.subject.mask.sum()))
-
-
-def left_open(fitter: Fitter, fit: Fit) -> float:
-    """What a fit leaves open, chi-square units."""
-    return max(slow_excess(fitter.white(fit.near)[0][0]), 0.0)
 
 
 def whole_gap(fitter: Fitter, found: Search) -> float:

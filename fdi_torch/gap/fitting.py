@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import EFFECTS
-from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.floor import Noise, slow_excess
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -181,16 +181,22 @@ class Fitter:
         return TankNetwork(self.subject.plant, _in_library_order([*believed, *placements]))
 
     def fit(
-        self, candidate: Candidate, base: Fit | None = None, rounds: int = ROUNDS, target: float = -math.inf
+        self,
+        candidate: Candidate,
+        base: Fit | None = None,
+        rounds: int = ROUNDS,
+        target: float = -math.inf,
+        settled: float = SETTLED,
     ) -> Fit:
         """The best of the candidate's starts; nuisances and trajectory begin where `base` found them.
 
-        target: the cost to compete with; starts that come near it too slowly are given up.
+        target: the cost to compete with; starts that come near it too slowly are given up. settled: chi-square units;
+        a start that gains less in a round is there.
         """
         by_free: dict[tuple[str, ...], list[Mapping[str, float]]] = {}
         for start in candidate.starts:
             by_free.setdefault(tuple(sorted(start)), []).append(start)
-        fits = [self._fit(candidate, free, starts, base, rounds, target) for free, starts in by_free.items()]
+        fits = [self._fit(candidate, free, starts, base, rounds, target, settled) for free, starts in by_free.items()]
         return min(fits, key=lambda f: f.cost)
 
     def _fit(
@@ -201,10 +207,11 @@ class Fitter:
         base: Fit | None,
         rounds: int,
         target: float,
+        settled: float,
     ) -> Fit:
         engine = self.engine(candidate, free)
         theta, levels = self._begin(engine, starts, base)
-        theta, cost, near = self.descend(engine, theta, levels, rounds, target)
+        theta, cost, near = self.descend(engine, theta, levels, rounds, target, settled)
         best = int(torch.nan_to_num(cost, nan=torch.inf).argmin())
         return Fit(candidate, engine.space, theta[best], float(cost[best]), near.lanes(torch.tensor([best])))
 
@@ -231,7 +238,13 @@ class Fitter:
         return found
 
     def descend(
-        self, engine: Collocation | Joint, theta: Tensor, levels: Tensor, rounds: int, target: float = -math.inf
+        self,
+        engine: Collocation | Joint,
+        theta: Tensor,
+        levels: Tensor,
+        rounds: int,
+        target: float = -math.inf,
+        settled: float = SETTLED,
     ) -> tuple[Tensor, Tensor, Linearised]:
         """theta (L, P), levels (L, K+1, n) -> where Levenberg-Marquardt ends, its cost (L,) and neighbourhood."""
         low, high, scale = self.box(engine.space)
@@ -260,7 +273,7 @@ class Fitter:
             rival = float(cost.min()) if len(cost) > 1 and not math.isfinite(target) else target
             behind = cost[lanes] - rival if math.isfinite(rival) else torch.zeros_like(gain)
             hopeless = (turn >= PATIENCE) & (ENOUGH * gain < behind) & (behind > 30.0)
-            done = (better & (gain < SETTLED)) | (damping[lanes] > 1e4) | hopeless
+            done = (better & (gain < settled)) | (damping[lanes] > 1e4) | hopeless
             active[lanes[done]] = False
         return theta, cost, near
 
@@ -299,6 +312,11 @@ class Fitter:
             span = top - p.low
             scale.append(p.std if finite else 0.1 * (span if math.isfinite(span) else max(abs(p.nominal), 1.0)))
         return tuple(torch.tensor(x, dtype=torch.float64) for x in (low, high, scale))  # type: ignore[return-value]
+
+
+def left_open(fitter: Fitter, fit: Fit) -> float:
+    """What a fit leaves open, chi-square units."""
+    return max(slow_excess(fitter.white(fit.near)[0][0]), 0.0)
 
 
 def _settled(engine: Collocation | Joint, theta: Tensor, near: Linearised) -> Linearised:

@@ -147,14 +147,6 @@ def shape_of(fit: Fit) -> dict[str, object]:
     return {"location": fit.candidate.placements[0].location, "tables": tables}
 
 
-def waves_at(place: str, plant: PlantDescription, reach: Reach, periods: Sequence[float]) -> Placement:
-    """Nothing but sines and cosines, to find a period by."""
-    effect = _free_at(place, plant, reach, periods)[0]
-    assert isinstance(effect, _Free)
-    effect.nodes = {}
-    return Placement(effect, place)
-
-
 def _free_at(place: str, plant: PlantDescription, reach: Reach, periods: Sequence[float]) -> list[Effect]:
     kind, time = place_kind(plant, place), _grid((0.0, reach.duration), TIME_NODES)
     if kind == "tank_pair":

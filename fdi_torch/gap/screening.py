@@ -74,12 +74,9 @@ def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Reach) ->
     """All starts of all placements."""
     plant = fitter.subject.plant
     return [
-        Option(
-            p,
-            {f"{p.prefix}.{name}": value for name, value in start.items()},
-            p.effect.parameters(p.location, plant),
-        )
+        Option(p, {f"{p.prefix}.{name}": value for name, value in start.items()}, parameters)
         for p in placements
+        for parameters in [p.effect.parameters(p.location, plant)]
         for start in p.effect.starts(p.location, plant, reach)
     ]
 

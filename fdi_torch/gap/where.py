@@ -9,12 +9,15 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter
-from fdi_torch.gap.freeform import HARMONICS, UNIT, free_form, waves_at
-from fdi_torch.gap.screening import against, effect_columns, options_of
+from fdi_torch.gap.freeform import HARMONICS, UNIT, free_form
+from fdi_torch.gap.screening import Option, against, effect_columns, options_of
 from fdi_torch.plant.reach import Reach
 
 AMPLITUDES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
-PERIODS = tuple(15.0 * 1.05**k for k in range(80))  # s: 15 s to 12 min, near enough for some ten cycles
+FINER = 4  # times finer than the recording's own frequencies
+SURROUNDINGS = 15  # of the recording's own frequencies, to each side
+CYCLES = 8  # that a line has to go through
+STANDS_OUT = 30.0  # times the median of its surroundings; chance alone makes 10 of some thousand frequencies
 
 
 @dataclass(frozen=True)
@@ -31,32 +34,51 @@ class Suspect:
 def suspects(
     fitter: Fitter, fit: Fit, places: Sequence[str], reach: Reach, heat: float, waves: bool = False
 ) -> list[Suspect]:
-    """All places, the likeliest first. waves: also look for what comes and goes by itself."""
-    found = []
-    for place in places:
-        periods = _periods(fitter, fit, place, reach) if waves else ()
-        found.append(_suspect(fitter, fit, place, reach, heat, periods))
+    """All places, the likeliest first. Where the residual has a line in its spectrum, a place may also come and go in
+    its period; waves: whether line or not, in the strongest period.
+    """
+    stands_out = 0.0 if waves else STANDS_OUT
+    line = spectral_line(fitter.white(fit.near)[0][0], _spacing(fitter), stands_out)
+    periods = tuple(line / k for k in range(1, HARMONICS + 1)) if line else ()
+    options = [options_of(free_form(p, fitter.subject.plant, reach, periods), fitter, reach) for p in places]
+    columns = effect_columns(fitter, fit, [o for own in options for o in own]) / UNIT
+    found, first = [], 0
+    for place, own in zip(places, options, strict=True):
+        theirs = columns[..., first : first + len(own)]
+        first += len(own)
+        found.append(_suspect(fitter, fit, place, own, theirs, heat, periods))
     return sorted(found, key=lambda s: -s.evidence)
 
 
-def _periods(fitter: Fitter, fit: Fit, place: str, reach: Reach) -> tuple[float, ...]:
-    """The period whose sine and cosine close most, and its first overtones."""
-    possible = [p for p in PERIODS if p < 0.25 * reach.duration]
-    placement = waves_at(place, fitter.subject.plant, reach, possible)
-    options = options_of([placement], fitter, reach)
-    found = against(fitter, fit, options, effect_columns(fitter, fit, options))
-    gains = []
-    for j in range(len(possible)):
-        pair = slice(2 * j, 2 * j + 2)
-        gram = found.gram[pair, pair] + 1e-9 * found.gram[pair, pair].diagonal().max() * torch.eye(2)
-        gains.append(float(found.score[pair] @ torch.linalg.solve(gram, found.score[pair])))
-    best = possible[max(range(len(gains)), key=gains.__getitem__)]
-    return tuple(best / k for k in range(1, HARMONICS + 1))
+def _spacing(fitter: Fitter) -> float:
+    return float(torch.median(torch.diff(fitter.subject.recording.time)))
 
 
-def _suspect(fitter: Fitter, fit: Fit, place: str, reach: Reach, heat: float, periods: tuple[float, ...]) -> Suspect:
-    options = options_of(free_form(place, fitter.subject.plant, reach, periods), fitter, reach)
-    columns = effect_columns(fitter, fit, options) / UNIT
+def spectral_line(white: Tensor, spacing: float, stands_out: float = STANDS_OUT) -> float | None:
+    """The period (s) of what stands out of its surroundings in the spectrum of a residual (S, C), if anything does."""
+    samples = len(white)
+    taper = torch.hann_window(samples, periodic=False, dtype=white.dtype).unsqueeze(-1)
+    power = (torch.fft.rfft(white * taper, n=FINER * samples, dim=0).abs() ** 2).sum(dim=-1)
+    if len(power) < 2 * SURROUNDINGS * FINER:
+        return None
+    width = 2 * SURROUNDINGS * FINER + 1
+    around = torch.nn.functional.pad(power.reshape(1, 1, -1), (width // 2, width // 2), mode="reflect")[0, 0]
+    median = around.unfold(0, width, FINER)[:, ::FINER].median(dim=-1).values
+    ratio = power / median.repeat_interleave(FINER)[: len(power)]
+    ratio[: CYCLES * FINER] = 0.0
+    peak = int(ratio.argmax())
+    return FINER * samples * spacing / peak if float(ratio[peak]) > stands_out else None
+
+
+def _suspect(
+    fitter: Fitter,
+    fit: Fit,
+    place: str,
+    options: Sequence[Option],
+    columns: Tensor,
+    heat: float,
+    periods: tuple[float, ...],
+) -> Suspect:
     prior = torch.tensor([o.parameters[0].std for o in options], dtype=columns.dtype)
     found = against(fitter, fit, options, columns * prior)
     spectrum, basis = torch.linalg.eigh(found.gram / heat)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from fdi_torch.gap.evidence import temperature
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Key
+from fdi_torch.gap.fitting import SETTLED, Candidate, Fit, Fitter, Key, left_open
 from fdi_torch.gap.screening import Option, Screen, screen
 
 SINGLES, STARTS = 14, 2
@@ -16,6 +16,9 @@ PARENTS, PARTNERS = 3, 5
 DEEPEST = 4
 POLISH = 20
 PROMISE = 10.0  # chi-square units, of the evidence, that an effect has to promise, to first order, to be fitted
+# Of the gap, and chi-square units: what noise alone may leave open. Then only what is beside the best is looked for.
+EXPLAINED_SHARE, EXPLAINED_LEAST = 1e-3, 60.0
+HOPELESS = 0.5  # of the gap left open by the best pair, at which a third effect will not explain it either
 SETTLED_SHARE = 0.02  # of the gap left open by the best single, below which lesser promises are not followed
 
 
@@ -36,22 +39,27 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEE
     """Fits singles, then pairs and more (`most`) about the best ones, while another effect promises something."""
     fits: dict[Key, Fit] = {null.key: null}
     screens = {null.key: screen(fitter, null, options)}
+    settled = SETTLED * temperature(left_open(fitter, null))
     for candidate in _further(null, screens[null.key], SINGLES, PROMISE):
         if not _outdone(fitter, null, _best(fits), candidate.promise):
-            _keep(fits, fitter.fit(candidate, null, target=_best(fits)))
+            _keep(fits, fitter.fit(candidate, null, target=_best(fits), settled=settled))
     _polish(fitter, fits, 1)
     for depth in range(2, most + 1):
         before = len(fits)
         heat = temperature(null.cost - _best(fits))
-        for parent in _parents(fits.values(), depth - 1, PARENTS if depth == 2 else 2):
+        left, gap = _open(fitter, null, fits)
+        if depth > 2 and left > HOPELESS * gap:
+            break
+        explained = left < max(EXPLAINED_SHARE * gap, min(EXPLAINED_LEAST, 0.1 * gap))
+        for parent in _parents(fits.values(), depth - 1, 1 if explained else PARENTS if depth == 2 else 2):
             screens[parent.key] = screen(fitter, parent, _beside(parent, options), heat)
             for candidate in _further(parent, screens[parent.key], PARTNERS if depth == 2 else 3, PROMISE):
                 if candidate.key not in fits:
-                    _keep(fits, fitter.fit(candidate, parent, target=_best(fits)))
-        if depth == 2 and len(fits) > before:
+                    _keep(fits, fitter.fit(candidate, parent, target=_best(fits), settled=settled))
+        if depth == 2 and len(fits) > before and not explained:
             for candidate in _pairs(screens[null.key], 3):
                 if candidate.key not in fits:
-                    _keep(fits, fitter.fit(candidate, null, target=_best(fits)))
+                    _keep(fits, fitter.fit(candidate, null, target=_best(fits), settled=settled))
         if len(fits) == before:
             break
         _polish(fitter, fits, depth)
@@ -60,9 +68,18 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEE
 
 def _polish(fitter: Fitter, fits: dict[Key, Fit], effects: int) -> None:
     """The two best fits of so many effects go on to where they end: thresholds come to rest slowly."""
+    null, best = fits[frozenset()], min(fits.values(), key=lambda f: f.cost)
+    settled = SETTLED * temperature(null.cost - best.cost, left_open(fitter, best))
     for fit in _parents(fits.values(), effects, 2):
         again = Candidate(fit.candidate.placements, (fit.effect_values,))
-        _keep(fits, fitter.fit(again, fit, rounds=POLISH))
+        _keep(fits, fitter.fit(again, fit, rounds=POLISH, settled=settled))
+
+
+def _open(fitter: Fitter, null: Fit, fits: dict[Key, Fit]) -> tuple[float, float]:
+    """What the best fit leaves open, and the whole gap, chi-square units."""
+    best = min(fits.values(), key=lambda f: f.cost)
+    left = left_open(fitter, best)
+    return left, null.cost - best.cost + left
 
 
 def _outdone(fitter: Fitter, null: Fit, best: float, promise: float) -> bool:

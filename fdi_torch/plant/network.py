@@ -32,6 +32,7 @@ class TankNetwork(nn.Module):
     """
 
     nominal: Tensor
+    rims = True
 
     def __init__(self, description: PlantDescription, placements: Iterable[Placement] = ()) -> None:
         super().__init__()
@@ -59,6 +60,12 @@ class TankNetwork(nn.Module):
         sensors = [sensor.name for sensor in self.description.sensors]
         self._command_chain = SignalChain(Stage.COMMAND, [name for name, _ in self.actuators()], placements)
         self._reading_chain = SignalChain(Stage.READING, sensors, placements)
+
+    def below_rims(self) -> TankNetwork:
+        """The same plant where no tank is full, for what never comes to the rims: nothing can run over them."""
+        other = copy(self)
+        other.rims = False
+        return other
 
     def bind(self, space: ParameterSpace, theta: Tensor) -> PlaceValues:
         """All constants by place and field: columns of theta (*batch, P) where `space` names them, else nominal."""
@@ -179,6 +186,8 @@ class TankNetwork(nn.Module):
         self, net: Sequence[Tensor], levels: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> list[Tensor]:
         """Net inflows (m^3/s) less what runs over the rims."""
+        if not self.rims:
+            return list(net)
         left = list(net)
         for tank, level, inflow in zip(self.description.tanks, levels, net, strict=True):
             own = values[tank.name]

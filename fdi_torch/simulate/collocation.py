@@ -57,6 +57,8 @@ class Collocation:
         tanks = [f"{t.name}.start_level" for t in network.description.tanks]
         self._start_columns = {space.index(name): i for i, name in enumerate(tanks) if name in space}
         self._moving = [j for j in range(len(space)) if j not in self._start_columns]
+        self._below_rims = network.below_rims()
+        self._rims = [t.height for t in network.description.tanks]
         self._names = [space.names[j] for j in self._moving]
         self._actuation = Actuation(network, experiment, self._names)
         self._sight = Sight(network, experiment, self._names)
@@ -140,6 +142,8 @@ class Collocation:
         lanes, n, steps = middle.shape
         shape, values = (lanes, steps), self.network.bind(self.space, theta.unsqueeze(-2))
         moving = [theta[:, j, None] for j in self._moving]
+        full = bool((middle >= middle.new_tensor(self._rims).unsqueeze(-1)).any())
+        network = self.network if full else self._below_rims
         commands, command_slopes, columns = self._actuation.slopes(values, moving, lanes)
         driven = [i for i, slopes in enumerate(command_slopes) if slopes is not None]
 
@@ -148,7 +152,7 @@ class Collocation:
             for i, value in zip(driven, x[n : n + len(driven)], strict=True):
                 acting[i] = value
             own = moved(values, self._names, x[n + len(driven) :])
-            return self.network.rates(x[:n], acting, self._actuation.clock, own)
+            return network.rates(x[:n], acting, self._actuation.clock, own)
 
         inputs = [*middle.unbind(1), *(commands[i] for i in driven), *moving]
         found, rows = partials(rates, inputs, shape)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_right
 
 import torch
-import torchdiffeq
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -102,6 +101,8 @@ class ReferenceEngine:
 
         # `perturb` asks for the slopes just inside each step, so that a switch at its end is not seen early.
         options = {"perturb": True} if self.method == "rk4" else {"jump_t": nodes[1:-1]}
+        import torchdiffeq  # half a second, which no command has to wait for that does not ask for this engine
+
         levels = torchdiffeq.odeint(
             rates, start, nodes, method=self.method, rtol=self.rtol, atol=self.atol, options=options
         )
