@@ -41,4 +41,5 @@ def settings_of(log: LoggedRun, overrides: Iterable[str] = ()) -> Settings:
             raise ValueError(f"--set {override}: expected one of {', '.join(KEYS)}, got {key}")
         told[key] = json.loads(value) if key in ("step", "most") else [name for name in value.split(",") if name]
     library = tuple(told["library"]) if told["library"] else None
-    return Settings(library, tuple(told["leave_out"]), told["step"], told["most"])
+    named_only = bool(json.loads(logged.get("settings.named_only", "false")))
+    return Settings(library, tuple(told["leave_out"]), told["step"], told["most"], named_only)

@@ -57,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="effects to deny the diagnosis")
     parser.add_argument("--step", metavar="S", type=float, help="of the simulation, s (the sampling interval)")
     parser.add_argument("--most", metavar="N", type=int, default=DEEPEST, help=f"effects at once, at most ({DEEPEST})")
+    parser.add_argument("--named-only", action="store_true", help="never unknown: the best that has a name, on the way")
     parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the causes found among its effects")
     parser.add_argument(
         "--with-constants", action="store_true", help="--adopt also writes the constants as fitted beside the causes"
@@ -88,7 +89,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     folder = Path(arguments.out)
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
-        settings = Settings(library, left_out, arguments.step, arguments.most)
+        settings = Settings(library, left_out, arguments.step, arguments.most, arguments.named_only)
         answer = run_gap(log, plant, recordings, holdouts, settings, advance)
         advance(1.0, "done")
     written = _keep(arguments, plant, answer, screen)

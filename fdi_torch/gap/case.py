@@ -25,13 +25,15 @@ that still count as noise."""
 class Settings:
     """library, leave_out: as in `library_of`. step: of the simulation, s; None for the sampling interval.
 
-    most: effects that one explanation may have.
+    most: effects that one explanation may have. named_only: the best of what has a name, however much it leaves open:
+    a step on the way where many causes come together.
     """
 
     library: tuple[str, ...] | None = None
     leave_out: tuple[str, ...] = ()
     step: float | None = None
     most: int = DEEPEST
+    named_only: bool = False
 
 
 PLAIN = Settings()
@@ -40,7 +42,7 @@ PLAIN = Settings()
 @dataclass(frozen=True)
 class Case:
     """library: the effects at places to search. subject: the recordings, for the plant with the limits of its sensors
-    that their values tell (`told`); held: the hold-outs. most: effects that one explanation may have.
+    that their values tell (`told`); held: the hold-outs. most, named_only: as in `Settings`.
     """
 
     library: tuple[Placement, ...]
@@ -49,6 +51,7 @@ class Case:
     subject: Subject
     held: tuple[Subject, ...]
     most: int
+    named_only: bool = False
 
 
 def case_of(
@@ -64,7 +67,7 @@ def case_of(
     told = told_limits(plant, recordings[0], believed, library) if len(recordings) == 1 else []
     believed += told
     subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recordings, *((h,) for h in holdouts)))
-    return Case(library, tuple(recordings), told, subject, tuple(held), settings.most)
+    return Case(library, tuple(recordings), told, subject, tuple(held), settings.most, settings.named_only)
 
 
 def expect_another(holdout: Recording, recordings: Sequence[Recording]) -> None:

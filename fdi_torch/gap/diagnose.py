@@ -62,7 +62,7 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
     rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
     rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]
     rounded += [(p.effect.name, p.location) for p in told]
-    unknown = _unnamed(fitter, weighed.fits[0], found, refits)
+    unknown = None if case.named_only else _unnamed(fitter, weighed.fits[0], found, refits)
     standing = _content(weighed.explanations)
     verdict: Verdict = "unknown" if unknown else _verdict(standing, rounded)
     finding = Finding(
