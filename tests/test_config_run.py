@@ -11,7 +11,7 @@ import yaml
 
 from fdi_torch.config import ConfigError, build_run, load_recordings, load_run, read_recording
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
-from fdi_torch.config.files import SHIPPED
+from fdi_torch.config.files import SHIPPED, read_yaml
 from fdi_torch.config.run import Run
 from fdi_torch.config.simulation import NoiseConfig, noise_std, planned_recording
 from fdi_torch.effects import build_network
@@ -25,7 +25,9 @@ TABLE_2 = {
     "4d": (0.1, 0.6, 0.5, 0.7, 1.0),
     "5d": (0.1, 0.6, 0.5, 0.7, 0.9),
 }
-SHIPPED_RUNS = [SHIPPED / "default.yaml", *sorted(SHIPPED.glob("paper/*.yaml")), *sorted(SHIPPED.glob("real/*.yaml"))]
+# Beside run files, configs/real/ has the plant files from which and to which the chains of gap diagnoses go.
+REAL_RUNS = sorted(path for path in SHIPPED.glob("real/*.yaml") if "tanks" not in read_yaml(path))
+SHIPPED_RUNS = [SHIPPED / "default.yaml", *sorted(SHIPPED.glob("paper/*.yaml")), *REAL_RUNS]
 
 
 def run(**changes: Any) -> Run:
@@ -303,7 +305,7 @@ def test_recordings_are_found_below_the_data_folder(tmp_path: Path, monkeypatch:
 @pytest.mark.data
 def test_shipped_runs_on_real_data_read_their_recordings(real_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FDI_TORCH_DATA", str(real_data))
-    for path in SHIPPED.glob("real/*.yaml"):
+    for path in REAL_RUNS:
         wanted = load_run(path)
-        (part,) = load_recordings(wanted.config.recordings, wanted.plant, wanted.base)
-        assert torch.isfinite(part.recording.inputs).all() and len(part.recording) > 100
+        for part in load_recordings(wanted.config.recordings, wanted.plant, wanted.base):
+            assert torch.isfinite(part.recording.inputs).all() and len(part.recording) > 20
