@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from fdi_torch.gap.evidence import temperature
-from fdi_torch.gap.fitting import Candidate, Fitter, subject_of
+from fdi_torch.gap.fitting import Candidate, Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.folds import FOLDS, STRETCHES, held_out_cost
+from fdi_torch.gap.subject import subject_of
 from fdi_torch.gap.where import spectral_line
 from tests.test_gap import believed, noise, recorded
 

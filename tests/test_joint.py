@@ -13,8 +13,9 @@ from fdi_torch.config.problems import ConfigError
 from fdi_torch.effects import place
 from fdi_torch.gap.answer import adopted
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.fitting import Candidate, Fitter, subject_of
+from fdi_torch.gap.fitting import Candidate, Fitter
 from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.subject import subject_of
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.network import TankNetwork

@@ -16,13 +16,14 @@ from fdi_torch.gap.curves import curves_at
 from fdi_torch.gap.evidence import temperature
 from fdi_torch.gap.excitation import excitation
 from fdi_torch.gap.finding import Finding, in_order
-from fdi_torch.gap.fitting import Fitter, Subject, left_open
+from fdi_torch.gap.fitting import Fitter, left_open
 from fdi_torch.gap.freeform import shape_of
 from fdi_torch.gap.impostors import PASSES, simulated_impostors
 from fdi_torch.gap.library import twins
 from fdi_torch.gap.next_input import next_input
 from fdi_torch.gap.remarks import remarks_on
 from fdi_torch.gap.standard_errors import standard_errors
+from fdi_torch.gap.subject import Subject
 from fdi_torch.gap.traces import traces
 
 MOST_EXPLANATIONS = 12

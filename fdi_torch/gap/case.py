@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.fitting import Subject, subject_of
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.limits import told_limits
+from fdi_torch.gap.subject import Subject, subject_of
 from fdi_torch.gap.which import DEEPEST
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement

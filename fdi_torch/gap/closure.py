@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter
 from fdi_torch.gap.floor import Noise, estimate_noise, with_rounding
+from fdi_torch.gap.subject import Subject
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement
 from fdi_torch.simulate.collocation import Collocation

@@ -11,10 +11,11 @@ from fdi_torch.gap.answering import answered
 from fdi_torch.gap.case import PLAIN, Case, Settings, case_of
 from fdi_torch.gap.evidence import opinions, temperature
 from fdi_torch.gap.finding import UNEXPLAINED, Finding, Weighed, in_order, whole_gap
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Subject, left_open
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter, left_open
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_rounding
 from fdi_torch.gap.library import canonical, possible_places
 from fdi_torch.gap.screening import options_of
+from fdi_torch.gap.subject import Subject
 from fdi_torch.gap.where import Suspect, refit, suspects
 from fdi_torch.gap.which import Search, search
 from fdi_torch.plant.description import PlantDescription

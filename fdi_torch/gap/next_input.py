@@ -14,7 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.fitting import Fit, Fitter, subject_of
+from fdi_torch.gap.fitting import Fit, Fitter
+from fdi_torch.gap.subject import subject_of
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import lay_out

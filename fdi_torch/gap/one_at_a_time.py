@@ -15,10 +15,11 @@ import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter, subject_of
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.screening import Option, Screen, options_of, screen
+from fdi_torch.gap.subject import subject_of
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.reach import reach_of

@@ -12,10 +12,11 @@ import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.excitation import Excitation, excitation
-from fdi_torch.gap.fitting import Candidate, Fitter, subject_of
+from fdi_torch.gap.fitting import Candidate, Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.screening import options_of, screen
+from fdi_torch.gap.subject import subject_of
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.reach import reach_of

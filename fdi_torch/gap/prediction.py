@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.fitting import Fitter, Subject, subject_of
+from fdi_torch.gap.fitting import Fitter
 from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.subject import Subject, subject_of
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from fdi_torch.gap.closure import HeldOut, Model, free_run
 from fdi_torch.gap.finding import Finding
-from fdi_torch.gap.fitting import Subject
+from fdi_torch.gap.subject import Subject
 
 KEPT = ("nominal", "recalibrated", "augmented", "ceiling")
 

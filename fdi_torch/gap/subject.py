@@ -1,0 +1,109 @@
+"""What is diagnosed: a plant file as it is believed, and one or several recordings laid out for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.experiment import Experiment, lay_out
+from fdi_torch.simulate.joint import own_name
+
+
+@dataclass(frozen=True)
+class Part:
+    """One recording of what is diagnosed: laid out, its sensors (S, C) in the plant's order."""
+
+    recording: Recording
+    experiment: Experiment
+    readings: Tensor
+    mask: Tensor
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is diagnosed: a plant (with the effects it is believed to have) and one or several recordings of it.
+
+    recording, experiment: of the first. readings, mask (S, C): of all, one blank sample between recordings.
+    """
+
+    plant: PlantDescription
+    believed: tuple[Placement, ...]
+    recording: Recording
+    experiment: Experiment
+    readings: Tensor
+    mask: Tensor
+    further: tuple[Part, ...] = ()
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        first = len(self.recording)
+        return (Part(self.recording, self.experiment, self.readings[:first], self.mask[:first]), *self.further)
+
+    @property
+    def rows(self) -> tuple[slice, ...]:
+        """Where each recording's samples stand among all."""
+        found, first = [], 0
+        for part in self.parts:
+            found.append(slice(first, first + len(part.recording)))
+            first += len(part.recording) + 1
+        return tuple(found)
+
+    def alone(self, recording: int) -> Subject:
+        """One of the recordings without the others."""
+        part = self.parts[recording]
+        return replace(
+            self,
+            recording=part.recording,
+            experiment=part.experiment,
+            readings=part.readings,
+            mask=part.mask,
+            further=(),
+        )
+
+    @cached_property
+    def own(self) -> tuple[str, ...]:
+        """What each recording has for itself: start levels, and constants that vary from recording to recording."""
+        return (*self.plant.varying, *(f"{t.name}.start_level" for t in self.plant.tanks))
+
+    @cached_property
+    def nuisance(self) -> tuple[str, ...]:
+        """Constants and effects' parameters with a tolerance, and start levels: refitted with every candidate."""
+        constants = TankNetwork(self.plant, self.believed).constants
+        common = [p.name for p in constants if math.isfinite(p.std) and p.name not in self.own]
+        own = [own_name(n, k) for k in range(len(self.further) + 1) for n in self.own]
+        return (*common, *own)
+
+
+def subject_of(
+    plant: PlantDescription, believed: Sequence[Placement], recordings: Recording | Sequence[Recording], step: float
+) -> Subject:
+    """Lays recordings out; their sensors in the plant's order. Raises ValueError where one is missing."""
+    each = [recordings] if isinstance(recordings, Recording) else recordings
+    first, *further = [_part(plant, recording, step) for recording in each]
+    readings, mask = [first.readings], [first.mask]
+    for part in further:
+        readings += [torch.zeros_like(part.readings[:1]), part.readings]
+        mask += [torch.zeros_like(part.mask[:1]), part.mask]
+    return Subject(
+        plant, tuple(believed), first.recording, first.experiment, torch.cat(readings), torch.cat(mask), tuple(further)
+    )
+
+
+def _part(plant: PlantDescription, recording: Recording, step: float) -> Part:
+    names = [s.column for s in plant.sensors]
+    missing = [n for n in names if n not in recording.output_names]
+    if missing:
+        known = ", ".join(recording.output_names) or "none"
+        raise ValueError(f"{recording.source}: expected a sensor '{missing[0]}', got {known}; map the column to it")
+    order = [recording.output_names.index(n) for n in names]
+    experiment = lay_out(recording, plant.channels(), step)
+    return Part(recording, experiment, recording.outputs[:, order], recording.mask[:, order])
