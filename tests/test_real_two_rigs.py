@@ -55,7 +55,8 @@ def test_overflow_and_clip_of_the_cascade_are_found() -> None:
 
 
 @pytest.mark.slow
-def test_offsets_and_rounding_of_the_leak_rig_are_named_and_its_leak_is_found() -> None:
+def test_offsets_and_rounding_of_the_leak_rig_are_named_and_its_leak_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FDI_TORCH_DATA", str(DATA))
     plant = load_plant(REAL / "three_tank_leak_nominal.yaml")
     calm = named_recordings(str(REAL / "three_tank_leak_calm.yaml"), plant, DATA)
     first = diagnose(plant, calm, settings=Settings(most=6))
