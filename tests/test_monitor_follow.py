@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import yaml
 from fdi_torch.cli import INTERRUPTED, main
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
-from fdi_torch.logbook import RunLog, read_run
+from fdi_torch.logbook import RunLog, follow, read_run
 from fdi_torch.monitor.arrivals import Arrivals, Punctuality
 from fdi_torch.monitor.observer import bound
 from fdi_torch.monitor.stepper import Stepper
@@ -292,3 +293,26 @@ def test_lateness_and_bursts_are_told_once_until_they_double() -> None:
     assert punctual.handled(35.0) == []
     punctual.restarted()
     assert punctual.handled(0.0) == []
+
+
+@pytest.mark.parametrize("look", range(4))
+def test_a_log_that_ends_between_two_looks_is_read_once(
+    look: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "rig.mcap"
+    stack = ExitStack()
+    log = stack.enter_context(RunLog(path, "rig", flush_seconds=0.0))
+    log.sample("/plant/output", 0.0, {"h1": 0.5}, units={"h1": "m"})
+    log.flush()
+    exists, looks = Path.exists, iter(range(100))
+
+    def ends_when_looked_at(self: Path) -> bool:
+        found = exists(self)
+        if found and self.suffix == ".partial" and next(looks) == look:
+            monkeypatch.setattr(Path, "exists", exists)
+            log.sample("/plant/output", 1.0, {"h1": 0.4}, units={"h1": "m"})
+            stack.close()
+        return found
+
+    monkeypatch.setattr(Path, "exists", ends_when_looked_at)
+    assert [m.payload["h1"] for m in follow(path, {"/plant/output"}, 5.0, 0.01)] == [0.5, 0.4]

@@ -53,6 +53,7 @@ class _Tail:
         self.partial = self.final.with_name(self.final.name + ".partial")
         self.place: int | None = None
         self.seen = 0
+        self.begun = False  # places in the unfinished file mean nothing in the finished one, which is joined anew
         self.on_damage = on_damage
         self.directory = Directory()
 
@@ -69,13 +70,19 @@ class _Tail:
             for damage in run.damages:
                 self.on_damage(damage)
             return
-        source = self.partial if self.partial.exists() else self.final
-        if source.exists() and source.stat().st_size:
-            yield from self._grown(source)
+        self.begun = self.begun or self.partial.exists()
+        source = self.partial if self.begun else self.final
+        try:
+            data = map_file(source) if source.stat().st_size else b""
+        except (FileNotFoundError, LogError):
+            if source.exists():
+                raise
+            return  # not there yet, or finished between two looks: the next one sees it under its final name
+        if data:
+            yield from self._grown(data)
 
-    def _grown(self, source: Path) -> Iterator[Message]:
+    def _grown(self, data: scan.Buffer) -> Iterator[Message]:
         """Messages of the records that have become whole since the last look."""
-        data = map_file(source)
         for part in scan.frames(data, self.place):
             if isinstance(part, scan.Damage):
                 if part.end == len(data):
