@@ -11,9 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fdi_torch import main_job, study_job
 from fdi_torch.config.run import load_run
 from fdi_torch.config.study import load_study
+from fdi_torch.jobs import study as study_job
+from fdi_torch.jobs import train as main_job
 from fdi_torch.logbook import RunLog, read_run
 
 # Ways into the log. What one of them calls is within its time; the thread that flushes counts too.

@@ -9,7 +9,7 @@ import torch
 from rigs import constant_inputs, paper_network, three_tank
 
 from fdi_torch.config.run import load_run
-from fdi_torch.main_job import train
+from fdi_torch.jobs.train import train
 from fdi_torch.simulate.choose import make_engine
 from fdi_torch.simulate.experiment import lay_out
 

@@ -13,14 +13,13 @@ ROOT = Path(__file__).parents[1] / "fdi_torch"
 
 # Lowest first. A room imports from rooms further down, and sideways only where that closes no circle.
 LAYERS = (
-    {"parameters", "recording"},
-    {"plant", "recording_csv", "recording_csv_growing"},
-    {"effects", "simulate", "recording_check"},
-    {"estimate", "logbook"},
+    {"names", "parameters", "recording"},
+    {"plant"},
+    {"effects", "simulate"},
+    {"estimate", "logbook", "recordings"},
     {"report", "gap", "study", "monitor"},
     {"config"},
-    {"run_setup", "log_paths", "logged_recordings"},
-    {"main_job", "study_job", "replay_job", "gap_job", "monitor_job", "gap_replay"},
+    {"jobs"},
     {"paper"},
     {"cli", "train", "__main__", "__init__"},
 )

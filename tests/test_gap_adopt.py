@@ -10,10 +10,10 @@ from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.run import load_run
 from fdi_torch.gap.answer import adopted
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.main_job import train
+from fdi_torch.jobs.train import train
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recording_csv import write_csv
+from fdi_torch.recordings.csv_files import write_csv
 from tests.test_gap import believed, recorded
 
 LAMINAR = {"P13.laminar_flow.transition_head": 0.1}

@@ -15,10 +15,10 @@ from fdi_torch.config.logged import logged_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
 from fdi_torch.gap.diagnose import Settings
-from fdi_torch.gap_job import run_gap
+from fdi_torch.jobs.gap import run_gap
 from fdi_torch.logbook import own_signals, read_run
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
-from fdi_torch.recording_csv import write_csv
+from fdi_torch.recordings.csv_files import write_csv
 from fdi_torch.report.material import gather
 from fdi_torch.report.verdict import headline
 from tests.test_gap import believed, recorded

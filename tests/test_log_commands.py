@@ -15,10 +15,10 @@ import torch
 from fdi_torch import cli
 from fdi_torch.config.run import load_run
 from fdi_torch.config.study import load_study
+from fdi_torch.jobs.replay import run_again
+from fdi_torch.jobs.study import run_study
+from fdi_torch.jobs.train import train
 from fdi_torch.logbook import Message, RunLog, read_run, replay
-from fdi_torch.main_job import train
-from fdi_torch.replay_job import run_again
-from fdi_torch.study_job import run_study
 
 QUICK = [
     "simulate.duration=200 s",

@@ -13,8 +13,8 @@ import torch
 
 from fdi_torch.cli import DONE, MISUSE, main
 from fdi_torch.config.run import Run, load_run
+from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.logbook import content_hash, read_run
-from fdi_torch.main_job import TrainResult, train
 
 QUICK = ("simulate.duration=400 s", "estimate.search.evaluations=1500", "estimate.step.refine=0.5 s")
 
@@ -189,7 +189,7 @@ import os, signal, sys, time
 import yaml
 from pathlib import Path
 from fdi_torch.config.run import build_run
-from fdi_torch.main_job import TrainResult, train
+from fdi_torch.jobs.train import TrainResult, train
 def tell(share, text):
     if f"generation {sys.argv[2]}," in text:
         time.sleep(1.2)

@@ -171,7 +171,7 @@ def test_ctrl_c_keeps_what_was_logged(tmp_path: Path, monkeypatch: pytest.Monkey
         return advance(self, state, samples, show)
 
     monkeypatch.setattr(Monitor, "advance", interrupted)
-    monkeypatch.setattr("fdi_torch.monitor_job.CHUNK", 20)
+    monkeypatch.setattr("fdi_torch.jobs.monitor.CHUNK", 20)
     assert main(["monitor", "--config", config(tmp_path), "--quiet"]) == INTERRUPTED
     [path] = (tmp_path / "logs").glob("*.mcap")
     assert "alarm" in [message.payload["event"] for message in read_run(path).messages(["/observer/alarm"])]

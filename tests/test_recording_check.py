@@ -10,7 +10,7 @@ import torch
 
 from fdi_torch.config import load_plant
 from fdi_torch.recording import Recording
-from fdi_torch.recording_check import RecordingCheck, check_recording
+from fdi_torch.recordings.check import RecordingCheck, check_recording
 
 PLANT = load_plant("three_tank")
 

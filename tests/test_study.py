@@ -10,13 +10,13 @@ import torch
 
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.study import Study, load_study
+from fdi_torch.jobs.study import TRIAL, progress, run_study
 from fdi_torch.logbook import read_run
 from fdi_torch.study.isolation import isolate
 from fdi_torch.study.monte_carlo import Trial, distant, run_block, run_blocks
 from fdi_torch.study.plan import Block, Plan, Setting, fault_modes, fixed_faults, mode_faults, uniform_faults
 from fdi_torch.study.summary import column, covered, rms_ratio, rms_with_error, share, summarise
 from fdi_torch.study.trials import limits, make_trials
-from fdi_torch.study_job import TRIAL, progress, run_study
 
 NOISE = "configs/studies/table3_noise.yaml"
 QUICK = ["study.steps=[1 s]", "study.data_step=0.2 s", "study.evaluations=600", "study.population=24"]
@@ -135,8 +135,8 @@ def test_a_killed_study_goes_on_from_its_partial_log(tmp_path: Path) -> None:
 
 
 def test_ten_thousand_trials_stay_below_ten_megabytes(tmp_path: Path, plan: Plan) -> None:
+    from fdi_torch.jobs.study import log_trials
     from fdi_torch.logbook import RunLog
-    from fdi_torch.study_job import log_trials
 
     trial = all_trials(replace(plan, settings=(replace(plan.settings[0], faults=plan.settings[0].faults[:1]),)))[0]
     generator = torch.Generator().manual_seed(0)

@@ -8,12 +8,13 @@ only when asked for, so that help is instant.
 from __future__ import annotations
 
 import argparse
-import difflib
 import importlib
 import sys
 from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn
+
+from fdi_torch.names import unknown
 
 DONE, MISUSE, NOT_CONVERGED, INTERRUPTED = 0, 2, 3, 130
 
@@ -42,9 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.write(_overview())
         return DONE if words else MISUSE
     if words[0] not in COMMANDS:
-        near = difflib.get_close_matches(words[0], COMMANDS, n=1)
-        hint = f"; the nearest is '{near[0]}'" if near else ""
-        sys.stderr.write(f"fdi: expected a command ({', '.join(COMMANDS)}), got '{words[0]}'{hint}\n")
+        sys.stderr.write(f"fdi: {unknown('a command', words[0], COMMANDS)}\n")
         return MISUSE
     return _run(words[0], words[1:])
 

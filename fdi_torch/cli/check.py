@@ -12,7 +12,7 @@ from fdi_torch.config.recordings import RecordingConfig, known_parts, read_recor
 from fdi_torch.config.run import load_run
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recording_check import ChannelSummary, RecordingCheck, check_recording
+from fdi_torch.recordings.check import ChannelSummary, RecordingCheck, check_recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -23,11 +23,11 @@ from fdi_torch.gap.next_input import planned
 from fdi_torch.gap.plan import plan
 from fdi_torch.gap.refit import Refit, refit
 from fdi_torch.gap.which import DEEPEST
-from fdi_torch.gap_job import one_thread, run_gap
-from fdi_torch.log_paths import free_path
+from fdi_torch.jobs.gap import one_thread, run_gap
+from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recording_csv import write_csv
+from fdi_torch.recordings.csv_files import write_csv
 
 EXAMPLES = """
 examples:

@@ -9,9 +9,9 @@ import orjson
 from fdi_torch.cli.options import add_config, add_live, live
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.monitor import load_monitor
+from fdi_torch.jobs.monitor import Listening, watch
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.prepare import Prepared
-from fdi_torch.monitor_job import Listening, watch
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

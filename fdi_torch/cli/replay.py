@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
     """The same again: every event must be the same."""
-    from fdi_torch.replay_job import comparable, run_again
+    from fdi_torch.jobs.replay import comparable, run_again
 
     with tempfile.TemporaryDirectory() as folder, screen.progress("replay") as advance:
         target = Path(arguments.out or Path(folder) / "again.mcap")
@@ -62,7 +62,7 @@ def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
     """The same data with another choice: a new log, compared with the old one."""
-    from fdi_torch.replay_job import run_again
+    from fdi_torch.jobs.replay import run_again
 
     source = Path(arguments.log)
     target = Path(arguments.out or source.with_name(f"{source.name.removesuffix('.mcap')}.what_if.mcap"))

@@ -10,9 +10,9 @@ import argparse
 from fdi_torch.cli.options import add_config, add_live, add_run, live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.study import load_study
+from fdi_torch.jobs.study import StudyResult, run_study
 from fdi_torch.study.isolation import Isolation
 from fdi_torch.study.summary import Ratio, Score, Summary
-from fdi_torch.study_job import StudyResult, run_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

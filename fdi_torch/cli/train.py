@@ -12,7 +12,7 @@ from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.options import add_config, add_live, add_run, live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.run import load_run
-from fdi_torch.main_job import TrainResult, train
+from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.parameters import display_unit
 
 

@@ -9,10 +9,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from fdi_torch.config.problems import ConfigError, unknown
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.strict import Amount, Share, Strict, quantity
 from fdi_torch.effects import EFFECTS, all_placements, effect, placements_for
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
+from fdi_torch.names import unknown
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement

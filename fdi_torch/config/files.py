@@ -10,7 +10,8 @@ from typing import Any
 
 import yaml
 
-from fdi_torch.config.problems import ConfigError, nearest, unknown
+from fdi_torch.config.problems import ConfigError
+from fdi_torch.names import nearest, unknown
 
 MOST_EXTENSIONS = 8
 SHIPPED = Path(__file__).resolve().parents[1] / "configs"

@@ -11,9 +11,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationError
 
 from fdi_torch.config.files import find_plant, read_yaml
-from fdi_torch.config.problems import ConfigError, explain, unknown
+from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Share, Strict, quantity
 from fdi_torch.effects import effect
+from fdi_torch.names import unknown
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import fits

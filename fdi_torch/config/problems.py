@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from pydantic import ValidationError
@@ -15,18 +14,6 @@ class ConfigError(ValueError):
     def __init__(self, problems: Sequence[str]) -> None:
         super().__init__("\n".join(problems))
         self.problems = tuple(problems)
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """'; the nearest is X', or nothing where no known name is near."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f"; the nearest is '{near[0]}'" if near else ""
-
-
-def unknown(kind: str, name: str, known: Iterable[str]) -> str:
-    """The sentence for a name that is not among the known ones."""
-    known = list(known)
-    return f"expected {kind} ({', '.join(known) or 'there are none'}), got '{name}'{nearest(name, known)}"
 
 
 def explain(error: ValidationError, source: str) -> ConfigError:

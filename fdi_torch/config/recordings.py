@@ -11,13 +11,14 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationError
 
 from fdi_torch.config.files import find_data, find_file, read_extended
-from fdi_torch.config.problems import ConfigError, explain, unknown
-from fdi_torch.config.recording_mcap import read_mcap
+from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
 from fdi_torch.logbook import LogError
+from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recording_csv import ChannelSource, read_csv
+from fdi_torch.recordings.csv_files import ChannelSource, read_csv
+from fdi_torch.recordings.mcap_files import read_mcap
 
 GIVE_A_CONSTANT = "give the unknown one a constant, as in columns: {Q1: {constant: 0 cm^3/s}}"
 

@@ -9,9 +9,10 @@ import torch
 from pydantic import BeforeValidator, Field
 from torch import Tensor
 
-from fdi_torch.config.problems import ConfigError, unknown
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recordings import StartLevels
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
+from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.record import noise_level

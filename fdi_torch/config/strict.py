@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from fdi_torch.config.problems import unknown
+from fdi_torch.names import unknown
 from fdi_torch.parameters import parse_quantity
 
 

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, ValidationError
 
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
 from fdi_torch.config.files import find_file, read_extended, with_overrides, write_yaml
-from fdi_torch.config.problems import ConfigError, explain, unknown
+from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.run import Run, build_run
 from fdi_torch.config.simulation import planned_recording
 from fdi_torch.config.strict import Seconds, Share, Strict, quantity
@@ -20,6 +20,7 @@ from fdi_torch.effects import build_network
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.estimate.refine import RefineSettings
+from fdi_torch.names import unknown
 from fdi_torch.study.plan import (
     ESTIMATORS,
     Estimator,

@@ -15,8 +15,8 @@ from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import estimate_parameters, information_std
 from fdi_torch.estimate.refine import levenberg_marquardt
+from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, simulated_truth, wanted_space
 from fdi_torch.paper.published import PARAMETERS
-from fdi_torch.run_setup import fitting_of, hybrid_settings, recordings_of, simulated_truth, wanted_space
 
 BOUND_SNR = 50.0
 """dB; the noise for which the bound of a noise-free row is given."""

@@ -16,7 +16,7 @@ from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.objectives import Objective, Problem, Term
 from fdi_torch.estimate.refine import levenberg_marquardt
-from fdi_torch.run_setup import hybrid_settings, simulated_truth, wanted_space
+from fdi_torch.jobs.run_setup import hybrid_settings, simulated_truth, wanted_space
 from fdi_torch.simulate.engine import Readings
 
 SEARCH_STEP, FINE_STEP, DATA_STEP = 1.0, 0.05, 0.0125

@@ -18,6 +18,7 @@ from fdi_torch.effects import build_network
 from fdi_torch.estimate.diagnosis import sample_noise
 from fdi_torch.estimate.fitting import set_up, start_levels
 from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
+from fdi_torch.jobs.run_setup import hybrid_settings, wanted_space
 from fdi_torch.monitor.detection import NEVER, Detector, make_detector
 from fdi_torch.monitor.gain import hand_gain
 from fdi_torch.monitor.noise import Noise, learn_noise
@@ -26,7 +27,6 @@ from fdi_torch.monitor.samples import take
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
-from fdi_torch.run_setup import hybrid_settings, wanted_space
 from fdi_torch.simulate.record import clean_readings, with_noise
 
 TIME_BETWEEN_FALSE_ALARMS = 20_000.0

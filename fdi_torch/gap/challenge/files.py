@@ -23,7 +23,7 @@ from fdi_torch.gap.challenge.conditions import command_unit
 from fdi_torch.gap.challenge.moment import Array
 from fdi_torch.gap.challenge.plants import Rig
 from fdi_torch.recording import Recording
-from fdi_torch.recording_csv import file_sha256, read_csv
+from fdi_torch.recordings.csv_files import file_sha256, read_csv
 
 _DECIMALS_OF_LEVEL = 3
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from fdi_torch.config.logged import logged_plant
 from fdi_torch.gap.diagnose import Settings, Tell
 from fdi_torch.gap.which import DEEPEST
-from fdi_torch.gap_job import groups, run_gap
+from fdi_torch.jobs.gap import groups, run_gap
+from fdi_torch.jobs.logged_recordings import recording_in
 from fdi_torch.logbook import LogError
 from fdi_torch.logbook import Run as LoggedRun
-from fdi_torch.logged_recordings import recording_in
 
 KEYS = ("library", "leave_out", "step", "most")
 

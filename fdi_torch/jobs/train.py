@@ -13,11 +13,8 @@ from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
 from fdi_torch.estimate.refine import Progress
-from fdi_torch.log_paths import free_path, killed_path, left_behind
-from fdi_torch.logbook import Listener, RunLog
-from fdi_torch.parameters import ParameterSpace
-from fdi_torch.report.fit_figure import fit_figure, save
-from fdi_torch.run_setup import (
+from fdi_torch.jobs.log_paths import free_path, killed_path, left_behind
+from fdi_torch.jobs.run_setup import (
     fitting_of,
     hybrid_settings,
     recordings_of,
@@ -26,6 +23,9 @@ from fdi_torch.run_setup import (
     usable_device,
     wanted_space,
 )
+from fdi_torch.logbook import Listener, RunLog
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.report.fit_figure import fit_figure, save
 
 Tell = Callable[[float, str], None]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_torch.recording_csv import (
+from fdi_torch.recordings.csv_files import (
     ChannelSource,
     bind,
     channels_in_si,

@@ -6,21 +6,21 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from fdi_torch import study_job
 from fdi_torch.config.files import with_overrides
 from fdi_torch.config.logged import logged_mapping
 from fdi_torch.config.recordings import LoadedRecording
 from fdi_torch.config.run import Run, build_run
 from fdi_torch.config.study import build_study
-from fdi_torch.gap_replay import gap_again
+from fdi_torch.jobs import study as study_job
+from fdi_torch.jobs.gap_replay import gap_again
+from fdi_torch.jobs.logged_recordings import recording_in
+from fdi_torch.jobs.run_setup import fitting_of, wanted_space
+from fdi_torch.jobs.study import TRIAL, concluded, log_trials
+from fdi_torch.jobs.train import Tell, estimate_logged, log_recordings, origin_of
 from fdi_torch.logbook import LogError, Message, RunLog, series
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook.replay import Select
-from fdi_torch.logged_recordings import recording_in
-from fdi_torch.main_job import Tell, estimate_logged, log_recordings, origin_of
-from fdi_torch.run_setup import fitting_of, wanted_space
 from fdi_torch.study.monte_carlo import Trial, run_blocks
-from fdi_torch.study_job import TRIAL, concluded, log_trials
 
 # The data are the log's own: what would make others cannot be changed.
 _DATA_KEYS = ("simulate", "recordings")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.study import Study
-from fdi_torch.log_paths import free_path
+from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.logbook import Listener, RunLog, read_run, unfinished
 from fdi_torch.logbook.reader import Run as OldLog
 from fdi_torch.report.fit_figure import save

@@ -15,7 +15,7 @@ from torch import Tensor
 from fdi_torch.config.growing import Row, growing_rows
 from fdi_torch.config.monitor import MonitorRun
 from fdi_torch.config.recordings import read_recording
-from fdi_torch.log_paths import free_path
+from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.monitor.arrivals import Arrivals, Punctuality
 from fdi_torch.monitor.events import Event

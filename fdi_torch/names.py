@@ -1,0 +1,18 @@
+"""Names asked for and names there are: what is said where the two do not meet."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """'; the nearest is X', or nothing where no known name is near."""
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f"; the nearest is '{near[0]}'" if near else ""
+
+
+def unknown(kind: str, name: str, known: Iterable[str]) -> str:
+    """The sentence for a name that is not among the known ones."""
+    known = list(known)
+    return f"expected {kind} ({', '.join(known) or 'there are none'}), got '{name}'{nearest(name, known)}"
