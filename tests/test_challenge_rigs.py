@@ -12,16 +12,22 @@ import torch
 
 from fdi_torch.effects import build_network
 from fdi_torch.gap.challenge.built import WIDEST, as_built
-from fdi_torch.gap.challenge.cases import make, noise, plans
-from fdi_torch.gap.challenge.conditions import asked_of_pumps, random_steps, two_steps
+from fdi_torch.gap.challenge.cases import make, plans
+from fdi_torch.gap.challenge.colours import Colour, autoregressive, rippling, smoothed
+from fdi_torch.gap.challenge.conditions import asked_of_pumps
 from fdi_torch.gap.challenge.exercise import exercised
+from fdi_torch.gap.challenge.inputs import SIGNALS, commanded, with_standstills
 from fdi_torch.gap.challenge.kinds import KINDS, STANDARD, choose
 from fdi_torch.gap.challenge.known import KNOWN
-from fdi_torch.gap.challenge.laws_sensor import SENSOR_LAWS
+from fdi_torch.gap.challenge.laws_pipe import HEAD_LAWS, PIPE_LAWS
+from fdi_torch.gap.challenge.laws_pump import PUMP_LAWS
+from fdi_torch.gap.challenge.laws_sensor import READOUT_LAWS, SENSOR_LAWS
+from fdi_torch.gap.challenge.laws_tank import STORAGE_LAWS, TANK_LAWS
 from fdi_torch.gap.challenge.moment import Array, Deviation
 from fdi_torch.gap.challenge.places import EFFECTS, canonical, effect_places
 from fdi_torch.gap.challenge.plants import Rig, cascaded_tanks, quadruple_tank, three_tank
 from fdi_torch.gap.challenge.simulator import HiddenRigs, simulate
+from fdi_torch.gap.challenge.surroundings import Surroundings
 from fdi_torch.gap.challenge.unknown import UNKNOWN, unknown_to
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
@@ -94,6 +100,21 @@ def test_water_that_only_changes_tanks_stays_in_them(off: tuple[Deviation, ...])
     levels = run(rig_of(LINK), 1.6e-4, [0.5, 0.1], 300, *off)
     np.testing.assert_allclose(levels.sum(axis=1), 0.6, atol=1e-12)
     assert levels[-1, 0] < 0.45
+
+
+def test_a_side_chamber_fills_until_it_stands_as_high() -> None:
+    chamber = Deviation("unknown", "A", "side_chamber", {"area": 0.5 * AREA, "tau": 20.0})
+    pumped = run(rig_of((), PUMP), 1.0, [0.2, 0.0], 200, chamber, asked=5e-5)[:, 0]
+    # A steady inflow splits as the two cross-sections do, once the chamber follows.
+    assert (pumped[200] - pumped[150]) == pytest.approx(5e-5 * 50 / (1.5 * AREA), rel=2e-3)
+
+
+def test_a_slewing_pump_takes_its_time() -> None:
+    asked = np.where(np.arange(61) >= 20, 5e-5, 0.0)
+    volume = filled_by("slewing", {"rate": 2.5e-6}, 60, asked)
+    t = np.maximum(np.arange(61) - 20.0, 0)
+    expected = np.where(t < 20, 0.5 * 2.5e-6 * t**2, 5e-5 * (t - 10))
+    np.testing.assert_allclose(volume, expected, atol=1e-9)
 
 
 def test_what_a_conical_tank_is_given_is_in_it() -> None:
@@ -172,16 +193,26 @@ def test_a_late_sensor_shows_the_level_of_before() -> None:
 
 
 def test_noise_has_the_colour_and_size_asked_for() -> None:
-    e = noise(np.random.default_rng(1), (20000, 1), 0.3, 0.8)[:, 0]
-    assert e.std() == pytest.approx(0.3, rel=0.05)
-    assert np.corrcoef(e[1:], e[:-1])[0, 1] == pytest.approx(0.8, abs=0.02)
+    colour = autoregressive(0.8)
+    e = colour.noise(np.random.default_rng(1), 20000, np.array([0.3, 0.6]))
+    assert e.std(axis=0) == pytest.approx([0.3, 0.6], rel=0.05)
+    assert np.corrcoef(e[1:, 0], e[:-1, 0])[0, 1] == pytest.approx(0.8, abs=0.02)
+    assert colour.repeats == pytest.approx((1 + 0.8**2) / (1 - 0.8**2), rel=1e-12)
+
+
+@pytest.mark.parametrize("colour", [smoothed(5), rippling(10.0, 4.0)], ids=lambda c: c.name)
+def test_mean_squares_of_coloured_noise_scatter_as_said(colour: Colour) -> None:
+    samples, runs = 500, 2000
+    squares = np.mean(colour.noise(np.random.default_rng(3), samples, np.ones(runs)) ** 2, axis=0)
+    assert squares.mean() == pytest.approx(1.0, rel=0.01)
+    assert squares.std() == pytest.approx(np.sqrt(2 * colour.repeats / samples), rel=0.06)
 
 
 @pytest.mark.parametrize("rig", [three_tank(), quadruple_tank(), cascaded_tanks()], ids=lambda r: r.plant.name)
 def test_two_independent_simulations_of_a_sound_rig_agree(rig: Rig) -> None:
     """The hidden rig without any effect and the library's plant: other code, other integrator, the same water."""
     plant, seconds = rig.plant, 200
-    commands = random_steps(rig, np.random.default_rng(2), seconds + 1)
+    commands = commanded(rig, np.random.default_rng(2), seconds + 1)
     start = [0.2 * t.height * (1 + 0.3 * i) for i, t in enumerate(plant.tanks)]
     rigs = HiddenRigs([plant], [()])
     hidden = simulate(rigs, asked_of_pumps(plant, commands)[..., None], np.array(start)[:, None])[:, :, 0]
@@ -269,6 +300,16 @@ def test_a_library_that_names_all_leaves_nothing_unknown() -> None:
         unknown_to([alias for u in UNKNOWN for alias in u.aliases])
 
 
+def test_every_law_belongs_to_an_effect_or_an_unknown() -> None:
+    laws = {*PUMP_LAWS, *HEAD_LAWS, *PIPE_LAWS, *TANK_LAWS, *STORAGE_LAWS, *SENSOR_LAWS, *READOUT_LAWS}
+    rig = three_tank()
+    built, rng = rig.plant, np.random.default_rng(4)
+    levels, asked = rng.uniform(0.2, 0.5, (1000, 3)), rng.uniform(1e-5, 7e-5, (1000, 2))
+    around = Surroundings(built, levels, asked, 1.0, rng)
+    drawn = {KNOWN[effect](around, place).law for effect, place in effect_places(built) * 30}
+    assert drawn | {u.law for u in UNKNOWN} == laws and not drawn & {u.law for u in UNKNOWN}
+
+
 def test_the_vocabulary_is_the_protocols() -> None:
     assert set(KNOWN) == set(EFFECTS)
     assert len(effect_places(three_tank().plant)) == 62
@@ -279,11 +320,12 @@ def test_the_vocabulary_is_the_protocols() -> None:
 @pytest.mark.parametrize("rig", [three_tank(), quadruple_tank(), cascaded_tanks()], ids=lambda r: r.plant.name)
 def test_inputs_stay_within_the_pumps(rig: Rig) -> None:
     rng = np.random.default_rng(5)
+    signals = [signal for inputs in SIGNALS.values() for signal in inputs]
     for commands in (
-        random_steps(rig, rng, 3601),
-        random_steps(rig, rng, 3601, rig.plant.channels()[0]),
-        two_steps(rig, rng),
+        with_standstills(rig, rng, 3601, rig.plant.channels()[0]),
+        *(commanded(rig, rng, 3601, signal) for signal in signals),
     ):
+        assert commands.shape == (3601, len(rig.plant.channels())) and np.ptp(commands, axis=0).min() > 0
         assert (commands >= 0).all()
         for i, channel in enumerate(rig.plant.channels()):
             pump = next(p for p in rig.plant.pumps if p.channel == channel)

@@ -186,7 +186,7 @@ def test_unknown_counts_at_its_place_only() -> None:
 
 
 def test_closure_is_compared_with_the_true_noise() -> None:
-    truth = {"kind": "single", "causes": [LAG], "noise_rms_m": {"holdout": [1e-3] * 3}, "colour": 0.0}
+    truth = {"kind": "single", "causes": [LAG], "noise_rms_m": {"holdout": [1e-3] * 3}, "repeats": 1.0}
     closure = {"recalibrated": 0.5, "augmented": 0.12, "closed": 0.99}
     expected = 1 - (0.12**2 - 0.1**2) / (0.5**2 - 0.1**2)
     row = judge(truth, named(LAG) | {"closure": closure}, RIG.plant)

@@ -13,11 +13,11 @@ from fdi_torch.gap.challenge.conditions import (
     RECORDED,
     Conditions,
     asked_of_pumps,
-    channel_to_rest,
     draw_conditions,
     kept_below_the_rim,
     levels_at_rest,
 )
+from fdi_torch.gap.challenge.inputs import channel_to_rest
 from fdi_torch.gap.challenge.kinds import FAINT, KINDS, Chosen, case_generator, choose
 from fdi_torch.gap.challenge.known import KNOWN
 from fdi_torch.gap.challenge.laws_sensor import READOUT_LAWS, SENSOR_LAWS
@@ -138,7 +138,7 @@ def _read(
     for lane, (part, samples) in enumerate(PARTS):
         clean = _sensed(rig, conditions.built, levels[:samples, :, lane], deviations)
         sound = _sensed(rig, conditions.built, levels[:samples, :, lane + 2], ())
-        noisy = clean + noise(rng, clean.shape, conditions.noise, conditions.colour)
+        noisy = clean + conditions.colour.noise(rng, samples, conditions.noise)
         shown = _applied(READOUT_LAWS, rig, noisy, deviations)
         readings.append(shown)
         noise_rms[part] = np.sqrt(np.mean((shown - clean) ** 2, axis=0)).tolist()
@@ -147,7 +147,9 @@ def _read(
     truth = _truth(plan, chosen, deviations) | {
         "noise_rms_m": noise_rms,
         "gap_rms_m": gap_rms,
-        "colour": conditions.colour,
+        "signal": conditions.signal,
+        "colour": conditions.colour.name,
+        "repeats": conditions.colour.repeats,
         "over_rim": bool((np.array(highest) >= [t.height for t in conditions.built.tanks]).any()),
     }
     return Case(plan, conditions.commands, (readings[0], readings[1]), truth)
@@ -160,6 +162,7 @@ def _truth(plan: Plan, chosen: Chosen, deviations: tuple[Deviation, ...]) -> dic
     return {
         "case": plan.name,
         "kind": plan.kind,
+        "index": plan.index,
         "causes": [{"effect": d.effect, "location": d.location} | really for d in full],
         "leave_out": list(chosen.leave_out),
         "deviations": [d.as_dict() for d in deviations],
@@ -181,11 +184,3 @@ def _applied(laws: Any, rig: Rig, signal: Array, deviations: Sequence[Deviation]
     for group in grouped(laws, [s.name for s in rig.plant.sensors], [tuple(deviations)]):
         out[:, group.rows] = group.law(out[:, group.rows], time, group.numbers)
     return out
-
-
-def noise(rng: np.random.Generator, shape: tuple[int, ...], std: float, colour: float) -> Array:
-    """Gaussian noise (T, S) of this standard deviation: e_i = a e_{i-1} + sqrt(1 - a^2) w_i."""
-    e = std * rng.normal(size=shape)
-    for i in range(1, shape[0] if colour else 0):
-        e[i] = colour * e[i - 1] + np.sqrt(1 - colour * colour) * e[i]
-    return e

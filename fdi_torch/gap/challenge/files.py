@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.gap.challenge.cases import PARTS, Case
-from fdi_torch.gap.challenge.conditions import command_unit
+from fdi_torch.gap.challenge.inputs import DECIMALS, command_unit
 from fdi_torch.gap.challenge.moment import Array
 from fdi_torch.gap.challenge.plants import Rig
 from fdi_torch.recording import Recording
@@ -35,7 +35,7 @@ def as_csv(rig: Rig, commands: Array, readings: Array, seal: str) -> str:
         unit = command_unit(next(p for p in rig.plant.pumps if p.channel == channel))
         header.append(f"{channel}_{unit}")
         columns.append(commands[:, i])
-        decimals.append({"cm3_s": 1, "V": 3, "1": 4}[unit])
+        decimals.append(DECIMALS[unit])
     for i, sensor in enumerate(rig.plant.sensors):
         in_metres = sensor.unit == "m"
         header.append(f"{sensor.column}_{'cm' if in_metres else sensor.unit}")

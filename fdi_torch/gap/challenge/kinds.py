@@ -18,14 +18,14 @@ from fdi_torch.plant.description import PlantDescription
 class Kind:
     """strength of its full effects (1 is usual). causes: how many. faint: how many more at an eighth of usual strength.
 
-    inputs: as in `draw_conditions`. coloured: chance of AR(1) noise.
+    inputs: as in `draw_conditions`. coloured: chance of coloured noise.
     """
 
     name: str
     strength: float = 1.0
     causes: int = 1
     faint: int = 0
-    inputs: str = "steps"
+    inputs: str = "rich"
     coloured: float = 0.0
 
 

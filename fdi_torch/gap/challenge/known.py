@@ -22,7 +22,8 @@ def pump_gain(s: Surroundings, at: str) -> Deviation:
 
 def pump_dead_zone(s: Surroundings, at: str) -> Deviation:
     zone = s.size(0.06, 0.13) * s.pump(at)[1]
-    return Deviation("pump_dead_zone", at, "soft_threshold", {"zone": zone, "knee": 0.15 * zone})
+    law = s.one_of("threshold", "soft_threshold")
+    return Deviation("pump_dead_zone", at, law, {"zone": zone} | ({"knee": 0.15 * zone} if "soft" in law else {}))
 
 
 def pump_saturation(s: Surroundings, at: str) -> Deviation:
@@ -36,19 +37,22 @@ def pump_lag(s: Surroundings, at: str) -> Deviation:
 
 
 def pump_delay(s: Surroundings, at: str) -> Deviation:
-    return Deviation("pump_delay", at, s.one_of("late", "late_and_smeared"), {"delay": s.size(5, 15)})
+    return Deviation("pump_delay", at, s.one_of("late", "late_and_smeared", "late_and_slow"), {"delay": s.size(5, 15)})
 
 
 def pump_back_pressure(s: Surroundings, at: str) -> Deviation:
     loss, high = s.size(0.1, 0.22), s.tank(s.tank_of(at), 0.98)
-    law = s.one_of("shut_off_head", "drooping")
-    head = high / (1 - (1 - loss) ** 2) if law == "shut_off_head" else high / loss**0.5
-    return Deviation("pump_back_pressure", at, law, {"head": head})
+    law = s.one_of("shut_off_head", "falling", "drooping")
+    share = {"shut_off_head": 1 - (1 - loss) ** 2, "falling": loss, "drooping": loss**0.5}[law]
+    return Deviation("pump_back_pressure", at, law, {"head": high / share})
 
 
 def laminar_flow(s: Surroundings, at: str) -> Deviation:
     """The size is the share of flow lost at the middling head, f = 1 - size, solved for the law's own head."""
-    law, kept = s.one_of("viscous_and_inertial", "reynolds_blend"), 1 - s.size(0.07, 0.22)
+    law = s.one_of("viscous_and_inertial", "reynolds_blend", "sharp_transition")
+    kept = 1 - s.size(0.07, 0.22)
+    if law == "sharp_transition":
+        return Deviation("laminar_flow", at, law, {"head": s.head(at, 0.6) / kept**2})
     ratio = (1 / kept - kept) ** 2 if law == "viscous_and_inertial" else np.arctanh(kept) ** -2
     return Deviation("laminar_flow", at, law, {"head": float(ratio) * s.head(at, 0.5)})
 
@@ -65,7 +69,7 @@ def outlet_drop(s: Surroundings, at: str) -> Deviation:
 
 
 def coefficient_drift(s: Surroundings, at: str) -> Deviation:
-    law = s.one_of("drifting_evenly", "drifting_to_rest", "drifting_as_sine")
+    law = s.one_of("drifting_evenly", "drifting_to_rest", "drifting_as_sine", "drifting_unevenly")
     return Deviation("coefficient_drift", at, law, {"change": s.either(0.1, 0.25), "span": s.seconds})
 
 
@@ -73,13 +77,17 @@ def plugging(s: Surroundings, at: str) -> Deviation:
     """From the start on where strong, else from some time on: a small one from the start is within tolerance."""
     sudden = s.strength < 0.5 or s.rng.random() < 0.5
     onset = s.uniform(0.12, 0.5) * s.seconds if sudden else -1e9
-    return Deviation("plugging", at, "narrowed", {"loss": s.either(0.14, 0.28), "onset": onset, "ramp": 15.0})
+    return Deviation(
+        "plugging", at, "narrowed", {"loss": s.either(0.14, 0.28), "onset": onset, "ramp": s.uniform(1.0, 40.0)}
+    )
 
 
 def cross_flow(s: Surroundings, at: str) -> Deviation:
     first, second = at.split("-")
-    numbers = {"conductance": s.size(0.08, 0.25) * s.conductance_at(first), "viscous": 1e-3}
-    return Deviation("cross_flow", at, "slot", numbers, other=second)
+    numbers = {"conductance": s.size(0.08, 0.25) * s.conductance_at(first)}
+    law = s.one_of("slot", "window")
+    numbers["viscous" if law == "slot" else "height"] = 1e-3 if law == "slot" else 0.3 * s.tank(first, 0.05)
+    return Deviation("cross_flow", at, law, numbers, other=second)
 
 
 def leak(s: Surroundings, at: str) -> Deviation:
@@ -87,7 +95,7 @@ def leak(s: Surroundings, at: str) -> Deviation:
     if s.rng.random() < 0.5:
         return Deviation("leak", at, "floor_hole", {"conductance": conductance})
     height = s.uniform(0.1, 0.6) * s.tank(at, 0.5)
-    numbers = {"conductance": 1.4 * conductance, "height": height, "bore": 0.03 * s.span(at)}
+    numbers = {"conductance": 1.4 * conductance, "height": height, "bore": s.uniform(0.01, 0.06) * s.span(at)}
     return Deviation("leak", at, "hole", numbers)
 
 
@@ -95,7 +103,9 @@ def unmetered_flow(s: Surroundings, at: str) -> Deviation:
     begin = s.uniform(0.08, 0.35) * s.seconds
     end = begin + s.uniform(0.2, 0.5) * s.seconds
     draw = s.either(0.07, 0.16) * float(np.max(s.asked))
-    return Deviation("unmetered_flow", at, "tapped", {"draw": draw, "begin": begin, "end": end, "ramp": 5.0})
+    return Deviation(
+        "unmetered_flow", at, "tapped", {"draw": draw, "begin": begin, "end": end, "ramp": s.uniform(1.0, 20.0)}
+    )
 
 
 def area_taper(s: Surroundings, at: str) -> Deviation:
@@ -103,19 +113,19 @@ def area_taper(s: Surroundings, at: str) -> Deviation:
     slope = ((1 + s.either(0.15, 0.4)) ** 0.5 - 1) / s.tank(at, 0.98)
     tank = s.plant.component(at)
     half = 0.5 * tank.height if isinstance(tank, Tank) and s.rng.random() < 0.5 else 0.0
-    return Deviation("area_taper", at, "cone", {"slope": slope, "reference": half})
+    return Deviation("area_taper", at, s.one_of("cone", "wedge"), {"slope": slope, "reference": half})
 
 
 def internal_body(s: Surroundings, at: str) -> Deviation:
     numbers = {"low": s.tank(at, s.uniform(0.05, 0.3)), "high": s.tank(at, s.uniform(0.7, 0.95))}
-    law = s.one_of("block", "barrel")
+    law = s.one_of("block", "barrel", "heap")
     numbers |= {"share": s.size(0.2, 0.45)} | ({"chamfer": s.uniform(0.05, 0.2)} if law == "block" else {})
     return Deviation("internal_body", at, law, numbers)
 
 
 def overflow(s: Surroundings, at: str) -> Deviation:
-    law = s.one_of("rectangular_weir", "notched_weir")
-    deep = 0.05 if law == "rectangular_weir" else 0.12
+    law = s.one_of("rectangular_weir", "notched_weir", "brim")
+    deep = {"rectangular_weir": 0.05, "notched_weir": 0.12, "brim": 0.02}[law]
     crest = s.tank(at, 0.98) - s.size(0.25, 0.5) * s.span(at)
     numbers = {"crest": crest, "depth": deep * s.span(at), "flow": float(np.max(s.asked))}
     others = [t.name for t in s.plant.tanks if t.name != at]
@@ -151,7 +161,7 @@ def sensor_delay(s: Surroundings, at: str) -> Deviation:
 def sensor_saturation(s: Surroundings, at: str) -> Deviation:
     tank = s.tank_of(at)
     ceiling = s.tank(tank, 0.98) - s.size(0.25, 0.5) * s.span(tank)
-    return Deviation("sensor_saturation", at, "clipped", {"ceiling": ceiling})
+    return Deviation("sensor_saturation", at, s.one_of("clipped", "clipped_reading"), {"ceiling": ceiling})
 
 
 KNOWN: dict[str, Draw] = {

@@ -34,6 +34,11 @@ def reynolds_blend(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -
     return np.tanh(np.sqrt(np.abs(head) / p["head"])), None
 
 
+def sharp_transition(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
+    """Linear in the head below one head, by the square root above it."""
+    return np.minimum(np.sqrt(np.abs(head) / p["head"]), 1.0), None
+
+
 def other_power(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
     """((x^2 + w^2) / x_ref^2)^((n - 1/2)/2), w = 2 mm."""
     ratio = (head * head + (2 * _MILLIMETRE) ** 2) / p["reference"] ** 2
@@ -52,6 +57,12 @@ def drifting_to_rest(head: Array, q: Array, now: Moment, p: Numbers, state: Any)
 def drifting_as_sine(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
     """A quarter of a slow sine."""
     return 1 + p["change"] * np.sin(0.5 * np.pi * now.time / p["span"]), None
+
+
+def drifting_unevenly(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
+    """Slower and faster in turn, but never back."""
+    t = now.time / p["span"]
+    return 1 + p["change"] * (t + 0.12 * np.sin(4 * np.pi * t) / (2 * np.pi)), None
 
 
 def narrowed(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
@@ -84,20 +95,48 @@ def fluttering(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Fa
     return 1 - p["loss"] * np.sin(np.pi * now.time / p["period"]) ** 2, None
 
 
+def choked(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
+    """A flow limiter: never more than a certain flow, q_max tanh(q/q_max) with a sharper knee."""
+    x = (q / p["most"]) ** 2
+    return 1 / np.sqrt(np.sqrt(1 + x * x)), None
+
+
+def blocked_at_times(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
+    """Something that floats in front of the mouth for irregular whiles."""
+    t = 2 * np.pi * now.time / p["period"]
+    return 1 - p["loss"] * (np.sin(t) + np.sin(t / 0.618 + 1.0) > 0.7), None
+
+
+def lopsided(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
+    """Another coefficient backwards than forwards."""
+    return np.where(head > 0, 1 + p["change"], 1 - p["change"]), None
+
+
+def gulping(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
+    """A vortex that brings air along as soon as the head is low."""
+    return np.where(np.abs(head) < p["head"], 1 - p["loss"], 1.0), None
+
+
 HEAD_LAWS = {"down_pipe": down_pipe}
 PIPE_LAWS = {
     law.__name__: law
     for law in (
         viscous_and_inertial,
         reynolds_blend,
+        sharp_transition,
         other_power,
         drifting_evenly,
         drifting_to_rest,
         drifting_as_sine,
+        drifting_unevenly,
         narrowed,
         check_valve,
         silting,
         two_regimes,
         fluttering,
+        choked,
+        blocked_at_times,
+        lopsided,
+        gulping,
     )
 }

@@ -25,6 +25,11 @@ def late_and_smeared(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered
     return 0.5 * (now.asked(0.92 * p["delay"]) + now.asked(1.08 * p["delay"])), None
 
 
+def late_and_slow(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
+    """A hose, and a valve behind it that takes a fifth of the delay as its time constant."""
+    return slow(now.asked(0.8 * p["delay"]), now, {"tau": 0.2 * p["delay"]}, state)
+
+
 def scaled(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
     return p["gain"] * q, None
 
@@ -33,6 +38,10 @@ def soft_threshold(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
     """A dead zone whose knee is a hyperbola: (x + sqrt(x^2 + w^2)) / 2 with x = q - d."""
     x = q - p["zone"]
     return np.where(q > 0, 0.5 * (x + np.sqrt(x * x + p["knee"] ** 2)), 0.0), None
+
+
+def threshold(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
+    return np.maximum(q - p["zone"], 0.0), None
 
 
 def hard_limit(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
@@ -76,6 +85,11 @@ def shut_off_head(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
     return q * np.sqrt(np.maximum(1 - now.level / p["head"], 0.0)), None
 
 
+def falling(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
+    """Falls off evenly with the level: q (1 - h/H)."""
+    return q * np.maximum(1 - now.level / p["head"], 0.0), None
+
+
 def drooping(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
     """Falls off with the square of the level: q (1 - (h/H)^2)."""
     return q * np.maximum(1 - (now.level / p["head"]) ** 2, 0.0), None
@@ -113,21 +127,50 @@ def stalling(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
     return np.where(stalled, p["rest"] * q, q), None
 
 
+def sputtering(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
+    """Sucks air now and then, for irregular whiles."""
+    return np.where(_irregular(now.time, p["period"]), p["rest"] * q, q), None
+
+
+def bent(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
+    """Right at rest and at its highest flow, off between: q (1 + 4 b (1 - q/q_max))."""
+    return q * (1 + 4 * p["bow"] * (1 - q / p["rated"])), None
+
+
+def slewing(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
+    """A drive whose flow changes no faster than so many m^3/s each second."""
+    old = q if state is None else state
+    most = p["rate"] * now.dt
+    new = old + np.minimum(np.maximum(q - old, -most), most)
+    return 0.5 * (old + new), new
+
+
+def _irregular(time: float, period: Array) -> Array:
+    """True for about a fourth of the time, in whiles that never repeat: two sines of incommensurate periods."""
+    return np.sin(2 * np.pi * time / period) + np.sin(2 * np.pi * time / (0.618 * period) + 1.0) > 0.9
+
+
 # In the order in which they act: what replaces the command comes first.
 PUMP_LAWS = {
     law.__name__: law
     for law in (
         late,
         late_and_smeared,
+        late_and_slow,
+        slewing,
         sticking,
         backlash,
         soft_threshold,
+        threshold,
+        bent,
         scaled,
         slow,
         slow_in_two_poles,
         shut_off_head,
+        falling,
         drooping,
         pulsating,
+        sputtering,
         tiring,
         stalling,
         hard_limit,

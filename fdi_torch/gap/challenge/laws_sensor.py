@@ -91,6 +91,27 @@ def freezing(x: Array, time: Array, p: Numbers) -> Array:
     return out
 
 
+def jumped(x: Array, time: Array, p: Numbers) -> Array:
+    """Somebody knocked against it: another zero from some time on."""
+    return x + p["offset"] * (time[:, None] > p["onset"])
+
+
+def kinked(x: Array, time: Array, p: Numbers) -> Array:
+    """Another gain above some level."""
+    return x + p["extra"] * np.maximum(x - p["knee"], 0.0)
+
+
+def leading(x: Array, time: Array, p: Numbers) -> Array:
+    """Foam: reads too high while the level rises, too low while it falls."""
+    return x + p["ahead"] * np.gradient(x, time, axis=0)
+
+
+def wandering(x: Array, time: Array, p: Numbers) -> Array:
+    """Zero that wanders with the temperature: two slow sines of incommensurate periods."""
+    t = 2 * np.pi * time[:, None] / p["period"]
+    return x + 0.5 * p["height"] * (np.sin(t) + np.sin(t / 0.618 + 1.0))
+
+
 def rounded(x: Array, time: Array, p: Numbers) -> Array:
     return p["step"] * np.round(x / p["step"])
 
@@ -113,12 +134,17 @@ SENSOR_LAWS = {
         damped_twice,
         bowed,
         sticking_float,
+        leading,
+        kinked,
         stretched,
         offset,
+        jumped,
+        wandering,
         creeping,
         humming,
         freezing,
         clipped,
     )
-}
-READOUT_LAWS = {"bursting": bursting, "rounded": rounded}
+} | {"clipped_reading": clipped}
+# A transmitter's own limit clips the noise with the level: it acts twice, on either side of the noise.
+READOUT_LAWS = {"bursting": bursting, "clipped_reading": clipped, "rounded": rounded}

@@ -32,6 +32,12 @@ def slot(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Out
     return p["conductance"] * head / (0.5 * np.sqrt(p["viscous"]) + np.sqrt(x + 0.25 * p["viscous"])), None
 
 
+def window(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """A hole in the wall between two tanks, at some height."""
+    head = np.maximum(level - p["height"], 0.0) - np.maximum(other - p["height"], 0.0)
+    return p["conductance"] * head / np.sqrt(np.abs(head) + 1e-4), None
+
+
 def tapped(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
     """A tap opened at `begin` and closed at `end`, each within `ramp` seconds (negative: a tap running in)."""
     opened = np.minimum(np.maximum((now.time - p["begin"]) / p["ramp"], 0.0), 1.0)
@@ -50,6 +56,11 @@ def notched_weir(level: Array, other: Array, now: Moment, p: Numbers, state: Any
     """q = q_ref (x/x_ref)^(5/2) (Thomson)."""
     x = np.maximum(level - p["crest"], 0.0) / p["depth"]
     return p["flow"] * x * x * np.sqrt(x), None
+
+
+def brim(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """A long straight edge: what comes in above it runs off, q = q_ref x/x_ref."""
+    return p["flow"] * np.maximum(level - p["crest"], 0.0) / p["depth"], None
 
 
 def siphon(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
@@ -72,9 +83,27 @@ def float_valve(level: Array, other: Array, now: Moment, p: Numbers, state: Any)
     return np.where(filling, -p["flow"], 0.0), filling
 
 
+def side_chamber(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """A closed side arm behind a filter: A' s' = q = (h - s) A'/tau."""
+    side = level if state is None else state
+    new = side + now.dt / p["tau"] * (level - side)
+    return p["area"] * (new - side) / now.dt, new
+
+
+def splashing_in(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
+    """Water from a neighbour, for irregular whiles."""
+    t = 2 * np.pi * now.time / p["period"]
+    return np.where(np.sin(t) + np.sin(t / 0.618 + 1.0) > 0.8, -p["flow"], 0.0), None
+
+
 def cone(level: Array, p: Numbers) -> Array:
     """Width grows evenly, so the cross-section with the square: (1 + b h)^2, as believed at a reference level."""
     return ((1 + p["slope"] * level) / (1 + p["slope"] * p["reference"])) ** 2
+
+
+def wedge(level: Array, p: Numbers) -> Array:
+    """One wall leans: the cross-section grows evenly, 1 + b h, as believed at a reference level."""
+    return (1 + 2 * p["slope"] * level) / (1 + 2 * p["slope"] * p["reference"])
 
 
 def block(level: Array, p: Numbers) -> Array:
@@ -90,18 +119,28 @@ def barrel(level: Array, p: Numbers) -> Array:
     return 1 - p["share"] * np.maximum(1 - (2 * x - 1) ** 6, 0.0)
 
 
+def heap(level: Array, p: Numbers) -> Array:
+    """A body that is half as wide at its top as at its foot."""
+    x = (level - p["low"]) / (p["high"] - p["low"])
+    return 1 - np.where((x >= 0) & (x <= 1), p["share"] * (1 - 0.5 * x), 0.0)
+
+
 TANK_LAWS = {
     law.__name__: law
     for law in (
         hole,
         floor_hole,
         slot,
+        window,
         tapped,
         rectangular_weir,
         notched_weir,
+        brim,
         siphon,
         cycling_user,
         float_valve,
+        side_chamber,
+        splashing_in,
     )
 }
-STORAGE_LAWS = {"cone": cone, "block": block, "barrel": barrel}
+STORAGE_LAWS = {"cone": cone, "wedge": wedge, "block": block, "barrel": barrel, "heap": heap}

@@ -114,8 +114,7 @@ def judge_closure(truth: Mapping[str, Any], answer: Answer, plant: PlantDescript
     floor = truth["noise_rms_m"]["holdout"]
     square = math.fsum(f * f for f in floor) / len(floor)
     left, gap = ((closure[k] * metres) ** 2 - square for k in ("augmented", "recalibrated"))
-    a = truth.get("colour", 0.0)
-    error = square * math.sqrt(2 / (HELD_OUT * len(floor)) * (1 + a * a) / (1 - a * a))
+    error = square * math.sqrt(2 / (HELD_OUT * len(floor)) * truth.get("repeats", 1.0))
     if gap < 5 * error:
         return {}
     if closure.get("closed") is None:
