@@ -14,13 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdi_torch.gap.challenge import challenge
+from fdi_torch.gap.challenge import challenge, joined, tables
 from fdi_torch.gap.challenge.baselines import always_null
+from fdi_torch.gap.challenge.calibration import calibration
 from fdi_torch.gap.challenge.cases import Case, plans
 from fdi_torch.gap.challenge.files import manifest, open_key, read_recording, write_cases
-from fdi_torch.gap.challenge.intervals import clopper_pearson, mean_interval
+from fdi_torch.gap.challenge.intervals import clopper_pearson, mean_interval, median_interval
 from fdi_torch.gap.challenge.plants import three_tank
+from fdi_torch.gap.challenge.rows import write_rows
 from fdi_torch.gap.challenge.score import by_effect, judge, summary, utility
+from fdi_torch.jobs.challenge import LOG, conclude
+from fdi_torch.logbook import read_run
 from fdi_torch.recording import Recording
 
 RIG = three_tank()
@@ -101,7 +105,9 @@ class Counting:
 
 
 def run(out: Path, diagnose: Callable[..., dict[str, Any]], **options: Any) -> dict[str, Any]:
-    return challenge(3, 1, out, diagnose, kinds=("single", "null"), **options)
+    """Scores by diagnosis and stratum."""
+    rows = challenge(3, 1, out, diagnose, kinds=("single", "null"), **options)
+    return {name: scores["strata"] for name, scores in tables(rows).get("three_tank", {}).items()}
 
 
 def test_scores_and_baselines_of_a_small_challenge(tmp_path: Path) -> None:
@@ -113,8 +119,6 @@ def test_scores_and_baselines_of_a_small_challenge(tmp_path: Path) -> None:
     assert scores["always_null"]["all"]["right"]["hits"] == 2
     assert scores["shy"]["all"]["right"] == scores["always_null"]["all"]["right"]
     assert scores["random"]["all"]["right"]["of"] == 3
-    assert json.loads((tmp_path / "scores.json").read_text())["fdi"]["single"]["cases"] == 2
-    assert "| single | 1/2 (1 .. 99 %) |" in (tmp_path / "scores.md").read_text()
 
 
 def test_an_interrupted_challenge_resumes(tmp_path: Path) -> None:
@@ -130,9 +134,15 @@ def test_an_interrupted_challenge_resumes(tmp_path: Path) -> None:
 
 def test_out_of_time_it_scores_what_is_answered_and_goes_on_later(tmp_path: Path) -> None:
     first = Counting()
-    scores = run(sealed(tmp_path), first, minutes=0.0)
-    assert first.calls == 0 and scores["fdi"] == {"all": {"cases": 0}, "by_effect": {}}
+    assert run(sealed(tmp_path), first, minutes=0.0) == {} and first.calls == 0
     assert run(tmp_path, first)["fdi"]["all"]["cases"] == first.calls == 3
+
+
+def test_it_says_how_far_it_is_and_how_long_it_will_take(tmp_path: Path) -> None:
+    said: list[tuple[float, str]] = []
+    run(sealed(tmp_path), Counting(), tell=lambda share, text: said.append((share, text)))
+    assert [share for share, _ in said] == pytest.approx([n / 9 for n in range(1, 10)])
+    assert said[-1][1].endswith("9 of 9 answers, 0 s left") and "fdi says named of case0001" in said[0][1]
 
 
 def test_a_crash_is_a_wrong_answer_and_ends_nothing(tmp_path: Path) -> None:
@@ -150,6 +160,50 @@ def test_the_effect_to_leave_out_reaches_the_diagnosis(tmp_path: Path) -> None:
 def test_another_challenge_in_the_same_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="take another folder"):
         challenge(3, 2, sealed(tmp_path), Counting(), kinds=("single", "null"))
+
+
+def row(kind: str, right: bool, seed: int = 1, index: int = 0, **more: Any) -> dict[str, Any]:
+    about = {"by": "fdi", "rig": "three_tank", "seed": seed, "index": index, "case": f"case{index}", "kind": kind}
+    judged = {"right": right, "named_wrong": False, "truth": [["pump_lag", "Q1"]], "effect": "pump_lag", "causes": []}
+    return about | judged | {"verdict": "named", "utility": 1.0, "sec": 3.0} | more
+
+
+def folder(path: Path, *rows: dict[str, Any]) -> Path:
+    path.mkdir()
+    write_rows(path, rows)
+    return path
+
+
+def test_folders_join_into_one_table_a_rig(tmp_path: Path) -> None:
+    first = folder(tmp_path / "a", row("single", True), row("single", False, index=1))
+    second = folder(tmp_path / "b", row("single", True, seed=2), row("left_out", True), row("null", True, rig="other"))
+    found = tables(joined([first, second]))
+    assert list(found) == ["three_tank", "three_tank, effect left out", "other"]
+    assert found["three_tank"]["fdi"]["strata"]["single"]["right"]["of"] == 3
+
+
+def test_a_case_answered_again_counts_once_as_it_was_answered_last(tmp_path: Path) -> None:
+    first, second = (folder(tmp_path / name, row("single", name == "b")) for name in ("a", "b"))
+    assert tables(joined([first, second]))["three_tank"]["fdi"]["strata"]["all"]["right"]["hits"] == 1
+    assert tables(joined([second, first]))["three_tank"]["fdi"]["strata"]["all"]["right"]["hits"] == 0
+
+
+def test_a_folder_without_answers_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected a challenge's folder"):
+        joined([tmp_path])
+
+
+def test_what_is_concluded_stands_in_the_folder(tmp_path: Path) -> None:
+    rows = [row("single", True, stated=0.9, stated_right=True), row("single", False, index=1)]
+    found = conclude(tmp_path / "out", rows, {"join": ["a"]}, [])
+    assert conclude(tmp_path / "out", rows, {"join": ["a"]}, []) == found
+    assert json.loads((tmp_path / "out" / "scores.json").read_text()).keys() == {"three_tank"}
+    text = (tmp_path / "out" / "scores.md").read_text()
+    assert "| single | 1/2 (1 .. 99 %) |" in text and "| 0.8 to 0.95 | 0.900 | 1/1 (3 .. 100 %) |" in text
+    assert "| single | three_tank | 1 | case1 | pump_lag at Q1 | named |  |" in text
+    log = read_run(tmp_path / "out" / LOG)
+    assert [m.payload["truth"] for m in log.messages(["/challenge/case"])] == [["pump_lag@Q1"]] * 2
+    assert log.metadata["fdi_torch.result"]["three_tank.single.right"] == "1/2"
 
 
 @pytest.mark.parametrize(
@@ -214,6 +268,38 @@ def test_exact_intervals_are_the_tabled_ones() -> None:
     assert all(math.isnan(v) for v in mean_interval([]))
 
 
+def test_the_median_lies_between_order_statistics() -> None:
+    # The sign test's table: of 10 values the 2nd and the 9th hold the median in 97.9 % of samples.
+    assert median_interval([float(k) for k in range(10, 0, -1)]) == (5.5, 2.0, 9.0)
+    assert median_interval([3.0])[0] == 3.0 and math.isnan(median_interval([3.0])[1])
+    assert all(math.isnan(v) for v in median_interval([]))
+
+
+def test_calibration_counts_how_often_what_was_given_so_much_is_true() -> None:
+    rows = [{"stated": p, "stated_right": right} for p, right in ((0.9, True), (0.9, False), (1.0, True))]
+    found = calibration([*rows, {"verdict": "crash"}])
+    assert [(b["stated"], b["hits"], b["of"]) for b in found] == [(0.9, 1, 2), (1.0, 1, 1)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "truth", "best", "right"),
+    [
+        ("single", [LAG], {"causes": [LAG]}, True),
+        ("single", [LAG], {"causes": [LAG, WIDER]}, False),
+        ("messy", [LAG], {"causes": [LAG, WIDER]}, True),
+        ("null", [], {"causes": []}, True),
+        ("unknown", [{"effect": "unknown", "location": "Q1"}], {"causes": [], "unknown_at": "Q1"}, True),
+        ("unknown", [{"effect": "unknown", "location": "Q1"}], {"causes": [], "unknown_at": "T1"}, False),
+    ],
+)
+def test_the_best_explanation_is_judged_beside_its_probability(
+    kind: str, truth: list[dict[str, str]], best: dict[str, Any], right: bool
+) -> None:
+    weaker = {"causes": [DELAY], "probability": 0.1}
+    row = judged(kind, truth, named(LAG) | {"posterior": [weaker, best | {"probability": 0.8}]})
+    assert (row["stated"], row["stated_right"]) == (0.8, right)
+
+
 def protocol_judge() -> Callable[..., dict[str, Any]]:
     for folder in Path(__file__).resolve().parents:
         path = folder / "shared" / "score_practice.py"
@@ -263,7 +349,6 @@ def test_scores_agree_with_the_protocols_scorer() -> None:
 
 @pytest.mark.slow
 def test_a_challenge_from_end_to_end(tmp_path: Path) -> None:
-    scores = challenge(9, 5, tmp_path, Counting())
-    assert scores["fdi"]["all"]["cases"] == 9
-    again = challenge(9, 5, tmp_path, Counting(RuntimeError, at=1))
-    assert again == scores
+    rows = challenge(9, 5, tmp_path, Counting())
+    assert len([r for r in rows if r["by"] == "fdi"]) == 9
+    assert challenge(9, 5, tmp_path, Counting(RuntimeError, at=1)) == rows

@@ -24,6 +24,7 @@ EVENTS = (
     "/gap/verdict",
     "/study/trial",
     "/study/summary",
+    "/challenge/case",
     "/log",
 )
 MOST_EVENTS = 100_000

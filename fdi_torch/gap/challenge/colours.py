@@ -9,7 +9,7 @@ import numpy as np
 from fdi_torch.gap.challenge.moment import Array
 
 LONGEST = 120
-_AT = np.arange(LONGEST)
+_AT = np.arange(LONGEST, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ WHITE = Colour("white")
 
 def autoregressive(coefficient: float) -> Colour:
     """e_i = a e_(i-1) + w_i."""
-    return _of_unit_energy("autoregressive", coefficient**_AT)
+    return _of_unit_energy("autoregressive", np.power(coefficient, _AT))
 
 
 def smoothed(samples: int) -> Colour:

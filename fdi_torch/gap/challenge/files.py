@@ -4,6 +4,8 @@ spec.json          what was asked for: seed, kinds, rig
 cases/caseNNNN_recording.csv.gz, cases/caseNNNN_holdout.csv.gz: the SHA-256 of the sealed key stands above the header
 manifest.jsonl     a line a case: SHA-256 of both recordings and of the sealed key
 key.jsonl          a line a case: the truth; opened after the diagnosis
+answers_WHO.jsonl  a line a case: what was answered, in how many seconds, by which state of the code
+rows.jsonl         a line an answer: how it was judged; see `rows`
 """
 
 from __future__ import annotations
@@ -102,6 +104,10 @@ def read_recording(out: Path, line: Mapping[str, Any], part: str, rig: Rig) -> R
             "it was changed after it was sealed: make the challenge anew"
         )
     return replace(found, source=f"{case}/{part}")
+
+
+def answers(out: Path, name: str) -> Path:
+    return out / f"answers_{name}.jsonl"
 
 
 def manifest(out: Path) -> dict[str, dict[str, Any]]:

@@ -25,6 +25,18 @@ def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
     return low, high
 
 
+def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Median and the order statistics that hold it in 95 % of samples of any distribution; NaN where there are few."""
+    ranked, n = sorted(values), len(values)
+    if not ranked:
+        return math.nan, math.nan, math.nan
+    median = 0.5 * (ranked[(n - 1) // 2] + ranked[n // 2])
+    outside = [k for k in range(1, n // 2 + 1) if 1 - binomial_tail(k, n, 0.5) <= 0.025]
+    if not outside:
+        return median, math.nan, math.nan
+    return median, ranked[outside[-1] - 1], ranked[n - outside[-1]]
+
+
 def _root(rising: Callable[[float], float]) -> float:
     """Where a function that rises on [0, 1] passes zero, by bisection."""
     low, high = 0.0, 1.0

@@ -52,7 +52,7 @@ def laminar_flow(s: Surroundings, at: str) -> Deviation:
     law = s.one_of("viscous_and_inertial", "reynolds_blend", "sharp_transition")
     kept = 1 - s.size(0.07, 0.22)
     if law == "sharp_transition":
-        return Deviation("laminar_flow", at, law, {"head": s.head(at, 0.6) / kept**2})
+        return Deviation("laminar_flow", at, law, {"head": s.head(at, 0.1 + 2 * (1 - kept))})
     ratio = (1 / kept - kept) ** 2 if law == "viscous_and_inertial" else np.arctanh(kept) ** -2
     return Deviation("laminar_flow", at, law, {"head": float(ratio) * s.head(at, 0.5)})
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fdi_torch.gap.challenge.moment import Array, Moment, Numbers
 
@@ -145,7 +146,7 @@ def slewing(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
     return 0.5 * (old + new), new
 
 
-def _irregular(time: float, period: Array) -> Array:
+def _irregular(time: float, period: Array) -> npt.NDArray[np.bool_]:
     """True for about a fourth of the time, in whiles that never repeat: two sines of incommensurate periods."""
     return np.sin(2 * np.pi * time / period) + np.sin(2 * np.pi * time / (0.618 * period) + 1.0) > 0.9
 

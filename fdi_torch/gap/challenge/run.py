@@ -14,20 +14,22 @@ from typing import Any
 from fdi_torch.gap.challenge.baselines import Diagnosis, always_null, random_pair
 from fdi_torch.gap.challenge.cases import make, plans
 from fdi_torch.gap.challenge.files import (
+    answers,
     append,
     lines_of,
     manifest,
-    open_key,
     read_recording,
     write_cases,
 )
 from fdi_torch.gap.challenge.kinds import STANDARD
 from fdi_torch.gap.challenge.plants import Rig, three_tank
-from fdi_torch.gap.challenge.score import Row, by_effect, judge, summary
-from fdi_torch.gap.challenge.table import markdown
+from fdi_torch.gap.challenge.rows import Row, judged
 
-Line = Mapping[str, Any]
-Each = Callable[[Callable[[Line], dict[str, Any]], Iterable[Line]], Iterable[dict[str, Any]]]
+Task = tuple[str, Mapping[str, Any]]
+"""Whose diagnosis, and a case's line of the manifest."""
+Done = tuple[str, dict[str, Any]]
+Each = Callable[[Callable[[Task], Done], Iterable[Task]], Iterable[Done]]
+Tell = Callable[[float, str], None]
 CHUNK = 200
 
 
@@ -44,25 +46,26 @@ def challenge(
     rivals: Mapping[str, Diagnosis] | None = None,
     each: Each = map,
     minutes: float = math.inf,
-    tell: Callable[[str], None] = lambda line: None,
-) -> dict[str, Any]:
-    """Scores `diagnose` and its rivals on `cases` recordings, kinds in turn; resumes where it was interrupted.
+    code: str = "",
+    tell: Tell = lambda share, text: None,
+) -> list[Row]:
+    """Has `diagnose` and its rivals answer `cases` recordings, kinds in turn; resumes where it was interrupted.
 
     diagnose(recording, holdout[, leave_out=(effect,)]) -> answer in the format `fdi_torch.gap/1`.
     library: effects that `diagnose` can name; those are not drawn as unknown.
     leave_out: effects to deny it, one a case.
-    rivals: further diagnoses scored beside the two without skill. each: map over cases, for example an executor's.
-    minutes: after which no further case is begun; what is answered by then is scored.
-    Returns {diagnosis: {stratum: scores}}; the same is in out/scores.json and .md, a row a case in out/rows_NAME.jsonl.
+    rivals: further diagnoses scored beside the two without skill. each: map over tasks, for example an executor's.
+    minutes: after which no further case is begun; what is answered by then is judged. code: state of the code that
+    answers, kept with each answer. tell(share, text): how far it is.
+    Returns a judged row an answer; see `rows`.
     """
     rig, out = rig or three_tank(), Path(out)
     kinds = ("left_out",) if leave_out else tuple(kinds)
-    seal(cases, seed, out, rig, kinds, library, leave_out, tell)
     stop = time.perf_counter() + 60 * minutes
-    diagnoses = {"always_null": always_null, "random": random_pair(rig.plant, seed), "fdi": diagnose, **(rivals or {})}
-    for name, each_diagnosis in diagnoses.items():
-        answer_all(name, each_diagnosis, cases, out, rig, each, stop, tell)
-    return score_all(tuple(diagnoses), cases, out, rig)
+    seal(cases, seed, out, rig, kinds, library, leave_out, tell)
+    diagnoses = {"fdi": diagnose, **(rivals or {}), "always_null": always_null, "random": random_pair(rig.plant, seed)}
+    answer_all(diagnoses, cases, out, rig, each, stop, code, tell)
+    return judged(tuple(diagnoses), cases, out, rig)
 
 
 def seal(
@@ -73,7 +76,7 @@ def seal(
     kinds: Sequence[str],
     library: Collection[str] = (),
     leave_out: Sequence[str] = (),
-    tell: Callable[[str], None] = lambda line: None,
+    tell: Tell = lambda share, text: None,
 ) -> None:
     """Makes what is missing of the first `cases` cases and seals it.
 
@@ -94,43 +97,56 @@ def seal(
     done = manifest(out)
     todo = [plan for plan in plans(cases, seed, kinds) if plan.name not in done]
     for at in range(0, len(todo), CHUNK):
+        tell(0.0, f"making {min(CHUNK, len(todo) - at)} recordings, about a minute")
         chunk, start = todo[at : at + CHUNK], time.perf_counter()
         write_cases(out, rig, make(chunk, rig, seed, library, leave_out), [token_hex(16) for _ in chunk])
-        tell(f"sealed {len(done) + at + len(chunk)} of {cases} cases, {time.perf_counter() - start:.0f} s")
+        tell(0.0, f"sealed {len(done) + at + len(chunk)} of {cases} cases in {time.perf_counter() - start:.0f} s")
 
 
 def answer_all(
-    name: str,
-    diagnose: Diagnosis,
+    diagnoses: Mapping[str, Diagnosis],
     cases: int,
     out: Path,
     rig: Rig,
     each: Each,
     stop: float,
-    tell: Callable[[str], None],
+    code: str,
+    tell: Tell,
 ) -> None:
-    """Diagnoses what has no answer yet, a JSON line a case, until the clock says `stop`. The key stays shut."""
-    path = out / f"answers_{name}.jsonl"
-    done = {line["case"] for line in lines_of(path)}
-    todo = [line for line in list(manifest(out).values())[:cases] if line["case"] not in done]
-    todo = todo if time.perf_counter() < stop else []
-    for n, line in enumerate(each(partial(answer, diagnose, out, rig), todo)):
-        append(path, json.dumps(line))
-        tell(f"{name} {len(done) + n + 1}/{cases} {line['case']} {line['answer'].get('verdict')} {line['sec']:.1f} s")
-        if time.perf_counter() > stop:
+    """Answers what has no answer yet, case by case, a JSON line each, until the clock says `stop`.
+
+    The key stays shut.
+    """
+    lines = list(manifest(out).values())[:cases]
+    known = {(name, line["case"]) for name in diagnoses for line in lines_of(answers(out, name))}
+    todo = [(name, line) for line in lines for name in diagnoses if (name, line["case"]) not in known]
+    start, total = time.perf_counter(), len(lines) * len(diagnoses)
+    todo = todo if start < stop else []
+    for n, (name, found) in enumerate(each(partial(answer, diagnoses, out, rig), todo), start=1):
+        append(answers(out, name), json.dumps(found | {"code": code}))
+        done, now = total - len(todo) + n, time.perf_counter()
+        left = min((now - start) / n * (len(todo) - n), max(stop - now, 0.0))
+        said = f"{name} says {found['answer'].get('verdict')} of {found['case']} in {found['sec']:.1f} s"
+        tell(done / total, f"{said}; {done} of {total} answers, {_span(left)} left")
+        if now > stop:
             break
 
 
-def answer(diagnose: Diagnosis, out: Path, rig: Rig, line: Line) -> dict[str, Any]:
-    """One case, by its line of the manifest; an exception of the diagnosis is an answer too, and a wrong one."""
+def _span(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
+def answer(diagnoses: Mapping[str, Diagnosis], out: Path, rig: Rig, task: Task) -> Done:
+    """One case by one of them; an exception of the diagnosis is an answer too, and a wrong one."""
+    name, line = task
     recording, holdout = (read_recording(out, line, part, rig) for part in ("recording", "holdout"))
     options = {"leave_out": tuple(line["leave_out"])} if line["leave_out"] else {}
     start = time.perf_counter()
     try:
-        found = diagnose(recording, holdout, **options)
+        found = diagnoses[name](recording, holdout, **options)
     except Exception as error:  # a crash is scored, not raised: one case must not end the challenge
         found = {"verdict": "crash", "error": f"{type(error).__name__}: {error}"}
-    return {"case": line["case"], "sec": round(time.perf_counter() - start, 3), "answer": without_nan(found)}
+    return name, {"case": line["case"], "sec": round(time.perf_counter() - start, 3), "answer": without_nan(found)}
 
 
 def without_nan(value: Any) -> Any:
@@ -140,25 +156,3 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [without_nan(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def score_all(names: Sequence[str], cases: int, out: Path, rig: Rig) -> dict[str, Any]:
-    """Opens the key, judges all answers."""
-    truths, scores = open_key(out), {}
-    for name in names:
-        wanted = set(list(manifest(out))[:cases])
-        rows = [
-            _row(line, truths[line["case"]], rig)
-            for line in lines_of(out / f"answers_{name}.jsonl")
-            if line["case"] in wanted
-        ]
-        (out / f"rows_{name}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-        scores[name] = summary(rows) | {"by_effect": by_effect(rows)}
-    (out / "scores.json").write_text(json.dumps(without_nan(scores), indent=1) + "\n")
-    (out / "scores.md").write_text(markdown(scores) + "\n")
-    return scores
-
-
-def _row(line: Mapping[str, Any], truth: Mapping[str, Any], rig: Rig) -> Row:
-    judged = judge(truth, line["answer"], rig.plant)
-    return {"case": line["case"], "sec": line["sec"], "gap_rms_m": truth["gap_rms_m"]["recording"]} | judged

@@ -7,7 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from fdi_torch.gap.challenge.conditions import HELD_OUT
-from fdi_torch.gap.challenge.intervals import clopper_pearson, mean_interval
+from fdi_torch.gap.challenge.intervals import clopper_pearson, mean_interval, median_interval
+from fdi_torch.gap.challenge.kinds import KINDS
 from fdi_torch.gap.challenge.places import Cause, canonical, effect_places
 from fdi_torch.parameters import unit_factor
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
@@ -25,7 +26,8 @@ SHARES = (
     "closed_within",
     "crash",
 )
-MEANS = ("utility", "set_size", "closed_error", "sec")
+MEANS = ("utility", "set_size", "sec")
+MEDIANS = ("closed_error", "sec")
 
 
 def utility(answer: Collection[Cause], truth: Collection[Cause], pairs: int) -> float:
@@ -60,6 +62,7 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
         "causes": causes,
         "set_size": len(sets),
         "crash": verdict == "crash",
+        **_stated(kind, true, answer, plant),
         "utility": expected_utility(answer, sets, [] if nameless else true, plant),
     }
     if kind == "null":
@@ -72,6 +75,21 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
         return row | _judge_messy(true[0], causes, verdict)
     tolerated = verdict == "no_gap" and true in [[("leak", p.source)] for p in plant.pipes if p.target == OUTSIDE]
     return row | _judge_named(true, causes, sets, verdict, tolerated)
+
+
+def _stated(kind: str, true: list[Cause], answer: Answer, plant: PlantDescription) -> Row:
+    """The probability that the best explanation was given, and whether it is the true one."""
+    best = max(answer.get("posterior") or [], key=lambda x: float(x["probability"]), default=None)
+    if best is None:
+        return {}
+    causes, unknown_at = _causes(best["causes"], plant), best.get("unknown_at")
+    if kind in ("unknown", "left_out"):
+        right = unknown_at == true[0][1]
+    elif kind == "messy":
+        right = not unknown_at and true[0] in causes
+    else:
+        right = not unknown_at and sorted(causes) == sorted(true)
+    return {"stated": float(best["probability"]), "stated_right": right}
 
 
 def _judge_nameless(true: list[Cause], verdict: Any, where: list[str]) -> Row:
@@ -129,7 +147,7 @@ def _causes(listed: Any, plant: PlantDescription) -> list[Cause]:
 
 def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     """Scores by stratum and over all: shares with exact 95 % intervals, means with normal ones."""
-    strata = {kind: [r for r in rows if r["kind"] == kind] for kind in dict.fromkeys(r["kind"] for r in rows)}
+    strata = {kind: own for kind in KINDS if (own := [r for r in rows if r["kind"] == kind])}
     return {name: _stratum(of) for name, of in (*strata.items(), ("all", list(rows)))}
 
 
@@ -150,10 +168,10 @@ def _stratum(rows: Sequence[Row]) -> dict[str, Any]:
         values = [float(r[name]) for r in rows if r.get(name) is not None]
         if values:
             mean, low, high = mean_interval(values)
-            out[name] = {
-                "of": len(values),
-                "mean": mean,
-                "ci95": [low, high],
-                "median": sorted(values)[len(values) // 2],
-            }
+            out[name] = {"of": len(values), "mean": mean, "ci95": [low, high]}
+    for name in MEDIANS:
+        values = [float(r[name]) for r in rows if r.get(name) is not None]
+        if values:
+            median, low, high = median_interval(values)
+            out[f"median_{name}"] = {"of": len(values), "median": median, "ci95": [low, high]}
     return out

@@ -1,52 +1,121 @@
-"""Scores as a table in Markdown."""
+"""Scores as tables: on the screen, on a page, and in Markdown."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-SHOWN = {
+from fdi_torch.gap.challenge.rows import Scores, Tables
+from fdi_torch.gap.challenge.score import Row
+
+OWN = "fdi"
+NAMES = {
     "right": "right",
     "in_set": "truth in the answer set",
     "place": "right place",
     "named_wrong": "named and wrong",
-    "closed_within": "`closed` within 3 points",
-    "utility": "utility",
+}
+SIZES = {
+    "false_alarm": "false alarm",
+    "detected": "detected",
     "set_size": "explanations",
+    "closed_within": "`closed` within 3 points",
+    "median_closed_error": "median error of `closed`",
+    "utility": "utility",
     "sec": "s a case",
 }
+MOST_MISSES = 200
 
 
-def markdown(scores: Mapping[str, Any], name: str = "fdi") -> str:
-    """A line a stratum: hits of cases and the 95 % interval in per cent; means with theirs; then the baselines."""
-    strata = [s for s in scores[name] if s != "by_effect"]
-    rows = [[s, *(in_words(scores[name][s].get(column)) for column in SHOWN)] for s in strata]
-    others = [other for other in scores if other != name]
-    beside = [[s, *(in_words(scores[other].get(s, {}).get("right")) for other in (name, *others))] for s in strata]
-    effects = scores[name].get("by_effect", {})
-    each = [[e, *(in_words(effects[e].get(column)) for column in ("right", "in_set", "named_wrong"))] for e in effects]
-    return "\n\n".join(
+@dataclass(frozen=True)
+class Sheet:
+    """A table: words about it, and rows under a header; the first `left` columns are words."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left: int = 1
+
+
+def sheets(by: Mapping[str, Scores]) -> list[Sheet]:
+    """All scores of one rig: whose answers -> scores."""
+    own, others = by[OWN], [name for name in by if name != OWN]
+    strata = own["strata"]
+    beside = [[s, *(in_words(by[n]["strata"].get(s, {}).get("right")) for n in (OWN, *others))] for s in strata]
+    over_all = [
+        [name, *(in_words(by[name]["strata"]["all"].get(c)) for c in (*NAMES, "utility"))] for name in (OWN, *others)
+    ]
+    found = [
+        Sheet("Names and places, by kind", ("kind", *NAMES.values()), _rows(strata, NAMES)),
+        Sheet("Alarm, answer set, closure, utility and time, by kind", ("kind", *SIZES.values()), _rows(strata, SIZES)),
+        Sheet("Right answers beside those of the baselines", ("kind", OWN, *others), beside),
+        Sheet("All kinds together, beside the baselines", ("", *NAMES.values(), "utility"), over_all),
+        Sheet(
+            "How often the best explanation is the true one, by the probability that it was given",
+            ("probability given", "mean", "is true"),
+            [[f"{b['low']:g} to {b['high']:g}", f"{b['stated']:.3f}", in_words(b)] for b in own["calibration"]],
+        ),
+        Sheet(
+            "Cases with one cause, by effect; those without a name by the law that the rig follows",
+            ("effect", *NAMES.values()),
+            _rows(own["by_effect"], NAMES),
+        ),
+    ]
+    return [sheet for sheet in found if sheet.rows]
+
+
+def misses(rows: Iterable[Row]) -> Sheet:
+    """Every case of ours that was not right."""
+    wrong = [row for row in rows if row["by"] == OWN and not row["right"]]
+    return Sheet(
+        "Not right",
+        ("kind", "rig", "seed", "case", "truth", "verdict", "best explanation"),
         [
-            _table(["kind", *SHOWN.values()], rows),
-            "Right answers beside those of the baselines:",
-            _table(["kind", name, *others], beside),
-            "Cases with one cause, by effect; those without a name by the law that the rig follows:",
-            _table(["effect", "right", "truth in the answer set", "named and wrong"], each),
-        ]
+            [r["kind"], r["rig"], str(r["seed"]), r["case"], _truth(r), r["verdict"], listed(r["causes"])]
+            for r in wrong[:MOST_MISSES]
+        ],
+        left=7,
     )
 
 
+def listed(causes: Iterable[Sequence[str]]) -> str:
+    return " + ".join(f"{effect} at {place}" for effect, place in causes)
+
+
+def _truth(row: Row) -> str:
+    """Causes by name; what has none by its law."""
+    return listed((row["effect"] if e == "unknown" else e, p) for e, p in row["truth"]) or "nothing"
+
+
+def markdown(found: Tables, rows: Sequence[Row]) -> str:
+    """All tables of all rigs, then every miss."""
+    parts = []
+    for group, by in found.items():
+        parts.append(f"## {group}")
+        for sheet in sheets(by):
+            parts += [f"{sheet.title}:", _table(sheet)]
+    missed = misses(rows)
+    return "\n\n".join([*parts, f"## {missed.title}", _table(missed)] if missed.rows else parts) + "\n"
+
+
 def in_words(score: Mapping[str, Any] | None) -> str:
+    """Hits of cases and the interval in per cent; a mean or a median with its interval."""
     if not score:
         return ""
     low, high = score["ci95"]
     if "share" in score:
         return f"{score['hits']}/{score['of']} ({100 * low:.0f} .. {100 * high:.0f} %)"
-    if low is None or low != low or score["of"] < 2:
-        return f"{score['mean']:.3g}"
-    return f"{score['mean']:.3g} ({low:.3g} .. {high:.3g})"
+    value = score["mean"] if "mean" in score else score["median"]
+    if low is None or low != low:
+        return f"{value:.2g}"
+    return f"{value:.3g} ({low:.3g} .. {high:.3g})"
 
 
-def _table(header: list[str], rows: list[list[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
+def _rows(strata: Mapping[str, Mapping[str, Any]], columns: Iterable[str]) -> list[list[str]]:
+    return [[name, *(in_words(scores.get(column)) for column in columns)] for name, scores in strata.items()]
+
+
+def _table(sheet: Sheet) -> str:
+    lines = [sheet.header, ["---"] * len(sheet.header), *sheet.rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)

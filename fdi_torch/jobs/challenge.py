@@ -1,0 +1,54 @@
+"""What is kept of a withheld check: judged answers, scores as JSON and as Markdown, and a log for the page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fdi_torch.gap.challenge import Row, Tables, tables
+from fdi_torch.gap.challenge.rows import write_rows
+from fdi_torch.gap.challenge.run import without_nan
+from fdi_torch.gap.challenge.table import OWN, markdown
+from fdi_torch.logbook import RunLog
+from fdi_torch.recordings.csv_files import file_sha256
+
+LOG = "challenge.mcap"
+
+
+def conclude(out: Path, rows: Sequence[Row], config: Mapping[str, Any], sources: Iterable[Path] = ()) -> Tables:
+    """Scores of all rows, written into `out` as rows.jsonl, scores.json, scores.md and challenge.mcap.
+
+    config: what was asked for. sources: files that the rows come from; their hashes go into the log.
+    """
+    data = [{"path": str(path), "sha256": file_sha256(path)} for path in sources]
+    found = tables(rows)
+    out.mkdir(parents=True, exist_ok=True)
+    write_rows(out, rows)
+    (out / "scores.json").write_text(json.dumps(without_nan(found), indent=1) + "\n", encoding="utf-8")
+    (out / "scores.md").write_text(markdown(found, rows), encoding="utf-8")
+    _log(out / LOG, rows, found, config, data)
+    return found
+
+
+def _log(
+    path: Path, rows: Sequence[Row], found: Tables, config: Mapping[str, Any], data: Sequence[Mapping[str, Any]]
+) -> None:
+    """A message an answer, in the order of the rows; an earlier log of the same folder is replaced."""
+    path.unlink(missing_ok=True)
+    seeds = {f"challenge_{k + 1}": seed for k, seed in enumerate(sorted({int(row["seed"]) for row in rows}))}
+    with RunLog(path, "challenge", config=config, seeds=seeds, data=data) as log:
+        for number, row in enumerate(rows):
+            log.write("/challenge/case", _message(row), number)
+        for group, by in found.items():
+            log.result({group: {name: _hits(score) for name, score in by[OWN]["strata"].items()}})
+
+
+def _message(row: Row) -> dict[str, Any]:
+    named = {key: [f"{effect}@{place}" for effect, place in row[key]] for key in ("truth", "causes")}
+    return {key: value for key, value in row.items() if value is not None} | named
+
+
+def _hits(score: Mapping[str, Any]) -> dict[str, str]:
+    return {n: f"{s['hits']}/{s['of']}" for n, s in score.items() if isinstance(s, Mapping) and "hits" in s}
