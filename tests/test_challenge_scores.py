@@ -202,7 +202,7 @@ def test_what_is_concluded_stands_in_the_folder(tmp_path: Path) -> None:
     assert "| single | 1/2 (1 .. 99 %) |" in text and "| 0.8 to 0.95 | 0.900 | 1/1 (3 .. 100 %) |" in text
     assert "| single | three_tank | 1 | case1 | pump_lag at Q1 | named |  |" in text
     log = read_run(tmp_path / "out" / LOG)
-    assert [m.payload["truth"] for m in log.messages(["/challenge/case"])] == [["pump_lag@Q1"]] * 2
+    assert [m.payload["truth"] for m in log.messages(["/study/trial"])] == [["pump_lag@Q1"]] * 2
     assert log.metadata["fdi_torch.result"]["three_tank.single.right"] == "1/2"
 
 

@@ -35,19 +35,20 @@ def conclude(out: Path, rows: Sequence[Row], config: Mapping[str, Any], sources:
 def _log(
     path: Path, rows: Sequence[Row], found: Tables, config: Mapping[str, Any], data: Sequence[Mapping[str, Any]]
 ) -> None:
-    """A message an answer, in the order of the rows; an earlier log of the same folder is replaced."""
+    """A trial an answer, in the order of the rows, its kind as its group; an earlier log is replaced."""
     path.unlink(missing_ok=True)
     seeds = {f"challenge_{k + 1}": seed for k, seed in enumerate(sorted({int(row["seed"]) for row in rows}))}
     with RunLog(path, "challenge", config=config, seeds=seeds, data=data) as log:
         for number, row in enumerate(rows):
-            log.write("/challenge/case", _message(row), number)
+            log.trial(number, _fields(row), group=row["kind"], seed=row["seed"], status=row["verdict"])
         for group, by in found.items():
             log.result({group: {name: _hits(score) for name, score in by[OWN]["strata"].items()}})
 
 
-def _message(row: Row) -> dict[str, Any]:
+def _fields(row: Row) -> dict[str, Any]:
+    """What is not None of the row, causes as texts, less what the message of a trial says anyway."""
     named = {key: [f"{effect}@{place}" for effect, place in row[key]] for key in ("truth", "causes")}
-    return {key: value for key, value in row.items() if value is not None} | named
+    return {k: v for k, v in row.items() if v is not None and k not in ("kind", "seed", "verdict")} | named
 
 
 def _hits(score: Mapping[str, Any]) -> dict[str, str]:

@@ -178,23 +178,6 @@ TOPICS: dict[str, Topic] = {
         {"group": ("text", "", "setting"), "trials": ("integer", "", "how many")},
         named=True,
     ),
-    "/challenge/case": Topic(
-        "fdi_torch.challenge_case",
-        "one answer of the withheld check, judged; true or false where a score applies",
-        {
-            "by": ("text", "", "whose answer"),
-            "rig": ("text", "", "hidden rig"),
-            "seed": ("integer", "", "of the challenge"),
-            "case": ("text", "", "its name"),
-            "kind": ("text", "", "stratum"),
-            "truth": ("texts", "", "effect@location"),
-            "verdict": ("text", "", "no_gap, named, ambiguous, unknown or crash"),
-            "causes": ("texts", "", "effect@location of the best explanation"),
-            "stated": ("number", "1", "probability that the best explanation was given"),
-            "sec": ("number", "s", "time it took"),
-        },
-        named=True,
-    ),
     "/log": Topic(
         "foxglove.Log",
         "what was said during the run",

@@ -24,7 +24,6 @@ EVENTS = (
     "/gap/verdict",
     "/study/trial",
     "/study/summary",
-    "/challenge/case",
     "/log",
 )
 MOST_EVENTS = 100_000
