@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from fdi_torch.effects import build_network
+from fdi_torch.gap.challenge import cases
 from fdi_torch.gap.challenge.built import WIDEST, as_built
 from fdi_torch.gap.challenge.cases import make, plans
 from fdi_torch.gap.challenge.colours import Colour, autoregressive, rippling, smoothed
@@ -358,3 +359,15 @@ def test_full_effects_show_and_stay_in_the_tanks(rig: Rig) -> None:
         quantised = truth["causes"] and truth["causes"][0]["effect"] == "sensor_quantization"
         assert np.isfinite(case.readings[0]).all()
         assert gap == 0 if truth["kind"] == "null" or quantised else gap > 0.05 * rig.noise_unit
+
+
+def test_a_cause_that_another_hides_is_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A weir above all levels, beside a leak."""
+    rig, plan = three_tank(), plans(1, 1, ("pair",))
+    shows = Deviation("leak", "T1", "floor_hole", {"conductance": 3e-5})
+    never = Deviation("overflow", "T3", "brim", {"crest": 0.99, "depth": 0.01, "flow": 7e-5})
+    monkeypatch.setattr(cases, "_deviations", lambda *_: (shows, never))
+    monkeypatch.setattr(cases, "STEP", 0.5)
+    truth = make(plan, rig, 1)[0].truth
+    assert truth["causes"] == [{"effect": "leak", "location": "T1"}]
+    assert [d["effect"] for d in truth["deviations"]] == ["leak", "overflow"]

@@ -22,7 +22,8 @@ def kind_words(material: Material) -> str:
 
 def headline(material: Material) -> str:
     """The verdict; how the run ended where it has none."""
-    for words in (gap_words(material), fault_words(findings(material)), alarm_words(material), study_words(material)):
+    said = (gap_words, lambda m: fault_words(findings(m)), alarm_words, challenge_words, study_words)
+    for words in (of(material) for of in said):
         if words:
             return words
     return material.about("status").get("status", "did not end").replace("_", " ").capitalize()
@@ -59,6 +60,14 @@ def alarm_words(material: Material) -> str:
     channels = _listed(list(dict.fromkeys(str(m["channel"]) for m in alarms if m.get("channel"))))
     first = f"the first at {number(float(alarms[0]['t']), 6)} s"
     return f"{len(alarms)} alarm{'s' if len(alarms) > 1 else ''}, {first}{': ' + channels if channels else ''}"
+
+
+def challenge_words(material: Material) -> str:
+    answers = [m for m in material.of("/study/trial") if m.get("by") == "fdi"] if material.kind == "challenge" else []
+    if not answers:
+        return ""
+    right, wrong = (sum(bool(m.get(name)) for m in answers) for name in ("right", "named_wrong"))
+    return f"{right} of {len(answers)} hidden causes told right, {wrong or 'none'} named and wrong"
 
 
 def study_words(material: Material) -> str:

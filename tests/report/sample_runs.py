@@ -188,3 +188,24 @@ def write_study(path: Path) -> Path:
         log.result({"isolation": {"labels": ["none", "T1.leak"], "trials": 40, "right": 38, "missed": 2, "false": 0}})
         log.result_arrays(confusion=[[20, 0], [2, 18]])
     return path
+
+
+def write_challenge(path: Path) -> Path:
+    """Judged answers of two rigs by three diagnoses; the names of one case try to break the page."""
+    kinds, effects = (
+        ("single", "unknown", "null", "pair", "left_out"),
+        ("pump_lag", "leak", "laminar_flow", "sensor_bias"),
+    )
+    rng = np.random.default_rng(4)
+    with RunLog(path, "challenge", **FIXED) as log:
+        for n in range(120):
+            kind, effect, right = kinds[n % 5], effects[n // 5 % 4], bool(rng.random() < 0.8)
+            truth = [f"{effect}@Q1"] * (kind != "null") + ["overflow@T2"] * (kind == "pair")
+            about = {"by": ("fdi", "fdi", "random", "one_at_a_time_bic")[n % 4], "rig": ("three_tank", NASTY)[n > 100]}
+            about |= {"case": f"case{n}", "index": n, "truth": truth, "causes": truth if right else ["leak@T1"]}
+            about |= {"effect": effect if kind != "null" else "none", "stated": 0.7 + 0.3 * rng.random()}
+            judged = {"right": right, "named_wrong": not right and kind != "null", "stated_right": right}
+            numbers = {"utility": 0.9, "sec": 2.0 + 3.0 * rng.random(), "closed_error": 0.01 * rng.random()}
+            verdict = "named" if kind != "unknown" else "unknown"
+            log.trial(n, {**about, **judged, **numbers}, group=kind, seed=1, status=verdict)
+    return path

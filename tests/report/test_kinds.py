@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sample_runs import GAP_ANSWER, material_of, write_gap, write_monitor, write_study
+from sample_runs import GAP_ANSWER, NASTY, material_of, write_challenge, write_gap, write_monitor, write_study
 
 from fdi_torch.config import load_plant
 from fdi_torch.logbook import RunLog
@@ -95,6 +95,17 @@ def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
     assert titles(made)[1:4] == ["Settings", "Isolation", "Errors"]
     assert {"trials_1", "errors_2", "isolation"} <= names(made) and ">T1.leak<" in page([made])
     assert "38 of 40 modes stated as they are; 2 faults missed" in page([made]) and "none (10 %)" in page([made])
+
+
+def test_a_challenge_page_shows_scores_confusion_and_misses(tmp_path: Path) -> None:
+    made = report(write_challenge, tmp_path)
+    assert headline(made.material) == "45 of 60 hidden causes told right, 13 named and wrong"
+    assert titles(made)[1:4] == ["Right answers", "What was named for what", "Not right"]
+    assert "Trials" not in titles(made)
+    assert {"challenge_1_right", "challenge_1_sure", "challenge_1_seconds", "challenge_4_seconds"} <= names(made)
+    assert {"challenge_confusion_1", "challenge_unknown", "challenge_left_out"} <= names(made)
+    text = page([made])
+    assert "cannot be shown" not in text and NASTY not in text and "three_tank, effect left out" in text
 
 
 def test_several_runs_share_a_page(tmp_path: Path) -> None:

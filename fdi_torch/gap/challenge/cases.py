@@ -18,7 +18,7 @@ from fdi_torch.gap.challenge.conditions import (
     levels_at_rest,
 )
 from fdi_torch.gap.challenge.inputs import channel_to_rest
-from fdi_torch.gap.challenge.kinds import FAINT, KINDS, Chosen, case_generator, choose
+from fdi_torch.gap.challenge.kinds import FAINT, KINDS, Chosen, Kind, case_generator, choose
 from fdi_torch.gap.challenge.known import KNOWN
 from fdi_torch.gap.challenge.laws_sensor import READOUT_LAWS, SENSOR_LAWS
 from fdi_torch.gap.challenge.moment import Array, Deviation
@@ -27,6 +27,10 @@ from fdi_torch.gap.challenge.simulator import STEP, HiddenRigs, grouped, simulat
 from fdi_torch.gap.challenge.surroundings import Surroundings
 from fdi_torch.plant.description import PlantDescription
 
+Off = tuple[Deviation, ...]
+"""What is off at a rig."""
+HIDDEN = 0.03
+"""Share of the noise below which the lack of a cause does not show: it is then not asked for."""
 PARTS = (("recording", RECORDED), ("holdout", HELD_OUT))
 
 
@@ -80,11 +84,8 @@ def make(
     drawn = [_conditions(p, c, rig, seed, rest) for p, c in zip(todo, chosen, strict=True)]
     conditions, sound = kept_below_the_rim(rig, drawn)
     deviations = [_deviations(plan, chosen[i], conditions[i], rig, sound[:, :, i], seed) for i, plan in enumerate(todo)]
-    levels = _run(rig, conditions, deviations)
-    return [
-        _read(plan, chosen[i], conditions[i], deviations[i], rig, levels[:, :, 4 * i : 4 * i + 4], seed)
-        for i, plan in enumerate(todo)
-    ]
+    runs = _run(rig, conditions, [_runs_of(KINDS[p.kind], d) for p, d in zip(todo, deviations, strict=True)])
+    return [_read(plan, chosen[i], conditions[i], deviations[i], rig, runs[i], seed) for i, plan in enumerate(todo)]
 
 
 def _conditions(plan: Plan, chosen: Chosen, rig: Rig, seed: int, rest: Array) -> Conditions:
@@ -94,9 +95,7 @@ def _conditions(plan: Plan, chosen: Chosen, rig: Rig, seed: int, rest: Array) ->
     return draw_conditions(rig, rng, kind.inputs, kind.coloured, rest, resting)
 
 
-def _deviations(
-    plan: Plan, chosen: Chosen, conditions: Conditions, rig: Rig, sound: Array, seed: int
-) -> tuple[Deviation, ...]:
+def _deviations(plan: Plan, chosen: Chosen, conditions: Conditions, rig: Rig, sound: Array, seed: int) -> Off:
     kind, asked = KINDS[plan.kind], asked_of_pumps(conditions.built, conditions.commands[0])
     rng = case_generator(seed, plan.kind, plan.index, 4)
 
@@ -110,54 +109,56 @@ def _deviations(
     return tuple(KNOWN[effect](surroundings(strength), place) for (effect, place), strength in pairs)
 
 
-def _run(rig: Rig, conditions: Sequence[Conditions], deviations: Sequence[tuple[Deviation, ...]]) -> Array:
-    """Levels (T, N, 4 cases) m: recording and hold-out of the rig as it is, then of the same rig with nothing wrong."""
-    asked = np.empty((RECORDED, len(rig.plant.pumps), 4 * len(conditions)))
-    starts, built, lanes = [], [], []
-    for i, c in enumerate(conditions):
-        for j, commands in enumerate((*c.commands, *c.commands)):
-            flow = asked_of_pumps(c.built, commands)
-            asked[:, :, 4 * i + j] = flow[np.minimum(np.arange(RECORDED), len(flow) - 1)]
-        starts += [c.starts[0], c.starts[1]] * 2
-        built += [c.built] * 4
-        lanes += [deviations[i]] * 2 + [()] * 2
-    return simulate(HiddenRigs(built, lanes), asked, np.stack(starts, axis=-1), STEP)
+def _runs_of(kind: Kind, deviations: Off) -> list[tuple[int, Off]]:
+    """Which part is run with what: both as the rig is, both with nothing wrong; the recording without each of several
+    full causes."""
+    without = [(0, (*deviations[:k], *deviations[k + 1 :])) for k in range(kind.causes if kind.causes > 1 else 0)]
+    return [(0, deviations), (1, deviations), (0, ()), (1, ()), *without]
+
+
+def _run(rig: Rig, conditions: Sequence[Conditions], runs: Sequence[Sequence[tuple[int, Off]]]) -> list[Array]:
+    """Levels (T, N, runs) m of each case."""
+    every = [(c, part, off) for c, own in zip(conditions, runs, strict=True) for part, off in own]
+    flows = [asked_of_pumps(c.built, c.commands[part]) for c, part, _ in every]
+    asked = np.stack([q[np.minimum(np.arange(RECORDED), len(q) - 1)] for q in flows], axis=-1)
+    starts = np.stack([c.starts[part] for c, part, _ in every], axis=-1)
+    levels = simulate(HiddenRigs([c.built for c, _, _ in every], [off for _, _, off in every]), asked, starts, STEP)
+    return np.split(levels, np.cumsum([len(own) for own in runs])[:-1], axis=-1)
 
 
 def _read(
-    plan: Plan,
-    chosen: Chosen,
-    conditions: Conditions,
-    deviations: tuple[Deviation, ...],
-    rig: Rig,
-    levels: Array,
-    seed: int,
+    plan: Plan, chosen: Chosen, conditions: Conditions, deviations: Off, rig: Rig, levels: Array, seed: int
 ) -> Case:
     rng = case_generator(seed, plan.kind, plan.index, 5)
-    readings, noise_rms, gap_rms, highest = [], {}, {}, []
+    built, readings, noise_rms, gap_rms, errors = conditions.built, [], {}, {}, []
     for lane, (part, samples) in enumerate(PARTS):
-        clean = _sensed(rig, conditions.built, levels[:samples, :, lane], deviations)
-        sound = _sensed(rig, conditions.built, levels[:samples, :, lane + 2], ())
-        noisy = clean + conditions.colour.noise(rng, samples, conditions.noise)
-        shown = _applied(READOUT_LAWS, rig, noisy, deviations)
+        clean = _sensed(rig, built, levels[:samples, :, lane], deviations)
+        sound = _sensed(rig, built, levels[:samples, :, lane + 2], ())
+        errors.append(conditions.colour.noise(rng, samples, conditions.noise))
+        shown = _applied(READOUT_LAWS, rig, clean + errors[-1], deviations)
         readings.append(shown)
         noise_rms[part] = np.sqrt(np.mean((shown - clean) ** 2, axis=0)).tolist()
         gap_rms[part] = float(np.sqrt(np.mean((clean - sound) ** 2)))
-        highest.append(levels[:samples, :, lane].max(axis=0))
-    truth = _truth(plan, chosen, deviations) | {
+    hidden = []
+    for k, (_, without) in enumerate(_runs_of(KINDS[plan.kind], deviations)[4:]):
+        other = _applied(READOUT_LAWS, rig, _sensed(rig, built, levels[:, :, 4 + k], without) + errors[0], without)
+        if np.sqrt(np.mean(((other - readings[0]) / conditions.noise) ** 2)) < HIDDEN:
+            hidden.append(k)
+    highest = levels[:, :, 0].max(axis=0), levels[: PARTS[1][1], :, 1].max(axis=0)
+    truth = _truth(plan, chosen, deviations, hidden) | {
         "noise_rms_m": noise_rms,
         "gap_rms_m": gap_rms,
         "signal": conditions.signal,
         "colour": conditions.colour.name,
         "repeats": conditions.colour.repeats,
-        "over_rim": bool((np.array(highest) >= [t.height for t in conditions.built.tanks]).any()),
+        "over_rim": bool((np.array(highest) >= [t.height for t in built.tanks]).any()),
     }
     return Case(plan, conditions.commands, (readings[0], readings[1]), truth)
 
 
-def _truth(plan: Plan, chosen: Chosen, deviations: tuple[Deviation, ...]) -> dict[str, Any]:
-    kind = KINDS[plan.kind]
-    full = deviations[: max(kind.causes, 1)]
+def _truth(plan: Plan, chosen: Chosen, deviations: Off, hidden: Collection[int]) -> dict[str, Any]:
+    """hidden: full causes that the others keep from showing, such as a weir above a level that a leak lowers."""
+    full = [d for k, d in enumerate(deviations[: max(KINDS[plan.kind].causes, 1)]) if k not in hidden]
     really = {"really": chosen.unknown.law} if chosen.unknown else {}
     return {
         "case": plan.name,

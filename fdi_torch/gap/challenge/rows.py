@@ -63,9 +63,12 @@ def tables(rows: Iterable[Row]) -> Tables:
     """Scores of each rig and of each diagnosis of it; cases whose effect is denied stand apart."""
     groups: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
-        group = f"{row['rig']}, effect left out" if row["kind"] == "left_out" else row["rig"]
-        groups.setdefault(group, {}).setdefault(row["by"], []).append(row)
+        groups.setdefault(group_of(row), {}).setdefault(row["by"], []).append(row)
     return {group: {name: scores_of(own) for name, own in by.items()} for group, by in groups.items()}
+
+
+def group_of(row: Row) -> str:
+    return f"{row['rig']}, effect left out" if row["kind"] == "left_out" else str(row["rig"])
 
 
 def scores_of(rows: Sequence[Row]) -> Scores:

@@ -20,10 +20,13 @@ SIZES = {
     "false_alarm": "false alarm",
     "detected": "detected",
     "set_size": "explanations",
+    "utility": "utility",
+}
+CLOSURE = {
     "closed_within": "`closed` within 3 points",
     "median_closed_error": "median error of `closed`",
-    "utility": "utility",
     "sec": "s a case",
+    "median_sec": "median s a case",
 }
 MOST_MISSES = 200
 
@@ -48,7 +51,8 @@ def sheets(by: Mapping[str, Scores]) -> list[Sheet]:
     ]
     found = [
         Sheet("Names and places, by kind", ("kind", *NAMES.values()), _rows(strata, NAMES)),
-        Sheet("Alarm, answer set, closure, utility and time, by kind", ("kind", *SIZES.values()), _rows(strata, SIZES)),
+        Sheet("Alarm, size of the answer set and utility, by kind", ("kind", *SIZES.values()), _rows(strata, SIZES)),
+        Sheet("Closure and time, by kind", ("kind", *CLOSURE.values()), _rows(strata, CLOSURE)),
         Sheet("Right answers beside those of the baselines", ("kind", OWN, *others), beside),
         Sheet("All kinds together, beside the baselines", ("", *NAMES.values(), "utility"), over_all),
         Sheet(
@@ -109,7 +113,7 @@ def in_words(score: Mapping[str, Any] | None) -> str:
     value = score["mean"] if "mean" in score else score["median"]
     if low is None or low != low:
         return f"{value:.2g}"
-    return f"{value:.3g} ({low:.3g} .. {high:.3g})"
+    return f"{value:.3g} ({low:.2g} .. {high:.2g})"
 
 
 def _rows(strata: Mapping[str, Mapping[str, Any]], columns: Iterable[str]) -> list[list[str]]:

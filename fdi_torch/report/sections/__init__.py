@@ -2,6 +2,7 @@
 
 from fdi_torch.report.section import Maker
 from fdi_torch.report.sections.before_after import holdout_section, profile_section
+from fdi_torch.report.sections.challenge import confusion_section, misses_section, scores_section
 from fdi_torch.report.sections.estimate import estimate_section, posterior_section
 from fdi_torch.report.sections.gap import causes_section, where_section
 from fdi_torch.report.sections.gap_closure import closure_section, constants_section
@@ -30,6 +31,9 @@ SECTIONS: tuple[Maker, ...] = (
     estimate_section,
     event_section,
     residual_section,
+    scores_section,
+    confusion_section,
+    misses_section,
     summary_section,
     isolation_section,
     error_section,
