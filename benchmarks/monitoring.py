@@ -11,7 +11,8 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.monitor.change import ChangedObserver, Window
 from fdi_torch.monitor.detection import make_detector
-from fdi_torch.monitor.isolation import Fault, isolate
+from fdi_torch.monitor.hypothesis import Fault
+from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.noise import Noise, learn_noise
 from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.prepare import usual_faults

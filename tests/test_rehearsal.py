@@ -17,6 +17,7 @@ from fdi_torch.monitor.rehearsal.alarms import count_false_alarms, delays, detec
 from fdi_torch.monitor.rehearsal.naming import Kind, confusions, name, smallest_isolable, wilson
 from fdi_torch.monitor.rehearsal.rivals import RIVALS, compare, draw_runs, track
 from fdi_torch.monitor.rehearsal.runs import Course, LevelControl, Rig, fault_free
+from fdi_torch.monitor.rehearsal.scoring import score
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.parameters import ParameterSpace
@@ -143,3 +144,8 @@ def test_shares_come_with_their_interval_and_wrong_answers_with_their_number() -
     assert low == pytest.approx(0.910, abs=2e-3) and high == pytest.approx(0.973, abs=2e-3)
     assert wilson(0, 0) == (0.0, 1.0)
     assert confusions(["a", "a", "b"], [("a",), ("b",), ()]) == [("a", "b", 1), ("b", "nothing", 1)]
+
+
+def test_alarms_are_hits_with_a_delay_misses_or_false() -> None:
+    found = score([3.0, 12.0, 14.0, 95.0], [10.0, 50.0, 100.0], early=6.0, late=5.0)
+    assert found.hits == ((10.0, 2.0), (100.0, -5.0)) and found.misses == (50.0,) and found.false == (3.0, 14.0)

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from fdi_torch.cli.screen import Screen
+from fdi_torch.config.estimation import full_name
 from fdi_torch.config.plant import load_plant
 from fdi_torch.config.recordings import RecordingConfig, read_recording
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
@@ -35,7 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant = load_plant(arguments.plant)
-    faults = arguments.faults.split(",") if arguments.faults else usual_faults(plant)
+    named = [full_name(name.strip(), plant) for name in (arguments.faults or "").split(",") if name.strip()]
+    faults = named or usual_faults(plant)
     noise = [parse_quantity(arguments.noise, sensor.unit) for sensor in plant.sensors]
     recording, constant = _inputs(arguments, plant)
     found = diagnosability(

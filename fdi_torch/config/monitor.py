@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
+from fdi_torch.config.estimation import full_name
 from fdi_torch.config.files import find_file, read_extended, with_overrides, write_yaml
 from fdi_torch.config.plant import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
@@ -104,5 +105,13 @@ def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:
         raise explain(error, str(file)) from None
     plant = config.plant
     known = build_plant(plant, str(file)) if isinstance(plant, dict) else load_plant(plant, file.parent)
+    config = _in_full(config, known)
     text = write_yaml({**data, "plant": plant_mapping(known)})
     return MonitorRun(config, known, file.parent, str(file), text)
+
+
+def _in_full(config: MonitorConfig, plant: PlantDescription) -> MonitorConfig:
+    """'T1.leak' stands for the leak's size."""
+    ranges = {full_name(name, plant): ends for name, ends in config.ranges.items()}
+    faults = [full_name(name, plant) for name in config.faults]
+    return config.model_copy(update={"faults": faults, "ranges": ranges})

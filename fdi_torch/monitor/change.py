@@ -79,7 +79,8 @@ class ChangedObserver:
     Where a hypothesis is right its innovations are white: half their sum of squares is its negative log-likelihood
     (prediction-error method; Ljung 1999, ch. 7). believed (P,): values of `space` before the change.
 
-    An effect that remembers and has an onset of its own (a stuck sensor keeps what it read then) is given the change's.
+    effects: the columns of `space` that belong together, such as an oscillation's amplitude, period and phase. One
+    that remembers and has an onset of its own (a stuck sensor keeps what it read then) is given the change's.
     """
 
     def __init__(
@@ -96,6 +97,10 @@ class ChangedObserver:
         self._held = _with_own_onset(network, space)
         onsets = [f"{name.rpartition('.')[0]}.onset" for name in self._held]
         names = [*space.names, *(f"after {name}" for name in space.names), ONSET, RAMP, *onsets]
+        groups: dict[str, list[int]] = {}
+        for column, name in enumerate(space.names):
+            groups.setdefault(name.rpartition(".")[0], []).append(column)
+        self.effects = tuple(tuple(columns) for columns in groups.values())
         self._columns = ParameterSpace(self.changing.constants[name] for name in names)
 
     def white(self, window: Window, believed: Tensor, changes: Changes) -> Tensor:

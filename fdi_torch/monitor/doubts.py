@@ -10,7 +10,8 @@ from torch import Tensor
 from fdi_torch.monitor.change import ChangedObserver, Window
 from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.gain import kalman_gain, start_uncertainty
-from fdi_torch.monitor.isolation import Fault, isolate
+from fdi_torch.monitor.hypothesis import Fault
+from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.noise import Noise, operating_point
 from fdi_torch.monitor.observer import Observation
 from fdi_torch.monitor.samples import Samples

@@ -16,17 +16,18 @@ from fdi_torch.monitor.change import ChangedObserver
 from fdi_torch.monitor.continuity import continuous
 from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.events import Event, Kind
-from fdi_torch.monitor.following import Change, MonitorState, begin, believe, forget, observe
-from fdi_torch.monitor.isolation import Fault, Finding, isolate, refit
+from fdi_torch.monitor.following import Change, MonitorState, adjust, begin, believe, forget, observe
+from fdi_torch.monitor.hypothesis import Fault, Finding
+from fdi_torch.monitor.isolation import isolate, refit
 from fdi_torch.monitor.noise import Noise
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.settings import MonitorSettings
+from fdi_torch.monitor.standing import CLEARLY, held_since, slight_change, trusted
 from fdi_torch.monitor.stepper import LONGEST_STEP
-from fdi_torch.monitor.telling import names_of, tell, with_nominals
+from fdi_torch.monitor.telling import rivals_of, tell, with_nominals
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 
-RIVAL = 6.0  # difference in BIC below which another explanation stands beside the best
 SHAPE = ("period", "phase")
 MOST_AT_ONCE = 512  # samples that the observer is run along before the detector looks at them
 
@@ -66,7 +67,7 @@ class Monitor:
     def start(self, samples: Samples, believed: Tensor | None = None, levels: Tensor | None = None) -> MonitorState:
         """The state after the first of some samples."""
         theta = self.space.nominal() if believed is None else believed
-        return begin(self.observer, samples.stretch(0, 1), theta, levels)
+        return begin(self.observer, samples.stretch(0, 1), theta, self._healthy(theta), levels)
 
     def advance(
         self, state: MonitorState, samples: Samples, show: Callable[[Seen], None] | None = None
@@ -79,13 +80,19 @@ class Monitor:
         for stretch, notice in continuous(state.samples, samples):
             if notice:
                 events.append(Event(float(stretch.time[0]), "notice", notice))
-                state = begin(self.observer, stretch.stretch(0, 1), state.believed)
+                state = begin(self.observer, stretch.stretch(0, 1), state.believed, state.healthy)
                 stretch = stretch.stretch(1, len(stretch))
             while len(stretch):
                 state, taken, news = self._take(state, stretch, show)
                 events += news
                 stretch = stretch.stretch(taken, len(stretch))
         return state, events
+
+    def _healthy(self, believed: Tensor) -> Tensor:
+        """What is believed, without any fault."""
+        healthy = believed.clone()
+        healthy[: self.watched] = self.space.nominal()[: self.watched]
+        return healthy
 
     def _take(
         self, state: MonitorState, samples: Samples, show: Callable[[Seen], None] | None
@@ -111,17 +118,24 @@ class Monitor:
     def _statistic(self, state: MonitorState, fresh: int) -> Tensor:
         """The detector's statistic at the last `fresh` samples, (fresh,)."""
         first = max(state.watched, len(state.samples) - fresh - self.detector.memory)
-        return self.detector.statistic(state.white[first:])[-fresh:]
+        return self.detector.statistic(trusted(self.observer, state)[first:])[-fresh:]
 
     def _alarm(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
         """An alarm; or only better sizes, where those of the last change explain the residual."""
         if state.change is not None and self._within_window(state, state.change):
-            revised, events = self._revise(state, state.change, "revised", (state.change.finding,))
-            assert revised.change is not None
-            if revised.change.finding.fits:
-                return revised, events
+            window = state.window(self._look_back(state, state.change))
+            same = refit(self.observer, window, state.change.before, [state.change.finding])
+            if same[0].fits:
+                return self._revise(state, state.change, "revised", same)
+        slight = slight_change(self.observer, state, self._reach(state, state.now), self.faults)
+        if slight is not None:
+            return adjust(self.observer, state, slight), []
         alarm = Event(state.now, "alarm", "the residual leaves its fault-free range")
         return replace(state, alarm=state.now, looks=0), [alarm]
+
+    def _reach(self, state: MonitorState, alarm: float) -> float:
+        """Since when a change that raised an alarm may be: not before the last one."""
+        return max(alarm - self.settings.lookback, held_since(state))
 
     def _next_look(self, state: MonitorState) -> float:
         if state.alarm is not None:
@@ -136,23 +150,32 @@ class Monitor:
         change = state.change
         if state.alarm is None:
             assert change is not None
-            return self._revise(state, change, "revised")
+            return self._reconsider(state, change)
         if change is not None and self._within_window(state, change):
             # Was the last change only taken for the wrong one? One change explaining all is preferred to two.
-            revised, events = self._revise(state, change, "isolated")
-            assert revised.change is not None
-            if revised.change.finding.fits:
-                return revised, events
+            found = self._explanations(state, self._look_back(state, change), change.before)
+            if found[0].fits:
+                return self._revise(state, change, "isolated", found)
         return self._isolate(state)
+
+    def _reconsider(self, state: MonitorState, change: Change) -> tuple[MonitorState, list[Event]]:
+        """The last change estimated again, or named anew; if nothing explains all, only for a clearly better name."""
+        if not self._within_window(state, change):
+            return replace(state, change=replace(change, next_look=float("inf"))), []
+        found = self._explanations(state, self._look_back(state, change), change.before)
+        same = [f for f in found if f.hypothesis == change.finding.hypothesis]
+        if not found[0].fits and same and same[0].score - found[0].score < CLEARLY:
+            later = self._look_again(change.finding, state.now)
+            return replace(state, change=replace(change, next_look=later)), []
+        return self._revise(state, change, "revised", found)
 
     def _isolate(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
         assert state.alarm is not None
-        start = max(state.alarm - self.settings.lookback, state.reachable)
-        finding, rivals = self._best(state, start, state.believed)
-        if finding.score >= 0.0:
+        found = self._explanations(state, self._reach(state, state.alarm), state.believed)
+        if found[0].score >= 0.0:
             return self._unexplained(state)
-        change = Change(state.believed, finding, state.alarm, self._look_again(finding, state.now))
-        return self._believe(state, change), [self._tell(state, change, rivals, "isolated")]
+        change = Change(state.believed, held_since(state), found[0], state.alarm, self._look_again(found[0], state.now))
+        return self._believe(state, change), self._tell(state, change, found, "isolated")
 
     def _unexplained(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
         """Said once; looked at again when more has been seen, until the longest window is full."""
@@ -164,16 +187,20 @@ class Monitor:
         return replace(state, alarm=None, looks=0, watched=len(state.samples)), events
 
     def _revise(
-        self, state: MonitorState, change: Change, kind: Kind, only: tuple[Finding, ...] = ()
+        self, state: MonitorState, change: Change, kind: Kind, found: Sequence[Finding]
     ) -> tuple[MonitorState, list[Event]]:
-        """The last change estimated again from all that has come since; `only`: of the same kind as before."""
-        if not self._within_window(state, change):
-            return replace(state, change=replace(change, next_look=float("inf"))), []
-        start = max(change.finding.onset - self.settings.lookback, state.reachable)
-        finding, rivals = self._best(state, start, change.before, only)
+        """The last change as the best of some findings has it."""
+        finding = found[0]
         alarm = change.alarm if state.alarm is None or change.alarm > finding.onset - 1.0 else state.alarm
         revised = replace(change, finding=finding, alarm=alarm, next_look=self._look_again(finding, state.now))
-        return self._believe(state, revised), [self._tell(state, revised, rivals, kind)]
+        news = self._tell(state, revised, found, kind)
+        if finding.hypothesis == change.finding.hypothesis and state.alarm is None:
+            news = [event for event in news if event.kind != "recovered"]  # it has been told
+        return self._believe(state, revised), news
+
+    def _look_back(self, state: MonitorState, change: Change) -> float:
+        """Since when the last change may be, when it is looked at again."""
+        return max(change.finding.onset - self.settings.lookback, change.since, state.reachable)
 
     def _within_window(self, state: MonitorState, change: Change) -> bool:
         return state.now - change.finding.onset <= self.settings.longest and change.finding.onset >= state.reachable
@@ -182,26 +209,17 @@ class Monitor:
         since = max(now - finding.onset, self.settings.confirm, 1.0)
         return finding.onset + self.settings.revise * since
 
-    def _best(
-        self, state: MonitorState, start: float, believed: Tensor, only: tuple[Finding, ...] = ()
-    ) -> tuple[Finding, tuple[str, ...]]:
-        """The best explanation of what came since `start`, and the names of those that fit nearly as well."""
-        window = state.window(start)
-        if only:
-            return refit(self.observer, window, believed, only)[0], ()
-        s = self.settings
-        found = isolate(self.observer, window, believed, self.faults, s.incipient, s.together)
-        best = found[0]
-        near = [f for f in found[1:] if f.score - best.score < RIVAL]
-        rivals = [f for f in near if not set(best.hypothesis.columns) <= set(f.hypothesis.columns)]
-        return best, tuple(dict.fromkeys(" + ".join(names_of(self.space, f)) for f in rivals))
+    def _explanations(self, state: MonitorState, start: float, believed: Tensor) -> list[Finding]:
+        """Of what came since `start`, best first."""
+        s, healthy = self.settings, self._healthy(believed)
+        return isolate(self.observer, state.window(start), believed, self.faults, s.incipient, s.together, healthy)
 
     def _believe(self, state: MonitorState, change: Change) -> MonitorState:
         """Feeds the newest parameters back."""
-        return believe(self.observer, state, change, with_nominals(self.space, change.finding))
+        return believe(self.observer, state, change, with_nominals(self.space, change))
 
-    def _tell(self, state: MonitorState, change: Change, rivals: tuple[str, ...], kind: Kind) -> Event:
-        return tell(self.space, change, rivals, state.now, kind, state.reachable)
+    def _tell(self, state: MonitorState, change: Change, found: Sequence[Finding], kind: Kind) -> list[Event]:
+        return tell(self.space, change, rivals_of(self.space, found), state.now, kind, state.reachable)
 
 
 def faults_of(names: Sequence[str]) -> list[Fault]:

@@ -69,7 +69,7 @@ class WindowMonitor:
     def start(self, samples: Samples, believed: Tensor | None = None, levels: Tensor | None = None) -> WindowState:
         """The state after the first of some samples."""
         theta = self.space.nominal() if believed is None else believed
-        state = begin(self._observer, samples.stretch(0, 1), theta, levels)
+        state = begin(self._observer, samples.stretch(0, 1), theta, theta, levels)
         return WindowState(state, state.reachable + self.length)
 
     def advance(
@@ -122,7 +122,7 @@ class WindowMonitor:
         believed = following.believed.clone()
         believed[: self.watched] = found.value[0, : self.watched]
         event = self._tell(found, following.now, start)
-        following = replace(following, believed=believed, watched=len(following.samples))
+        following = replace(following, believed=believed, healthy=believed, watched=len(following.samples))
         return WindowState(following, state.next_end + self.stride, False, state.number + 1), event
 
     def _fitting(self, window: Samples, believed: Tensor) -> Fitting:

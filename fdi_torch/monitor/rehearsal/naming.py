@@ -12,7 +12,7 @@ from torch import Tensor
 
 from fdi_torch.monitor.change import ChangedObserver, Changes, Window, unchanged
 from fdi_torch.monitor.events import Event
-from fdi_torch.monitor.isolation import Fault
+from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.online import SHAPE, Monitor
 from fdi_torch.monitor.samples import Samples
 
