@@ -18,7 +18,7 @@ from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Hold, Recording
 from fdi_torch.simulate import build
 from fdi_torch.simulate.build import BuildError
-from fdi_torch.simulate.choose import make_engine
+from fdi_torch.simulate.choose import adaptive_engine, make_engine
 from fdi_torch.simulate.compiled import CompiledEngine, _kernel
 from fdi_torch.simulate.engine import Readings, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment, lay_out
@@ -187,6 +187,19 @@ def test_the_reference_differentiates_alike() -> None:
     theta = random_theta(space, 5)
     truth = ReferenceEngine(network, space, e).linearise(theta)[1]
     assert relative(CompiledEngine(network, space, e).linearise(theta)[1], truth) < 1e-10
+
+
+def test_an_adaptive_solver_gives_the_same_slopes_lane_by_lane() -> None:
+    network, space = rig()
+    e = lay_out(recording(regular(10.0, 8)), ("Q1", "Q2"), 0.5)
+    theta = random_theta(space, 2)
+    readings, slopes = adaptive_engine(network, space, e, 0.02).linearise(theta)
+    fine = replace(lay_out(recording(regular(10.0, 8)), ("Q1", "Q2"), 0.05), resolution=e.nodes.new_tensor(0.02))
+    expected, truth = CompiledEngine(network, space, fine).linearise(theta)
+    assert float((readings - expected).abs().max()) < 1e-7
+    assert relative(slopes, truth) < 1e-5
+    alone = adaptive_engine(network, space, e, 0.02).linearise(theta[1:])[1]
+    assert torch.equal(alone[0], slopes[1])
 
 
 @pytest.mark.parametrize("ar", [False, True])

@@ -33,6 +33,19 @@ def test_the_built_in_fault_is_found(tmp_path: Path) -> None:
     assert all(picture.stat().st_size > 10_000 for picture in done.pictures)
 
 
+@pytest.mark.slow
+def test_the_reference_engine_finds_the_same(tmp_path: Path) -> None:
+    """In Python steps are dear: it searches more roughly and refines adaptively, to the same end."""
+    short = ["simulate.duration=300 s", "estimate.parameters=[T1.leak, T3.leak, P13.openness]"]
+    short += ["simulate.faults={T1.leak: 0.3, T3.leak: 0.5, P13.openness: 0.6}"]
+    ends = []
+    for engine in ("compiled", "reference"):
+        run = load_run(None, [*short, f"engine={engine}", f"output.folder={tmp_path / engine}"])
+        ends.append(train(run).result.estimate)
+    assert bool(((ends[1].value - ends[0].value).abs() < 0.02 * ends[0].std).all())
+    assert bool(((ends[1].std / ends[0].std - 1.0).abs() < 0.01).all())
+
+
 def test_the_log_tells_how_it_was_found(tmp_path: Path) -> None:
     done = train(quick_run(tmp_path))
     run = read_run(done.log)

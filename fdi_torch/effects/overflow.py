@@ -9,7 +9,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.orifice import weir_flow
+from fdi_torch.plant.orifice import rim_strength, weir_flow
 from fdi_torch.plant.reach import Reach, inside
 
 
@@ -59,4 +59,6 @@ class Overflow(Effect):
         return {name.removeprefix("to_"): share for name, share in p.items() if name.startswith("to_")}
 
     def _weir(self, above: Tensor, local: Local, crest: Tensor) -> Tensor:
-        return weir_flow(above, local.net, local.constants["area"], local.gravity, local.clock.resolution, crest)
+        area = local.constants["area"]
+        strength = rim_strength(area, local.gravity) * crest
+        return weir_flow(above, local.net, area, strength, local.clock.resolution)

@@ -15,7 +15,7 @@ from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.choose import make_engine
+from fdi_torch.simulate.choose import adaptive_engine, make_engine
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import lay_out
@@ -27,6 +27,8 @@ EngineKind = Literal["auto", "reference", "compiled"]
 # A start level that is estimated is searched this share of its tank's height about the first readings.
 START_SEARCH_SHARE = 0.05
 FIRST_READINGS = 5
+# An adaptive solver sees inputs that run linearly as their means over so many seconds.
+LONGEST_STEP = 1.0
 
 
 @dataclass(frozen=True)
@@ -49,27 +51,29 @@ class Fitting:
     def plant(self) -> PlantDescription:
         return self.networks[0].description
 
-    def engines(self, step: float) -> list[Engine]:
-        """An engine for each recording, in steps no longer than `step` s."""
-        return [
-            make_engine(
-                network,
-                own,
-                lay_out(recording, self.plant.channels(), step),
-                self.engine,
-                device=recording.time.device.type,
-            )
-            for network, own, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True)
-        ]
+    @property
+    def is_slow(self) -> bool:
+        """Whether each operation of each step costs a call from Python, so that steps have to be saved."""
+        return self.engine == "reference"
 
-    def problem(self, step: float, objective: Objective = "likelihood") -> Problem:
+    def engines(self, step: float, adaptive: bool = False) -> list[Engine]:
+        """An engine for each recording, in steps no longer than `step` s, or by an adaptive solver about as exact."""
+        engines = []
+        for network, own, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True):
+            experiment = lay_out(recording, self.plant.channels(), LONGEST_STEP if adaptive else step)
+            if adaptive:
+                engines.append(adaptive_engine(network, own, experiment, step))
+            else:
+                device = recording.time.device.type
+                engines.append(make_engine(network, own, experiment, self.engine, device=device))
+        return engines
+
+    def problem(self, step: float, objective: Objective = "likelihood", adaptive: bool = False) -> Problem:
         """Raises ValueError where the objective is correlation and readings that count stand still."""
         for recording in self.recordings if objective == "correlation" else ():
             _expect_variation(recording, self.plant)
-        terms = [
-            Term(engine, readings_of(recording, self.plant), columns)
-            for engine, recording, columns in zip(self.engines(step), self.recordings, self.columns, strict=True)
-        ]
+        parts = zip(self.engines(step, adaptive), self.recordings, self.columns, strict=True)
+        terms = [Term(engine, readings_of(recording, self.plant), columns) for engine, recording, columns in parts]
         return Problem(self.space, terms, objective)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -21,6 +21,10 @@ from fdi_torch.simulate.steps import choose_step, probe_points
 LEFT_TO_GO = 0.1
 # Finer steps than this change no standard error that a recording could support.
 FINEST_STEP = 0.01
+# What a slow engine makes do with: a search that ends where refinement can go on, and an adaptive solver for that.
+NEAR_SHARE, NEAR_COST, ROUGH_ERROR = 0.2, 1e-2, 0.1
+ADAPTIVE_STEPS = (2.0, 0.05)
+NEAR_ENOUGH, CLOSE = 1e-2, 1e-4
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class HybridSettings:
     objectives: the one searched on and the one refined on. steps in s; None: chosen by measured error.
     search_tolerance, refine_tolerance: that error, as a share of a channel's spread over the box of parameters.
     starts: how many of the search's best, mutually distant members are refined. std_tolerance: standard errors change
-    by less than this share when the step is halved.
+    by less than this share when the step is halved. adaptive: refine by an adaptive solver instead of in fixed steps.
     """
 
     objectives: tuple[Objective, Objective] = ("correlation", "likelihood")
@@ -44,6 +48,7 @@ class HybridSettings:
     starts: int = 3
     std_tolerance: float = 5e-3
     confidence: float = 0.95
+    adaptive: bool = False
 
 
 @dataclass(frozen=True)
@@ -73,12 +78,29 @@ def estimate_parameters(
     resume: a state that `on_generation` was given; the search goes on from there to the same end.
     """
     settings = settings or HybridSettings()
+    settings = sparing(settings) if fitting.is_slow else settings
     low, high = search_box(fitting)
     coarse, fine = pick_steps(fitting, settings, low, high)
     found = search(fitting.problem(coarse, settings.objectives[0]), low, high, settings, seed, on_generation, resume)
     starts = distant_members(found, low, high, settings.starts)
-    refinement, fine = refine_to_convergence(fitting, settings, starts, low, high, fine, on_iteration)
+    if settings.adaptive:
+        refinement = refine_adaptively(fitting, settings, starts, low, high, coarse, on_iteration)
+    else:
+        refinement, fine = refine_to_convergence(fitting, settings, starts, low, high, fine, on_iteration)
     return conclude(fitting, settings, found, refinement, (coarse, fine))
+
+
+def sparing(settings: HybridSettings) -> HybridSettings:
+    """The same for an engine that pays for every step in Python: a rougher search that ends as soon as its members are
+    near each other, and refinement by an adaptive solver where no step was asked for.
+    """
+    search = replace(
+        settings.search,
+        parameter_tolerance=max(settings.search.parameter_tolerance, NEAR_SHARE),
+        cost_tolerance=max(settings.search.cost_tolerance, NEAR_COST),
+    )
+    rough = max(settings.search_tolerance, ROUGH_ERROR)
+    return replace(settings, search=search, search_tolerance=rough, adaptive=settings.refine_step is None)
 
 
 def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
@@ -112,7 +134,7 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
     spread = readings.flatten(0, 1).std(dim=0).clamp(min=1e-12)
     if coarse is None:
         coarse = choose_step(engine_at, own_points, settings.search_tolerance * spread, longest, quantile=0.9)
-    fine = settings.refine_step
+    fine = ADAPTIVE_STEPS[-1] if settings.adaptive else settings.refine_step
     if fine is None:
         fine = choose_step(engine_at, own_points, settings.refine_tolerance * spread, coarse, quantile=0.9)
     return coarse, fine
@@ -174,6 +196,28 @@ def refine_to_convergence(
     return refinement, step
 
 
+def refine_adaptively(
+    fitting: Fitting,
+    settings: HybridSettings,
+    starts: Tensor,
+    low: Tensor,
+    high: Tensor,
+    coarse: float,
+    on_iteration: Callable[[Progress], None] | None,
+) -> Refined:
+    """Refines from every start in coarse steps, and goes on from the best with an adaptive solver, then a tight one."""
+
+    def run(problem: Problem, theta: Tensor, enough: float) -> Refined:
+        stop = replace(settings.refine, decrease_tolerance=max(settings.refine.decrease_tolerance, enough))
+        return best_of(levenberg_marquardt(problem.linearise, theta, low, high, stop, on_iteration))
+
+    refinement = run(fitting.problem(coarse, settings.objectives[1]), starts, NEAR_ENOUGH)
+    for step in ADAPTIVE_STEPS:
+        problem = fitting.problem(step, settings.objectives[1], adaptive=True)
+        refinement = run(problem, refinement.theta, CLOSE if step == ADAPTIVE_STEPS[-1] else NEAR_ENOUGH)
+    return refinement
+
+
 def best_of(refined: Refined) -> Refined:
     """The member (1, P) of lowest cost of a flat batch; a cost that is no number never wins."""
     cost = torch.where(torch.isfinite(refined.cost), refined.cost, torch.inf)
@@ -204,7 +248,7 @@ def conclude(
     """Estimate, diagnosis and goodness of fit at the refined optimum."""
     theta = refinement.theta
     lanes = torch.zeros(1, dtype=torch.int64)
-    problem = fitting.problem(steps[1], "likelihood")
+    problem = fitting.problem(steps[1], "likelihood", settings.adaptive)
     noise = problem.noise(theta, lanes)
     predicted, ratios, slow_noise = [], [], []
     for term, level in zip(problem.terms, noise, strict=True):
@@ -233,7 +277,7 @@ def conclude(
         diagnosis=diagnosis,
         search=found,
         refinement=refinement,
-        correlation=fitting.problem(steps[1], "likelihood").correlations(theta.unsqueeze(1), lanes)[0, 0],
+        correlation=problem.correlations(theta.unsqueeze(1), lanes)[0, 0],
         predicted=tuple(predicted),
         steps=steps,
         engine=problem.terms[0].engine.why or problem.terms[0].engine.name,

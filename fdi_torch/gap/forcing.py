@@ -13,6 +13,7 @@ from torch import Tensor
 
 from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.plant.effect import Placement, Stage
+from fdi_torch.plant.moment import Moment
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.simulate.actuation import Actuation
 from fdi_torch.simulate.experiment import Experiment
@@ -44,11 +45,12 @@ class Forcing:
         actuation = Actuation(network, experiment, [])
         self._clock = actuation.clock
         self._commands = actuation.commands(values, 1)
-        self._pumps = network.pump_flows(self._levels, self._commands, self._clock, values)
-        self._pipes = network.pipe_flows(self._levels, self._commands, self._clock, values)
-        gathered = network.gathered(self._levels, self._pumps, self._pipes, self._clock, values)
+        now = self._now(network, values, self._commands)
+        self._pumps = network.pump_flows(now)
+        self._pipes = network.pipe_flows(now)
+        gathered = network.gathered(now, self._pumps, self._pipes)
         self._gathered = [net.expand(self._levels[0].shape) for net in gathered]
-        self._net = network.spilled(self._gathered, self._levels, self._clock, values)
+        self._net = network.spilled(now, self._gathered)
         self._rates, self._by_inflow = self._inflow_slopes(network)
         self._readings = Sight(network, experiment, []).read(self._path, values)[0]
 
@@ -57,7 +59,7 @@ class Forcing:
         network, values, lanes = self._with(placement, starts)
         shape = (lanes, self._levels[0].shape[-1])
         if placement.effect.stage is Stage.STORAGE:
-            rates = network.level_rates(self._levels, self._net, self._clock, values)
+            rates = network.level_rates(self._now(network, values, self._commands), self._net)
             return torch.stack([(a - b).expand(shape) for a, b in zip(rates, self._rates, strict=True)])
         inflows = self._inflows(network, placement, values, lanes)
         changed = []
@@ -80,31 +82,36 @@ class Forcing:
         values = {**self.values, placement.prefix: {**self.values[placement.prefix], **starts}}
         return network, values, max(len(s) for s in starts.values())
 
+    def _now(self, network: TankNetwork, values: PlaceValues, commands: Sequence[Tensor]) -> Moment:
+        return network.moment(self._levels, commands, self._clock, values)
+
     def _inflows(self, network: TankNetwork, placement: Placement, values: PlaceValues, lanes: int) -> Sequence[Tensor]:
         """By how much more flows into each tank, (M, K) or (1, K) m^3/s."""
         plant, place, commands = network.description, placement.location, self._commands
         if placement.effect.stage is Stage.BALANCE:
             net = list(self._gathered)
-            network.move_by_effect(net, placement, self._levels, self._clock, values)
+            network.move_by_effect(net, placement, self._now(network, values, commands))
             return [a - b for a, b in zip(net, self._gathered, strict=True)]
         if placement.effect.stage is Stage.COMMAND:
             commands = Actuation(network, self.experiment, []).commands(values, lanes)
+        now = self._now(network, values, commands)
         more = [torch.zeros_like(net) for net in self._gathered]
         for i, pump in enumerate(plant.pumps):
             if pump.name == place:
-                flow = network.pump_flow(i, self._levels, commands, self._clock, values)
+                flow = network.pump_flow(now, pump)
                 network.move(more, OUTSIDE, pump.target, flow - self._pumps[i])
         for j, pipe in enumerate(plant.pipes):
             if pipe.name == place:
-                flow = network.pipe_flow(j, self._levels, commands, self._clock, values)
+                flow = network.pipe_flow(now, pipe)
                 network.move(more, pipe.source, pipe.target, flow - self._pipes[j])
         return more
 
     def _inflow_slopes(self, network: TankNetwork) -> tuple[list[Tensor], list[Row]]:
         """Rates, and by how much each tank's rate rises with what flows into each tank, 1/m^2."""
 
+        now = self._now(network, self.values, self._commands)
+
         def rates(net: Sequence[Tensor]) -> Sequence[Tensor]:
-            left = network.spilled(net, self._levels, self._clock, self.values)
-            return network.level_rates(self._levels, left, self._clock, self.values)
+            return network.level_rates(now, network.spilled(now, net))
 
         return partials(rates, self._gathered, self._levels[0].shape)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from torch import Tensor
 
 from fdi_torch.plant.effect import Effect, Memory, Placement, Stage, Values
+from fdi_torch.plant.moment import PlaceValues
 from fdi_torch.plant.signals import Clock
-
-PlaceValues = Mapping[str, Mapping[str, Tensor]]
-"""The constants of a plant by place and field."""
 
 
 class SignalChain:

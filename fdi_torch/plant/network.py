@@ -14,14 +14,13 @@ import torch
 from torch import Tensor, nn
 
 from fdi_torch.parameters import Parameter, ParameterSpace
-from fdi_torch.plant.chain import PlaceValues, SignalChain
-from fdi_torch.plant.constants import constant_parameters, inverse_areas, leak_pipe, nominal_capacity
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Sensor
-from fdi_torch.plant.effect import Effect, Local, Memory, Placement, Stage, Values, fits
-from fdi_torch.plant.orifice import orifice_capacity, regular_width, weir_flow
+from fdi_torch.plant.chain import SignalChain
+from fdi_torch.plant.constants import constant_parameters
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor
+from fdi_torch.plant.effect import Effect, Memory, Placement, Stage, Values, fits
+from fdi_torch.plant.moment import Constants, Moment, PlaceValues
+from fdi_torch.plant.orifice import weir_flow
 from fdi_torch.plant.signals import Clock
-
-Bound = tuple[Effect, Values]
 
 
 class TankNetwork(nn.Module):
@@ -58,7 +57,8 @@ class TankNetwork(nn.Module):
         for placement in placements:
             self._by_place.setdefault((placement.location, placement.effect.stage), []).append(placement)
         sensors = [sensor.name for sensor in self.description.sensors]
-        self._command_chain = SignalChain(Stage.COMMAND, [name for name, _ in self.actuators()], placements)
+        self._actuator_names = [name for name, _ in self.actuators()]
+        self._command_chain = SignalChain(Stage.COMMAND, self._actuator_names, placements)
         self._reading_chain = SignalChain(Stage.READING, sensors, placements)
 
     def below_rims(self) -> TankNetwork:
@@ -77,7 +77,7 @@ class TankNetwork(nn.Module):
             self.constants.index(name)
             place, _, field = name.rpartition(".")
             values[place][field] = value
-        return values
+        return Constants(values)
 
     def forward(self, levels: Tensor, commands: Tensor, clock: Clock, values: PlaceValues) -> Tensor:
         """dh/dt (*batch, tanks) in m/s; levels (*batch, tanks) in m, commands (*batch, actuators) as they act."""
@@ -88,10 +88,16 @@ class TankNetwork(nn.Module):
         self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> list[Tensor]:
         """The physical stages, in the order water takes; one tensor (*batch) a tank."""
-        pumps = self.pump_flows(levels, commands, clock, values)
-        pipes = self.pipe_flows(levels, commands, clock, values)
-        net = self.net_inflows(levels, pumps, pipes, clock, values)
-        return self.level_rates(levels, net, clock, values)
+        now = self.moment(levels, commands, clock, values)
+        pumped = self.pump_flows(now)
+        piped = self.pipe_flows(now)
+        net = self.gathered(now, pumped, piped)
+        kept = self.spilled(now, net)
+        return self.level_rates(now, kept)
+
+    def moment(self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Moment:
+        """What the stages look at: one tensor (*batch) a tank in m, one an actuator."""
+        return Moment.of(self.description, levels, self._actuator_names, commands, clock, values)
 
     def commands(
         self, channels: Sequence[Tensor], memory: Memory, clock: Clock, values: PlaceValues
@@ -107,43 +113,26 @@ class TankNetwork(nn.Module):
         """By how many seconds an actuator (index into `actuators`) is late; only those that can be."""
         return self._command_chain.delays(values)
 
-    def pump_flows(
-        self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
-    ) -> list[Tensor]:
+    def pump_flows(self, now: Moment) -> list[Tensor]:
         """FLOW of each pump, m^3/s."""
-        return [self.pump_flow(i, levels, commands, clock, values) for i in range(len(self.description.pumps))]
+        return [self.pump_flow(now, pump) for pump in self.description.pumps]
 
-    def pump_flow(
-        self, which: int, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
-    ) -> Tensor:
+    def pump_flow(self, now: Moment, pump: Pump) -> Tensor:
         """FLOW of one pump: gain x command within [0, max_flow], m^3/s."""
-        pump = self.description.pumps[which]
-        own, command = values[pump.name], commands[which]
-        flow = torch.minimum(torch.clamp(own["gain"] * command, min=0.0), own["max_flow"])
-        local = replace(
-            self._tank_local(pump.target, levels, clock, values), capacity=own["gain"], command=command, constants=own
-        )
-        for effect, p in self._effects(pump.name, Stage.FLOW, values):
-            flow = effect.flow(flow, local, p)
+        own = now.values[pump.name]
+        flow = torch.minimum(torch.clamp(own["gain"] * now.commands[pump.name], min=0.0), own["max_flow"])
+        for effect, p in self._effects(pump.name, Stage.FLOW, now):
+            flow = effect.flow(flow, now.at_pump(pump), p)
         return flow
 
-    def pipe_flows(
-        self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
-    ) -> list[Tensor]:
+    def pipe_flows(self, now: Moment) -> list[Tensor]:
         """FLOW of each pipe and outlet, m^3/s, positive from source to target."""
-        return [self.pipe_flow(j, levels, commands, clock, values) for j in range(len(self.description.pipes))]
+        return [self.pipe_flow(now, pipe) for pipe in self.description.pipes]
 
-    def pipe_flow(
-        self, which: int, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
-    ) -> Tensor:
+    def pipe_flow(self, now: Moment, pipe: Pipe) -> Tensor:
         """FLOW of one pipe or outlet by Torricelli's law, m^3/s, positive from source to target."""
-        pipe = self.description.pipes[which]
-        local = self._pipe_local(pipe, levels, clock, values)
-        if pipe.valve:
-            before = sum(1 for p in self.description.pipes[:which] if p.valve)
-            opening = commands[len(self.description.pumps) + before]
-            local = replace(local, command=torch.clamp(opening, 0.0, 1.0))
-        effects = self._effects(pipe.name, Stage.FLOW, values)
+        local = now.at_pipe(pipe)
+        effects = self._effects(pipe.name, Stage.FLOW, now)
         for effect, p in effects:
             local = replace(local, head=effect.head(local.head, local, p))
         head = torch.clamp(local.head, min=0.0) if pipe.is_outlet else local.head
@@ -152,60 +141,35 @@ class TankNetwork(nn.Module):
             flow = effect.flow(flow, local, p)
         return flow
 
-    def net_inflows(
-        self,
-        levels: Sequence[Tensor],
-        pumps: Sequence[Tensor],
-        pipes: Sequence[Tensor],
-        clock: Clock,
-        values: PlaceValues,
-    ) -> list[Tensor]:
-        """BALANCE of each tank: pumps in, pipes through, faults, and what runs over the rim, m^3/s."""
-        return self.spilled(self.gathered(levels, pumps, pipes, clock, values), levels, clock, values)
-
-    def gathered(
-        self,
-        levels: Sequence[Tensor],
-        pumps: Sequence[Tensor],
-        pipes: Sequence[Tensor],
-        clock: Clock,
-        values: PlaceValues,
-    ) -> list[Tensor]:
-        """Net inflows before anything runs over a rim, m^3/s."""
-        net = [torch.zeros_like(level) for level in levels]
-        for pump, flow in zip(self.description.pumps, pumps, strict=True):
+    def gathered(self, now: Moment, pumped: Sequence[Tensor], piped: Sequence[Tensor]) -> list[Tensor]:
+        """BALANCE of each tank: pumps in, pipes through, faults; before anything runs over a rim, m^3/s."""
+        net = [torch.zeros_like(level) for level in now.levels.values()]
+        for pump, flow in zip(self.description.pumps, pumped, strict=True):
             self.move(net, OUTSIDE, pump.target, flow)
-        for pipe, flow in zip(self.description.pipes, pipes, strict=True):
+        for pipe, flow in zip(self.description.pipes, piped, strict=True):
             self.move(net, pipe.source, pipe.target, flow)
         for placement in self.placements:
             if placement.effect.stage is Stage.BALANCE:
-                self.move_by_effect(net, placement, levels, clock, values)
+                self.move_by_effect(net, placement, now)
         return net
 
-    def spilled(
-        self, net: Sequence[Tensor], levels: Sequence[Tensor], clock: Clock, values: PlaceValues
-    ) -> list[Tensor]:
+    def spilled(self, now: Moment, net: Sequence[Tensor]) -> list[Tensor]:
         """Net inflows (m^3/s) less what runs over the rims."""
-        if not self.rims:
-            return list(net)
-        left = list(net)
-        for tank, level, inflow in zip(self.description.tanks, levels, net, strict=True):
-            own = values[tank.name]
-            spill = weir_flow(level - own["height"], inflow, own["area"], values[""]["gravity"], clock.resolution)
-            self.move(left, tank.name, tank.overflow_to, spill)
-        return left
+        kept = list(net)
+        for tank, inflow in zip(self.description.tanks, net, strict=True) if self.rims else ():
+            own, level = now.values[tank.name], now.levels[tank.name]
+            spill = weir_flow(level - own["height"], inflow, own["area"], now.rim(tank), now.clock.resolution)
+            self.move(kept, tank.name, tank.overflow_to, spill)
+        return kept
 
-    def level_rates(
-        self, levels: Sequence[Tensor], net: Sequence[Tensor], clock: Clock, values: PlaceValues
-    ) -> list[Tensor]:
+    def level_rates(self, now: Moment, net: Sequence[Tensor]) -> list[Tensor]:
         """STORAGE: dh/dt = net inflow / area(h); an empty tank cannot lose more, m/s."""
         rates = []
-        for i, tank in enumerate(self.description.tanks):
-            local = self._tank_local(tank.name, levels, clock, values)
-            area = local.constants["area"]
-            for effect, p in self._effects(tank.name, Stage.STORAGE, values):
-                area = effect.area(area, local, p)
-            kept = torch.where(levels[i] <= 0.0, torch.clamp(net[i], min=0.0), net[i])
+        for tank, inflow in zip(self.description.tanks, net, strict=True):
+            area = now.values[tank.name]["area"]
+            for effect, p in self._effects(tank.name, Stage.STORAGE, now):
+                area = effect.area(area, now.at_tank(tank.name), p)
+            kept = torch.where(now.levels[tank.name] <= 0.0, torch.clamp(inflow, min=0.0), inflow)
             rates.append(kept / area)
         return rates
 
@@ -248,76 +212,24 @@ class TankNetwork(nn.Module):
         owns = [values[sensor.name] for sensor in self.description.sensors]
         return [own["gain"] * level + own["offset"] for own, level in zip(owns, levels, strict=True)]
 
-    def _effects(self, location: str, stage: Stage, values: PlaceValues) -> list[Bound]:
-        return [(p.effect, values[p.prefix]) for p in self._by_place.get((location, stage), ())]
+    def _effects(self, location: str, stage: Stage, now: Moment) -> list[tuple[Effect, Values]]:
+        return [(p.effect, now.values[p.prefix]) for p in self._by_place.get((location, stage), ())]
 
     def move(self, net: list[Tensor], source: str, target: str, flow: Tensor) -> None:
         """Takes a flow (m^3/s) from one tank's net inflow and adds it to another's, in place; either may be outside."""
-        for end, sign in ((source, -1.0), (target, 1.0)):
-            if end != OUTSIDE:
-                i = self._tank_index[end]
-                net[i] = net[i] + sign * flow
+        if source != OUTSIDE:
+            net[self._tank_index[source]] = net[self._tank_index[source]] - flow
+        if target != OUTSIDE:
+            net[self._tank_index[target]] = net[self._tank_index[target]] + flow
 
-    def move_by_effect(
-        self, net: list[Tensor], placement: Placement, levels: Sequence[Tensor], clock: Clock, values: PlaceValues
-    ) -> None:
+    def move_by_effect(self, net: list[Tensor], placement: Placement, now: Moment) -> None:
         """The same for what flows by a BALANCE effect."""
-        ends = placement.location.split("-") if placement.location not in self._tank_index else [placement.location]
-        local = self._tank_local(ends[0], levels, clock, values, ends[-1])
-        local = replace(local, net=net[self._tank_index[ends[0]]])
-        flow = placement.effect.inflow(local, values[placement.prefix])
-        self.move(net, *((ends[0], ends[1]) if len(ends) == 2 else (OUTSIDE, ends[0])), flow)
-        for tank, share in placement.effect.caught(values[placement.prefix]).items():
+        at, own = placement.location, now.values[placement.prefix]
+        first, last = (at, at) if at in self._tank_index else at.split("-")
+        flow = placement.effect.inflow(now.at_tank(first, last, net[self._tank_index[first]]), own)
+        self.move(net, *((OUTSIDE, at) if at in self._tank_index else (first, last)), flow)
+        for tank, share in placement.effect.caught(own).items():
             self.move(net, tank, OUTSIDE, share * flow)
-
-    def _pipe_local(self, pipe: Pipe, levels: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Local:
-        own = values[pipe.name]
-        level = levels[self._tank_index[pipe.source]]
-        head = far = level - own["elevation"]
-        if pipe.is_outlet:
-            far = torch.zeros_like(level) if pipe.target == OUTSIDE else levels[self._tank_index[pipe.target]]
-        else:
-            far = levels[self._tank_index[pipe.target]]
-            wet_far = torch.clamp(far - own["elevation"], min=0.0)
-            head = torch.clamp(head, min=0.0) - wet_far if pipe.elevation else level - far
-        gravity = values[""]["gravity"]
-        return Local(
-            clock,
-            level,
-            far,
-            head,
-            capacity=orifice_capacity(own["discharge_coefficient"], own["area"], gravity),
-            command=torch.ones_like(level),
-            net=torch.zeros_like(level),
-            width=self._width(pipe, clock),
-            height=values[pipe.source]["height"],
-            gravity=gravity,
-            constants=own,
-        )
-
-    def _tank_local(
-        self, name: str, levels: Sequence[Tensor], clock: Clock, values: PlaceValues, far: str | None = None
-    ) -> Local:
-        level = levels[self._tank_index[name]]
-        far_level = levels[self._tank_index[far or name]]
-        own = values[name]
-        return Local(
-            clock,
-            level,
-            far_level,
-            head=level,
-            capacity=own["leak_capacity"],
-            command=level,
-            net=torch.zeros_like(level),
-            width=self._width(leak_pipe(self.description, name), clock),
-            height=own["height"],
-            gravity=values[""]["gravity"],
-            constants=own,
-        )
-
-    def _width(self, pipe: Pipe, clock: Clock) -> Tensor:
-        rate = nominal_capacity(self.description, pipe) * inverse_areas(self.description, pipe)
-        return regular_width(rate, clock.resolution)
 
 
 def _clipped(sensor: Sensor, value: Tensor) -> Tensor:

@@ -37,23 +37,25 @@ def orifice_capacity(discharge_coefficient: Tensor, area: Tensor, gravity: Tenso
     return discharge_coefficient * area * torch.sqrt(2.0 * gravity)
 
 
-def weir_flow(
-    excess: Tensor,
-    inflow: Tensor | float,
-    tank_area: Tensor,
-    gravity: Tensor,
-    resolution: Tensor,
-    share: Tensor | float = 1.0,
-) -> Tensor:
-    """What runs over a `share` of the rim of a round tank at `excess` m above it while `inflow` m^3/s comes in, m^3/s.
+def rim_strength(tank_area: Tensor, gravity: Tensor) -> Tensor:
+    """(2/3) C sqrt(2 g) 2 sqrt(pi A): the flow over the whole rim of a round tank at 1 m above it, m^1.5/s.
 
-    Sharp-crested weir as long as the rim: w(x) = (2/3) C sqrt(2 g) 2 sqrt(pi A) x^(3/2). It is far faster than the
-    tank: where w'(x) r / A is too large for a step of r = `resolution` s, it is taken linearly implicitly for the
-    excess a of that number (Rosenbrock 1963), (w + a q) / (1 + a). At rest this is w = q exactly, at any step.
+    A sharp-crested weir as long as the rim; x^(3/2) of it at x m.
+    """
+    crest = 2.0 * torch.sqrt(math.pi * tank_area)
+    return (2.0 / 3.0) * WEIR_COEFFICIENT * torch.sqrt(2.0 * gravity) * crest
+
+
+def weir_flow(
+    excess: Tensor, inflow: Tensor | float, tank_area: Tensor, strength: Tensor, resolution: Tensor
+) -> Tensor:
+    """What runs over a rim (or a share of it) of that strength at `excess` m above it while `inflow` m^3/s comes in.
+
+    w(x) = strength x^(3/2), m^3/s. It is far faster than the tank: where w'(x) r / A is too large for a step of
+    r = `resolution` s, it is taken linearly implicitly for the excess a of that number (Rosenbrock 1963),
+    (w + a q) / (1 + a). At rest this is w = q exactly, at any step.
     """
     above = torch.clamp(excess, min=0.0)
-    crest = 2.0 * torch.sqrt(math.pi * tank_area)
     root = torch.sqrt(above + _DRY)
-    strength = (2.0 / 3.0) * WEIR_COEFFICIENT * torch.sqrt(2.0 * gravity) * crest * share
     stiffness = torch.clamp(1.5 * strength * root * resolution / tank_area - STABLE_SPILL_TIMES_STEP, min=0.0)
     return torch.clamp((strength * above * root + stiffness * inflow) / (1.0 + stiffness), min=0.0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -32,6 +33,17 @@ class Experiment:
     @property
     def steps(self) -> Tensor:
         return torch.diff(self.nodes)
+
+    def mapped(self, make: Callable[[Tensor], Tensor]) -> Experiment:
+        """The same experiment with another kind of tensor for all that a plant's equations see of it."""
+        return replace(
+            self,
+            nodes=make(self.nodes),
+            inputs=make(self.inputs),
+            sample_times=make(self.sample_times),
+            sample_share=make(self.sample_share),
+            resolution=make(self.resolution),
+        )
 
     @property
     def sample_intervals(self) -> Tensor:

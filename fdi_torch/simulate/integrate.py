@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from contextlib import AbstractContextManager, nullcontext
+from copy import copy
 
 import torch
 from torch import Tensor
@@ -10,10 +12,12 @@ from torch.autograd import forward_ad
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Memory
+from fdi_torch.plant.moment import Constants
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.forward_mode import Everywhere, beside, directions, value_and_slope, with_slope
 
 
 class ReferenceEngine:
@@ -21,9 +25,12 @@ class ReferenceEngine:
 
     method: 'rk4' for populations, or any adaptive method of torchdiffeq for one run (rtol, atol in m).
     Adaptive solvers share one step over the batch, so a member would depend on its neighbours: lanes run one by one.
+    every_node: an adaptive solver begins anew at each node, not only where an actuator switches; its levels there are
+    then steps' ends rather than interpolated within long steps.
     """
 
     name = "reference"
+    arithmetic: AbstractContextManager[object] = nullcontext()
 
     def __init__(
         self,
@@ -34,9 +41,10 @@ class ReferenceEngine:
         rtol: float = 1e-10,
         atol: float = 1e-12,
         why: str = "",
+        every_node: bool = True,
     ) -> None:
         self.network, self.space, self.experiment, self.why = network, space, experiment, why
-        self.method, self.rtol, self.atol = method, rtol, atol
+        self.method, self.rtol, self.atol, self.every_node = method, rtol, atol, every_node
 
     def readings(self, theta: Tensor) -> Tensor:
         """theta (*batch, P) -> readings (*batch, S, sensors) in SI."""
@@ -57,17 +65,23 @@ class ReferenceEngine:
     def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """theta (*batch, P) -> readings (*batch, S, sensors), their Jacobian (*batch, S, sensors, P), forward mode.
 
-        Slow: torch differentiates each operation in Python; the other engines differentiate the equations beforehand.
+        Levels and their slopes are integrated side by side; torch differentiates each operation of the right-hand side.
         """
-        count = theta.shape[-1]
-        tangents = torch.eye(count, dtype=theta.dtype, device=theta.device)
-        tangents = tangents.reshape(count, *[1] * (theta.dim() - 1), count).expand(count, *theta.shape)
+        lanes = theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
+        parts = [self._run_with_slopes(p) for p in ([lanes] if self.method == "rk4" else lanes.split(1))]
+        readings, slopes = (torch.cat(each, dim=1) for each in zip(*parts, strict=True))
+        readings = readings.movedim(1, 0)
+        shape = (*theta.shape[:-1], *readings.shape[1:])
+        return readings.reshape(shape), slopes.movedim(1, 0).reshape(*shape, theta.shape[-1])
+
+    def _run_with_slopes(self, lanes: Tensor) -> tuple[Tensor, Tensor]:
+        """lanes (L, P) -> readings (S, L, sensors) and slopes (S, L, sensors, P): each lane once for each slope."""
         with forward_ad.dual_level():
-            dual = forward_ad.make_dual(theta.expand(count, *theta.shape).contiguous(), tangents.contiguous())
-            readings, slopes = forward_ad.unpack_dual(self.readings(dual))
-        if slopes is None:
-            slopes = torch.zeros_like(readings)
-        return readings[0], slopes.movedim(0, -1)
+            moving = copy(self)
+            moving.experiment, moving.arithmetic = self.experiment.mapped(with_slope), Everywhere()
+            readings, slopes = value_and_slope(moving._run(directions(lanes)))
+        assert slopes is not None
+        return readings[:, : len(lanes)], slopes.unflatten(1, (lanes.shape[-1], len(lanes))).movedim(1, -1)
 
     def moments(self, theta: Tensor, data: Readings) -> Tensor:
         """As `Engine.moments`."""
@@ -80,32 +94,48 @@ class ReferenceEngine:
         return gram_of(*self.linearise(theta), data)
 
     def _run(self, lanes: Tensor) -> Tensor:
-        """lanes (L, P) -> readings (S, L, sensors)."""
+        """lanes (L, P) -> readings (S, L, sensors); with slopes where the lanes have them."""
         values = self.network.bind(self.space, lanes)
-        levels = self._sample(*self._integrate(values, len(lanes)))
-        return self._read(levels, values)
+        if value_and_slope(lanes)[1] is not None:
+            values = Constants({place: {f: with_slope(v) for f, v in own.items()} for place, own in values.items()})
+        levels, commands, values = self._integrate(values, len(lanes))
+        with self.arithmetic:
+            return self._read(self._sample(levels, commands, values), values)
 
     def _clock(self, start: Tensor, step: Tensor) -> Clock:
         return Clock(start, step, self.experiment.resolution)
 
     def _integrate(self, values: PlaceValues, lanes: int) -> tuple[Tensor, Tensor, PlaceValues]:
         """Levels at the nodes (K+1, L, tanks), what the actuators do over the steps (K, L, actuators)."""
-        nodes, steps = self.experiment.nodes, self.experiment.steps
-        commands = self._commands(values, lanes)
-        start = torch.stack([h.expand(lanes) for h in self.network.start_levels(values)], dim=-1)
-        edges = nodes.tolist()
+        e = self.experiment
+        with self.arithmetic:
+            commands = self._commands(values, lanes)
+            start, slopes = value_and_slope(
+                torch.stack([h.expand(lanes) for h in self.network.start_levels(values)], dim=-1)
+            )
+        instants = e.nodes.detach()
+        edges, held = instants.tolist(), commands.unbind()
+        clocks = [self._clock(begin, step) for begin, step in zip(e.nodes[:-1].unbind(), e.steps.unbind(), strict=True)]
 
-        def rates(t: Tensor, levels: Tensor) -> Tensor:
+        def rates(t: Tensor, state: Tensor) -> Tensor:
             k = min(max(bisect_right(edges, float(t)) - 1, 0), len(edges) - 2)
-            return self.network(levels, commands[k], self._clock(nodes[k], steps[k]), values)
+            if slopes is None:
+                return self.network(state, held[k], clocks[k], values)
+            with self.arithmetic:
+                return beside(self.network(with_slope(*state.unbind()), held[k], clocks[k], values))
 
         # `perturb` asks for the slopes just inside each step, so that a switch at its end is not seen early.
-        options = {"perturb": True} if self.method == "rk4" else {"jump_t": nodes[1:-1]}
+        begins_anew = instants[1:-1]
+        if not self.every_node:
+            begins_anew = begins_anew[(torch.diff(commands.detach(), dim=0) != 0).flatten(1).any(dim=1)]
+        options = {"perturb": True} if self.method == "rk4" else {"jump_t": begins_anew}
         import torchdiffeq  # half a second, which no command has to wait for that does not ask for this engine
 
-        levels = torchdiffeq.odeint(
-            rates, start, nodes, method=self.method, rtol=self.rtol, atol=self.atol, options=options
+        first = start if slopes is None else torch.stack([start, slopes])
+        states = torchdiffeq.odeint(
+            rates, first, instants, method=self.method, rtol=self.rtol, atol=self.atol, options=options
         )
+        levels = states if slopes is None else with_slope(*states.unbind(1))
         return levels, commands, values
 
     def _commands(self, values: PlaceValues, lanes: int) -> Tensor:
