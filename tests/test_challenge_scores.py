@@ -165,7 +165,7 @@ def test_another_challenge_in_the_same_folder_is_refused(tmp_path: Path) -> None
 def row(kind: str, right: bool, seed: int = 1, index: int = 0, **more: Any) -> dict[str, Any]:
     about = {"by": "fdi", "rig": "three_tank", "seed": seed, "index": index, "case": f"case{index}", "kind": kind}
     judged = {"right": right, "named_wrong": False, "truth": [["pump_lag", "Q1"]], "effect": "pump_lag", "causes": []}
-    return about | judged | {"verdict": "named", "utility": 1.0, "sec": 3.0} | more
+    return about | judged | {"verdict": "named", "utility": 1.0, "sec": 3.0, "code": "abc"} | more
 
 
 def folder(path: Path, *rows: dict[str, Any]) -> Path:
@@ -199,6 +199,7 @@ def test_what_is_concluded_stands_in_the_folder(tmp_path: Path) -> None:
     assert conclude(tmp_path / "out", rows, {"join": ["a"]}, []) == found
     assert json.loads((tmp_path / "out" / "scores.json").read_text()).keys() == {"three_tank"}
     text = (tmp_path / "out" / "scores.md").read_text()
+    assert "2 cases of seeds 1, answered by the code of abc (2)." in text
     assert "| single | 1/2 (1 .. 99 %) |" in text and "| 0.8 to 0.95 | 0.900 | 1/1 (3 .. 100 %) |" in text
     assert "| single | three_tank | 1 | case1 | pump_lag at Q1 | named |  |" in text
     log = read_run(tmp_path / "out" / LOG)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fdi_torch.gap.challenge.rows import Scores, Tables
+from fdi_torch.gap.challenge.rows import Scores, Tables, group_of
 from fdi_torch.gap.challenge.score import Row
 
 OWN = "fdi"
@@ -83,6 +84,15 @@ def misses(rows: Iterable[Row]) -> Sheet:
     )
 
 
+def origin(rows: Iterable[Row]) -> str:
+    """How many cases, of which seeds, answered by which states of the code."""
+    own = list(rows)
+    seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in own}))
+    by_code = Counter(row["code"] or "an unknown state" for row in own)
+    states = ", ".join(f"{code} ({count})" for code, count in by_code.items())
+    return f"{len(own)} cases of seeds {seeds}, answered by the code of {states}. Brackets are 95 % intervals."
+
+
 def listed(causes: Iterable[Sequence[str]]) -> str:
     return " + ".join(f"{effect} at {place}" for effect, place in causes)
 
@@ -96,7 +106,7 @@ def markdown(found: Tables, rows: Sequence[Row]) -> str:
     """All tables of all rigs, then every miss."""
     parts = []
     for group, by in found.items():
-        parts.append(f"## {group}")
+        parts += [f"## {group}", origin(row for row in rows if row["by"] == OWN and group_of(row) == group)]
         for sheet in sheets(by):
             parts += [f"{sheet.title}:", _table(sheet)]
     missed = misses(rows)
