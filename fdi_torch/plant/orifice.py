@@ -58,4 +58,5 @@ def weir_flow(
     above = torch.clamp(excess, min=0.0)
     root = torch.sqrt(above + _DRY)
     stiffness = torch.clamp(1.5 * strength * root * resolution / tank_area - STABLE_SPILL_TIMES_STEP, min=0.0)
-    return torch.clamp((strength * above * root + stiffness * inflow) / (1.0 + stiffness), min=0.0)
+    spill = torch.clamp((strength * above * root + stiffness * inflow) / (1.0 + stiffness), min=0.0)
+    return torch.where(excess > 0.0, spill, 0.0)

@@ -1,22 +1,20 @@
 """One C++ source for a plant: its program's sections as functions over a block of lanes, in the loops of kernel.hpp.
 
 What varies with nothing is computed once, what varies between lanes once a trajectory, what varies in time only once
-a step for all lanes; the rest stands in loops over lanes that a compiler turns into vector instructions.
+a step for all lanes; the rest stands in loops over the vectors of a block, in the functions of vector.hpp.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from fdi_torch.simulate.expression import Varies
-from fdi_torch.simulate.operations import OPERATIONS
 from fdi_torch.simulate.program import Program
 from fdi_torch.simulate.section import Output, Place, Row, Section
+from fdi_torch.simulate.statements import Statements, stored
 
-_SKELETON = Path(__file__).with_name("kernel.hpp")
-_MATHS = ("FABS", "SQRT", "EXP", "LOG", "POW", "SIN", "COS", "TANH", "FLOOR", "CEIL", "TRUNC")
+_SKELETON, _PRIMITIVES = (Path(__file__).with_name(name) for name in ("kernel.hpp", "vector.hpp"))
 # glibc has vector forms of these, which a compiler may use once they are declared; the same lane always takes the same.
 _VECTORS = """#if defined(__GLIBC__) && defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 extern "C" {
@@ -25,6 +23,7 @@ VECTOR double exp(double); VECTOR double log(double); VECTOR double pow(double, 
 VECTOR double sin(double); VECTOR double cos(double);
 VECTOR float expf(float); VECTOR float logf(float); VECTOR float powf(float, float);
 VECTOR float sinf(float); VECTOR float cosf(float);
+#undef VECTOR
 }
 #endif
 """
@@ -32,8 +31,8 @@ VECTOR float sinf(float); VECTOR float cosf(float);
 
 def emit(program: Program, inner_samples: bool, real: str, lanes: int) -> str:
     """The source. real: 'double' or 'float'. inner_samples: whether samples lie within steps. lanes: in a block."""
-    writer = _Writer(program)
-    sections = writer.sections(inner_samples)
+    writer = _Writer(program, inner_samples)
+    sections = writer.sections()
     columns = program.columns
     defines = {
         "LANES": lanes,
@@ -54,18 +53,23 @@ def emit(program: Program, inner_samples: bool, real: str, lanes: int) -> str:
         "UNIFORM_CONSTANTS": len(writer.uniform_constants),
         "ROWS": len(writer.rows),
     }
-    head = ["#include <cmath>", _VECTORS, f"typedef {real} real;"]
-    suffix = "f" if real == "float" else ""
-    head += [f"#define {m} {m.lower()}{suffix}" for m in _MATHS]
-    head += [f"#define ROUND {'rint' + suffix}"]
-    head += [f"#define {name} {value}" for name, value in defines.items()]
+    head = [f"#define {name} {value}" for name, value in defines.items()]
     head += [
         _table("LATE_CHANNEL", [program.channels[i] for i in program.late_actuators]),
         _table("LATE_SENSOR", program.late_sensors),
         _table("SENSOR_TANK", program.sensor_tanks),
+        primitives(real),
     ]
     skeleton = _SKELETON.read_text(encoding="utf-8").replace("//@SECTIONS@", sections)
     return "\n".join(head) + "\n" + skeleton
+
+
+def primitives(real: str) -> str:
+    """The elementary functions, of 'double' or 'float'."""
+    bits, suffix = (32, "##f") if real == "float" else (64, "")
+    head = ["#include <cmath>", _VECTORS, f"typedef {real} real;"]
+    head += [f"#define REAL_BITS {bits}", f"#define LIBRARY(name) name{suffix}"]
+    return "\n".join([*head, _PRIMITIVES.read_text(encoding="utf-8")])
 
 
 def _table(name: str, values: Sequence[int]) -> str:
@@ -75,62 +79,95 @@ def _table(name: str, values: Sequence[int]) -> str:
 class _Writer:
     """Text of the sections; collects what is computed before the loop over time as it goes."""
 
-    def __init__(self, program: Program) -> None:
-        self.program, self.graph = program, program.graph
+    def __init__(self, program: Program, inner_samples: bool) -> None:
+        self.program, self.graph, self.inner_samples = program, program.graph, inner_samples
         self.lane_constants: dict[int, int] = {}
         self.uniform_constants: dict[int, int] = {}
         self.rows: dict[Place, tuple[int, Row]] = {}
 
-    def sections(self, inner_samples: bool) -> str:
+    def sections(self) -> str:
         p = self.program
         texts = [
-            self._section("settle_commands", p.settle_commands),
-            self._section("step", p.step),
-            self._section("settle_readings", p.settle_readings),
-            self._section("read", p.read),
+            self._section("settle_commands", [p.settle_commands]),
+            self._section("step", [p.act + p.stages[0], *p.stages[1:-1], p.stages[-1] + p.advance]),
+            self._section("settle_readings", [p.settle_readings]),
+            self._section("read", [p.read]),
         ]
-        if inner_samples:
-            texts.append(self._section("end", p.end))
+        if self.inner_samples:
+            texts.append(self._section("end", [p.end]))
         texts.insert(0, self._prepare())
         return "\n".join(texts)
 
-    def _section(self, name: str, section: Section) -> str:
-        """A function: numbers common to all lanes, the loop over lanes, and the loop over directions."""
-        body = _Body(self)
-        kept = body.values(section)
-        lines = [f"static inline void {name}(Block &b, const real *clock, const real *channel) {{"]
-        lines += [f"    Lane kept[{max(len(kept), 1)}];", *body.common, "    EACH_LANE {", *body.lane, "    }"]
-        lines += self._directions(section, body)
-        return "\n".join([*lines, "    (void)kept; (void)clock; (void)channel;", "}"])
+    def _section(self, name: str, parts: Sequence[Section]) -> str:
+        """A function: numbers common to all lanes, a loop over vectors for each part, and the loop over directions."""
+        outputs = [o for part in parts for o in part]
+        body = Statements(self.graph, self.constant)
+        ends = self._ends(parts)
+        wanted = [self._wanted(part, end) for part, end in zip(parts, ends, strict=True)]
+        body.keep(wanted, [slope for o in outputs for slope, _ in o.row.terms])
+        lines = []
+        for part, end, nodes in zip(parts, ends, wanted, strict=True):
+            loop = self._loop(body, part, end, nodes)
+            lines += ["    EACH_VECTOR {", *loop, "    }"] if loop else []
+        head = [f"static inline void {name}(Block &b, const real *clock, const real *channel) {{"]
+        head += [f"    alignas(64) Lane kept[{max(len(body.kept), 1)}];", *body.common]
+        tail = ["    (void)kept; (void)clock; (void)channel;", "}"]
+        return "\n".join([*head, *lines, *self._directions(outputs, body), *tail])
 
-    def _directions(self, section: Section, body: _Body) -> list[str]:
+    def _ends(self, parts: Sequence[Section]) -> list[list[Output]]:
+        """What each part stores. What a step ends with waits for the last, when no other needs what it began with."""
+        late = [o for part in parts for o in part if o.place[0].startswith("next_")]
+        ends = [[o for o in part if o not in late and self._place(o.place)] for part in parts]
+        ends[-1] += late
+        return ends
+
+    def _wanted(self, part: Section, ends: Sequence[Output]) -> list[int]:
+        slopes = [s for o in part for s in (*(slope for slope, _ in o.row.terms), *o.row.theta.values())]
+        return [*(o.node for o in (*part, *ends)), *slopes]
+
+    def _loop(self, body: Statements, part: Section, ends: Sequence[Output], wanted: list[int]) -> list[str]:
+        lines = body.compute(wanted)
+        for o in part:
+            for q, slope in o.row.theta.items():
+                row = self.row_index(o)
+                if self.graph.nodes[slope].varies & Varies.STEP:
+                    lines.append(stored(f"b.row[{row}][{q}]", body.text(slope)))
+        lines += [stored(place_text(o.place), body.text(o.node)) for o in ends]
+        body.leave()
+        return lines
+
+    def _directions(self, section: Sequence[Output], body: Statements) -> list[str]:
         """The loop over directions: what each output changes by; stored last, when no old value is needed any more."""
         moving = [o for o in section if o.row]
         if not moving:
             return []
         here = {o.place for o in moving}
-        lines = [f"        const real {d_name(o.place)} = {self._change(o, body, here)};" for o in moving]
-        lines += [f"        {d_store(o.place)} = {d_name(o.place)};" for o in moving if d_store(o.place)]
-        return ["    for (int p = 0; p < COLUMNS; ++p) EACH_LANE {", *lines, "    }"]
+        lines = [f"        const Vec {d_name(o.place)} = {self._change(o, body, here)};" for o in moving]
+        lines += [stored(d_place_text(o.place), d_name(o.place)) for o in moving if self._place(o.place)]
+        return ["    for (int p = 0; p < COLUMNS; ++p) EACH_VECTOR {", *lines, "    }"]
 
-    def _change(self, output: Output, body: _Body, here: Collection[Place]) -> str:
+    def _change(self, output: Output, body: Statements, here: Collection[Place]) -> str:
         """The row as a C expression. here: what is computed in the same loop; the rest is stored."""
         terms = [
-            product(body.text(slope), d_name(place) if place in here else d_store(place))
+            product(body.text(slope), d_name(place) if place in here else f"AT({d_place_text(place)})")
             for slope, place in output.row.terms
         ]
         if output.row.theta:
-            terms.append(f"b.row[{self.rows[output.place][0]}][p][l]")
+            terms.append(f"AT(b.row[{self.rows[output.place][0]}][p])")
         return " + ".join(terms)
+
+    def _place(self, place: Place) -> str:
+        """Where an output is stored; slopes are for samples within a step."""
+        return "" if place[0] == "slope1" and not self.inner_samples else place_text(place)
 
     def constant(self, i: int) -> str:
         """Where a node that does not vary in time is stored by `prepare`."""
         node = self.graph.nodes[i]
         if node.varies & Varies.LANE:
-            text = f"b.lane[{self.lane_constants.setdefault(i, len(self.lane_constants))}][l]"
+            text = f"AT(b.lane[{self.lane_constants.setdefault(i, len(self.lane_constants))}])"
         else:
             text = f"b.uniform[{self.uniform_constants.setdefault(i, len(self.uniform_constants))}]"
-        return f"({text} != 0)" if node.boolean else text
+        return f"DIFFERENT({text}, real(0))" if node.boolean else text
 
     def row_index(self, output: Output) -> int:
         return self.rows.setdefault(output.place, (len(self.rows), output.row))[0]
@@ -141,7 +178,7 @@ class _Writer:
         for output in section:
             if output.row.theta:
                 self.row_index(output)
-        body = _Body(self, before_time=True)
+        body = Statements(self.graph)
         constant = [
             (row, q, slope)
             for row, content in self.rows.values()
@@ -149,87 +186,15 @@ class _Writer:
             if not self.graph.nodes[slope].varies & Varies.STEP
         ]
         wanted = [*self.uniform_constants, *self.lane_constants, *(c[2] for c in constant), *(o.node for o in section)]
-        body.compute(wanted)
-        body.common += [f"    b.uniform[{i}] = {body.text(n)};" for n, i in self.uniform_constants.items()]
-        body.lane += [f"        b.lane[{i}][l] = {body.text(n)};" for n, i in self.lane_constants.items()]
-        body.lane += [f"        b.row[{row}][{q}][l] = {body.text(slope)};" for row, q, slope in constant]
-        body.lane += [f"        {store(o.place)} = {body.text(o.node)};" for o in section]
-        lines = ["static inline void prepare(Block &b, const real *clock, const real *channel) {", *body.common]
-        lines += ["    EACH_LANE {", *body.lane, "    }", *self._directions(section, body)]
+        lanes = body.compute(wanted)
+        common = [*body.common, *(f"    b.uniform[{i}] = {body.text(n)};" for n, i in self.uniform_constants.items())]
+        lanes += [stored(f"b.lane[{i}]", body.number(n)) for n, i in self.lane_constants.items()]
+        lanes += [stored(f"b.row[{row}][{q}]", body.text(slope)) for row, q, slope in constant]
+        lanes += [stored(place_text(o.place), body.text(o.node)) for o in section]
+        body.leave()
+        lines = ["static inline void prepare(Block &b, const real *clock, const real *channel) {", *common]
+        lines += ["    EACH_VECTOR {", *lanes, "    }", *self._directions(section, body)]
         return "\n".join([*lines, "    (void)clock; (void)channel;", "}"])
-
-
-class _Body:
-    """The statements of one section: `common` to all lanes, and those within the loop over lanes."""
-
-    def __init__(self, writer: _Writer, before_time: bool = False) -> None:
-        self.writer, self.graph, self.before_time = writer, writer.graph, before_time
-        self.common: list[str] = []
-        self.lane: list[str] = []
-        self.kept: dict[int, int] = {}
-        self._inside = True
-
-    def values(self, section: Section) -> dict[int, int]:
-        """Writes what computes and stores the outputs and the slopes that directions need; returns the kept ones."""
-        slopes = [slope for o in section for slope, _ in o.row.terms]
-        by_theta = [(o, q, slope) for o in section for q, slope in o.row.theta.items()]
-        self.compute([*(o.node for o in section), *slopes, *(slope for _, _, slope in by_theta)])
-        for o, q, slope in by_theta:
-            row = self.writer.row_index(o)
-            if self.graph.nodes[slope].varies & Varies.STEP:
-                self.lane.append(f"        b.row[{row}][{q}][l] = {self.text(slope)};")
-        for slope in slopes:
-            if self.graph.nodes[slope].varies == Varies.BOTH and slope not in self.kept:
-                self.lane.append(f"        kept[{len(self.kept)}][l] = {self.text(slope)};")
-                self.kept[slope] = len(self.kept)
-        self.lane += [f"        {store(o.place)} = {self.text(o.node)};" for o in section if store(o.place)]
-        self._inside = False
-        return self.kept
-
-    def compute(self, wanted: Iterable[int]) -> None:
-        """Writes a statement for each node that the wanted ones need and that is not known yet."""
-        nodes = self.graph.nodes
-        for i in self.graph.reach(wanted, [] if self.before_time else self._before(wanted)):
-            if nodes[i].operation == "literal":
-                continue
-            kind = "bool" if nodes[i].boolean else "real"
-            lines, indent = (self.lane, 8) if nodes[i].varies & Varies.LANE else (self.common, 4)
-            lines.append(f"{' ' * indent}const {kind} v{i} = {self._formula(i)};")
-
-    def _before(self, wanted: Iterable[int]) -> list[int]:
-        return [i for i in self.graph.reach(wanted) if not self.graph.nodes[i].varies & Varies.STEP]
-
-    def _formula(self, i: int) -> str:
-        node = self.graph.nodes[i]
-        if node.operation == "input":
-            return input_text(node.kind, node.index, node.varies)
-        if self.before_time or node.varies & Varies.STEP:
-            return OPERATIONS[node.operation].c.format(*(self.text(a) for a in node.arguments))
-        return self.writer.constant(i)
-
-    def text(self, i: int) -> str:
-        """The C expression of a node that has been computed; in the loop over directions, of one that was kept."""
-        node = self.graph.nodes[i]
-        if node.operation == "literal":
-            return literal(node.value)
-        if self._inside or not node.varies & Varies.LANE:
-            return f"v{i}"
-        if i in self.kept:
-            return f"kept[{self.kept[i]}][l]"
-        return input_text(node.kind, node.index, node.varies) if node.operation == "input" else self.writer.constant(i)
-
-
-def literal(value: float | None) -> str:
-    assert value is not None
-    return f"real({value!r})" if math.isfinite(value) else f"real({'-' if value < 0 else ''}INFINITY)"
-
-
-def input_text(kind: str, index: int, varies: Varies) -> str:
-    if kind == "resolution":
-        return "b.resolution"
-    if kind in ("clock", "channel"):
-        return f"{kind}[{index}]"
-    return f"b.{kind}[{index}][l]" if varies & Varies.LANE else f"b.{kind}[{index}]"
 
 
 def product(slope: str, change: str) -> str:
@@ -238,12 +203,12 @@ def product(slope: str, change: str) -> str:
     return f"-{change}" if slope == "real(-1.0)" else f"{slope} * {change}"
 
 
-def store(place: Place) -> str:
+def place_text(place: Place) -> str:
     """Where an output is stored; nowhere for what lives within a step only."""
     kind, i = place
     if kind.startswith("stage") or kind in ("slope2", "slope3", "slope4"):
         return ""
-    return f"b.{_STORED.get(kind, kind)}[{i}][l]"
+    return f"b.{_STORED.get(kind, kind)}[{i}]"
 
 
 _STORED = {
@@ -254,9 +219,9 @@ _STORED = {
 }
 
 
-def d_store(place: Place) -> str:
+def d_place_text(place: Place) -> str:
     kind, i = place
-    return f"b.d_{_STORED.get(kind, kind)}[p][{i}][l]" if store(place) else ""
+    return f"b.d_{_STORED.get(kind, kind)}[p][{i}]" if place_text(place) else ""
 
 
 def d_name(place: Place) -> str:

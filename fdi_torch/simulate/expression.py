@@ -43,11 +43,13 @@ class Graph:
 
     lifted: numbers from the equations that are handed to a program when it runs, so that plants that differ only
     in such numbers share one program; simple ones (halves, small integers) stay in the program.
+    closed: products that are needed as they are anyway, and are not taken apart to be grouped with other factors.
     """
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self.lifted: list[float] = []
+        self.closed: set[int] = set()
         self._known: dict[tuple[object, ...], int] = {}
 
     def input(self, kind: str, index: int, varies: Varies) -> int:
@@ -123,6 +125,8 @@ class Graph:
 
     def _chain(self, i: int, slopes: Mapping[int, Mapping[int, int]]) -> dict[int, int]:
         node = self.nodes[i]
+        if node.operation == "where":
+            return self._chain_of_choice(node.arguments, slopes)
         rule = OPERATIONS[node.operation].partials if node.operation in OPERATIONS else None
         if rule is None or not any(slopes[a] for a in node.arguments):
             return {}
@@ -134,6 +138,13 @@ class Graph:
                 term = self.apply("mul", factor, slope)
                 result[source] = self.apply("add", result[source], term) if source in result else term
         return result
+
+    def _chain_of_choice(self, arguments: tuple[int, ...], slopes: Mapping[int, Mapping[int, int]]) -> dict[int, int]:
+        """The slopes of the branch taken: what the other one's are does not matter."""
+        condition, yes, no = arguments
+        zero = self.literal(0.0)
+        sources = dict.fromkeys([*slopes[yes], *slopes[no]])
+        return {s: self.apply("where", condition, slopes[yes].get(s, zero), slopes[no].get(s, zero)) for s in sources}
 
     def _simplify(self, operation: str, a: Sequence[int]) -> int | None:
         value = [self.value(x) for x in a]
@@ -187,7 +198,7 @@ class Graph:
     def _grouped(self, a: Sequence[int]) -> int | None:
         """(x c) d = x (c d), where c and d vary less than x, so that c d is computed less often."""
         for product, d in ((a[0], a[1]), (a[1], a[0])):
-            if self.nodes[product].operation != "mul":
+            if self.nodes[product].operation != "mul" or product in self.closed:
                 continue
             first, second = self.nodes[product].arguments
             for x, c in ((first, second), (second, first)):

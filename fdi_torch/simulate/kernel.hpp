@@ -4,43 +4,12 @@
 // lanes and becomes vector instructions. No lane reads another's numbers, and every block is full (a last, short one
 // repeats its last lane), so a trajectory does not depend on its neighbours, their number, or the threads.
 #include <atomic>
-#include <cmath>
-#include <cstdint>
-#include <cstring>
 #include <memory>
 #include <thread>
-#include <type_traits>
 #include <vector>
 
 #define EACH_LANE _Pragma("GCC ivdep") for (int l = 0; l < LANES; ++l)
 #define SOME(n) ((n) > 0 ? (n) : 1)
-
-// NaN wins, as in torch. Two selects and no `or` of conditions: GCC then still makes vectors of the loop around them.
-static inline real MINIMUM(real a, real b) {
-    const real least = a < b ? a : b;
-    return a != a ? a : least;
-}
-static inline real MAXIMUM(real a, real b) {
-    const real most = a > b ? a : b;
-    return a != a ? a : most;
-}
-static inline real SIGN(real a) { return a > 0 ? real(1) : a < 0 ? real(-1) : a; }
-
-// s^(-1/4) for s > 0, to two units in the last place and in half the time of two roots and a division: a guess from
-// the exponent, right to 3 %, then twice y (1 + h/4 + 5 h^2/32 + 15 h^3/128) with h = 1 - s y^4.
-static inline real INVERSE_FOURTH_ROOT(real s) {
-    using Bits = std::conditional<sizeof(real) == 8, uint64_t, uint32_t>::type;
-    Bits bits;
-    std::memcpy(&bits, &s, sizeof s);
-    bits = (sizeof(real) == 8 ? Bits(0x4feb028f5c28f800) : Bits(0x4f58147a)) - (bits >> 2);
-    real y;
-    std::memcpy(&y, &bits, sizeof y);
-    for (int i = 0; i < 2; ++i) {
-        const real square = y * y, h = 1 - s * (square * square);
-        y += y * h * (real(0.25) + h * (real(5.0 / 32.0) + h * real(15.0 / 128.0)));
-    }
-    return y;
-}
 
 enum Mode { LEVELS, READINGS, MOMENTS, LINEARISE, GRAM, OBSERVE };
 enum { MEMORY = COMMAND_MEMORY + READING_MEMORY, STATE = TANKS + MEMORY };
@@ -60,20 +29,14 @@ struct Job {
 using Lane = real[LANES];
 
 struct Block {
-    Lane theta[SOME(COLUMNS)], lane[SOME(LANE_CONSTANTS)];
-    real uniform[SOME(UNIFORM_CONSTANTS)];
+    alignas(64) Lane theta[SOME(COLUMNS)];
+    Lane lane[SOME(LANE_CONSTANTS)];
     Lane level[TANKS], before[TANKS], sample[TANKS], slope_left[TANKS], slope_right[TANKS];
     Lane action[SOME(ACTUATORS)], command_memory[SOME(COMMAND_MEMORY)], late_channel[SOME(LATE_ACTUATORS)];
     Lane command_delay[SOME(LATE_ACTUATORS)], reading_delay[SOME(LATE_SENSORS)];
     Lane seen[SENSORS], reading[SENSORS], reading_memory[SOME(READING_MEMORY)];
-    int64_t begin[SOME(LATE_ACTUATORS)][LANES], end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
     Lane value, weight, centre;
     Lane squares[SENSORS][3];
-    int64_t problem[LANES];
-    bool one_problem;
-    const real *nominal, *lifted;
-    real resolution;
-    std::vector<real> history;                               // (LATE_SENSORS, S, LANES)
 #if TANGENT
     Lane row[SOME(ROWS)][COLUMNS];                           // what theta alone does to each output
     Lane d_level[COLUMNS][TANKS], d_before[COLUMNS][TANKS], d_sample[COLUMNS][TANKS];
@@ -82,8 +45,14 @@ struct Block {
     Lane d_command_delay[COLUMNS][SOME(LATE_ACTUATORS)], d_reading_delay[COLUMNS][SOME(LATE_SENSORS)];
     Lane d_seen[COLUMNS][SENSORS], d_reading[COLUMNS][SENSORS], d_reading_memory[COLUMNS][SOME(READING_MEMORY)];
     Lane gram[SENSORS][PAIRS], previous[SENSORS][WIDTH], column[WIDTH], previous_weight[SENSORS];
-    std::vector<real> d_history;                             // (COLUMNS, LATE_SENSORS, S, LANES)
 #endif
+    real uniform[SOME(UNIFORM_CONSTANTS)];
+    int64_t begin[SOME(LATE_ACTUATORS)][LANES], end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
+    int64_t problem[LANES];
+    bool one_problem;
+    const real *nominal, *lifted;
+    real resolution;
+    std::vector<real> history, d_history;                    // (LATE_SENSORS, S, LANES), (COLUMNS, LATE_SENSORS, S, LANES)
 };
 
 //@SECTIONS@

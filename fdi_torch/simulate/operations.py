@@ -44,8 +44,8 @@ def _where(condition: Tensor, yes: Tensor, no: Tensor) -> Tensor:
     return torch.where(condition, yes, no)
 
 
-def _comparison(function: Callable[..., Tensor], symbol: str) -> Operation:
-    return Operation(function, f"({{0}} {symbol} {{1}})", boolean=True)
+def _comparison(function: Callable[..., Tensor], name: str) -> Operation:
+    return Operation(function, f"{name}({{0}}, {{1}})", boolean=True)
 
 
 def _choose(g: Graph, condition: int, yes: float, no: float) -> int:
@@ -116,25 +116,25 @@ OPERATIONS: dict[str, Operation] = {
     "maximum": Operation(torch.maximum, "MAXIMUM({0}, {1})", _extreme("gt")),
     # clamp at one side: unlike minimum and maximum, torch gives the whole slope to a value on the bound
     "at_least": Operation(
-        torch.clamp_min, "({0} < {1} ? {1} : {0})", lambda g, out, a: (_choose(g, g.apply("ge", *a), 1.0, 0.0), None)
+        torch.clamp_min, "AT_LEAST({0}, {1})", lambda g, out, a: (_choose(g, g.apply("ge", *a), 1.0, 0.0), None)
     ),
     "at_most": Operation(
-        torch.clamp_max, "({0} > {1} ? {1} : {0})", lambda g, out, a: (_choose(g, g.apply("le", *a), 1.0, 0.0), None)
+        torch.clamp_max, "AT_MOST({0}, {1})", lambda g, out, a: (_choose(g, g.apply("le", *a), 1.0, 0.0), None)
     ),
     "where": Operation(
         _where,
-        "({0} ? {1} : {2})",
+        "WHERE({0}, {1}, {2})",
         lambda g, out, a: (None, _choose(g, a[0], 1.0, 0.0), _choose(g, a[0], 0.0, 1.0)),
     ),
-    "lt": _comparison(torch.lt, "<"),
-    "le": _comparison(torch.le, "<="),
-    "gt": _comparison(torch.gt, ">"),
-    "ge": _comparison(torch.ge, ">="),
-    "eq": _comparison(torch.eq, "=="),
-    "ne": _comparison(torch.ne, "!="),
-    "and": Operation(torch.logical_and, "({0} & {1})", boolean=True),
-    "or": Operation(torch.logical_or, "({0} | {1})", boolean=True),
-    "not": Operation(torch.logical_not, "!{0}", boolean=True),
+    "lt": _comparison(torch.lt, "LESS"),
+    "le": _comparison(torch.le, "AT_MOST_AS"),
+    "gt": _comparison(torch.gt, "MORE"),
+    "ge": _comparison(torch.ge, "AT_LEAST_AS"),
+    "eq": _comparison(torch.eq, "EQUAL"),
+    "ne": _comparison(torch.ne, "DIFFERENT"),
+    "and": Operation(torch.logical_and, "BOTH({0}, {1})", boolean=True),
+    "or": Operation(torch.logical_or, "EITHER({0}, {1})", boolean=True),
+    "not": Operation(torch.logical_not, "NOT({0})", boolean=True),
 }
 
 FOLDED: dict[str, Callable[..., float]] = {

@@ -52,6 +52,7 @@ class Stages:
         replaced = {**self.replaced, **dict(zip(self.levels, at, strict=True))}
         found = moved(self.graph, self.law, replaced, {("level", i): (f"stage{stage}", i) for i in range(len(at))})
         rates = [Output((f"slope{stage + 1}", o.place[1]), o.node, o.row) for o in found]
+        self.graph.closed |= {o.node for o in rates}
         self.stages.append((*reached, *rates))
         return [o.node for o in rates]
 
