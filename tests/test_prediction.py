@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.gap.in_turn import in_turn
 from fdi_torch.gap.prediction import predict
 from fdi_torch.gap.refit import refit
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
@@ -69,3 +70,60 @@ def test_a_refit_finds_what_the_effects_are_and_loses_those_left_out() -> None:
     assert predict(found.plant, run).rmse["level"] == pytest.approx(NOISE, rel=0.2)
     assert found.plant.effects[0].parameters["time_constant"] == pytest.approx(60.0, rel=0.1)
     assert refit(wrong, run, leave_out=["pump_lag"]).plant.effects == ()
+
+
+def tank(**changes: object) -> PlantDescription:
+    """One tank, filled by a pump whose command is known, emptied through a valve; its sensor zeroed before each run."""
+    data = {
+        "tanks": {"T": {"area": "100 cm^2", "height": "50 cm"}},
+        "pipes": {"OUT": {"source": "T", "area": "0.5 cm^2", "discharge_coefficient": 0.6, "valve": "v"}},
+        "pumps": {"Q": {"target": "T", "max_flow": "100 cm^3/s"}},
+        "sensors": {"h": {"tank": "T"}},
+        "tolerances": {"OUT.discharge_coefficient": 0.3, "Q.gain": 0.2, "h.offset": "2 cm"},
+        "varying": ["h.offset"],
+    }
+    return build_plant({**data, **changes}, "tank")
+
+
+def filling(gain: float, offset: float, seed: int, name: str = "a") -> Recording:
+    """200 s of a tank like that, with a pump of another gain, read with an offset (m)."""
+    time = torch.arange(201, dtype=torch.float64)
+    flow = 1e-6 * (60.0 + 30.0 * torch.sin(time / (9.0 + seed)))
+    inputs = torch.stack([flow, (time > 100.0).double()], dim=1)
+    blank = torch.full((201, 1), 0.1, dtype=torch.float64)
+    rig = tank(pumps={"Q": {"target": "T", "max_flow": "200 cm^3/s", "gain": gain}}, varying=[])
+    empty = Recording(time, inputs, blank, ("Q", "v"), ("h",), ("m^3/s", "1"), ("m",), source=name, sha256=name)
+    levels = predict(rig, empty).readings
+    noise = 1e-4 * torch.randn(201, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return replace(empty, outputs=levels + offset + noise)
+
+
+def test_a_sensor_that_reads_less_than_nothing_is_off_and_its_tank_empty() -> None:
+    run = filling(1.0, 0.0, 1)
+    early = replace(run, outputs=run.outputs - float(run.outputs[0]) - 0.01)
+    found = predict(tank(), early, start_samples=3)
+    assert found.start_levels["T"] == pytest.approx(0.0, abs=1e-3)
+    assert predict(tank(varying=[]), early, start_samples=3).rmse["h"] > found.rmse["h"]
+
+
+def test_several_recordings_share_what_does_not_vary_and_held_constants_stay() -> None:
+    runs = [filling(1.1, 0.004, 1), filling(1.1, -0.004, 2, "b")]
+    found = refit(tank(), runs, white=1e-4)
+    value, error = found.fitted["Q.gain"]
+    assert abs(value - 1.1) < 4.0 * error < 0.05
+    assert found.plant.pumps[0].gain == value
+    assert found.plant.varying == ("h.offset",) and "h.offset" not in found.fitted
+    held = refit(tank(), runs, white=1e-4, hold=["Q.*"])
+    assert held.plant.pumps[0].gain == 1.0 and held.plant.tolerances["Q.gain"] == 0.2
+    assert held.rmse["h"] > found.rmse["h"]
+
+
+def test_a_file_is_predicted_by_what_the_others_say() -> None:
+    runs = [filling(1.1, 0.0, 1), filling(1.1, 0.0, 2, "b"), filling(1.2, 0.0, 3, "c")]
+    trials = in_turn(tank(), runs, runs, lambda rest: refit(tank(), rest, white=1e-4).plant, 3)
+    assert [t.source for t in trials] == ["a", "b", "c"]
+    assert trials[0].refitted["h"] < trials[0].as_is["h"]  # 1.1 and 1.2 are nearer to 1.1 than the believed 1 is
+    alone = in_turn(tank(), runs[:2], runs[2:], lambda rest: refit(tank(), rest, white=1e-4).plant, 3)
+    assert alone[0].refitted["h"] == pytest.approx(trials[2].refitted["h"], rel=1e-6)
+    with pytest.raises(ValueError, match="recordings of another file"):
+        in_turn(tank(), runs[:1], runs[:1], lambda rest: tank(), 3)

@@ -12,6 +12,7 @@ import json
 from pathlib import Path
 
 from fdi_torch.cli import DONE
+from fdi_torch.cli.gap_refit import add_refit_arguments, run_refit
 from fdi_torch.cli.gap_text import next_steps, show, show_plan
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant import load_plant
@@ -21,11 +22,9 @@ from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.next_input import planned
 from fdi_torch.gap.plan import plan
-from fdi_torch.gap.refit import Refit, refit
 from fdi_torch.gap.which import DEEPEST
 from fdi_torch.jobs.gap import one_thread, run_gap
 from fdi_torch.jobs.log_paths import free_path
-from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recordings.csv_files import write_csv
 
@@ -62,9 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--with-constants", action="store_true", help="--adopt also writes the constants as fitted beside the causes"
     )
-    parser.add_argument(
-        "--refit", action="store_true", help="search nothing: fit the plant's own effects and constants together"
-    )
+    add_refit_arguments(parser)
     parser.add_argument("--plan", action="store_true", help="only say what the inputs of the recording can never show")
     parser.add_argument("--noise", metavar="STD", type=float, default=1e-3, help="for --plan: of a reading, SI (0.001)")
     parser.add_argument("--out", metavar="DIR", default="logs", help="folder for log, gap.json and next_input.csv")
@@ -85,7 +82,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     left_out = tuple(name for name in arguments.leave_out.split(",") if name)
     if arguments.refit:
         with one_thread():
-            return show_refit(refit(plant, recordings, left_out, arguments.step), arguments.adopt, screen)
+            return run_refit(plant, recordings, holdouts, left_out, arguments, screen)
     folder = Path(arguments.out)
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
@@ -98,28 +95,6 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         screen.say(f"- {sentence}")
     screen.say(f"log: {log} (fdi report {log} makes the page)")
     screen.result(answer.to_dict())
-    return DONE
-
-
-def show_refit(found: Refit, target: str | None, screen: Screen) -> int:
-    """The errors before and after, and the plant as fitted."""
-    rows = []
-    for sensor in found.plant.sensors:
-        unit, scale = display_unit(sensor.unit)
-        rows.append([sensor.name, *(f"{scale * of[sensor.name]:.4g}" for of in (found.before, found.rmse)), unit])
-    screen.table("error", ("sensor", "constants fitted", "effects too", "unit"), rows)
-    screen.say(f"{found.parameters} numbers fitted, start levels among them")
-    if target:
-        Path(target).write_text(dump_plant(found.plant), encoding="utf-8")
-        screen.note(f"plant file as fitted: {target}")
-    screen.result(
-        {
-            "format": "fdi_torch.refit/1",
-            "before": dict(found.before),
-            "rmse": dict(found.rmse),
-            "parameters": found.parameters,
-        }
-    )
     return DONE
 
 

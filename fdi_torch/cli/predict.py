@@ -1,59 +1,137 @@
-"""Run a plant file freely along a recording: only its first samples are used, for the start levels.
+"""Run a plant file freely along recordings: of each only the first samples are used, for the start levels.
 
-What is printed is the error of the whole run, the first samples included, in each sensor's unit.
+What is printed is the error of the whole run, the first samples included, in each sensor's unit. A run ends where an
+input becomes unknown, and begins anew where it is known again.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant import load_plant
-from fdi_torch.config.recordings import RecordingConfig, read_recording
-from fdi_torch.gap.prediction import START_SAMPLES, predict
+from fdi_torch.config.recordings import RecordingConfig, load_recordings, named_recordings
+from fdi_torch.gap.prediction import START_SAMPLES, Prediction, predict
 from fdi_torch.parameters import display_unit
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.report.free_run_figure import free_run_figure
+from fdi_torch.report.style import save
+
+EXAMPLES = """
+examples:
+  fdi predict run.csv --plant better.yaml                    one free run
+  fdi predict a.csv b.csv --plant rig.yaml --to 300          several, each for its first 300 s
+  fdi predict runs.yaml --plant rig.yaml                     stretches listed under `recordings`, as in a run file
+  fdi predict run.csv --plant better.yaml --beside rig.yaml --picture run.png
+  fdi predict run.csv --plant rig.yaml --constant q1_cmd=0   an input that was not recorded
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", help="CSV or MCAP file whose columns are named as the plant's channels")
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EXAMPLES
+    parser.add_argument(
+        "recordings", metavar="recording", nargs="*", help="CSV or MCAP file, or a YAML file with `recordings`"
+    )
+    parser.add_argument("--recording", metavar="FILE", action="append", default=[], help="the same, as an option")
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
     parser.add_argument(
         "--start-samples", metavar="N", type=int, default=START_SAMPLES, help=f"for the start levels ({START_SAMPLES})"
     )
-    parser.add_argument("--from", metavar="S", dest="start", type=float, help="first time used, s")
-    parser.add_argument("--to", metavar="S", dest="stop", type=float, help="last time used, s")
+    parser.add_argument("--from", metavar="S", dest="start", type=float, help="first time used of each file, s")
+    parser.add_argument("--to", metavar="S", dest="stop", type=float, help="last time used of each file, s")
+    parser.add_argument("--picture", metavar="FILE", help="draw the run (PNG or SVG); of several, the last")
+    parser.add_argument("--beside", metavar="PLANT", help="another plant, drawn beside it, such as the one before")
+    parser.add_argument(
+        "--constant", metavar="INPUT=VALUE", action="append", default=[], help="an input that was not recorded, SI"
+    )
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     torch.set_num_threads(1)
     plant = load_plant(arguments.plant)
-    config = RecordingConfig(file=arguments.recording, start=_seconds(arguments.start), stop=_seconds(arguments.stop))
-    recording = read_recording(config, plant, Path.cwd())
-    found = predict(plant, recording, arguments.start_samples)
-    rows = []
-    for sensor in plant.sensors:
-        unit, scale = display_unit(sensor.unit)
-        rows.append([sensor.name, f"{scale * found.rmse[sensor.name]:.4g}", unit])
-    screen.say(f"free run of {plant.name} along {recording.source}, {len(recording)} samples")
-    screen.table("error", ("sensor", "RMSE", "unit"), rows)
-    levels = ", ".join(f"{tank} {100 * level:.1f} cm" for tank, level in found.start_levels.items())
-    screen.say(f"start levels, from the first {arguments.start_samples} samples: {levels}")
-    screen.result(
+    names = [*arguments.recordings, *arguments.recording]
+    if not names:
+        raise ValueError("expected a recording, got none; name a CSV, MCAP or YAML file")
+    recordings = [r for name in names for r in _recordings(name, plant, arguments)]
+    found = [(recording, predict(plant, recording, arguments.start_samples)) for recording in recordings]
+    screen.say(f"free run of {plant.name}, start levels from the first {arguments.start_samples} samples")
+    screen.table(
+        "root mean square error",
+        ("recording", "from, s", "to, s", *(f"{s.name}, {display_unit(s.unit)[0]}" for s in plant.sensors), "start at"),
+        [_row(plant, recording, prediction) for recording, prediction in found],
+    )
+    if arguments.picture:
+        recording, prediction = found[-1]
+        runs = {plant.name: prediction.readings}
+        if arguments.beside:
+            other = load_plant(arguments.beside)
+            before = predict(other, recording, arguments.start_samples)
+            runs = {_other_name(other, plant, arguments): before.readings} | runs
+        columns = [sensor.column for sensor in plant.sensors]
+        title = f"free run along {Path(recording.source).name}"
+        screen.note(f"picture: {save(free_run_figure(recording, columns, runs, title), Path(arguments.picture))}")
+    results = [_result(plant, recording, prediction, arguments.start_samples) for recording, prediction in found]
+    screen.result(results[0] if len(results) == 1 else {"format": "fdi_torch.predictions/1", "runs": results})
+    return DONE
+
+
+def _recordings(name: str, plant: PlantDescription, arguments: argparse.Namespace) -> list[Recording]:
+    if Path(name).suffix in (".yaml", ".yml"):
+        return named_recordings(name, plant, Path.cwd())
+    units = plant.channel_units()
+    columns: dict[str, dict[str, Any]] = {
+        key: {"constant": f"{value} {units[key]}" if units.get(key, "1") != "1" else value}
+        for key, value in _constants(arguments).items()
+    }
+    config = RecordingConfig.model_validate(
         {
-            "format": "fdi_torch.prediction/1",
-            "plant": plant.name,
-            "rmse": dict(found.rmse),
-            "start_levels": dict(found.start_levels),
-            "start_samples": arguments.start_samples,
-            "time": recording.time.tolist(),
-            "readings": {s.name: found.readings[:, i].tolist() for i, s in enumerate(plant.sensors)},
+            "file": name,
+            "start": _seconds(arguments.start),
+            "stop": _seconds(arguments.stop),
+            "columns": columns,
         }
     )
-    return DONE
+    loaded = load_recordings([config], plant, Path.cwd())
+    return [part.recording for part in loaded]
+
+
+def _other_name(other: PlantDescription, plant: PlantDescription, arguments: argparse.Namespace) -> str:
+    return other.name if other.name != plant.name else Path(arguments.beside).stem
+
+
+def _constants(arguments: argparse.Namespace) -> dict[str, float]:
+    pairs = [text.partition("=") for text in arguments.constant]
+    for name, sign, value in pairs:
+        if not (name and sign and value):
+            raise ValueError(f"--constant: expected INPUT=VALUE such as q1_cmd=0, got '{name}{sign}{value}'")
+    return {name: float(value) for name, _, value in pairs}
+
+
+def _row(plant: PlantDescription, recording: Recording, found: Prediction) -> list[str]:
+    errors = [f"{display_unit(s.unit)[1] * found.rmse[s.name]:.4g}" for s in plant.sensors]
+    levels = ", ".join(f"{tank} {100 * level:.1f} cm" for tank, level in found.start_levels.items())
+    times = (f"{float(recording.time[i]):g}" for i in (0, -1))
+    return [Path(recording.source).name, *times, *errors, levels]
+
+
+def _result(plant: PlantDescription, recording: Recording, found: Prediction, start_samples: int) -> dict[str, Any]:
+    return {
+        "format": "fdi_torch.prediction/1",
+        "plant": plant.name,
+        "recording": recording.source,
+        "rmse": dict(found.rmse),
+        "start_levels": dict(found.start_levels),
+        "start_samples": start_samples,
+        "time": recording.time.tolist(),
+        "readings": {s.name: found.readings[:, i].tolist() for i, s in enumerate(plant.sensors)},
+    }
 
 
 def _seconds(value: float | None) -> str | None:

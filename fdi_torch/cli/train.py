@@ -11,8 +11,10 @@ import math
 from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.options import add_config, add_live, add_run, live, overrides
 from fdi_torch.cli.screen import Screen
+from fdi_torch.cli.windows import show_windows
 from fdi_torch.config.run import load_run
 from fdi_torch.jobs.train import TrainResult, train
+from fdi_torch.jobs.windows import windows_of
 from fdi_torch.parameters import display_unit
 
 
@@ -25,6 +27,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     job = load_run(arguments.config, overrides(arguments))
+    if job.config.estimate.windows is not None:
+        with screen.progress(job.name) as advance:
+            found = windows_of(job, advance)
+        show_windows(found, screen)
+        return DONE
     with live(arguments, job.name, screen) as listener, screen.progress(job.name) as advance:
         done = train(job, advance, arguments.resume, listener)
     show(done, screen)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.strict import Amount, Share, Strict, quantity
+from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
 from fdi_torch.effects import EFFECTS, all_placements, effect, placements_for
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.names import unknown
@@ -80,6 +80,9 @@ class EstimationConfig(Strict):
     refine: RefineConfig = Field(default_factory=RefineConfig)
     step: StepConfig = Field(default_factory=StepConfig)
     confidence: Share = Field(0.95, gt=0, lt=1, description="of intervals and of the diagnosis")
+    windows: Seconds | None = Field(
+        None, gt=0, description="length of windows, s: each is fitted on its own, for faults that come and go"
+    )
 
 
 def full_name(name: str, plant: PlantDescription) -> str:

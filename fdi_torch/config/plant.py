@@ -45,6 +45,7 @@ class PipeConfig(Strict):
     elevation: Length = Field(0.0, description="of the orifice above both floors, m")
     free_fall: bool = Field(False, description="whether it pours into its target from above")
     valve: str | None = Field(None, description="the input channel with its measured opening, 0 to 1")
+    unrecorded: Share | None = Field(None, ge=0, le=1, description="its opening in recordings that lack the channel")
 
 
 class PumpConfig(Strict):

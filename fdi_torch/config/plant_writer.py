@@ -52,6 +52,7 @@ def _pipe_mapping(pipe: Pipe) -> dict[str, Any]:
         elevation=_text(pipe.elevation, "m", "cm") if pipe.elevation else None,
         free_fall=pipe.free_fall or None,
         valve=pipe.valve,
+        unrecorded=pipe.unrecorded,
     )
 
 

@@ -15,9 +15,10 @@ from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
 from fdi_torch.logbook import LogError
 from fdi_torch.names import unknown
+from fdi_torch.parameters import header_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.csv_files import ChannelSource, read_csv
+from fdi_torch.recordings.csv_files import ChannelSource, read_csv, read_header
 from fdi_torch.recordings.mcap_files import read_mcap
 
 GIVE_A_CONSTANT = "give the unknown one a constant, as in columns: {Q1: {constant: 0 cm^3/s}}"
@@ -114,7 +115,7 @@ def read_recording(config: RecordingConfig, plant: PlantDescription, base: Path 
     path = find_data(config.file, base or Path.cwd())
     channels, columns = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
     try:
-        mapping = channel_mapping(config, plant)
+        mapping = unrecorded_valves(path, plant) | channel_mapping(config, plant)
         recording = _reader(path)(path, channels, columns, mapping, config.hold)
         names = (*recording.input_names, *recording.output_names)
         expect_units(recording.source, names, (*recording.input_units, *recording.output_units), plant)
@@ -128,6 +129,16 @@ def read_recording(config: RecordingConfig, plant: PlantDescription, base: Path 
 def _reader(path: Path) -> Callable[..., Recording]:
     """By the file's ending: an MCAP log (also one that was cut off while written), or else CSV."""
     return read_mcap if ".mcap" in path.suffixes else read_csv
+
+
+def unrecorded_valves(path: Path, plant: PlantDescription) -> dict[str, ChannelSource]:
+    """The valves that a CSV file lacks and the plant file says how they then stand."""
+    known = {p.valve: p.unrecorded for p in plant.pipes if p.valve and p.unrecorded is not None}
+    if not known or ".mcap" in path.suffixes:
+        return {}
+    header = read_header(path)
+    there = {*header, *(split[0] for column in header if (split := header_unit(column)))}
+    return {valve: ChannelSource(None, "1", opening) for valve, opening in known.items() if valve not in there}
 
 
 def channel_mapping(config: RecordingConfig, plant: PlantDescription) -> dict[str, ChannelSource]:

@@ -1,4 +1,8 @@
-"""A plant file on trial: its free run along a recording, whose first samples alone are used, for the start levels."""
+"""A plant file on trial: its free run along a recording, whose first samples alone are used, for the start levels.
+
+What the plant file says varies from recording to recording (the zero of a sensor that is zeroed before each run) is
+taken from the same samples, within its tolerance: a tank that reads less than nothing is empty, and its sensor off.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +73,8 @@ def _run(subject: Subject, start_samples: int) -> Prediction:
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     fitter = Fitter(replace(subject, mask=early), Noise(1e-2 * spread, torch.zeros_like(spread)))
     network = fitter.network([])
-    names = [f"{t.name}.start_level" for t in plant.tanks]
+    tanks = [f"{t.name}.start_level" for t in plant.tanks]
+    names = [*tanks, *plant.varying]
     engine = Collocation(network, ParameterSpace(network.constants[n] for n in names), subject.experiment)
     theta = torch.stack([engine.space.vector(start) for start in _starts(plant, fitter.first_levels())])
     theta, cost, near = fitter.descend(engine, theta, engine.settle(theta, engine.constant_guess(theta)).levels, ROUNDS)
@@ -81,7 +86,7 @@ def _run(subject: Subject, start_samples: int) -> Prediction:
     return Prediction(
         readings,
         residuals,
-        dict(zip((t.name for t in plant.tanks), theta[best].tolist(), strict=True)),
+        dict(zip((t.name for t in plant.tanks), theta[best].tolist(), strict=False)),
         dict(zip((s.name for s in plant.sensors), rmse.tolist(), strict=True)),
         float(run.defect.max()) < SETTLED,
     )

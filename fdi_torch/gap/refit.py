@@ -1,12 +1,14 @@
 """All effects of a plant file fitted anew together, with its constants: the last step after causes were adopted.
 
-A cause that was adopted early was fitted while others were still missing. No effect is searched here.
+A cause that was adopted early was fitted while others were still missing. No effect is searched here. A parameter with
+a tolerance stays near what the plant file says (valves of one make are nearly alike), one without is free.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 
 import torch
 
@@ -30,13 +32,15 @@ WIDE = 0.5  # of a range
 @dataclass(frozen=True)
 class Refit:
     """plant: with effects and constants as fitted. rmse: by sensor, in SI; before: of the plant as it was, its
-    constants and start levels fitted. parameters: how many were fitted, start levels included.
+    constants and start levels fitted. parameters: how many were fitted, start levels included. fitted: value and
+    standard error, misfit included, of what all recordings have in common.
     """
 
     plant: PlantDescription
     before: Mapping[str, float]
     rmse: Mapping[str, float]
     parameters: int
+    fitted: Mapping[str, tuple[float, float]]
 
 
 def refit(
@@ -44,25 +48,45 @@ def refit(
     recordings: Recording | Sequence[Recording],
     leave_out: Collection[str] = (),
     step: float | None = None,
+    hold: Collection[str] = (),
+    white: float | None = None,
 ) -> Refit:
-    """step: of the simulation, s; None for half the sampling interval. leave_out: effects that the plant is to lose."""
+    """step: of the simulation, s; None for half the sampling interval. leave_out: effects that the plant is to lose.
+
+    hold: patterns of constants that stay as the plant file has them. white: errors count as white noise of that size
+    (SI) in every reading, whatever is left of the fast ones; that is what a free run asks for where equations are not
+    quite the rig's, while the noise itself lets fast errors count for more than slow ones.
+    """
     kept = tuple(e for e in plant.effects if e.effect not in leave_out)
     placed = [Placement(effect(e.effect), e.location, e.parameters) for e in kept]
-    bare = replace(plant, effects=kept, tolerances={n: v for n, v in plant.tolerances.items() if n.count(".") == 1})
+    prefixes = {p.prefix for p in placed}
+    tolerances = {n: v for n, v in plant.tolerances.items() if n.count(".") == 1 or n.rpartition(".")[0] in prefixes}
+    held = {n for n in tolerances for pattern in hold if fnmatchcase(n, pattern)}
+    bare = replace(
+        plant,
+        effects=kept,
+        tolerances={n: v for n, v in tolerances.items() if n not in held},
+        varying=tuple(n for n in plant.varying if n not in held),
+    )
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     step = step or 0.5 * float(torch.median(torch.diff(recordings[0].time)))
     subject = laid_out(bare, placed, recordings, step)
-    start = _start(kept, plant, recordings)
+    start = {n: v for n, v in _start(kept, plant, recordings).items() if n not in tolerances}
+    start = {n: v for n, v in start.items() if not any(fnmatchcase(n, pattern) for pattern in hold)}
     free = [p for p in placed if any(n.startswith(f"{p.prefix}.") for n in start)]
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    fitter = Fitter(subject, Noise(1e-2 * spread, torch.zeros_like(spread)))
+    size = 1e-2 * spread if white is None else torch.full_like(spread, white)
+    fitter = Fitter(subject, Noise(size, torch.zeros_like(spread)))
     null = fitter.fit(Candidate(), rounds=ROUNDS)
-    fit = null
-    for _ in range(TURNS):
-        fitter = Fitter(subject, estimate_noise(subject.readings - fit.near.readings[0], subject.mask))
-        fit = fitter.fit(Candidate(tuple(free), (start,)), fit, rounds=ROUNDS)
-        start = {n: v for n, v in fit.effect_values.items() if n not in _undetermined(fitter, fit)}
-    return Refit(_with(bare, fit), _rmse(fitter, null), _rmse(fitter, fit), len(fit.space))
+    fit, base = null, null if white is None else None
+    for _ in range(TURNS if white is None else 1):
+        if white is None:
+            fitter = Fitter(subject, estimate_noise(subject.readings - fit.near.readings[0], subject.mask))
+        fit = base = fitter.fit(Candidate(tuple(free), (start,)), base, rounds=ROUNDS)
+        found = {n: v for n, v in fit.effect_values.items() if n in start}
+        start = {n: v for n, v in found.items() if n not in _undetermined(fitter, fit)}
+    better = replace(_with(bare, fit), tolerances=tolerances, varying=plant.varying)
+    return Refit(better, _rmse(fitter, null), _rmse(fitter, fit), len(fit.space), _errors(fitter, fit))
 
 
 def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
@@ -70,10 +94,17 @@ def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
     them, and what the plant file says is better than an end of the range.
     """
     low, high, _ = fitter.box(fit.space)
+    errors = _errors(fitter, fit)
+    widths = dict(zip(fit.space.names, (high - low).tolist(), strict=True))
+    return {n for n in fit.effect_values if errors[n][1] > WIDE * widths[n]}
+
+
+def _errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
+    """Values with standard errors, misfit included, of what all recordings have in common."""
     misfit = max(1.0, (fit.cost / float(fitter.subject.mask.sum())) ** 0.5)
     stds = standard_errors(fitter, fit)
-    widths = dict(zip(fit.space.names, (high - low).tolist(), strict=True))
-    return {n for n in fit.effect_values if misfit * stds[n] > WIDE * widths[n]}
+    own = set(fitter.subject.own)
+    return {n: (v, misfit * stds[n]) for n, v in fit.values.items() if n.partition("@")[0] not in own}
 
 
 def _start(
@@ -100,8 +131,10 @@ def _told(placed: PlacedEffect, plant: PlantDescription, recording: Recording) -
 
 
 def _with(plant: PlantDescription, fit: Fit) -> PlantDescription:
-    """Constants and effects as fitted; start levels belong to the recording and stay as they were."""
-    constants = {n: v for n, v in fit.values.items() if n.count(".") == 1 and not n.endswith(".start_level")}
+    """Constants and effects as fitted; what each recording has for itself stays as it was."""
+    own = {*plant.varying, *(f"{tank.name}.start_level" for tank in plant.tanks)}
+    common = {n: v for n, v in fit.values.items() if n.partition("@")[0] not in own}
+    constants = {n: v for n, v in common.items() if n.count(".") == 1}
     found = fit.effect_values
     effects = []
     for placed in plant.effects:

@@ -33,7 +33,8 @@ class Pipe:
     """An orifice from one tank into another tank or the outside.
 
     area m^2; elevation m above both floors. free_fall: it pours into `target` from above, so that only the
-    source's level drives it (always so into the outside). valve: the input channel with its measured opening (0..1).
+    source's level drives it (always so into the outside). valve: the input channel with its measured opening (0..1);
+    unrecorded: its opening in recordings that lack the channel, None where every recording has to have it.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Pipe:
     elevation: float = 0.0
     free_fall: bool = False
     valve: str | None = None
+    unrecorded: float | None = None
 
     @property
     def is_outlet(self) -> bool:

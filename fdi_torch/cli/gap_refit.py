@@ -1,0 +1,111 @@
+"""`fdi gap --refit`: nothing is searched; a plant's own effects and constants are fitted together, and tried on runs
+that were not used.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from fdi_torch.cli import DONE
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.plant_writer import dump_plant
+from fdi_torch.effects import build_network
+from fdi_torch.gap.in_turn import Trial, in_turn
+from fdi_torch.gap.prediction import START_SAMPLES
+from fdi_torch.gap.refit import Refit, refit
+from fdi_torch.parameters import display_unit
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+
+
+def add_refit_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--refit", action="store_true", help="search nothing: fit the plant's own effects and constants together"
+    )
+    parser.add_argument(
+        "--hold", metavar="NAME,...", default="", help="with --refit: leave these as they are (* is any name)"
+    )
+    parser.add_argument(
+        "--white", metavar="STD", type=float, help="with --refit: slow errors count like fast ones, of that size, SI"
+    )
+    parser.add_argument(
+        "--in-turn",
+        action="store_true",
+        help="with --refit: also free runs of every file (of every --holdout, if any) by a refit without that file",
+    )
+    parser.add_argument(
+        "--start-samples",
+        metavar="N",
+        type=int,
+        default=START_SAMPLES,
+        help=f"with --in-turn: for the start levels ({START_SAMPLES})",
+    )
+
+
+def run_refit(
+    plant: PlantDescription,
+    recordings: Sequence[Recording],
+    holdouts: Sequence[Recording],
+    leave_out: Collection[str],
+    arguments: argparse.Namespace,
+    screen: Screen,
+) -> int:
+    hold = [name for name in arguments.hold.split(",") if name]
+    found = refit(plant, recordings, leave_out, arguments.step, hold, arguments.white)
+    _show(found, screen)
+    if arguments.adopt:
+        Path(arguments.adopt).write_text(dump_plant(found.plant), encoding="utf-8")
+        screen.note(f"plant file as fitted: {arguments.adopt}")
+    trials: list[Trial] = []
+    if arguments.in_turn:
+        with screen.progress("without each file in turn") as advance:
+            trials = in_turn(
+                plant,
+                recordings,
+                holdouts or recordings,
+                lambda rest: refit(plant, rest, leave_out, arguments.step, hold, arguments.white).plant,
+                arguments.start_samples,
+                advance,
+            )
+        _show_trials(trials, plant, screen)
+    screen.result(
+        {
+            "format": "fdi_torch.refit/1",
+            "before": dict(found.before),
+            "rmse": dict(found.rmse),
+            "parameters": found.parameters,
+            "fitted": {n: {"value": v, "std": s} for n, (v, s) in found.fitted.items()},
+            "in_turn": trials,
+        }
+    )
+    return DONE
+
+
+def _show(found: Refit, screen: Screen) -> None:
+    rows = []
+    for sensor in found.plant.sensors:
+        unit, scale = display_unit(sensor.unit)
+        rows.append([sensor.name, *(f"{scale * of[sensor.name]:.4g}" for of in (found.before, found.rmse)), unit])
+    screen.table("error", ("sensor", "constants fitted", "effects too", "unit"), rows)
+    constants = build_network(found.plant).constants
+    rows = []
+    for name, (value, error) in found.fitted.items():
+        unit, scale = display_unit(constants[name].unit)
+        rows.append([name, f"{scale * value:.4g}", f"{scale * error:.2g}", "" if unit == "1" else unit])
+    screen.table("fitted to all recordings", ("parameter", "value", "std error", "unit"), rows)
+    screen.say(f"{found.parameters} numbers fitted, start levels among them")
+
+
+def _show_trials(trials: Sequence[Trial], plant: PlantDescription, screen: Screen) -> None:
+    """One line a free run: the plant file as it is, and as refitted without that file."""
+    header = ["run", "from, s", "to, s"]
+    header += [f"{s.name} {of}, {display_unit(s.unit)[0]}" for of in ("as is", "refitted") for s in plant.sensors]
+    rows = []
+    for trial in trials:
+        errors = [
+            f"{display_unit(s.unit)[1] * of[s.name]:.3g}" for of in (trial.as_is, trial.refitted) for s in plant.sensors
+        ]
+        rows.append([Path(trial.source).name, f"{trial.start:g}", f"{trial.stop:g}", *errors])
+    screen.table("root mean square error of free runs, refitted without the file that the run is of", header, rows)

@@ -1,0 +1,51 @@
+"""The picture of free runs: what was read, what one or two plant files predict from the first samples, what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from fdi_torch.recording import Recording
+from fdi_torch.report.curves import thinned
+from fdi_torch.report.html import short
+from fdi_torch.report.numbers import axis, shown_unit
+from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, styled
+
+
+def free_run_figure(recording: Recording, columns: list[str], runs: Mapping[str, Tensor], title: str) -> Figure:
+    """One column a sensor (`columns`: its output in the recording). runs: predicted readings (T, N) in SI by the name
+    of the plant, the better one last.
+    """
+    count = len(columns)
+    with styled():
+        figure = Figure(figsize=(max(4.2 * count, 6.0), 5.2), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots(2, count, sharex=True, squeeze=False, height_ratios=(2, 1))
+        for i, column in enumerate(columns):
+            said = {name: predicted[:, i] for name, predicted in runs.items()}
+            _draw(axes[0, i], axes[1, i], recording, recording.output_names.index(column), said)
+        figure.suptitle(short(title, 100))
+    return figure
+
+
+def _draw(upper: Axes, lower: Axes, recording: Recording, i: int, runs: Mapping[str, Tensor]) -> None:
+    unit, scale = shown_unit(recording.output_units[i])
+    counted, outputs = recording.mask[:, i].cpu().numpy(), recording.outputs[:, i].cpu().numpy()
+    read = scale * np.where(counted, outputs, np.nan)
+    time = recording.time.cpu().numpy()
+    upper.plot(*thinned(time, read), color=SOFT, lw=2.0, label="read")
+    lower.axhline(0.0, color=SOFT, lw=0.7)
+    for (name, predicted), color in zip(runs.items(), (MARK, MODEL)[-len(runs) :], strict=True):
+        said = scale * predicted.detach().cpu().numpy()
+        upper.plot(*thinned(time, said), color=color, lw=1.0, label=name)
+        lower.plot(*thinned(time, read - said), color=color, lw=0.8)
+    upper.set_title(short(recording.output_names[i]), loc="left")
+    upper.set_ylabel(axis("reading", unit))
+    lower.set_ylabel(axis("read − run", unit))
+    lower.set_xlabel("time, s")
+    label_lines(upper)

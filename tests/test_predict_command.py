@@ -1,0 +1,78 @@
+"""`fdi predict`: what strangers' files ask of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from fdi_torch.cli import main
+
+PLANT = """
+tanks: {T: {area: 100 cm^2, height: 50 cm}}
+pipes: {OUT: {source: T, area: 0.5 cm^2, discharge_coefficient: 0.6, valve: v, unrecorded: 0}}
+pumps: {Q: {target: T, max_flow: 100 cm^3/s}}
+sensors: {h: {tank: T}}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A tank that is filled by 50 cm^3/s, in files of several kinds: columns in any order, cells missing."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.yaml").write_text(PLANT)
+    levels = [10.0 + 0.5 * k for k in range(40)]
+    cells = [(f"{k}", f"{10 * h:.1f}" if k % 7 else "", "0.05") for k, h in enumerate(levels)]
+    (tmp_path / "novalve.csv").write_text("h_mm,Q_lps,t_s\n" + "".join(f"{h},{q},{t}\n" for t, h, q in cells))
+    (tmp_path / "nopump.csv").write_text("t_s,h_mm,v_pct\n" + "".join(f"{t},100,0\n" for t, _, _ in cells))
+    unknown = [(t, h, "" if 15 <= int(t) < 20 else q) for t, h, q in cells]
+    (tmp_path / "cut.csv").write_text("t_s,h_mm,Q_lps,v_pct\n" + "".join(f"{t},{h},{q},0\n" for t, h, q in unknown))
+    (tmp_path / "runs.yaml").write_text("recordings: [{file: cut.csv, stop: 14 s}, {file: cut.csv, start: 20 s}]\n")
+    return tmp_path
+
+
+def said(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, object]:
+    assert main(["predict", "--plant", "rig.yaml", "--start-samples", "3", "--json", *words]) == 0
+    out: dict[str, object] = json.loads(capsys.readouterr().out)
+    return out
+
+
+def test_a_valve_that_was_not_recorded_stands_as_the_plant_file_says_and_missing_readings_do_not_count(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert said(capsys, "--recording", "novalve.csv")["rmse"] == {"h": pytest.approx(0.0, abs=2e-4)}
+
+
+def test_a_valve_of_which_nothing_is_said_has_to_be_recorded(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "rig.yaml").write_text(PLANT.replace(", unrecorded: 0", ""))
+    assert main(["predict", "--plant", "rig.yaml", "novalve.csv"]) == 2
+    assert "expected a column for v" in capsys.readouterr().err
+
+
+def test_a_pump_that_was_not_recorded_has_to_be_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["predict", "--plant", "rig.yaml", "nopump.csv"]) == 2
+    assert "expected a column for Q" in capsys.readouterr().err
+    assert said(capsys, "nopump.csv", "--constant", "Q=0")["rmse"] == {"h": pytest.approx(0.0, abs=1e-6)}
+    assert main(["predict", "--plant", "rig.yaml", "nopump.csv", "--constant", "Q"]) == 2
+    assert "INPUT=VALUE" in capsys.readouterr().err
+
+
+def test_a_run_ends_where_a_command_is_unknown_and_begins_anew(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = said(capsys, "cut.csv")["runs"]
+    assert isinstance(runs, list) and [(r["time"][0], r["time"][-1]) for r in runs] == [(0, 14), (20, 39)]
+    listed = said(capsys, "runs.yaml")["runs"]
+    assert isinstance(listed, list) and [r["rmse"] for r in listed] == [r["rmse"] for r in runs]
+
+
+def test_the_picture_has_both_plants(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "before.yaml").write_text(PLANT.replace("100 cm^2", "80 cm^2"))
+    said(capsys, "novalve.csv", "--picture", "run.svg", "--beside", "before.yaml")
+    assert (folder / "run.svg").stat().st_size > 5000
+
+
+def test_no_recording_is_misuse(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["predict", "--plant", "rig.yaml"]) == 2
+    assert "expected a recording" in capsys.readouterr().err

@@ -1,0 +1,63 @@
+"""Faults window by window: a fault that comes and goes is there when it was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from fdi_torch.config.run import build_run
+from fdi_torch.jobs.windows import Window, WindowFault, cut_up, state_of, stretches_of, windows_of
+from fdi_torch.recording import Recording
+
+
+def window(start: float, state: str, size: float = 0.5) -> Window:
+    return Window(start, start + 10.0, (WindowFault("T1.leak.size", size, 0.1, state, 1e-6),), 1.0)  # type: ignore[arg-type]
+
+
+def test_neighbouring_windows_with_the_fault_are_one_stretch() -> None:
+    states = ["absent", "present", "present", "cannot tell", "present"]
+    found = stretches_of([window(10.0 * k, state) for k, state in enumerate(states)])
+    assert [(s.start, s.stop) for s in found] == [(10.0, 30.0), (40.0, 50.0)]
+    assert found[0].size == pytest.approx(0.5) and found[0].std == pytest.approx(0.1 / 2**0.5)
+
+
+def test_windows_that_are_apart_are_two_stretches() -> None:
+    assert len(stretches_of([window(0.0, "present"), window(20.0, "present")])) == 2
+
+
+def test_a_size_that_its_error_covers_is_absent_and_one_that_nothing_tells_is_unknown() -> None:
+    assert state_of(0.2, 0.01, 1.0) == "present"
+    assert state_of(0.2, 0.12, 1.0) == "absent"
+    assert state_of(0.01, 0.001, 1.0) == "absent"
+    assert state_of(0.2, 0.3, 1.0) == "cannot tell"
+
+
+def test_windows_lie_side_by_side_and_share_a_sample() -> None:
+    time = torch.arange(101, dtype=torch.float64)
+    blank = torch.zeros(101, 1, dtype=torch.float64)
+    cuts = cut_up(Recording(time, blank, blank, ("q",), ("h",), ("m^3/s",), ("m",)), 30.0)
+    assert [(float(c.time[0]), float(c.time[-1])) for c in cuts] == [(0.0, 30.0), (30.0, 60.0), (60.0, 90.0)]
+
+
+def test_a_leak_that_opens_halfway_is_in_the_windows_after_it(tmp_path: Path) -> None:
+    simulated = {
+        "plant": "three_tank",
+        "simulate": {
+            "inputs": {"Q1": "50 cm^3/s", "Q2": "40 cm^3/s"},
+            "duration": "400 s",
+            "faults": {"T1.leak": 0.3, "T1.leak.onset": "200 s"},
+            "noise": {"std": {"h1": "1 mm", "h2": "1 mm", "h3": "1 mm"}},
+            "start_levels": {"T1": "30 cm", "T2": "15 cm", "T3": "20 cm"},
+        },
+        "estimate": {"parameters": ["T1.leak", "T3.leak"], "calibrate": [], "windows": "100 s"},
+        "output": {"folder": str(tmp_path)},
+    }
+    found = windows_of(build_run(simulated, tmp_path, "windows.yaml"))
+    assert [[f.state for f in w.faults] for w in found.windows] == [["absent"] * 2] * 2 + [["present", "absent"]] * 2
+    (leak,) = found.stretches
+    assert (leak.start, leak.stop) == (200.0, 400.0)
+    assert abs(leak.size - 0.3) < 4.0 * leak.std < 0.1
+    assert leak.flow is not None and leak.flow > 0.0
+    assert found.log.is_file()
