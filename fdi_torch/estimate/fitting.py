@@ -56,6 +56,11 @@ class Fitting:
         """Whether each operation of each step costs a call from Python, so that steps have to be saved."""
         return self.engine == "reference"
 
+    def beginning(self, samples: int) -> Fitting:
+        """The same with the first samples of each recording only."""
+        cut = [r.stretch(0, samples) for r in self.recordings]
+        return replace(self, recordings=tuple(cut))
+
     def engines(self, step: float, adaptive: bool = False) -> list[Engine]:
         """An engine for each recording, in steps no longer than `step` s, or by an adaptive solver about as exact."""
         engines = []

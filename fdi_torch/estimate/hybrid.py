@@ -15,6 +15,7 @@ from fdi_torch.estimate.objectives import Objective, Problem
 from fdi_torch.estimate.refine import Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.uncertainty import Estimate, make_estimate
+from fdi_torch.simulate.engine import Engine
 from fdi_torch.simulate.steps import choose_step, probe_points
 
 # A refinement that stopped at the last digits of its cost is converged when this few standard errors are left to go.
@@ -25,6 +26,8 @@ FINEST_STEP = 0.01
 NEAR_SHARE, NEAR_COST, ROUGH_ERROR = 0.2, 1e-2, 0.1
 ADAPTIVE_STEPS = (2.0, 0.05)
 NEAR_ENOUGH, CLOSE = 1e-2, 1e-4
+# Tanks forget, so that errors of the step do not add up: a long recording's beginning tells how large they are.
+PROBE_SAMPLES = 20_000
 
 
 @dataclass(frozen=True)
@@ -122,10 +125,10 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
     spans = [float(r.time[-1] - r.time[0]) for r in fitting.recordings]
     longest = max(min(spans) / 20.0, 1e-6)
     shortest = min(range(len(spans)), key=spans.__getitem__)
+    beginning = fitting.beginning(PROBE_SAMPLES)
 
-    def engine_at(step: float):  # type: ignore[no-untyped-def]
-        own = fitting.engines(step)
-        return own[shortest]
+    def engine_at(step: float) -> Engine:
+        return beginning.engines(step)[shortest]
 
     columns = fitting.columns[shortest]
     own_points = points[:, columns]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,6 +10,8 @@ from torch import Tensor
 
 from fdi_torch.plant.signals import CumulativeSignal
 from fdi_torch.recording import Hold, Recording
+
+BLOCK = 1 << 17
 
 
 @dataclass(frozen=True)
@@ -71,12 +73,15 @@ def lay_out(recording: Recording, channels: tuple[str, ...], step: float) -> Exp
     nodes = grid_nodes(time, inputs, recording.hold, step)
     signal = CumulativeSignal(time, inputs, recording.hold)
     starts, steps = nodes[:-1], torch.diff(nodes)
-    means = [signal.average(starts, steps, c) for c in range(len(channels))]
+    means = torch.empty(len(starts), len(channels), dtype=time.dtype, device=time.device)
+    for block in _blocks(len(starts)):
+        for c in range(len(channels)):
+            means[block, c] = signal.average(starts[block], steps[block], c)
     index = torch.clamp(torch.searchsorted(nodes, time) - 1, min=0)
     share = (time - nodes[index]) / steps[index]
     return Experiment(
         nodes=nodes,
-        inputs=torch.stack(means, dim=1) if means else time.new_zeros(len(starts), 0),
+        inputs=means,
         signal=signal,
         sample_times=time,
         sample_step=index,
@@ -103,10 +108,20 @@ def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float) -> Tensor:
     ends = torch.cat([time[:1], anchors, time[-1:]]).unique()
     gaps = torch.diff(ends)
     counts = torch.ceil(gaps / step - 1e-9).clamp(min=1).to(torch.int64)
-    which = torch.repeat_interleave(torch.arange(len(gaps)), counts)
-    first = torch.cumsum(counts, 0) - counts
-    within = (torch.arange(int(counts.sum())) - first[which]).to(time.dtype)
-    return torch.cat([ends[which] + gaps[which] * within / counts[which], ends[-1:]])
+    after = torch.cumsum(counts, 0)
+    nodes = torch.empty(int(after[-1]) + 1, dtype=time.dtype, device=time.device)
+    nodes[-1] = ends[-1]
+    for block in _blocks(len(nodes) - 1):
+        number = torch.arange(block.start, block.stop, device=time.device)
+        gap = torch.searchsorted(after, number, right=True)
+        within = (number - (after[gap] - counts[gap])).to(time.dtype)
+        nodes[block] = ends[gap] + gaps[gap] * within / counts[gap]
+    return nodes
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    """0 .. count in pieces, so that what is worked out on the way to millions of steps takes little memory."""
+    return (slice(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK))
 
 
 def _select(recording: Recording, channels: tuple[str, ...]) -> Tensor:
