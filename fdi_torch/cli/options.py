@@ -24,7 +24,7 @@ def add_config(parser: argparse.ArgumentParser, required: bool = False) -> None:
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", help="folder for the log and the pictures (default: logs)")
+    parser.add_argument("--out", metavar="DIR", help="folder for what is written (default: logs)")
     parser.add_argument("--device", metavar="cpu|cuda", help="where tensors live")
     parser.add_argument("--seed", metavar="N", type=int, help="of everything drawn at random")
 

@@ -19,10 +19,11 @@ _INDEX_HEAD = 6  # channel number and length of the list, in a message index's b
 
 @dataclass(frozen=True)
 class Described:
-    """A channel and its schema as records of the format."""
+    """A channel and its schema as records of the format; whether it carries a recording's inputs or outputs."""
 
     schema: Schema | None
     channel: Channel
+    is_signal: bool = False
 
 
 class Chunk:

@@ -32,10 +32,23 @@ def copy_log(source: Path, target: Path, salvage: bool = False, extra: Extra | N
     return run
 
 
-def copy_records(run: Run, sink: Sink) -> int:
-    """Metadata, attachments and messages in the order of the file. Returns the number of messages."""
+def joined(sink: Sink, target: Path) -> None:
+    """The file of a finished sink as it would be had nothing been cut: as it is up to the mark, then in full chunks."""
+    assert sink.mark is not None
+    run = read_run(sink.path)
+    other = sink.again(target)
+    try:
+        copy_records(run, other, sink.mark.size)
+    except BaseException:
+        other.abandon()
+        raise
+    other.finish()
+
+
+def copy_records(run: Run, sink: Sink, start: int = 0) -> int:
+    """Metadata, attachments and messages in the order of the file, from byte `start`. Returns how many messages."""
     count = 0
-    for part in run.walk():
+    for part in run.walk(start):
         if not isinstance(part, Frame):
             count += 1
             sink.message(part.channel, part.log_time, part.publish_time, part.sequence, part.data)

@@ -6,7 +6,9 @@ the same topic, so that every message is described by a schema.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain, count, repeat
 from typing import Any
 
 import numpy as np
@@ -15,23 +17,31 @@ import orjson
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, plain
 from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, Topic, json_schema, named_kinds, topic_definition
+from fdi_torch.logbook.sink import EPOCH_NS, Timed, log_time_of
 
 Named = Mapping[str, Any]
-Encoded = tuple[Channel, float, int, bytes]
-"""Channel, plant time in s, sequence number and payload of a message."""
+Fields = Callable[[], Named]
 _RESERVED = ("t", NON_FINITE, WALL, "masked")
 _BLOCK = 4096
+_TOGETHER, _TOGETHER_BYTES = 64, 1 << 22
 
 
 class Messages:
-    """Encodes messages and hands them to `put`."""
+    """Encodes messages and hands them to `put`, with their log time in ns.
+
+    What comes in a slow trickle can be put off (`later`), and is then encoded many at a time: a processor that has been
+    busy with other things takes several times as long over each alone.
+    """
 
     def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._put_off: list[tuple[str, Fields, float, Mapping[str, str] | None]] = []
+        self._put_off_bytes = 0
         self._latest = 0.0
         self._described: dict[str, tuple[frozenset[str], Channel]] = {}
         self._sequence: dict[str, int] = {}
 
-    def put(self, messages: Iterable[Encoded]) -> None:
+    def put(self, messages: Iterable[Timed]) -> None:
         raise NotImplementedError
 
     def wall(self) -> dict[str, int]:
@@ -51,6 +61,7 @@ class Messages:
 
         A field of value None is left out. Raises ValueError for a time that is not finite and for names taken already.
         """
+        self.settle()
         if "t" in fields:
             raise ValueError(f"{topic}: expected the time as argument, got it among the fields; remove it there")
         t = self._latest if t is None else float(t)
@@ -61,7 +72,30 @@ class Messages:
             message[WALL] = self.wall()
         self._latest = max(self._latest, t)
         channel = self._channel(topic, fields, message, units, about)
-        self.put([(channel, t, self._next(topic), orjson.dumps(message))])
+        log_time = log_time_of(t)
+        self.put([(channel, log_time, log_time, self._next(topic), orjson.dumps(message))])
+
+    def later(
+        self, topic: str, fields: Fields, t: float, units: Mapping[str, str] | None = None, size: int = 0
+    ) -> None:
+        """One message, soon: before the next one that is written at once. size: about how many bytes it keeps alive.
+
+        What it holds must not change any more. The first of a topic is written at once, so that errors show.
+        """
+        if topic not in self._described:
+            self.write(topic, fields(), t, units=units)
+            return
+        self._put_off.append((topic, fields, t, units))
+        self._put_off_bytes += size
+        if len(self._put_off) >= _TOGETHER or self._put_off_bytes > _TOGETHER_BYTES:
+            self.settle()
+
+    def settle(self) -> None:
+        """Writes what was put off."""
+        with self._lock:
+            put_off, self._put_off, self._put_off_bytes = self._put_off, [], 0
+            for topic, fields, t, units in put_off:
+                self.write(topic, fields(), t, units=units)
 
     def samples(
         self,
@@ -109,21 +143,24 @@ class Messages:
             _check_signal(topic, values, names, len(time))
         if not np.isfinite(time).all():
             raise ValueError(f"{signals[0][0]}: expected finite times, got NaN or infinity; drop those samples")
+        self.settle()
         for first in range(0, len(time), _BLOCK):
-            clock = time[first : first + _BLOCK].astype(np.float64).tolist()
-            encoded = [self._encode_block(signal, clock, first) for signal in signals]
-            self.put(self._in_turn([topic for topic, *_ in signals], clock, encoded))
+            clock = time[first : first + _BLOCK].astype(np.float64)
+            seconds, log_times = clock.tolist(), (EPOCH_NS + np.rint(clock * 1e9).astype(np.int64)).tolist()
+            encoded = [self._encode_block(signal, seconds, first) for signal in signals]
+            self.put(self._in_turn([topic for topic, *_ in signals], log_times, encoded))
         self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
 
     def _in_turn(
-        self, topics: Sequence[str], clock: Sequence[float], encoded: Sequence[Sequence[bytes]]
-    ) -> Iterator[Encoded]:
+        self, topics: Sequence[str], log_times: Sequence[int], encoded: Sequence[Sequence[bytes]]
+    ) -> Iterator[Timed]:
         """One message of each topic a sample."""
-        ready = [(self._described[topic][1], self._sequence.get(topic, 0)) for topic in topics]
-        for number, (t, payloads) in enumerate(zip(clock, zip(*encoded, strict=True), strict=True)):
-            for (channel, first), payload in zip(ready, payloads, strict=True):
-                yield channel, t, first + number, payload
-        self._sequence.update({topic: first + len(clock) for topic, (_, first) in zip(topics, ready, strict=True)})
+        streams = []
+        for topic, payloads in zip(topics, encoded, strict=True):
+            channel, first = self._described[topic][1], self._sequence.get(topic, 0)
+            self._sequence[topic] = first + len(payloads)
+            streams.append(zip(repeat(channel), log_times, log_times, count(first), payloads, strict=False))
+        return chain.from_iterable(zip(*streams, strict=True))
 
     def follow_on(self, channel: Channel, sequence: int, t: float) -> None:
         """Number and describe what comes as if the message (channel, sequence, t) had just been written."""

@@ -38,9 +38,11 @@ class Recovery:
         if self.whole:
             return f"{self.source}: the file is whole, all {self.messages} messages are in {self.target}"
         size = sum(damage.end - damage.start for damage in self.lost)
-        gaps = f"{len(self.lost)} damaged stretches of together {size} bytes are lost" if self.lost else ""
-        end = "" if self.ended else "the run did not come to its end and up to its last second is missing"
-        trouble = " and ".join(part for part in (gaps, end) if part)
+        gaps = "" if not self.lost else f"1 damaged stretch of {size} bytes is lost"
+        if len(self.lost) > 1:
+            gaps = f"{len(self.lost)} damaged stretches, {size} bytes in all, are lost"
+        end = "" if self.ended else "the run did not come to its end: up to its last second is missing"
+        trouble = "; ".join(part for part in (gaps, end) if part)
         return f"{self.source}: {self.messages} messages saved in {self.target}; {trouble}"
 
 

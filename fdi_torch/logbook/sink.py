@@ -1,15 +1,17 @@
 """The way into an MCAP file: one exclusive writer, channels registered at their first message, clear errors.
 
-A chunk ends where it exceeds 256 KiB, before a metadata record or an attachment, and where `flush` is called:
-files with equal contents and equal flushes are byte-identical. The records are those of https://mcap.dev/spec; the
-chunks are put together here, because a run may have a million messages and the library takes its time over each.
+A chunk ends where it exceeds 256 KiB, before a metadata record or an attachment, and after a long stretch of signals:
+files with equal contents are byte-identical. A chunk that `cut` ends is another matter: `Mark` remembers where the
+first one begins, so that only what follows is written again. The records are those of https://mcap.dev/spec; chunks
+are put together here, because a run may have a million messages and the library takes its time over each.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,25 @@ from fdi_torch.logbook.stream import Stream
 PROFILE = "fdi_torch"
 CHUNK_BYTES = 256 * 1024
 EPOCH_NS = 946_684_800 * 10**9  # 2000-01-01T00:00:00Z: plant time 0; leaves room for negative times
+STRETCH = 1000
+"""So many messages of signals in a row, a recording, end with a chunk."""
 _FOOTER = struct.Struct("<BQQQ")
+
+Timed = tuple[Channel, int, int, int, bytes]
+"""Channel, log time and publish time in ns, sequence number and payload of a message."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A place between two chunks, and what the file had come to there."""
+
+    size: int
+    crc: int
+    signals: int
+    chunks: int
+    metadata: int
+    attachments: int
+    counts: Mapping[int, int]
 
 
 class Sink:
@@ -43,8 +63,25 @@ class Sink:
         self._metadata: list[records.MetadataIndex] = []
         self._attachments: list[records.AttachmentIndex] = []
         self._crc = 0
+        self._signals = 0
+        self._perhaps: Mark | None = None
+        self.mark: Mark | None = None
+        self._head = (library, profile)
         self._write(MAGIC)
         self._write(_bytes(records.Header(profile, library)))
+
+    def again(self, target: Path) -> Sink:
+        """A new file with all up to the mark, to which the rest is to be written again."""
+        assert self.mark is not None
+        other = Sink(target, *self._head, self._compress)
+        with self.path.open("rb") as file:
+            other._stream.copy(file, other.size, self.mark.size)
+        other._schemas, other._channels = dict(self._schemas), dict(self._channels)
+        other._crc, other._signals, other._counts = self.mark.crc, self.mark.signals, dict(self.mark.counts)
+        other._chunks = self._chunks[: self.mark.chunks]
+        other._metadata = self._metadata[: self.mark.metadata]
+        other._attachments = self._attachments[: self.mark.attachments]
+        return other
 
     @property
     def size(self) -> int:
@@ -72,12 +109,46 @@ class Sink:
         self._write(record)
 
     def message(self, channel: Channel, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
-        if self._stream.dead:
-            self._stream.expect_alive()
-        told = self._channels.get(channel) or self._register(channel)
-        self._chunk.message(told, log_time, publish_time, sequence, data)
-        if self._chunk.size > CHUNK_BYTES:
+        self.messages([(channel, log_time, publish_time, sequence, data)])
+
+    def messages(self, messages: Iterable[Timed]) -> None:
+        self._stream.expect_alive()
+        last, told = None, None
+        for channel, log_time, publish_time, sequence, data in messages:
+            if told is None or channel is not last:
+                last, told = channel, self._channels.get(channel) or self._register(channel)
+            if told.is_signal:
+                self._signals += 1
+                if self._perhaps is not None:
+                    self.mark, self._perhaps = self.mark or self._perhaps, None
+            elif self._signals:
+                self._end_of_signals()
+            self._chunk.message(told, log_time, publish_time, sequence, data)
+            if self._chunk.size > CHUNK_BYTES:
+                self.flush()
+
+    def _end_of_signals(self) -> None:
+        if self._signals >= STRETCH:
             self.flush()
+        self._signals, self._perhaps = 0, None
+
+    def cut(self) -> None:
+        """What waits goes to disk now, though its chunk is not full. Where signals end it would end anyway."""
+        if self.waiting and self.mark is None:
+            mark = Mark(
+                self.size,
+                self._crc,
+                self._signals,
+                len(self._chunks),
+                len(self._metadata),
+                len(self._attachments),
+                dict(self._counts),
+            )
+            if self._signals >= STRETCH:
+                self._perhaps = self._perhaps or mark
+            else:
+                self.mark = mark
+        self.flush()
 
     def flush(self) -> None:
         """What waits goes to disk as a chunk."""
@@ -119,7 +190,8 @@ class Sink:
             metadata=dict(channel.metadata),
             schema_id=schema.id if schema else 0,
         )
-        self._channels[channel] = Described(schema, told)
+        is_signal = channel.topic.startswith("/plant/") and channel.topic.endswith(("/input", "/output"))
+        self._channels[channel] = Described(schema, told, is_signal)
         return self._channels[channel]
 
     def _write(self, data: bytes) -> None:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import fcntl
 import os
 from pathlib import Path
+from typing import BinaryIO
 
 from fdi_torch.logbook.errors import LogError, log_error
+
+_PIECE = 1 << 20
 
 
 class Stream:
@@ -37,6 +40,14 @@ class Stream:
         except OSError as error:
             self.dead = log_error(self.path, error)
             raise self.dead from error
+
+    def copy(self, source: BinaryIO, start: int, end: int) -> None:
+        """The bytes `start` to `end` of another file."""
+        source.seek(start)
+        while start < end:
+            data = source.read(min(_PIECE, end - start))
+            self.write(data)
+            start += len(data)
 
     def expect_alive(self) -> None:
         if self.dead is not None:

@@ -55,15 +55,23 @@ class Topics(Messages):
         numbers: mean_cost, spread, evaluations and others by name.
         """
         fields = {"problem": problem, "generation": generation, "best_cost": best_cost, **numbers, **best}
-        self.write("/estimator/de/generation", fields, generation if t is None else t, units=units)
+        self.later("/estimator/de/generation", lambda: fields, generation if t is None else t, units)
 
     def population(
         self, generation: int, arrays: Mapping[str, Any], *, problem: int = 0, t: float | None = None
     ) -> None:
-        """The state of the search, from which it can go on: any arrays of numbers, such as population and cost."""
-        packed = {key: value for name, array in arrays.items() for key, value in pack(name, array).items()}
-        fields = {"problem": problem, "generation": generation, **packed}
-        self.write("/estimator/de/population", fields, generation if t is None else t)
+        """The state of the search, from which it can go on: any arrays of numbers, such as population and cost.
+
+        They are written a little later, and must not be changed in place.
+        """
+        kept = dict(arrays)
+
+        def fields() -> Named:
+            packed = {key: value for name, array in kept.items() for key, value in pack(name, array).items()}
+            return {"problem": problem, "generation": generation, **packed}
+
+        size = sum(getattr(array, "nbytes", 0) for array in kept.values())
+        self.later("/estimator/de/population", fields, generation if t is None else t, size=size)
 
     def iteration(
         self,
@@ -81,7 +89,7 @@ class Topics(Messages):
         numbers: step, gradient, damping, accepted and others by name.
         """
         fields = {"problem": problem, "iteration": iteration, "cost": cost, **numbers, **parameters}
-        self.write("/estimator/refine/iteration", fields, iteration if t is None else t, units=units)
+        self.later("/estimator/refine/iteration", lambda: fields, iteration if t is None else t, units)
 
     def estimate(
         self,

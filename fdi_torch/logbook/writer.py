@@ -1,8 +1,8 @@
 """RunLog: the log of one run or study, written so that a crash loses at most its last second.
 
 The run is written to `NAME.mcap.partial` and becomes `NAME.mcap` at its end. What waits in memory goes to disk after
-half a second at the latest, by a small thread, also while the run computes and says nothing. Chunks that the clock cut
-are joined again at the end, so that equal configuration, data and seed give byte-identical files but for the wall-clock
+half a second at the latest, by a small thread, also while the run computes and says nothing. Chunks that it cut are
+joined again at the end, so that equal configuration, data and seed give byte-identical files but for the wall-clock
 fields: `started` and `run_id` of `fdi_torch.run`, `ended` and `wall_seconds` of `fdi_torch.status`.
 """
 
@@ -13,7 +13,7 @@ import io
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -23,15 +23,15 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.logbook.channel import Channel
-from fdi_torch.logbook.copying import copy_log
+from fdi_torch.logbook.copying import joined
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.flat import flatten
-from fdi_torch.logbook.messages import Encoded
+from fdi_torch.logbook.messages import Fields
 from fdi_torch.logbook.payload import as_array
 from fdi_torch.logbook.provenance import environment, git_state
 from fdi_torch.logbook.reader import Message
 from fdi_torch.logbook.schemas import FORMAT_VERSION
-from fdi_torch.logbook.sink import Sink, log_time_of
+from fdi_torch.logbook.sink import Sink, Timed
 from fdi_torch.logbook.terminate import Terminated
 from fdi_torch.logbook.topics import Topics
 
@@ -84,11 +84,9 @@ class RunLog(Topics):
         self._results: dict[str, str] = {}
         self._arrays: dict[str, np.ndarray] = {}
         self._sink: Sink | None = None
-        self._lock = threading.RLock()
         self._stop = threading.Event()
         self._waiting_since: float | None = None
         self._size = 0
-        self._cut_by_clock = False
 
     @property
     def run_id(self) -> str:
@@ -118,6 +116,7 @@ class RunLog(Topics):
         if error is not None:
             self.status, self.reason = _ending(error)
         try:
+            self.settle()
             self._write_end(self._open_sink())
         except LogError:
             if error is None:
@@ -139,6 +138,7 @@ class RunLog(Topics):
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
         """A file inside the log."""
+        self.settle()
         with self._lock:
             self._open_sink().attachment(name, media_type, data)
             self._note_progress()
@@ -146,32 +146,39 @@ class RunLog(Topics):
     def flush(self) -> None:
         """Everything logged so far goes to disk."""
         with self._lock:
-            self._open_sink().flush()
-            self._cut_by_clock = True
+            self.settle()
+            self._open_sink().cut()
             self._note_progress()
 
-    def put(self, messages: Iterable[Encoded]) -> None:
+    def later(
+        self, topic: str, fields: Fields, t: float, units: Mapping[str, str] | None = None, size: int = 0
+    ) -> None:
+        self._open_sink()
+        super().later(topic, fields, t, units, size)
+        if self._waiting_since is None:
+            self._waiting_since = time.monotonic()
+
+    def put(self, messages: Iterable[Timed]) -> None:
         """Encoded messages; the methods of `Topics` end here."""
-        timed = ((channel, log_time_of(t), sequence, payload) for channel, t, sequence, payload in messages)
-        self._put((channel, time, time, sequence, payload) for channel, time, sequence, payload in timed)
+        with self._lock:
+            sink = self._open_sink()
+            sink.messages(messages if self._listener is None else self._heard(messages, self._listener))
+            self._note_progress()
 
     def carry_over(self, messages: Iterable[Message]) -> int:
         """Messages of an earlier log of the same run, as they were; what is logged next follows them. Their number."""
         count = 0
         for message in messages:
             self.follow_on(message.channel, message.sequence, message.t)
-            self._put([(message.channel, message.log_time, message.publish_time, message.sequence, message.data)])
+            self.put([(message.channel, message.log_time, message.publish_time, message.sequence, message.data)])
             count += 1
         return count
 
-    def _put(self, messages: Iterable[tuple[Channel, int, int, int, bytes]]) -> None:
-        with self._lock:
-            sink = self._open_sink()
-            for message in messages:
-                sink.message(*message)
-                if self._listener is not None:
-                    self._listener(message[0], message[1], message[4])
-            self._note_progress()
+    @staticmethod
+    def _heard(messages: Iterable[Timed], listener: Listener) -> Iterator[Timed]:
+        for message in messages:
+            yield message
+            listener(message[0], message[1], message[4])
 
     def wall(self) -> dict[str, int]:
         """Wall time for a message's field `wall`."""
@@ -226,10 +233,10 @@ class RunLog(Topics):
 
     def _publish(self) -> None:
         """Give the finished file its name, with its chunks joined if the clock cut them."""
-        source = self.partial_path
+        source, sink = self.partial_path, self._open_sink()
         try:
-            if self._cut_by_clock:
-                source = _joined(source)
+            if sink.mark is not None:
+                source = _joined(sink)
             os.replace(source, self.path)
             if source != self.partial_path:
                 self.partial_path.unlink()
@@ -249,14 +256,14 @@ def _make_room(path: Path) -> None:
         raise LogError(f"{path}: exists already; choose another name, or delete it")
 
 
-def _joined(partial: Path) -> Path:
+def _joined(sink: Sink) -> Path:
     """A copy with full chunks; the partial file itself where there is no room for a copy."""
-    target = partial.with_name(partial.name + ".joined")
+    target = sink.path.with_name(sink.path.name + ".joined")
     try:
-        copy_log(partial, target)
+        joined(sink, target)
     except LogError:
         target.unlink(missing_ok=True)
-        return partial
+        return sink.path
     return target
 
 
@@ -270,7 +277,7 @@ def _ending(error: BaseException) -> tuple[str, str]:
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
     return buffer.getvalue()
 
 

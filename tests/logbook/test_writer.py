@@ -9,6 +9,7 @@ import sys
 import textwrap
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +79,8 @@ def test_chunks_cut_by_the_clock_leave_no_trace(tmp_path: Path) -> None:
         write_everything(log)
         log.result({"estimate": {"T1.leak.size": 0.1}})
         log.result_arrays(covariance=np.eye(2))
-        assert log._cut_by_clock
+        log.flush()
+        assert log._sink is not None and log._sink.mark is not None
     assert fast.read_bytes() == (tmp_path / "b.mcap").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "b.mcap"]
 
@@ -382,3 +384,30 @@ def test_a_log_whose_name_was_taken_meanwhile_is_kept_under_its_partial_name(tmp
         log.say("hello")
         (tmp_path / "a.mcap").mkdir()
     assert read_run(tmp_path / "a.mcap.partial").complete
+
+
+@pytest.mark.parametrize("cuts", [(), (700,), (1500,), (2000,), (1500, 2000)])
+def test_chunks_cut_within_or_after_a_recording_leave_no_trace(tmp_path: Path, cuts: tuple[int, ...]) -> None:
+    for name, at in (("a", ()), ("b", cuts)):
+        with RunLog(tmp_path / f"{name}.mcap", "train", **FIXED) as log:
+            for first, last in pairwise(sorted({0, 700, 1500, 2000})):
+                time_s = np.arange(first, last) * 1.0
+                log.samples("/plant/output", time_s, np.sin(time_s)[:, None], ["h1"], ["m"])
+                if last in at:
+                    log.flush()
+            for generation in range(5):
+                log.generation(generation, 1.0 / (1 + generation), {"x": 0.5})
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+    assert sum(1 for _ in read_run(tmp_path / "b.mcap").messages()) == 2005
+
+
+def test_what_is_put_off_comes_before_what_follows(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED, flush_seconds=0.02) as log:
+        for generation in range(200):
+            log.generation(generation, 1.0, {"x": 0.5})
+            if generation == 150:
+                time.sleep(0.1)
+                assert len(list(read_run(tmp_path / "a.mcap.partial").messages())) == 151
+        log.say("done")
+    *generations, last = read_run(tmp_path / "a.mcap").messages()
+    assert [m.payload["generation"] for m in generations] == list(range(200)) and last.topic == "/log"
