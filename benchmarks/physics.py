@@ -24,7 +24,7 @@ def widths(resolution: float) -> tuple[float, float]:
 
 
 def make_rates(sqrt: Callable, maximum: Callable, where: Callable, jit: Callable = lambda f: f) -> Callable[..., Any]:
-    """rates(h1, h2, h3, t1, t2, t3, t4, t5, pipe width^2, outlet width^2, resolution) -> three dh/dt in m/s."""
+    """rates(three levels, five theta, pipe width^2, outlet width^2, resolution, two inflows) -> three dh/dt in m/s."""
 
     @jit
     def root(x, w2):  # type: ignore[no-untyped-def]
@@ -39,15 +39,15 @@ def make_rates(sqrt: Callable, maximum: Callable, where: Callable, jit: Callable
         return where(h <= 0.0, maximum(q, 0.0), q) / AREA
 
     @jit
-    def rates(h1, h2, h3, t1, t2, t3, t4, t5, w_pipe, w_outlet, resolution):  # type: ignore[no-untyped-def]
+    def rates(h1, h2, h3, t1, t2, t3, t4, t5, w_pipe, w_outlet, resolution, q1=INFLOW, q2=INFLOW):  # type: ignore[no-untyped-def]
         q13 = t4 * CAPACITY * root(h1 - h3, w_pipe)
         q32 = t5 * CAPACITY * root(h3 - h2, w_pipe)
         out = t2 * CAPACITY * root(maximum(h2, 0.0), w_outlet)
         leak1 = t1 * CAPACITY * root(maximum(h1, 0.0), w_pipe)
         leak3 = t3 * CAPACITY * root(maximum(h3, 0.0), w_pipe)
         return (
-            spilled(h1, INFLOW - q13 - leak1, resolution),
-            spilled(h2, INFLOW + q32 - out, resolution),
+            spilled(h1, q1 - q13 - leak1, resolution),
+            spilled(h2, q2 + q32 - out, resolution),
             spilled(h3, q13 - q32 - leak3, resolution),
         )
 
@@ -58,15 +58,17 @@ def make_step(rates: Callable[..., Any], jit: Callable = lambda f: f) -> Callabl
     """One RK4 step (3/8 rule): levels, theta, widths and the step's length -> levels."""
 
     @jit
-    def step(h1, h2, h3, t1, t2, t3, t4, t5, wp, wo, dt):  # type: ignore[no-untyped-def]
-        a1, a2, a3 = rates(h1, h2, h3, t1, t2, t3, t4, t5, wp, wo, dt)
-        b1, b2, b3 = rates(h1 + dt * a1 / 3, h2 + dt * a2 / 3, h3 + dt * a3 / 3, t1, t2, t3, t4, t5, wp, wo, dt)
+    def step(h1, h2, h3, t1, t2, t3, t4, t5, wp, wo, dt, q1=INFLOW, q2=INFLOW):  # type: ignore[no-untyped-def]
+        a1, a2, a3 = rates(h1, h2, h3, t1, t2, t3, t4, t5, wp, wo, dt, q1, q2)
+        b1, b2, b3 = rates(h1 + dt * a1 / 3, h2 + dt * a2 / 3, h3 + dt * a3 / 3, t1, t2, t3, t4, t5, wp, wo, dt, q1, q2)
         c1, c2, c3 = rates(
-            h1 + dt * (b1 - a1 / 3), h2 + dt * (b2 - a2 / 3), h3 + dt * (b3 - a3 / 3), t1, t2, t3, t4, t5, wp, wo, dt
-        )
+            h1 + dt * (b1 - a1 / 3), h2 + dt * (b2 - a2 / 3), h3 + dt * (b3 - a3 / 3),
+            t1, t2, t3, t4, t5, wp, wo, dt, q1, q2,
+        )  # fmt: skip
         d1, d2, d3 = rates(
-            h1 + dt * (a1 - b1 + c1), h2 + dt * (a2 - b2 + c2), h3 + dt * (a3 - b3 + c3), t1, t2, t3, t4, t5, wp, wo, dt
-        )
+            h1 + dt * (a1 - b1 + c1), h2 + dt * (a2 - b2 + c2), h3 + dt * (a3 - b3 + c3),
+            t1, t2, t3, t4, t5, wp, wo, dt, q1, q2,
+        )  # fmt: skip
         e = dt / 8
         return (
             h1 + e * (a1 + 3 * (b1 + c1) + d1),

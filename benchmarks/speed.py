@@ -1,40 +1,62 @@
-"""Trajectories per CPU second: three tanks, 1000 s in 10 s RK4 steps, float64, by the number of lanes."""
+"""Trajectories per CPU second by the number of lanes, 1000 s in 10 s RK4 steps, float64, of two plants.
+
+Three tanks read every 100 s, and the same with eight effects with memory, read every 10 s.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from benchmarks.simulators import ADAPTIVE, FIXED, random_faults
+from benchmarks import memory
+from benchmarks.simulators import ADAPTIVE, FIXED, Simulator, random_faults
 from benchmarks.timing import best_seconds
 
 LANES = (64, 1024, 16384)
 STEP, TOLERANCE = 10.0, 1e-6
 OURS, BY_HAND = "fdi_torch, compiled", "numba, by hand, blocks of lanes"
+Rows = dict[str, list[float]]
 
 
-def measure(budget: float) -> dict[str, list[float]]:
-    """Rows of the table; a fixed-step peer must get the same levels as we do."""
-    theta = random_faults(max(LANES))
-    truth = FIXED[OURS](STEP)(theta[:64])
-    rows: dict[str, list[float]] = {}
-    for name, make in {**FIXED, **ADAPTIVE}.items():
+def measure(budget: float) -> dict[str, Rows]:
+    """Rows of each plant's table; a fixed-step peer must get the same numbers as we do."""
+    three = {name: (lambda make=make: make(STEP)) for name, make in FIXED.items()}
+    three |= {name: (lambda make=make: make(TOLERANCE)) for name, make in ADAPTIVE.items()}
+    return {
+        "three tanks": _plant(three, random_faults(max(LANES)), budget),
+        "three tanks, eight effects with memory, 13 parameters": _plant(
+            memory.SIMULATORS, memory.random_theta(max(LANES)), budget
+        ),
+    }
+
+
+def _plant(simulators: dict[str, Callable[[], Simulator]], theta: np.ndarray, budget: float) -> Rows:
+    truth = simulators[OURS]()(theta[:64])
+    rows: Rows = {}
+    for name, make in simulators.items():
         try:
-            simulate = make(STEP if name in FIXED else TOLERANCE)
+            simulate = make()
+            found = simulate(theta[:64])
         except ImportError:
             continue
-        if name in FIXED:
-            error = np.abs(simulate(theta[:64]) - truth).max()
+        if name not in ADAPTIVE:
+            error = np.abs(found - truth).max()
             assert error < (1e-3 if "float32" in name else 1e-9), f"{name}: levels differ by {error:.1e} m"
         rows[name] = [_rate(name, simulate, theta[:lanes], budget) for lanes in LANES]
     return rows
 
 
-def _rate(name, simulate, theta, budget: float) -> float:  # type: ignore[no-untyped-def]
+def _rate(name: str, simulate: Simulator, theta: np.ndarray, budget: float) -> float:
     part = theta[:64] if "SciPy" in name else theta[:1024] if "diffrax" in name else theta
     return len(part) / best_seconds(lambda: simulate(part), budget)
 
 
-def table(rows: dict[str, list[float]]) -> str:
+def table(plants: dict[str, Rows]) -> str:
+    return "\n\n".join(f"**{plant}**\n\n{_table(rows)}" for plant, rows in plants.items())
+
+
+def _table(rows: Rows) -> str:
     """The last two lines: against what others' users run, and against our own kernel's layout written by hand."""
     lines = ["| simulator | " + " | ".join(f"{n} lanes" for n in LANES) + " |", "|---|" + "---|" * len(LANES)]
     lines += [f"| {name} | " + " | ".join(f"{r:,.0f}" for r in row) + " |" for name, row in rows.items()]

@@ -18,7 +18,10 @@ from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.injection import Injection, expect_injectable
 from fdi_torch.simulate.program import build_program
 
-_INTEGERS = ("lanes", "lanes_per_problem", "steps", "samples", "signal_samples", "mode", "threads", "gain_stride")
+_INTEGERS = (
+    "lanes", "lanes_per_problem", "steps", "samples", "signal_samples", "mode", "threads", "gain_stride", "out_bytes",
+    "jacobian_bytes",
+)  # fmt: skip
 _ARRAYS = (
     "theta", "nominal", "lifted", "resolution", "starts", "spans", "means", "first_sample", "sample_times",
     "sample_intervals", "sample_shares", "signal_times", "signal_integral", "signal_slopes", "values", "weights",
@@ -132,6 +135,8 @@ class CompiledEngine:
             "mode": _MODES[mode],
             "threads": torch.get_num_threads(),
             "gain_stride": 0 if injection is None else injection.stride,
+            "out_bytes": out.nbytes,
+            "jacobian_bytes": 0 if jacobian is None else jacobian.nbytes,
         }
         pointers = {name: None if a is None else a.data_ptr() for name, a in arrays.items()}
         run(ctypes.byref(_Job(**sizes, **pointers)))

@@ -7,6 +7,9 @@
 #include <memory>
 #include <thread>
 #include <vector>
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 #define EACH_LANE _Pragma("GCC ivdep") for (int l = 0; l < LANES; ++l)
 #define SOME(n) ((n) > 0 ? (n) : 1)
@@ -16,6 +19,7 @@ enum { MEMORY = COMMAND_MEMORY + READING_MEMORY, STATE = TANKS + MEMORY };
 
 struct Job {
     int64_t lanes, lanes_per_problem, steps, samples, signal_samples, mode, threads, gain_stride;
+    int64_t out_bytes, jacobian_bytes;
     const real *theta, *nominal, *lifted, *resolution;
     const real *starts, *spans, *means;                      // (K), (K), (K, CHANNELS)
     const int64_t *first_sample;                             // (K + 1): step k holds samples first[k] .. first[k + 1]
@@ -33,6 +37,7 @@ struct Block {
     Lane lane[SOME(LANE_CONSTANTS)];
     Lane level[TANKS], before[TANKS], sample[TANKS], slope_left[TANKS], slope_right[TANKS];
     Lane action[SOME(ACTUATORS)], command_memory[SOME(COMMAND_MEMORY)], late_channel[SOME(LATE_ACTUATORS)];
+    Lane integral[SOME(LATE_ACTUATORS)], late_slope[SOME(LATE_ACTUATORS)];   // of late channels, so far
     Lane command_delay[SOME(LATE_ACTUATORS)], reading_delay[SOME(LATE_SENSORS)];
     Lane seen[SENSORS], reading[SENSORS], reading_memory[SOME(READING_MEMORY)];
     Lane value, weight, centre;
@@ -47,7 +52,7 @@ struct Block {
     Lane gram[SENSORS][PAIRS], previous[SENSORS][WIDTH], column[WIDTH], previous_weight[SENSORS];
 #endif
     real uniform[SOME(UNIFORM_CONSTANTS)];
-    int64_t begin[SOME(LATE_ACTUATORS)][LANES], end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
+    int64_t end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
     int64_t problem[LANES];
     bool one_problem;
     const real *nominal, *lifted;
@@ -60,25 +65,31 @@ struct Block {
 // As in plant/signals.py: at a switch the slope is the one before it, since a delay reaches back.
 static const real SAME_INSTANT = 1e-9;
 
-// The mean of a held or linear signal over [start - delay, start - delay + span], exactly.
-static void look_up_late_channels(const Job &job, Block &b, real start, real span) {
-    const int64_t n = job.signal_samples;
+// The integral of channel c up to an instant; i moves on to the slope that holds there.
+static real up_to(const Job &job, int c, real instant, int64_t &i, real &slope) {
+    while (i < job.signal_samples && job.signal_times[i] < instant - SAME_INSTANT) ++i;
+    const int64_t left = i > 0 ? i - 1 : 0;
+    slope = job.signal_slopes[i * CHANNELS + c];
+    return job.signal_integral[left * CHANNELS + c] + slope * (instant - job.signal_times[left]);
+}
+
+// The mean of a held or linear signal over [start - delay, start - delay + span], exactly. Steps follow one another:
+// an interval begins where the one before it ended.
+static void look_up_late_channels(const Job &job, Block &b, real start, real span, bool first) {
     for (int j = 0; j < LATE_ACTUATORS; ++j) {
         const int c = LATE_CHANNEL[j];
         for (int l = 0; l < LANES; ++l) {
-            const real from = start - b.command_delay[j][l], to = from + span;
-            int64_t &i = b.begin[j][l], &k = b.end[j][l];
-            while (i < n && job.signal_times[i] < from - SAME_INSTANT) ++i;
-            while (k < n && job.signal_times[k] < to - SAME_INSTANT) ++k;
-            const int64_t left = i > 0 ? i - 1 : 0, right = k > 0 ? k - 1 : 0;
-            const real slope_from = job.signal_slopes[i * CHANNELS + c], slope_to = job.signal_slopes[k * CHANNELS + c];
-            const real before = job.signal_integral[left * CHANNELS + c] + slope_from * (from - job.signal_times[left]);
-            const real after = job.signal_integral[right * CHANNELS + c] + slope_to * (to - job.signal_times[right]);
-            b.late_channel[j][l] = (after - before) / span;
+            const real from = start - b.command_delay[j][l];
+            if (first) b.integral[j][l] = up_to(job, c, from, b.end[j][l], b.late_slope[j][l]);
+            real slope;
+            const real after = up_to(job, c, from + span, b.end[j][l], slope);
+            b.late_channel[j][l] = (after - b.integral[j][l]) / span;
 #if TANGENT
             for (int p = 0; p < COLUMNS; ++p)
-                b.d_late_channel[p][j][l] = -(slope_to - slope_from) / span * b.d_command_delay[p][j][l];
+                b.d_late_channel[p][j][l] = -(slope - b.late_slope[j][l]) / span * b.d_command_delay[p][j][l];
 #endif
+            b.integral[j][l] = after;
+            b.late_slope[j][l] = slope;
         }
     }
 }
@@ -289,7 +300,6 @@ static void load(const Job &job, Block &b, const Rows &rows) {
         b.problem[l] = lane / job.lanes_per_problem;
     }
     b.one_problem = b.problem[0] == b.problem[LANES - 1];
-    std::memset(b.begin, 0, sizeof b.begin);
     std::memset(b.end, 0, sizeof b.end);
     std::memset(b.past, 0, sizeof b.past);
     std::memset(b.squares, 0, sizeof b.squares);
@@ -335,7 +345,7 @@ static void run_block(const Job &job, Block &b, const Rows &rows) {
         const real *channel = job.means + k * CHANNELS;
         int64_t s = job.first_sample[k];
         const int64_t stop = job.first_sample[k + 1];
-        if (LATE_ACTUATORS) look_up_late_channels(job, b, clock[0], clock[1]);
+        if (LATE_ACTUATORS) look_up_late_channels(job, b, clock[0], clock[1], k == 0);
         if (k == 0) {
             settle_commands(b, clock, channel);
             begin_with(b.command_memory, job.start_memory, MEMORY, 0, COMMAND_MEMORY, rows);
@@ -378,7 +388,18 @@ static void work(const Job &job, std::atomic<int64_t> &next) {
         run_block(job, *b, {first, job.lanes - first < LANES ? job.lanes - first : LANES});
 }
 
+// Results are written once and all over: large pages are handed out five hundred times as rarely as small ones.
+static void prefer_large_pages(void *from, int64_t bytes) {
+#if defined(__linux__)
+    const uintptr_t page = 1 << 21, begin = (reinterpret_cast<uintptr_t>(from) + page - 1) / page * page;
+    const uintptr_t end = (reinterpret_cast<uintptr_t>(from) + bytes) / page * page;
+    if (end > begin) madvise(reinterpret_cast<void *>(begin), end - begin, MADV_HUGEPAGE);
+#endif
+}
+
 extern "C" void run(const Job *job) {
+    prefer_large_pages(job->out, job->out_bytes);
+    prefer_large_pages(job->jacobian, job->jacobian_bytes);
     std::atomic<int64_t> next(0);
     const int64_t blocks = (job->lanes + LANES - 1) / LANES;
     const int64_t threads = job->threads < blocks ? job->threads : blocks;
