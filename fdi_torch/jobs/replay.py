@@ -16,7 +16,7 @@ from fdi_torch.jobs.gap_replay import gap_again
 from fdi_torch.jobs.logged_recordings import recording_in
 from fdi_torch.jobs.run_setup import fitting_of, wanted_space
 from fdi_torch.jobs.study import TRIAL, concluded, log_trials
-from fdi_torch.jobs.train import Tell, estimate_logged, log_recordings, origin_of
+from fdi_torch.jobs.train import STATE, Tell, estimate_logged, log_recordings, origin_of, state_is_due
 from fdi_torch.logbook import LogError, Message, RunLog, series
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook.replay import Select
@@ -83,11 +83,16 @@ def study_again(
 
 
 def comparable(trials: Sequence[int] = ()) -> Select:
-    """Which events of a log and its replay are held against each other: a study's trials by number, then its sums."""
+    """Which events of a log and its replay are held against each other: a study's trials by number, then its sums.
+
+    Of a search's states only those that are logged today: older versions logged more of them.
+    """
 
     def select(messages: Iterable[Message]) -> Iterator[Message]:
         waiting: list[Message] = []
         for message in messages:
+            if message.topic == STATE and not state_is_due(message.payload["generation"]):
+                continue
             if message.topic != TRIAL:
                 yield from sorted(waiting, key=lambda m: m.payload["trial"])
                 waiting = []

@@ -28,6 +28,7 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.report.fit_figure import fit_figure, save
 
 Tell = Callable[[float, str], None]
+STATE = "/estimator/de/population"
 
 
 @dataclass(frozen=True)
@@ -129,8 +130,8 @@ class Watch:
 
 
 def state_is_due(generation: int) -> bool:
-    """Is the whole state of the search logged? So often that a resumed run repeats a sixteenth at most."""
-    return generation % (1 << max(0, generation.bit_length() - 5)) == 0
+    """Is the whole state of the search logged? So often that a resumed run repeats an eighth at most."""
+    return generation % (1 << max(0, generation.bit_length() - 4)) == 0
 
 
 def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[str, float]) -> None:

@@ -6,6 +6,7 @@ the same topic, so that every message is described by a schema.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, count, repeat
@@ -24,6 +25,10 @@ Fields = Callable[[], Named]
 _RESERVED = ("t", NON_FINITE, WALL, "masked")
 _BLOCK = 4096
 _TOGETHER, _TOGETHER_BYTES = 64, 1 << 22
+
+
+class Ready(dict[str, Any]):
+    """Fields that are JSON values already, without a number that is not finite."""
 
 
 class Messages:
@@ -65,8 +70,8 @@ class Messages:
         if "t" in fields:
             raise ValueError(f"{topic}: expected the time as argument, got it among the fields; remove it there")
         t = self._latest if t is None else float(t)
-        message = plain({"t": t, **fields})
-        if "t" not in message:
+        message = {"t": t, **fields} if isinstance(fields, Ready) else plain({"t": t, **fields})
+        if not math.isfinite(t):
             raise ValueError(f"{topic}: expected a finite time, got {t}; give the plant's time in s")
         if wall:
             message[WALL] = self.wall()

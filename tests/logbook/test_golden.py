@@ -10,14 +10,23 @@ from typing import Any
 
 import numpy as np
 import orjson
+import pytest
 
-from fdi_torch.logbook import arrays, content_hash, inspect_log, own_signals, read_run, series, unpack
+from fdi_torch.cli import DONE, main
+from fdi_torch.logbook import arrays, content_hash, inspect_log, last_state, own_signals, read_run, series, unpack
 from fdi_torch.logbook.schemas import TOPICS
 
 TESTS = Path(__file__).parents[1]
 FORMAT_1 = TESTS / "data/log_format_1.mcap"
 FILE_SHA256 = "a3de1a9c2dc88e21bb76cccbf913e53bc97940ad099ddd1ef2a8894b0a6f6687"
 CONTENT_HASH = "091835383d95f91e15527ac9b2043511a0fdd05585a89bec5194d7ab317aa312"
+# Logs of whole commands, small ones: kind, and how the hashes of the file and of its contents begin.
+COMMANDS = [
+    ("train", "3be63431989f79ef", "e701dfee7b4401e0"),
+    ("study", "8eaefe247aa0b1f9", "b4b4ba56d7656891"),
+    ("gap", "f6aabf6a3d422db2", "602075beedd8c92d"),
+    ("monitor", "89e8a937099d6f32", "3f2ec0ba2ff55757"),
+]
 LAYOUT = TESTS.parent / "docs/fdi_torch.foxglove-layout.json"
 
 
@@ -43,6 +52,28 @@ def test_format_1_means_what_it_meant() -> None:
     (verdict,) = run.messages(["/gap/verdict"])
     assert orjson.loads(verdict.payload["answer"])["closure"]["closed_ci95"] == [0.99, 1.0]
     np.testing.assert_array_equal(arrays(run)["covariance"], np.eye(2))
+
+
+@pytest.mark.parametrize(("kind", "file_hash", "content"), COMMANDS)
+def test_each_commands_log_stays_readable(kind: str, file_hash: str, content: str, tmp_path: Path) -> None:
+    path = TESTS / f"data/log_format_1_{kind}.mcap"
+    assert hashlib.sha256(path.read_bytes()).hexdigest().startswith(file_hash)
+    run = read_run(path)
+    assert content_hash(run.messages()).startswith(content)
+    assert inspect_log(path).health.sound and run.metadata["fdi_torch.run"]["kind"] == kind
+    assert main(["report", str(path), "--out", str(tmp_path / "page.html"), "--quiet"]) == DONE
+    assert "<svg" in (tmp_path / "page.html").read_text()
+
+
+def test_each_commands_log_means_what_it_meant() -> None:
+    logs = {kind: read_run(TESTS / f"data/log_format_1_{kind}.mcap") for kind, *_ in COMMANDS}
+    (estimate,) = logs["train"].messages(["/estimate/final"])
+    assert estimate.payload["values"] == [0.3000623650791432] and estimate.payload["names"] == ["T1.leak.size"]
+    assert last_state(logs["train"]) is not None
+    assert [m.payload["trial"] for m in logs["study"].messages(["/study/trial"])] == [0, 1, 2, 3, 4]
+    (verdict,) = logs["gap"].messages(["/gap/verdict"])
+    assert (verdict.payload["verdict"], verdict.payload["causes"]) == ("ambiguous", ["leak@T1"])
+    assert {m.payload["event"] for m in logs["monitor"].messages(["/observer/alarm"])} == {"notice"}
 
 
 def test_the_layout_shows_what_is_in_a_log() -> None:

@@ -272,7 +272,8 @@ def test_a_full_disk_ends_the_log_not_the_process(tmp_path: Path) -> None:
     assert refused.endswith("nothing more is logged") and at_end.endswith("nothing more is logged")
     run = read_run(tmp_path / "a.mcap.partial")
     trials = [message.payload["trial"] for message in run.messages()]
-    assert trials == list(range(len(trials))) and 1000 < len(trials) <= int(written)
+    # The message at which the disk was full may be whole in the file, where the limit cut what followed it.
+    assert trials == list(range(len(trials))) and 1000 < len(trials) <= int(written) + 2
     assert "fdi recover" in run.advice
 
 
