@@ -13,6 +13,7 @@ from fdi_torch.simulate.expression import Varies
 from fdi_torch.simulate.program import Program
 from fdi_torch.simulate.section import Output, Place, Row, Section
 from fdi_torch.simulate.statements import Statements, stored
+from fdi_torch.simulate.steady import steady_nodes
 
 _SKELETON, _PRIMITIVES = (Path(__file__).with_name(name) for name in ("kernel.hpp", "vector.hpp"))
 # glibc has vector forms of these, which a compiler may use once they are declared; the same lane always takes the same.
@@ -52,6 +53,8 @@ def emit(program: Program, inner_samples: bool, real: str, lanes: int) -> str:
         "LANE_CONSTANTS": len(writer.lane_constants),
         "UNIFORM_CONSTANTS": len(writer.uniform_constants),
         "ROWS": len(writer.rows),
+        "STEADY": len(writer.steady),
+        "SPANS": len(writer.spans),
     }
     head = [f"#define {name} {value}" for name, value in defines.items()]
     head += [
@@ -84,6 +87,9 @@ class _Writer:
         self.lane_constants: dict[int, int] = {}
         self.uniform_constants: dict[int, int] = {}
         self.rows: dict[Place, tuple[int, Row]] = {}
+        self.steady_nodes = steady_nodes(program.graph)
+        self.steady: dict[tuple[str, int], int] = {}
+        self.spans: list[str] = []
 
     def sections(self) -> str:
         p = self.program
@@ -101,7 +107,7 @@ class _Writer:
     def _section(self, name: str, parts: Sequence[Section]) -> str:
         """A function: numbers common to all lanes, a loop over vectors for each part, and the loop over directions."""
         outputs = [o for part in parts for o in part]
-        body = Statements(self.graph, self.constant)
+        body = Statements(self.graph, lambda i: self.constant(i, name), self.steady_nodes)
         ends = self._ends(parts)
         wanted = [self._wanted(part, end) for part, end in zip(parts, ends, strict=True)]
         body.keep(wanted, [slope for o in outputs for slope, _ in o.row.terms])
@@ -112,7 +118,21 @@ class _Writer:
         head = [f"static inline void {name}(Block &b, const real *clock, const real *channel) {{"]
         head += [f"    alignas(64) Lane kept[{max(len(body.kept), 1)}];", *body.common]
         tail = ["    (void)kept; (void)clock; (void)channel;", "}"]
-        return "\n".join([*head, *lines, *self._directions(outputs, body), *tail])
+        lines += self._directions(outputs, body)
+        return "\n".join([*head, *self._refresh(name), *lines, *tail])
+
+    def _refresh(self, name: str) -> list[str]:
+        """Computes what the section keeps from step to step, where the step has another length than the one before."""
+        nodes = {i: k for (section, i), k in self.steady.items() if section == name}
+        if not nodes:
+            return []
+        body = Statements(self.graph, self.constant)
+        lanes = body.compute(list(nodes))
+        lanes += [stored(f"b.steady[{k}]", body.number(i)) for i, k in nodes.items()]
+        self.spans.append(name)
+        span = f"b.span[{len(self.spans) - 1}]"
+        head = [f"    if (clock[1] != {span}) {{", f"    {span} = clock[1];", *body.common]
+        return [*head, "    EACH_VECTOR {", *lanes, "    }", "    }"]
 
     def _ends(self, parts: Sequence[Section]) -> list[list[Output]]:
         """What each part stores. What a step ends with waits for the last, when no other needs what it began with."""
@@ -160,10 +180,12 @@ class _Writer:
         """Where an output is stored; slopes are for samples within a step."""
         return "" if place[0] == "slope1" and not self.inner_samples else place_text(place)
 
-    def constant(self, i: int) -> str:
-        """Where a node that does not vary in time is stored by `prepare`."""
+    def constant(self, i: int, section: str = "") -> str:
+        """Where `prepare` stores what does not vary in time, and a section what varies with its clock only."""
         node = self.graph.nodes[i]
-        if node.varies & Varies.LANE:
+        if section and i in self.steady_nodes:
+            text = f"AT(b.steady[{self.steady.setdefault((section, i), len(self.steady))}])"
+        elif node.varies & Varies.LANE:
             text = f"AT(b.lane[{self.lane_constants.setdefault(i, len(self.lane_constants))}])"
         else:
             text = f"b.uniform[{self.uniform_constants.setdefault(i, len(self.uniform_constants))}]"

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from fdi_torch.simulate.expression import Graph
-
-_DEAR = {"sqrt", "inverse_fourth_root", "div", "exp", "log", "pow", "sin", "cos", "tanh"}
+from fdi_torch.simulate.steady import DEAR
 
 
 def guarded(graph: Graph, order: Sequence[int], outputs: Collection[int]) -> dict[int, int]:
@@ -31,5 +30,5 @@ def guarded(graph: Graph, order: Sequence[int], outputs: Collection[int]) -> dic
         for place, argument in enumerate(node.arguments):
             rare = argument in first and place == 1 and node.arguments.count(argument) == 1
             conditions.setdefault(argument, set()).add(node.arguments[0] if rare else only)
-    worth = {owner[i] for i in owner if graph.nodes[i].operation in _DEAR}
+    worth = {owner[i] for i in owner if graph.nodes[i].operation in DEAR}
     return {i: c for i, c in owner.items() if c in worth}

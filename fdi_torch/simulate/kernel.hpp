@@ -34,7 +34,7 @@ using Lane = real[LANES];
 
 struct Block {
     alignas(64) Lane theta[SOME(COLUMNS)];
-    Lane lane[SOME(LANE_CONSTANTS)];
+    Lane lane[SOME(LANE_CONSTANTS)], steady[SOME(STEADY)];
     Lane level[TANKS], before[TANKS], sample[TANKS], slope_left[TANKS], slope_right[TANKS];
     Lane action[SOME(ACTUATORS)], command_memory[SOME(COMMAND_MEMORY)], late_channel[SOME(LATE_ACTUATORS)];
     Lane integral[SOME(LATE_ACTUATORS)], late_slope[SOME(LATE_ACTUATORS)];   // of late channels, so far
@@ -51,7 +51,7 @@ struct Block {
     Lane d_seen[COLUMNS][SENSORS], d_reading[COLUMNS][SENSORS], d_reading_memory[COLUMNS][SOME(READING_MEMORY)];
     Lane gram[SENSORS][PAIRS], previous[SENSORS][WIDTH], column[WIDTH], previous_weight[SENSORS];
 #endif
-    real uniform[SOME(UNIFORM_CONSTANTS)];
+    real uniform[SOME(UNIFORM_CONSTANTS)], span[SOME(SPANS)];    // span: the steps' lengths that `steady` is of
     int64_t end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
     int64_t problem[LANES];
     bool one_problem;
@@ -299,6 +299,7 @@ static void load(const Job &job, Block &b, const Rows &rows) {
         for (int i = 0; i < COLUMNS; ++i) b.theta[i][l] = job.theta[lane * COLUMNS + i];
         b.problem[l] = lane / job.lanes_per_problem;
     }
+    for (real &span : b.span) span = NAN;
     b.one_problem = b.problem[0] == b.problem[LANES - 1];
     std::memset(b.end, 0, sizeof b.end);
     std::memset(b.past, 0, sizeof b.past);

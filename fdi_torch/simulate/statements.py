@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 from fdi_torch.simulate.expression import Graph, Varies
 from fdi_torch.simulate.guard import guarded
@@ -14,11 +14,14 @@ class Statements:
     """Writes what computes the nodes of one section, loop after loop.
 
     constant: where a node that does not vary in time stands, or None before time, when it has to be computed.
+    steady: further nodes that stand where `constant` says.
     kept: where a node stands that is needed after its own loop, by node.
     """
 
-    def __init__(self, graph: Graph, constant: Callable[[int], str] | None = None) -> None:
-        self.graph, self.constant = graph, constant
+    def __init__(
+        self, graph: Graph, constant: Callable[[int], str] | None = None, steady: Collection[int] = frozenset()
+    ) -> None:
+        self.graph, self.constant, self.steady = graph, constant, steady
         self.common: list[str] = []
         self.kept: dict[int, int] = {}
         self._known: set[int] = set()
@@ -27,7 +30,7 @@ class Statements:
 
     def keep(self, loops: Sequence[list[int]], slopes: Iterable[int]) -> None:
         """Finds what to keep: the slopes, for the loop over directions, and what a loop needs of an earlier one."""
-        wanted = [i for i in slopes if self.graph.nodes[i].varies == Varies.BOTH]
+        wanted = [i for i in slopes if self.graph.nodes[i].varies == Varies.BOTH and i not in self.steady]
         known: set[int] = set()
         for loop in loops:
             order = self._order(loop, known)
@@ -95,21 +98,24 @@ class Statements:
         if self.constant is None:
             return self.graph.reach(wanted)
         wanted = list(wanted)
-        constant = [i for i in self.graph.reach(wanted) if not self.graph.nodes[i].varies & Varies.STEP]
+        constant = [i for i in self.graph.reach(wanted) if self._is_constant(i)]
         return self.graph.reach(wanted, stop=[*known, *constant])
 
     def _is_computed(self, i: int) -> bool:
         """Whether a node of a loop is the result of an operation, and not read from where it stands anyway."""
         node = self.graph.nodes[i]
-        return node.varies == Varies.BOTH and node.operation != "input"
+        return node.varies == Varies.BOTH and node.operation != "input" and i not in self.steady
+
+    def _is_constant(self, i: int) -> bool:
+        return i in self.steady or not self.graph.nodes[i].varies & Varies.STEP
 
     def _statement(self, i: int, declared: bool = False) -> str:
         return f"{'' if declared else f'const {self._type(i)} '}v{i} = {self._formula(i)};"
 
     def _formula(self, i: int) -> str:
         node = self.graph.nodes[i]
-        before_time = self.constant is None
-        if node.operation == "input" or i in self._known or not (before_time or node.varies & Varies.STEP):
+        constant = self.constant is not None and self._is_constant(i)
+        if node.operation == "input" or i in self._known or constant:
             return self._stored(i)
         return OPERATIONS[node.operation].c.format(*(self.text(a) for a in node.arguments))
 
