@@ -11,12 +11,13 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUM
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
-from benchmarks import logging, machine, monitoring, noise, precision, scaling, search, speed  # noqa: E402
+from benchmarks import logging, machine, monitoring, noise, precision, scaling, search, speed, threads  # noqa: E402
 
 PARTS = {
     "speed": ("Trajectories per CPU second, 1000 s in 10 s RK4 steps, float64", speed),
-    "precision": ("Trajectories per CPU second at a given worst error, 256 random faults", precision),
+    "precision": ("Trajectories per CPU second at a given worst error, 1000 random faults", precision),
     "scaling": ("Sums over the samples, fused with the simulation: many lanes, sensitivities, memory", scaling),
+    "threads": ("Wall-clock time with one thread and with two, three tanks, sums over the samples", threads),
     "search": ("CPU seconds to find a noise-free 5-parameter fault to 1e-6", search),
     "noise": ("1000 noise draws of one fault, estimated", noise),
     "monitoring": ("The monitor on three tanks, beside the time that samples take to come", monitoring),
@@ -31,13 +32,15 @@ One command compares fdi_torch with other tools on the same work, in one run on 
     pip install -e '.[benchmarks]' && python -m benchmarks --write benchmarks/README.md
 
 The peers' equations are written by hand in `physics.py` and give the same levels to 1e-9 m, which each run checks.
-`numba, blocks of lanes` is no tool of its own: it is our kernel's layout (trajectories side by side) written by hand
-for this one plant, and shows what any compiler can make of it. What is left between the two is the root without
-divisions and the grouping of constants; without its roots and divisions altogether, which nobody can spare, the kernel
-would be 2.6 times as fast. The SciPy search is stopped after 120 generations, those of evosax and EvoX after 1500; all
-start from the tools' own defaults. Logging is timed at the log's own doors, on each thread, with the process that asks
-git; the job's seconds do not hold the imports. A sample's message costs 8 microseconds, half of them at the end, when
-chunks are joined; what is written once a generation finds the caches cold and costs ten times as much.
+`numba, blocks of lanes` is no tool of its own: it is our kernel's layout (trajectories side by side) written by hand,
+and shows what a compiler makes of it. What is left between the two is the root, refined from the processor's own
+rough one without divisions, the weirs that are skipped where no level stands above a rim, and what is computed once a
+lane or once a length of step. What bounds the kernel is the processor's products: with its roots unrefined, which
+would be wrong, it would be twice as fast. The SciPy search is stopped after 120 generations, those of evosax and EvoX
+after 1500; all start from the tools' own defaults. Logging is timed at the log's own doors, on each thread, with the
+process that asks git; the job's seconds do not hold the imports. A sample's message costs 8 microseconds, half of
+them at the end, when chunks are joined; what is written once a generation finds the caches cold and costs ten times
+as much.
 
 """
 

@@ -1,0 +1,43 @@
+"""Wall-clock time with one thread and with two, on a machine that does nothing else."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+
+from benchmarks.simulators import experiment, plant, random_faults
+from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.engine import Readings
+
+STEP, LANES, RUNS = 10.0, (1_024, 16_384, 1_000_000), 3
+Row = tuple[int, float, float]
+
+
+def measure(budget: float) -> list[Row]:
+    """Lanes, and trajectories per second with one thread and with two. budget is not used: each is run three times."""
+    network, space = plant()
+    engine = CompiledEngine(network, space, experiment(STEP))
+    values = engine.readings(space.nominal())
+    data = Readings(values, torch.ones_like(values))
+    rows = []
+    for lanes in LANES:
+        theta = torch.from_numpy(random_faults(lanes))
+        rates = []
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            rates.append(lanes / min(_seconds(lambda theta=theta: engine.moments(theta, data)) for _ in range(RUNS)))
+        rows.append((lanes, *rates))
+    torch.set_num_threads(1)
+    return rows
+
+
+def _seconds(run) -> float:  # type: ignore[no-untyped-def]
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
+
+
+def table(rows: list[Row]) -> str:
+    lines = ["| lanes | one thread, trajectories/s | two threads | ratio |", "|---|---|---|---|"]
+    return "\n".join(lines + [f"| {n:,} | {a:,.0f} | {b:,.0f} | {b / a:.2f} |" for n, a, b in rows])
