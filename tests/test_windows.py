@@ -23,6 +23,14 @@ def test_neighbouring_windows_with_the_fault_are_one_stretch() -> None:
     assert found[0].size == pytest.approx(0.5) and found[0].std == pytest.approx(0.1 / 2**0.5)
 
 
+def test_windows_at_the_end_of_the_range_have_no_say_in_the_size() -> None:
+    beyond = Window(10.0, 20.0, (WindowFault("T1.leak.size", 1.0, float("inf"), "present", 1e-6),), 1.0)
+    (found,) = stretches_of([window(0.0, "present"), beyond])
+    assert (found.start, found.stop, found.size, found.std) == (0.0, 20.0, pytest.approx(0.5), pytest.approx(0.1))
+    (alone,) = stretches_of([beyond])
+    assert alone.size == 1.0 and alone.std == float("inf")
+
+
 def test_windows_that_are_apart_are_two_stretches() -> None:
     assert len(stretches_of([window(0.0, "present"), window(20.0, "present")])) == 2
 

@@ -22,7 +22,7 @@ def show_windows(found: WindowsResult, screen: Screen) -> None:
     rows = []
     for s in found.stretches:
         flow = "" if s.flow is None else f"{1e6 * s.flow:.3g}"
-        rows.append([s.name, f"{s.start:g}", f"{s.stop:g}", f"{s.size:.3g}", f"{s.std:.2g}", flow])
+        rows.append([s.name, f"{s.start:g}", f"{s.stop:g}", *_size(s.size, s.std), flow])
     screen.table("present", ("fault", "from, s", "to, s", "size", "std error", "flow, cm^3/s"), rows)
     screen.say(f"log: {found.log}")
     screen.result(
@@ -35,5 +35,9 @@ def show_windows(found: WindowsResult, screen: Screen) -> None:
     )
 
 
+def _size(size: float, std: float) -> tuple[str, str]:
+    return (f"{size:.3f}", f"{std:.2g}") if std < 10.0 else (f"> {size:.3g}", "")
+
+
 def _cells(fault: WindowFault) -> tuple[str, str, str]:
-    return f"{fault.size:.3f}", f"{fault.std:.2g}", MARKS[fault.state]
+    return f"{fault.size:.3f}", f"{fault.std:.2g}" if fault.std < 10.0 else "", MARKS[fault.state]

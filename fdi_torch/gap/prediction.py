@@ -26,6 +26,7 @@ from fdi_torch.simulate.collocation import Collocation
 START_SAMPLES = 50
 ROUNDS, CORRECTIONS, HALVINGS = 30, 80, 4
 SETTLED = 1e-5  # m
+MOST_STEPS = 4000  # of the first try; samples may be closer, levels do not change as fast
 UNSEEN_STARTS = (0.1, 0.25, 0.5, 0.8)  # shares of the height, for a tank that no sensor sees
 
 
@@ -46,15 +47,17 @@ class Prediction:
 def predict(
     plant: PlantDescription, recording: Recording, start_samples: int = START_SAMPLES, step: float | None = None
 ) -> Prediction:
-    """The free run of the plant as its file has it. step: of the simulation, s; None for half the sampling interval,
-    and less where a rim that runs over, or another sharp bend, keeps the trajectory from settling.
+    """The free run of the plant as its file has it. step: of the simulation, s; None for half the sampling interval (in
+    a long run of close samples the MOST_STEPS-th part of it), and less where a rim that runs over, or another sharp
+    bend, keeps the trajectory from settling.
 
     Raises ValueError where there is no first sample to start from.
     """
     if start_samples < 1:
         raise ValueError(f"expected at least 1 sample for the start levels, got {start_samples}")
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
-    step = step or 0.5 * float(torch.median(torch.diff(recording.time)))
+    span = float(recording.time[-1] - recording.time[0])
+    step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), span / MOST_STEPS)
     for _ in range(HALVINGS):
         subject = subject_of(plant, believed, recording, step)
         found = _run(subject, start_samples)

@@ -32,6 +32,7 @@ REFINE = RefineSettings(iterations=40, decrease_tolerance=1e-6)
 STARTS = (0.0, 0.3)  # of each fault, between nominal and the end of its range
 NOTICED = 0.05  # a size within this of nominal is none, as a share of the range
 TOLD = 0.15  # a standard error beyond this share of the range tells nothing
+EMPTY = 0.02  # share of its height below which a tank counts as empty: what drains it then, nothing tells
 State = Literal["present", "absent", "cannot tell"]
 
 
@@ -58,8 +59,8 @@ class Window:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive windows in which a fault was present: start, stop in s; size and std of their weighted mean; flow
-    (m^3/s) at the mean level.
+    """Consecutive windows in which a fault was present: start, stop in s; size and std of all together (std infinite
+    where the size is beyond its range in each); flow (m^3/s) at the mean levels.
     """
 
     name: str
@@ -144,7 +145,14 @@ def window_of(fitting: Fitting, std: Tensor, suspects: set[str]) -> Window:
     for i, parameter in enumerate(space):
         if parameter.name in suspects:
             size, error = float(theta[i]), float(errors[i])
-            state = state_of(size - parameter.nominal, error, parameter.high - parameter.nominal)
+            at_end = size >= parameter.high  # the size is larger than that; how large, nothing tells
+            empty = _empty(fitting, parameter.name.partition(".")[0], levels)
+            state: State = (
+                "cannot tell"
+                if empty
+                else state_of(size - parameter.nominal, error, parameter.high - parameter.nominal)
+            )
+            error = math.inf if at_end or empty else error
             flow, _ = fault_flow(fitting.networks[0], space, theta, i, levels, channels)
             faults.append(WindowFault(parameter.name, size, error, state, flow))
     return Window(float(recording.time[0]), float(recording.time[-1]), tuple(faults), misfit)
@@ -157,6 +165,17 @@ def _mean_level(fitting: Fitting, tank: str, data: Readings) -> Tensor:
             mean = (data.values[:, i] * data.weight[:, i]).sum() / data.weight[:, i].sum().clamp(min=1.0)
             return ((mean - sensor.offset) / sensor.gain).clamp(min=0.0)
     return data.values.new_zeros(())
+
+
+def _empty(fitting: Fitting, place: str, levels: Tensor) -> bool:
+    """Whether the tank that a fault drains (a pipe's: both) holds next to nothing."""
+    pipes = {p.name: {p.source, p.target} for p in fitting.plant.pipes}
+    drained = pipes.get(place, {place})
+    return all(
+        float(level) < EMPTY * tank.height
+        for tank, level in zip(fitting.plant.tanks, levels, strict=True)
+        if tank.name in drained
+    )
 
 
 def state_of(size: float, std: float, width: float) -> State:
@@ -183,14 +202,21 @@ def stretches_of(windows: Sequence[Window]) -> list[Stretch]:
 
 
 def _joined(name: str, each: Sequence[WindowFault], start: float, stop: float) -> Stretch:
-    """Sizes weighted by their certainty; the error is that of the weighted mean, scatter included."""
-    size = torch.tensor([f.size for f in each], dtype=torch.float64)
-    weight = torch.tensor([max(f.std, 1e-9) for f in each], dtype=torch.float64) ** -2
-    mean = float((weight * size).sum() / weight.sum())
-    scatter = float((weight * (size - mean) ** 2).sum()) / max(len(each) - 1, 1)
-    std = float(torch.sqrt(max(1.0, scatter) / weight.sum()))
+    """The size of the windows together, those in which more water flowed counting for more; its error has their own
+    errors and their scatter. Windows whose size is beyond its range have no say in it.
+    """
     flows = [f.flow for f in each if f.flow is not None]
-    return Stretch(name, start, stop, mean, std, sum(flows) / len(flows) if flows else None)
+    flow = sum(flows) / len(flows) if flows else None
+    known = [f for f in each if math.isfinite(f.std)]
+    if not known:
+        return Stretch(name, start, stop, max(f.size for f in each), math.inf, flow)
+    size = torch.tensor([f.size for f in known], dtype=torch.float64)
+    weight = torch.tensor([1.0 if f.flow is None else max(f.flow, 1e-12) for f in known], dtype=torch.float64)
+    weight = weight / weight.sum()
+    mean = float((weight * size).sum())
+    own = torch.tensor([f.std for f in known], dtype=torch.float64)
+    std = float(torch.sqrt((weight**2 * (own**2 + (size - mean) ** 2)).sum()))
+    return Stretch(name, start, stop, mean, std, flow)
 
 
 def _plain(window: Window) -> dict[str, object]:
