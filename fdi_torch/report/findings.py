@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from fdi_torch.effects import effect
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import fits
 from fdi_torch.report.material import Material
 
 NAN = float("nan")
@@ -33,7 +36,7 @@ class Finding:
 def findings(material: Material) -> list[Finding]:
     """Faults of a diagnosis (the last word on each), then the causes of a gap."""
     faults = {(m.get("fault"), m.get("location")): _fault(m) for m in material.of("/diagnosis/fault")}
-    return [*faults.values(), *(_cause(cause) for cause in material.answer.get("causes", []))]
+    return [*faults.values(), *(_cause(cause, material.plant) for cause in material.answer.get("causes", []))]
 
 
 def _fault(message: Mapping[str, Any]) -> Finding:
@@ -47,11 +50,21 @@ def _effect_name(name: str) -> str:
     return name.removesuffix(".size")
 
 
-def _cause(cause: Mapping[str, Any]) -> Finding:
-    """The first parameter of an effect is its size."""
-    size: Mapping[str, Any] = next(iter(cause.get("parameters", {}).values()), {})
+def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> Finding:
+    """A log may hold the parameters in any order: which is the size, the effect itself says."""
+    name, location, parameters = str(cause["effect"]), str(cause["location"]), cause.get("parameters", {})
+    size: Mapping[str, Any] = parameters.get(_size_of(name, location, plant)) or next(iter(parameters.values()), {})
     value, std = _number(size.get("value")), _number(size.get("std"))
-    return Finding(str(cause["effect"]), str(cause["location"]), True, value, std, str(size.get("unit", "")))
+    return Finding(name, location, True, value, std, str(size.get("unit", "")))
+
+
+def _size_of(name: str, location: str, plant: PlantDescription | None) -> str:
+    """The short name of an effect's size; empty where the library or the plant lacks it."""
+    try:
+        placed = plant is not None and fits(effect(name), plant, location)
+    except ValueError:
+        return ""
+    return effect(name).parameters(location, plant)[0].name if placed and plant is not None else ""
 
 
 def _number(value: Any) -> float:

@@ -53,7 +53,7 @@ class _Drawing:
         longest = max((len(words) for name in plant.locations() for words in self.said(name)), default=0)
         margin = max(1.0, 0.058 * longest)
         beside = max((len(w) for s in plant.sensors for w in (short(s.name, 16), *self.said(s.name))), default=0)
-        left, right = -margin, (columns - 1) * COLUMN + max(margin, 0.65 + LETTER * beside)
+        left, right = -margin, (columns - 1) * COLUMN + max(margin, 0.8 + LETTER * beside)
         words = 0.2 * max((len(self.said(name)) for name in plant.locations()), default=0)
         bottom, top = -(rows - 1) * ROW - 0.85 - words, TALL + 1.05 + words
         self.figure = Figure(figsize=((right - left) * INCH, (top - bottom) * INCH))

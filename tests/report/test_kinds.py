@@ -11,7 +11,9 @@ import pytest
 from sample_runs import GAP_ANSWER, NASTY, material_of, write_challenge, write_gap, write_monitor, write_study
 
 from fdi_torch.config import load_plant
-from fdi_torch.logbook import RunLog
+from fdi_torch.logbook import RunLog, read_run
+from fdi_torch.report.findings import findings
+from fdi_torch.report.material import gather
 from fdi_torch.report.page import RunReport, page, report_of
 from fdi_torch.report.sections.before_after import sample_noise
 from fdi_torch.report.verdict import headline
@@ -113,3 +115,9 @@ def test_several_runs_share_a_page(tmp_path: Path) -> None:
         [report_of(material_of(write(tmp_path / f"{write.__name__}.mcap"))) for write in (write_gap, write_study)]
     )
     assert text.count("<article>") == 2
+
+
+def test_a_cause_shows_its_size_in_whatever_order_its_parameters_were_logged() -> None:
+    log = read_run(Path(__file__).parents[1] / "data/log_format_1_gap.mcap")
+    (found,) = findings(gather(log, load_plant("three_tank")))
+    assert (found.words, round(found.size, 3), found.unit) == ("leak at T1", 0.295, "1")

@@ -40,8 +40,9 @@ def health_section(material: Material) -> Section | None:
     found = material.inspection
     problems = [*found.health.problems, *material.trouble]
     state = tag("span", "not sound", class_="bad") if problems else tag("span", "sound", class_="good")
+    chunks = "chunk" if found.health.chunks == 1 else "chunks"
     counted = (
-        f"{found.messages} messages on {len(found.topics)} topics in {found.health.chunks} chunks, {found.size} bytes"
+        f"{found.messages} messages on {len(found.topics)} topics in {found.health.chunks} {chunks}, {found.size} bytes"
     )
     rows = [[info.topic, str(info.messages), number(info.first), number(info.last)] for info in found.topics.values()]
     said = [_spoken(message) for message in material.of("/log")]
