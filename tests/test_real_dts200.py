@@ -9,6 +9,7 @@ import pytest
 from fdi_torch.config.plant import load_plant
 from fdi_torch.config.recordings import RecordingConfig, named_recordings, read_recording
 from fdi_torch.config.run import load_run
+from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.prediction import predict
 from fdi_torch.gap.refit import refit
 from fdi_torch.jobs.windows import windows_of
@@ -70,3 +71,18 @@ def test_windows_with_open_drains_are_told_and_sized_from_levels_and_commands_al
                 assert 0.85 < fault.size < 1.2  # of the drain fully open
                 assert fault.flow is not None and 40e-6 < fault.flow < 130e-6
     assert seen >= 4
+
+
+@pytest.mark.slow
+def test_the_valve_the_pump_and_the_offset_of_the_sensors_are_named_where_they_are(data: Path) -> None:
+    plant = load_plant(REAL / "dts200_nominal.yaml")
+    recordings = named_recordings(str(REAL / "dts200_runs.yaml"), plant, ROOT)
+    plain = ("internal_body", "overflow", "plugging")  # tanks are cylinders, no run reaches a rim, pipes do not silt up
+    answer = diagnose(plant, recordings, settings=Settings(leave_out=plain, step=2.0, most=10, named_only=True))
+    causes = {(c.effect, c.location): c for c in answer.causes}
+    dead_zone = causes["valve_dead_zone", "LM"].parameters["dead_zone"]
+    assert 0.12 < dead_zone.value < 0.16 and dead_zone.std < 0.01
+    gain = causes["pump_gain", "qR"].parameters["factor"]
+    assert 1.08 < gain.value < 1.13 and gain.std < 0.01  # pulses of 4 s deliver 1.10 to 1.12 of 60 to 100 cm^3/s
+    (offset,) = (c for (effect, place), c in causes.items() if effect == "sensor_bias" and place in ("hL", "hM"))
+    assert 0.004 < abs(offset.parameters["bias"].value) < 0.010  # m; 6 to 6.7 mm by eye, at one level

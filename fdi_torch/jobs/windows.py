@@ -203,12 +203,12 @@ def stretches_of(windows: Sequence[Window]) -> list[Stretch]:
 
 def _joined(name: str, each: Sequence[WindowFault], start: float, stop: float) -> Stretch:
     """The size of the windows together, those in which more water flowed counting for more; its error has their own
-    errors and their scatter. Windows whose size is beyond its range have no say in it.
+    errors and their scatter. Windows whose size is beyond its range have no say in it, unless they are most.
     """
     flows = [f.flow for f in each if f.flow is not None]
     flow = sum(flows) / len(flows) if flows else None
     known = [f for f in each if math.isfinite(f.std)]
-    if not known:
+    if 2 * len(known) < len(each):
         return Stretch(name, start, stop, max(f.size for f in each), math.inf, flow)
     size = torch.tensor([f.size for f in known], dtype=torch.float64)
     weight = torch.tensor([1.0 if f.flow is None else max(f.flow, 1e-12) for f in known], dtype=torch.float64)
