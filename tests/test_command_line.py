@@ -148,3 +148,11 @@ def test_quiet_shows_no_progress_but_complaints(capsys: pytest.CaptureFixture[st
 def test_json_has_null_where_a_number_is_not_finite(capsys: pytest.CaptureFixture[str]) -> None:
     Screen(json=True).result({"a": float("nan"), "b": float("inf")})
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": None}
+
+
+def test_a_job_shows_life_before_its_libraries_are_loaded() -> None:
+    for more, lines in (([], 2), (["--quiet"], 1)):
+        command = [sys.executable, "-m", "fdi_torch", "train", "--config", "nowhere.yaml", *more]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 2 and len(done.stderr.splitlines()) == lines
+        assert done.stderr.startswith("fdi train: loading\n") == (not more)

@@ -36,6 +36,9 @@ COMMANDS = {
     "paper": "make the 2020 paper's tables and figures again",
 }
 
+LONG = ("train", "study", "gap", "monitor", "challenge", "paper")
+"""Commands that work for more than a moment, and say so at once."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
@@ -59,6 +62,7 @@ def _overview() -> str:
 
 
 def _run(name: str, words: list[str]) -> int:
+    _say_that_it_began(name, words)
     command = importlib.import_module(f"fdi_torch.cli.{name}")
     arguments = _parser(name, command).parse_args(words)
     from fdi_torch.cli.screen import Screen
@@ -78,6 +82,13 @@ def _run(name: str, words: list[str]) -> int:
         for line in str(error).splitlines():
             screen.complain(f"fdi {name}: {line}")
         return MISUSE
+
+
+def _say_that_it_began(name: str, words: Sequence[str]) -> None:
+    """A job's libraries take seconds to load where they are not there yet: its first sign of life comes before them."""
+    if name in LONG and "torch" not in sys.modules and not {"-h", "--help", "--quiet"} & set(words):
+        sys.stderr.write(f"fdi {name}: loading\n")
+        sys.stderr.flush()
 
 
 def _parser(name: str, command: ModuleType) -> argparse.ArgumentParser:
