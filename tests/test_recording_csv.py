@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.csv_files import ChannelSource, read_csv
+from fdi_torch.recordings.csv_files import read_csv
+from fdi_torch.recordings.source import ChannelSource
 
 GOOD = "t_s,Q1_cm3_s,h1_cm\n0,50,10\n1,50,11\n2,60,12\n"
 

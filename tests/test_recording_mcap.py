@@ -11,8 +11,8 @@ from mcap.writer import Writer
 from fdi_torch.config import ConfigError, RecordingConfig, load_plant, read_recording
 from fdi_torch.logbook import RunLog
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.csv_files import ChannelSource
 from fdi_torch.recordings.mcap_files import read_mcap
+from fdi_torch.recordings.source import ChannelSource
 
 
 def written(path: Path) -> Recording:

@@ -14,8 +14,8 @@ from fdi_torch.config.recordings import RecordingConfig, channel_mapping, expect
 from fdi_torch.logbook import LogError, Message, follow, number_at
 from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recordings.csv_files import ChannelSource
 from fdi_torch.recordings.csv_growing import GrowingCsv
+from fdi_torch.recordings.source import ChannelSource
 
 POLL = 0.1  # s
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,8 +18,9 @@ from fdi_torch.names import unknown
 from fdi_torch.parameters import header_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.csv_files import ChannelSource, read_csv, read_header
+from fdi_torch.recordings.csv_files import read_csv, read_header
 from fdi_torch.recordings.mcap_files import read_mcap
+from fdi_torch.recordings.source import ChannelSource, Reader
 
 GIVE_A_CONSTANT = "give the unknown one a constant, as in columns: {Q1: {constant: 0 cm^3/s}}"
 
@@ -126,7 +127,7 @@ def read_recording(config: RecordingConfig, plant: PlantDescription, base: Path 
         raise ConfigError([str(error)]) from error
 
 
-def _reader(path: Path) -> Callable[..., Recording]:
+def _reader(path: Path) -> Reader:
     """By the file's ending: an MCAP log (also one that was cut off while written), or else CSV."""
     return read_mcap if ".mcap" in path.suffixes else read_csv
 

@@ -12,7 +12,7 @@ from fdi_torch.gap.challenge.rows import write_rows
 from fdi_torch.gap.challenge.run import without_nan
 from fdi_torch.gap.challenge.table import OWN, markdown
 from fdi_torch.logbook import RunLog
-from fdi_torch.recordings.csv_files import file_sha256
+from fdi_torch.recordings.source import file_sha256
 
 LOG = "challenge.mcap"
 

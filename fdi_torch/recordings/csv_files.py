@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import difflib
 import gzip
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -21,22 +20,10 @@ import torch
 
 from fdi_torch.parameters import header_unit, si_unit_of, unit_factor
 from fdi_torch.recording import Hold, Recording
+from fdi_torch.recordings.source import ChannelSource, file_sha256
 
 LINES_PER_BLOCK = 1 << 16
 MISSING_WORDS = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
-
-
-@dataclass(frozen=True)
-class ChannelSource:
-    """Where a channel's numbers come from.
-
-    column: its header (the channel's own name where None). unit: of the numbers in it (from the header where None).
-    constant: the value (SI, in `unit`) of a channel that the file does not hold; NaN where it was never recorded.
-    """
-
-    column: str | None = None
-    unit: str | None = None
-    constant: float | None = None
 
 
 @dataclass(frozen=True)
@@ -90,11 +77,6 @@ def read_header(path: Path) -> list[str]:
     """The column names of a CSV file."""
     with open_csv(path) as handle:
         return header_of(path, handle)[0]
-
-
-def file_sha256(path: Path) -> str:
-    with path.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def open_csv(path: Path) -> TextIO:

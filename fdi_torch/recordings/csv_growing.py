@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from fdi_torch.recordings.csv_files import (
-    ChannelSource,
     bind,
     channels_in_si,
     header_of,
@@ -18,6 +17,7 @@ from fdi_torch.recordings.csv_files import (
     positions_of,
     time_source,
 )
+from fdi_torch.recordings.source import ChannelSource
 
 
 class GrowingCsv:

@@ -12,7 +12,7 @@ from fdi_torch.logbook import Signals, mapped_signals, own_signals, read_run
 from fdi_torch.names import unknown
 from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.recording import Hold, Recording
-from fdi_torch.recordings.csv_files import ChannelSource, file_sha256
+from fdi_torch.recordings.source import ChannelSource, file_sha256
 
 
 def read_mcap(

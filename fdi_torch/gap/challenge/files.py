@@ -25,7 +25,8 @@ from fdi_torch.gap.challenge.inputs import DECIMALS, command_unit
 from fdi_torch.gap.challenge.moment import Array
 from fdi_torch.gap.challenge.plants import Rig
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.csv_files import file_sha256, read_csv
+from fdi_torch.recordings.csv_files import read_csv
+from fdi_torch.recordings.source import file_sha256
 
 _DECIMALS_OF_LEVEL = 3
 
