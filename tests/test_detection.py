@@ -122,3 +122,30 @@ def test_misuse_is_refused() -> None:
 
 def test_cusum_threshold_is_for_all_channels_together() -> None:
     assert cusum_run_length(cusum_threshold(1000.0, 3, 0.25), 0.25) == pytest.approx(6000.0, rel=1e-3)
+
+
+def test_slow_sums_of_whitened_residuals_are_known_as_well_as_is_said() -> None:
+    """60 fits of an AR(1) of 0.7: the true spread of slow sums about each, beside its stated standard error."""
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.randn(60, 1700, 2, generator=generator, dtype=torch.float64)
+    coloured = torch.zeros_like(drawn)
+    for k in range(1, 1700):
+        coloured[:, k] = 0.7 * coloured[:, k - 1] + drawn[:, k]
+    off, said = [], []
+    for residual in coloured[:, 200:]:
+        learnt = fit_whitening(residual)
+        slow = learnt.whitener @ (torch.eye(2, dtype=torch.float64) - learnt.coefficients.sum(0)) / (1.0 - 0.7)
+        off.append(torch.linalg.vector_norm(slow, dim=1).log())
+        said.append(learnt.slow_error)
+    # 120 values: a standard deviation known to 7 %.
+    assert float(torch.stack(off).std()) == pytest.approx(float(torch.stack(said).mean()), rel=0.2)
+
+
+def test_thresholds_allow_for_what_their_recording_does_not_tell() -> None:
+    generator = torch.Generator().manual_seed(1)
+    long, short = (fit_whitening(torch.randn(n, 2, generator=generator, dtype=torch.float64)) for n in (20000, 400))
+    for chart in CHARTS:
+        sure, unsure = (more_alarms(chart, 5000.0, 2, 0.5, learnt) for learnt in (long, short))
+        assert 1.0 < sure < 1.05 < unsure < 2.0
+    known, doubted = (make_detector("cusum", 5000.0, 1.0, 2, generator, learnt=w) for w in (None, short))
+    assert doubted.threshold > known.threshold

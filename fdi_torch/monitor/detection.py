@@ -10,7 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.run_length import cusum_threshold, fixed_threshold, simulated_threshold
+from fdi_torch.monitor.run_length import cusum_run_length, cusum_threshold, fixed_threshold, simulated_threshold
+from fdi_torch.monitor.whitening import Whitening
 
 Chart = Literal["fixed", "cusum", "glr"]
 CHARTS: tuple[Chart, ...] = ("fixed", "cusum", "glr")
@@ -60,12 +61,17 @@ def make_detector(
     generator: torch.Generator,
     drift: float = DRIFT,
     window: int = LONGEST_WINDOW,
+    learnt: Whitening | None = None,
 ) -> Detector:
     """A detector whose mean time between false alarms, all channels taken together, is the requested one (s).
 
-    sampling: s between samples. drift: of the CUSUM. window: the longest of the GLR, in samples. Raises ValueError.
+    sampling: s between samples. drift: of the CUSUM. window: the longest of the GLR, in samples. learnt: what whitens
+    the residual, known no better than its recording allows: then as many false alarms are expected as asked
+    for in the mean over such recordings. Raises ValueError.
     """
     run_length = time_between_false_alarms / sampling
+    if learnt is not None:
+        run_length *= more_alarms(chart, run_length, channels, drift, learnt)
     if chart == "fixed":
         return Detector(chart, largest, fixed_threshold(run_length, channels), 1)
     if chart == "cusum":
@@ -81,6 +87,26 @@ def make_detector(
 
         return Detector(chart, statistic, simulated_threshold(statistic, run_length, channels, generator), window)
     raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
+
+
+def more_alarms(chart: Chart, run_length: float, channels: int, drift: float, learnt: Whitening) -> float:
+    """How many more false alarms a detector raises in the mean over recordings that its noise may be learnt from.
+
+    Its rate grows as exp(s d) with an error d of ln of the residual's standard deviation, s = 10 to 25, so that an
+    error with the variance v costs a factor exp(s^2 v / 2).
+    """
+    if chart == "fixed":
+        steep, variance = fixed_threshold(run_length, channels) ** 2, torch.tensor([learnt.fast_error**2])
+    elif chart == "cusum":
+        threshold, change = cusum_threshold(run_length, channels, drift), 1.01
+        longer = cusum_run_length(threshold, drift) / cusum_run_length(threshold / change, drift / change)
+        steep, variance = math.log(longer) / math.log(change), learnt.slow_error**2
+    else:
+        # Of windows of n samples |sum e|^2 / n, chi-square of C channels, exceeds h as exp(-h / 2); h is about that of
+        # the largest of run_length such. The direction of a chance excess is any: E sum u^4 = 3 / (C + 2).
+        steep = 2.0 * math.log(run_length)
+        variance = learnt.slow_error**2 * 3.0 / (channels + 2.0)
+    return float(torch.exp(0.5 * steep**2 * variance).mean())
 
 
 def largest(white: Tensor) -> Tensor:

@@ -61,7 +61,8 @@ def fault_doubts(
         return []
     start = start_uncertainty(network.description, std)
     gain = kalman_gain(linear, STILL * float(std.min()) * torch.ones_like(start), std, start)
-    still = Whitening(torch.zeros_like(std), std.new_zeros(0, len(std), len(std)), torch.diag(1.0 / std), len(samples))
+    none, count = torch.zeros_like(std), len(samples)
+    still = Whitening(none, std.new_zeros(0, len(std), len(std)), torch.diag(1.0 / std), count, none)
     observer = ChangedObserver(network, space, gain, still, step)
     steady = [fault for fault in faults if not fault.shape]
     first, _ = observer.first_state(samples, believed)

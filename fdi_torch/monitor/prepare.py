@@ -93,7 +93,8 @@ def prepare(
         noise, seen = noise_of_gain(network, wished, samples, space, believed, step)
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)
-    detector = make_detector(chart, time_between_false_alarms, sampling, len(plant.sensors), generator)
+    every = time_between_false_alarms
+    detector = make_detector(chart, every, sampling, len(plant.sensors), generator, learnt=noise.whitening)
     monitor = Monitor(network, space, noise, detector, settings, step, watched=len(watched))
     doubts = (
         *residual_doubts(plant, noise, detector, seen),

@@ -17,13 +17,20 @@ class Whitening:
     """e_k = W (r_k - m - sum_j A_j (r_(k-j) - m)): residuals as a vector autoregression driven by unit white noise.
 
     mean m (C,) in the readings' units, zero where the recording shows none; coefficients A (order, C, C);
-    whitener W (C, C), lower triangular. samples: how many it was estimated from.
+    whitener W (C, C), lower triangular. samples: how many it was estimated from. slow_error (C,): standard error of
+    ln of the standard deviation that slow sums of e have, which is 1 where the colour is known.
     """
 
     mean: Tensor
     coefficients: Tensor
     whitener: Tensor
     samples: int
+    slow_error: Tensor
+
+    @property
+    def fast_error(self) -> float:
+        """Standard error of ln of the standard deviation of single e: 1 / sqrt(2 n)."""
+        return (2.0 * self.samples) ** -0.5
 
     @property
     def order(self) -> int:
@@ -90,8 +97,23 @@ def _fit(residual: Tensor, order: int, highest: int, with_mean: bool) -> tuple[f
     covariance = error.mT @ error / max(len(error) - spent, 1)
     matrices = solution.reshape(order, channels, channels).mT
     whitener = torch.linalg.inv(torch.linalg.cholesky(covariance))
+    slow = _slow_error(regressors, matrices, whitener, len(error))
     score = len(error) * float(torch.logdet(covariance)) + spent * channels * math.log(len(error))
-    return score, Whitening(mean, matrices, whitener, len(error))
+    return score, Whitening(mean, matrices, whitener, len(error), slow)
+
+
+def _slow_error(regressors: Tensor, matrices: Tensor, whitener: Tensor, count: int) -> Tensor:
+    """What errors of A do to slow sums of e: W dA(1) (I - A(1))^-1 W^-1 on its diagonal, rows of W dA having the least
+    squares covariance (X' X)^-1, beside 1 / (2 n) of the spread itself (delta method).
+    """
+    own = whitener.new_full((len(whitener),), 1.0 / (2.0 * count))
+    if not len(matrices):
+        return own.sqrt()
+    eye = torch.eye(len(whitener), dtype=whitener.dtype)
+    through = torch.linalg.solve(eye - matrices.sum(0), torch.linalg.inv(whitener))  # columns: one for each channel
+    direction = through.repeat(len(matrices), 1)
+    spread = (direction * torch.linalg.solve(regressors.mT @ regressors, direction)).sum(0)
+    return (own + spread).sqrt()
 
 
 def _apply(matrix: Tensor, values: Tensor) -> Tensor:

@@ -13,12 +13,15 @@ from fdi_torch.monitor.noise import Noise
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.rehearsal.runs import Course, Rig, fault_free
 from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.whitening import Whitening
 
 
-def detectors(every: float, sampling: float, channels: int, seed: int = 0) -> list[Detector]:
+def detectors(
+    every: float, sampling: float, channels: int, seed: int = 0, learnt: Whitening | None = None
+) -> list[Detector]:
     """One of each kind, for the same mean time between false alarms, s."""
     return [
-        make_detector(chart, every, sampling, channels, torch.Generator().manual_seed(seed + i))
+        make_detector(chart, every, sampling, channels, torch.Generator().manual_seed(seed + i), learnt=learnt)
         for i, chart in enumerate(CHARTS)
     ]
 
