@@ -7,8 +7,18 @@ import math
 import pytest
 import torch
 
-from fdi_torch.monitor.detection import CHARTS, NEVER, Detector, cusum, glr, largest, make_detector, window_lengths
-from fdi_torch.monitor.run_length import cusum_run_length, cusum_threshold, fixed_threshold, simulated_threshold
+from fdi_torch.monitor.detection import (
+    CHARTS,
+    NEVER,
+    Detector,
+    cusum,
+    glr,
+    largest,
+    make_detector,
+    more_alarms,
+    window_lengths,
+)
+from fdi_torch.monitor.run_length import cusum_run_length, cusum_threshold, fixed_threshold, highest, threshold_of
 from fdi_torch.monitor.whitening import fit_whitening
 
 
@@ -37,7 +47,7 @@ def test_false_alarms_come_as_often_as_asked_for(chart: str) -> None:
 
 
 def test_simulated_threshold_agrees_with_the_exact_one() -> None:
-    found = simulated_threshold(largest, 5000.0, 3, torch.Generator().manual_seed(0))
+    found = threshold_of(highest(largest, 3, torch.Generator().manual_seed(0)), 5000.0)
     assert found == pytest.approx(fixed_threshold(5000.0, 3), abs=0.03)
 
 

@@ -24,6 +24,7 @@ COMMANDS = {
     "check": "examine a plant and a recording before any fit",
     "monitor": "follow a recording: alarms, faults with their onset and size, recoveries",
     "diagnosability": "what an experiment can tell: which faults show, which can be told apart",
+    "rehearse": "try a monitor out on simulated runs: false alarms, delays, names, rivals",
     "report": "make one HTML page of one or more logs",
     "inspect": "what a log is about, whether it is sound, and its messages for other tools",
     "replay": "run a logged estimation or study again and compare, or try what another choice gives",

@@ -54,7 +54,7 @@ def run_study(
     tell = tell or (lambda share, text: None)
     output = study.run.config.output
     path = Path(output.folder) / f"{study.run.name}.mcap"
-    before = earlier(path, study) if resume else None
+    before = earlier(path, study.text) if resume else None
     path = path if resume else free_path(path.parent, study.run.name)
     with RunLog(path, "study", **origin_of(study), listener=listener) as log:
         trials = carried_over(log, before)
@@ -76,8 +76,8 @@ def origin_of(study: Study) -> dict[str, Any]:
     return {"config_text": study.text, "config": resolved, "seeds": {"seed": study.plan.seed}}
 
 
-def earlier(path: Path, study: Study) -> OldLog | None:
-    """What a killed or interrupted run of the same study left, set aside; None where there is nothing.
+def earlier(path: Path, text: str) -> OldLog | None:
+    """What a killed or interrupted run of the same configuration left, set aside; None where there is nothing.
 
     Raises ValueError where the study is finished already, or the log is that of another configuration.
     """
@@ -86,7 +86,7 @@ def earlier(path: Path, study: Study) -> OldLog | None:
     if known is None:
         return None
     old = read_run(known, salvage=True)
-    if old.config_text != study.text:
+    if old.config_text != text:
         raise ValueError(f"{known}: expected the log of this configuration, got another's; run without --resume")
     if path.exists():
         if old.metadata.get("fdi_torch.status", {}).get("status") == "completed":

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.run_length import cusum_run_length, cusum_threshold, fixed_threshold, simulated_threshold
+from fdi_torch.monitor.run_length import cusum_run_length, cusum_threshold, fixed_threshold, highest, threshold_of
 from fdi_torch.monitor.whitening import Whitening
 
 Chart = Literal["fixed", "cusum", "glr"]
@@ -19,6 +19,7 @@ CHARTS: tuple[Chart, ...] = ("fixed", "cusum", "glr")
 # CUSUM's drift: half the shift, in standard deviations of the white residual, that is to be found soonest.
 DRIFT = 0.5
 LONGEST_WINDOW = 200
+MOST_MORE = 3.0
 NEVER = -1
 
 
@@ -62,12 +63,13 @@ def make_detector(
     drift: float = DRIFT,
     window: int = LONGEST_WINDOW,
     learnt: Whitening | None = None,
+    peaks: Tensor | None = None,
 ) -> Detector:
     """A detector whose mean time between false alarms, all channels taken together, is the requested one (s).
 
     sampling: s between samples. drift: of the CUSUM. window: the longest of the GLR, in samples. learnt: what whitens
     the residual, known no better than its recording allows: then as many false alarms are expected as asked
-    for in the mean over such recordings. Raises ValueError.
+    for in the mean over such recordings. peaks: of the GLR, where they have been simulated. Raises ValueError.
     """
     run_length = time_between_false_alarms / sampling
     if learnt is not None:
@@ -85,7 +87,8 @@ def make_detector(
         def statistic(white: Tensor) -> Tensor:
             return glr(white, lengths)
 
-        return Detector(chart, statistic, simulated_threshold(statistic, run_length, channels, generator), window)
+        peaks = highest(statistic, channels, generator) if peaks is None else peaks
+        return Detector(chart, statistic, threshold_of(peaks, run_length), window)
     raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
 
 
@@ -93,7 +96,8 @@ def more_alarms(chart: Chart, run_length: float, channels: int, drift: float, le
     """How many more false alarms a detector raises in the mean over recordings that its noise may be learnt from.
 
     Its rate grows as exp(s d) with an error d of ln of the residual's standard deviation, s = 10 to 25, so that an
-    error with the variance v costs a factor exp(s^2 v / 2).
+    error with the variance v costs a factor exp(s^2 v / 2). Beyond MOST_MORE, which a few hundred samples of coloured
+    noise reach, the mean is that of rare recordings, and no threshold would serve.
     """
     if chart == "fixed":
         steep, variance = fixed_threshold(run_length, channels) ** 2, torch.tensor([learnt.fast_error**2])
@@ -106,7 +110,7 @@ def more_alarms(chart: Chart, run_length: float, channels: int, drift: float, le
         # the largest of run_length such. The direction of a chance excess is any: E sum u^4 = 3 / (C + 2).
         steep = 2.0 * math.log(run_length)
         variance = learnt.slow_error**2 * 3.0 / (channels + 2.0)
-    return float(torch.exp(0.5 * steep**2 * variance).mean())
+    return min(float(torch.exp(0.5 * steep**2 * variance).mean()), MOST_MORE)
 
 
 def largest(white: Tensor) -> Tensor:

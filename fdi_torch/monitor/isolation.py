@@ -52,12 +52,36 @@ def isolate(
     for _ in range(1, deepest):
         best = sorted(found, key=lambda finding: finding.score)[:2]
         wider = {b.hypothesis.beside(f): b for b in best for f in faults if f.size not in b.hypothesis.columns}
+        # The best so far go on too: what more steps of the fit gain is no evidence for another fault.
         kept = [h for h in wider if h not in {f.hypothesis for f in found}]
         if not kept:
             break
+        wider |= {b.hypothesis: b for b in best}
+        kept += [b.hypothesis for b in best]
         again = torch.stack([torch.cat([wider[h].value, wider[h].value.new_tensor([wider[h].onset])]) for h in kept])
         found += fit(observer, window, believed, kept, again, _misfit(base))
-    return doubted(found, _misfit(base))
+    closest: dict[Hypothesis, Finding] = {}
+    for finding in sorted(found, key=lambda finding: finding.score):
+        closest.setdefault(finding.hypothesis, finding)
+    told = [searched(f, len(faults)) for f in closest.values() if not needless(f, believed)]
+    return doubted(told, _misfit(base))
+
+
+def needless(finding: Finding, believed: Tensor) -> bool:
+    """Whether one of several faults is, to three standard errors, what was believed of it."""
+    sizes = [c for c in finding.hypothesis.sizes if c in finding.hypothesis.free]
+    change = (finding.value - believed).abs() <= 3.0 * finding.std
+    return len(finding.hypothesis.sizes) > 1 and any(bool(change[c]) for c in sizes)
+
+
+def searched(finding: Finding, faults: int) -> Finding:
+    """Sets of several faults are many, and the best of many fits by chance: the extended BIC adds twice the logarithm
+    of their number over that of single ones (Chen & Chen 2008). What goes away together is one choice.
+    """
+    several = len(set(finding.hypothesis.sizes) - set(finding.hypothesis.gone))
+    if several < 2:
+        return finding
+    return replace(finding, score=finding.score + 2.0 * math.log(max(math.comb(faults, several) / faults, 1.0)))
 
 
 def doubted(found: Sequence[Finding], base: float) -> list[Finding]:

@@ -126,7 +126,11 @@ class Monitor:
             window = state.window(self._look_back(state, state.change))
             same = refit(self.observer, window, state.change.before, [state.change.finding])
             if same[0].fits:
-                return self._revise(state, state.change, "revised", same)
+                due = state.change.next_look  # names are looked at again no later for it
+                revised, events = self._revise(state, state.change, "revised", same)
+                assert revised.change is not None
+                sooner = min(due, revised.change.next_look)
+                return replace(revised, change=replace(revised.change, next_look=sooner)), events
         slight = slight_change(self.observer, state, self._reach(state, state.now), self.faults)
         if slight is not None:
             return adjust(self.observer, state, slight), []
@@ -164,7 +168,9 @@ class Monitor:
             return replace(state, change=replace(change, next_look=float("inf"))), []
         found = self._explanations(state, self._look_back(state, change), change.before)
         same = [f for f in found if f.hypothesis == change.finding.hypothesis]
-        if not found[0].fits and same and same[0].score - found[0].score < CLEARLY:
+        followed = state.adjusted > change.finding.onset  # its sizes have been: no single change is what happened
+        close = followed or (same and same[0].score - found[0].score < CLEARLY)
+        if not found[0].fits and close:
             later = self._look_again(change.finding, state.now)
             return replace(state, change=replace(change, next_look=later)), []
         return self._revise(state, change, "revised", found)

@@ -49,20 +49,22 @@ def cusum_threshold(run_length: float, channels: int, drift: float) -> float:
     return 0.5 * (low + high)
 
 
-def simulated_threshold(
-    statistic: Callable[[Tensor], Tensor], run_length: float, channels: int, generator: torch.Generator
-) -> float:
-    """h of any statistic (*batch, S, C) -> (*batch, S), by simulation of white residuals.
+def highest(statistic: Callable[[Tensor], Tensor], channels: int, generator: torch.Generator) -> Tensor:
+    """The highest value of a statistic (*batch, S, C) -> (*batch, S) in each of many blocks of white residuals."""
+    found = []
+    for _ in range(BLOCKS // 200):
+        noise = torch.randn(200, BURN_IN + BLOCK, channels, generator=generator, dtype=torch.float64)
+        found.append(statistic(noise)[:, BURN_IN:].amax(dim=1))
+    return torch.cat(found).sort().values
+
+
+def threshold_of(peaks: Tensor, run_length: float) -> float:
+    """h of any statistic, from its sorted peaks in blocks of white residuals.
 
     In stationarity the chance of an alarm within a block of B samples is 1 - exp(-B / N). log(-log P(no alarm)) is
     fitted as a parabola in h, so that all blocks tell where a rare alarm begins. Raises ValueError below 20 samples.
     """
     _expect_rare(run_length)
-    highest = []
-    for _ in range(BLOCKS // 200):
-        noise = torch.randn(200, BURN_IN + BLOCK, channels, generator=generator, dtype=torch.float64)
-        highest.append(statistic(noise)[:, BURN_IN:].amax(dim=1))
-    peaks = torch.cat(highest).sort().values
     share = (torch.arange(len(peaks), dtype=torch.float64) + 0.5) / len(peaks)
     used = (share > 0.02) & (share < 0.995)
     hazard = torch.log(-torch.log(share[used]))

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.detection import CHARTS, NEVER, Detector, make_detector
+from fdi_torch.monitor.detection import CHARTS, LONGEST_WINDOW, NEVER, Detector, glr, make_detector, window_lengths
 from fdi_torch.monitor.noise import Noise
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.rehearsal.runs import Course, Rig, fault_free
+from fdi_torch.monitor.run_length import highest
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.whitening import Whitening
 
@@ -20,18 +22,23 @@ def detectors(
     every: float, sampling: float, channels: int, seed: int = 0, learnt: Whitening | None = None
 ) -> list[Detector]:
     """One of each kind, for the same mean time between false alarms, s."""
+    peaks = _peaks(channels, seed)
     return [
-        make_detector(chart, every, sampling, channels, torch.Generator().manual_seed(seed + i), learnt=learnt)
-        for i, chart in enumerate(CHARTS)
+        make_detector(chart, every, sampling, channels, torch.Generator(), learnt=learnt, peaks=peaks)
+        for chart in CHARTS
     ]
+
+
+@lru_cache(maxsize=8)
+def _peaks(channels: int, seed: int) -> Tensor:
+    """What the threshold of the GLR is simulated from, once for many detectors."""
+    lengths = window_lengths(LONGEST_WINDOW)
+    return highest(lambda white: glr(white, lengths), channels, torch.Generator().manual_seed(seed))
 
 
 def white_residuals(rig: Rig, noise: Noise, samples: Samples) -> Tensor:
     """White residuals (R, S, sensors) of an observer that believes in no fault; it starts from rest."""
-    network, nominal = rig.changing, rig.space.nominal()
-    plain = Observer(network, noise.gain)
-    seen = plain.run(samples, rig.levels)
-    assert len(nominal)
+    seen = Observer(rig.network, noise.gain).run(samples, rig.levels)
     return noise.whitening(seen.steady_residual)
 
 

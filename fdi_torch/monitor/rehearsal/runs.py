@@ -52,7 +52,7 @@ class Rig:
         colour: float = 0.0,
         controller: Callable[[], Controller] | None = None,
     ) -> None:
-        self.changing = ChangingNetwork(network, space.names)
+        self.network, self.changing = network, ChangingNetwork(network, space.names)
         self.space, self.inputs, self.levels, self.reading_std = space, inputs, levels, reading_std
         self.sampling, self.wander, self.colour, self.controller = sampling, wander, colour, controller
         self._stepper = Stepper(self.changing, min(sampling, LONGEST_STEP))

@@ -1,0 +1,40 @@
+"""Try a monitor out on simulated runs: false alarms, delays, faults named, estimators side by side.
+
+It is computed in pieces of seconds to minutes; Ctrl-C keeps those that are done, and --resume goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from fdi_torch.cli.options import add_config, add_live, live
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.rehearsal import load_rehearsal
+from fdi_torch.jobs.rehearsal import Rehearsed, rehearse
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_config(parser, required=True)
+    parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
+    parser.add_argument("--resume", action="store_true", help="go on from what a stopped run left in its log")
+    add_live(parser)
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    folder = [f"output.folder={arguments.out}"] if arguments.out else []
+    rehearsal = load_rehearsal(arguments.config, [*arguments.set, *folder])
+    with live(arguments, rehearsal.name, screen) as listener, screen.progress(rehearsal.name) as advance:
+        done = rehearse(rehearsal, arguments.resume, advance, listener)
+    for table in done.tables:
+        screen.table(table.title, table.header, table.rows, left=2)
+        screen.say()
+    screen.say(f"{done.computed} of {done.pieces} pieces in {done.seconds:.0f} s; log: {done.log}")
+    screen.result(as_json(done))
+    return 0
+
+
+def as_json(done: Rehearsed) -> dict[str, object]:
+    tables = [
+        {"title": t.title, "rows": [dict(zip(t.header, row, strict=True)) for row in t.rows]} for t in done.tables
+    ]
+    return {"format": "fdi_torch.rehearsal/1", "tables": tables, "computed": done.computed, "log": str(done.log)}

@@ -1,0 +1,191 @@
+"""Rehearsal files: a simulated plant, its noise, and what a monitor is tried out on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import BeforeValidator, Field, ValidationError
+
+from fdi_torch.config.estimation import full_name
+from fdi_torch.config.files import find_file, read_extended, with_overrides, write_yaml
+from fdi_torch.config.monitor import WindowConfig
+from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.problems import explain
+from fdi_torch.config.run import OutputConfig
+from fdi_torch.config.strict import Seconds, Share, Strict, quantity
+from fdi_torch.effects import build_network, placements_for
+from fdi_torch.estimate.fitting import Fitting, set_up
+from fdi_torch.monitor.prepare import with_shapes
+from fdi_torch.monitor.rehearsal.false_alarms import FalseAlarmPlan
+from fdi_torch.monitor.rehearsal.faults_found import FaultsFoundPlan
+from fdi_torch.monitor.rehearsal.naming_plan import NamingPlan, moving_commands, moving_set_points
+from fdi_torch.monitor.rehearsal.rivals import RIVALS
+from fdi_torch.monitor.rehearsal.rivals_plan import RivalPlan
+from fdi_torch.monitor.rehearsal.runs import Rig
+from fdi_torch.parameters import ParameterSpace, parse_quantity
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.equilibrium import equilibrium
+
+Metres = Annotated[float, BeforeValidator(lambda value: quantity(value, "m"))]
+
+
+class NoiseConfig(Strict):
+    colour: float = Field(0.0, ge=0, lt=1, description="coefficient of the first-order filter that colours it")
+    wander: Metres = Field(0.0, ge=0, description="by which levels wander in a sample")
+
+
+class FalseAlarmConfig(Strict):
+    noises: dict[str, NoiseConfig] = Field(min_length=1, description="each by a name")
+    runs: int = Field(500, ge=1, description="free of faults")
+    lasts: Seconds = Field(3600.0, gt=0, description="each of them, and the one that noise is learnt from, s")
+    calibrations: int = Field(8, ge=1, description="other runs that noise is learnt from, one after the other")
+
+
+class FaultsFoundConfig(Strict):
+    faults: list[str] = Field(min_length=1, description="one of them opens in each run")
+    sizes: list[Share] = Field([0.02, 0.05, 0.1, 0.2], min_length=1, description="shares of the fault's range")
+    runs: int = Field(500, ge=1, description="of each size")
+    named: int = Field(100, ge=0, description="how many of them the monitor follows to name the fault")
+    onset: Seconds = Field(300.0, description="when the fault opens, s")
+    lasts: Seconds = Field(900.0, description="each run, s")
+    window: WindowConfig = Field(default_factory=WindowConfig)
+
+
+class NamingConfig(Strict):
+    faults: list[str] = Field(min_length=1, description="sudden, and slowly growing where they can")
+    loops: list[Literal["closed", "open"]] = Field(["closed", "open"], description="level control, or commands alone")
+    swing: Metres = Field(0.03, description="of the set points each minute")
+    share: Share = Field(0.5, description="by which commands change each minute, of themselves")
+    runs: int = Field(200, ge=1, description="of each loop")
+    times: float = Field(3.0, gt=0, description="the smallest size that can be isolated")
+    onset: Seconds = Field(300.0, description="when the fault opens, s")
+    lasts: Seconds = Field(900.0, description="each run, s")
+    window: WindowConfig = Field(default_factory=WindowConfig)
+
+
+class RivalConfig(Strict):
+    faults: list[str] = Field(min_length=1, description="random sets of them")
+    sets: int = Field(200, ge=1, description="of faults")
+    part: int = Field(50, ge=1, description="sets computed at once")
+    snr_db: list[float] = Field([30.0, 10.0], min_length=1, description="signal-to-noise ratios, dB")
+    rivals: list[Literal[RIVALS]] = Field(list(RIVALS), min_length=1, description="who is compared")  # type: ignore[valid-type]
+    looks: list[int] = Field([30, 60, 100, 150, 200, 300, 400, 600, 800, 1000], description="in samples")
+
+
+class RehearsalConfig(Strict):
+    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+    inputs: list[str] = Field(description="constant commands, one for each channel")
+    reading_noise: str = Field("1 mm", description="standard deviation of every reading")
+    sampling: Seconds = Field(1.0, gt=0, description="between readings, s")
+    false_alarms_every: Seconds = Field(20000.0, description="mean time between false alarms asked for, s")
+    detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="what raises alarms under naming")
+    false_alarms: FalseAlarmConfig | None = Field(None, description="how often without a fault")
+    faults_found: FaultsFoundConfig | None = Field(None, description="how soon, how surely and under which name")
+    naming: NamingConfig | None = Field(None, description="faults of components, sensors and actuators told apart")
+    rivals: RivalConfig | None = Field(None, description="estimators side by side")
+    output: OutputConfig = Field(default_factory=OutputConfig)
+    seed: int = Field(0, ge=0, description="of everything drawn at random")
+
+
+Plan = FalseAlarmPlan | FaultsFoundPlan | NamingPlan | RivalPlan
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """A rehearsal file understood. plans: what is tried out. text: YAML that gives the same."""
+
+    config: RehearsalConfig
+    plant: PlantDescription
+    plans: tuple[Plan, ...]
+    source: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        return self.config.output.name or Path(self.source).stem
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
+
+
+def load_rehearsal(path: str | Path, overrides: Iterable[str] = ()) -> Rehearsal:
+    """A rehearsal file with some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
+    file = find_file(str(path), Path.cwd())
+    data = dict(with_overrides(read_extended(file), overrides))
+    try:
+        config = RehearsalConfig.model_validate(data)
+    except ValidationError as error:
+        raise explain(error, str(file)) from None
+    given = config.plant
+    plant = build_plant(given, str(file)) if isinstance(given, dict) else load_plant(given, file.parent)
+    plans = tuple(_plans(config, plant))
+    if not plans:
+        raise ValueError(f"{file}: expected false_alarms, faults_found, naming or rivals, got none of them; add one")
+    return Rehearsal(config, plant, plans, str(file), write_yaml({**data, "plant": plant_mapping(plant)}))
+
+
+def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:
+    every, count = c.false_alarms_every, lambda seconds: int(seconds / c.sampling) + 1
+    if (f := c.false_alarms) is not None:
+        rigs = {name: _rig(c, plant, (), noise) for name, noise in f.noises.items()}
+        yield FalseAlarmPlan(rigs, f.runs, count(f.lasts), f.calibrations, every, c.seed)
+    if (d := c.faults_found) is not None:
+        rig, settings = _rig(c, plant, d.faults), d.window.settings()
+        yield FaultsFoundPlan(
+            rig, settings, d.runs, d.named, count(d.lasts), tuple(d.sizes), d.onset, every, c.seed
+        )  # fmt: skip
+    if (n := c.naming) is not None:
+        for loop in n.loops:
+            rig, settings = _rig(c, plant, n.faults, None, loop), n.window.settings()
+            yield NamingPlan(
+                rig, loop, c.detector, settings, n.runs, count(n.lasts), n.onset, n.times, every, c.seed
+            )  # fmt: skip
+    if (r := c.rivals) is not None:
+        fitting = _fitting(c, plant, r, max(r.looks) + 1)
+        yield RivalPlan(fitting, r.sets, r.part, tuple(r.snr_db), tuple(r.looks), c.seed, tuple(r.rivals))
+
+
+def _inputs(c: RehearsalConfig, plant: PlantDescription) -> torch.Tensor:
+    units = plant.channel_units()
+    if len(c.inputs) != len(units):
+        raise ValueError(f"inputs: expected {len(units)} ({', '.join(units)}), got {len(c.inputs)}")
+    amounts = [parse_quantity(text, unit) for text, unit in zip(c.inputs, units.values(), strict=True)]
+    return torch.tensor(amounts, dtype=torch.float64)
+
+
+def _rig(
+    c: RehearsalConfig,
+    plant: PlantDescription,
+    faults: Iterable[str],
+    noise: NoiseConfig | None = None,
+    loop: str | None = None,
+) -> Rig:
+    names = with_shapes([full_name(name, plant) for name in faults], plant)
+    network, inputs, noise = build_network(plant, placements_for(names)), _inputs(c, plant), noise or NoiseConfig()
+    space = ParameterSpace(network.constants[name] for name in names)
+    levels = equilibrium(network, inputs)
+    std = torch.tensor([parse_quantity(c.reading_noise, s.unit) for s in plant.sensors], dtype=torch.float64)
+    controller = None
+    if loop == "open":
+        controller = moving_commands(inputs, c.naming.share if c.naming else 0.0)
+    elif loop == "closed":
+        fed = [[t.name for t in plant.tanks].index(pump.target) for pump in plant.pumps]
+        highest, swing = min(p.max_flow for p in plant.pumps), c.naming.swing if c.naming else 0.0
+        controller = moving_set_points(inputs, levels[fed], swing, highest)
+    return Rig(network, space, inputs, levels, std, c.sampling, noise.wander, noise.colour, controller)
+
+
+def _fitting(c: RehearsalConfig, plant: PlantDescription, r: RivalConfig, samples: int) -> Fitting:
+    inputs, time = _inputs(c, plant), c.sampling * torch.arange(samples, dtype=torch.float64)
+    columns, units = tuple(s.column for s in plant.sensors), tuple(s.unit for s in plant.sensors)
+    unread = torch.full((samples, len(columns)), torch.nan, dtype=torch.float64)
+    channels, channel_units = tuple(plant.channels()), tuple(plant.channel_units().values())
+    blank = Recording(time, inputs.expand(samples, -1), unread, channels, columns, channel_units, units)
+    return set_up(plant, [blank], [full_name(name, plant) for name in r.faults], "equilibrium")

@@ -1,0 +1,71 @@
+"""A whole rehearsal: pieces computed one after the other, logged as they come, resumed, and put into tables."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fdi_torch.config.rehearsal import Rehearsal
+from fdi_torch.jobs.log_paths import free_path
+from fdi_torch.jobs.study import earlier
+from fdi_torch.logbook import Listener, RunLog
+from fdi_torch.monitor.rehearsal.pieces import Shown
+
+PIECE = "/study/trial"
+_ENVELOPE = ("t", "trial", "group", "seed", "status")
+
+
+@dataclass(frozen=True)
+class Rehearsed:
+    """tables: one a rehearsal. computed: pieces of this run, of `pieces`. seconds: they took. log: where all lies."""
+
+    tables: tuple[Shown, ...]
+    pieces: int
+    computed: int
+    seconds: float
+    log: Path
+
+
+def rehearse(
+    rehearsal: Rehearsal,
+    resume: bool = False,
+    tell: Callable[[float, str], None] = lambda share, text: None,
+    listener: Listener | None = None,
+) -> Rehearsed:
+    """Computes every piece that the log does not hold yet. tell(share, text) is called after each."""
+    path = Path(rehearsal.config.output.folder) / f"{rehearsal.name}.mcap"
+    before = earlier(path, rehearsal.text) if resume else None
+    path = path if resume else free_path(path.parent, rehearsal.name)
+    pieces = [piece for plan in rehearsal.plans for piece in plan.pieces()]
+    seeds, known = {"seed": rehearsal.config.seed}, {}
+    with RunLog(
+        path, "rehearsal", config_text=rehearsal.text, config=rehearsal.resolved, seeds=seeds, listener=listener
+    ) as log:
+        for message in before.messages([PIECE]) if before else ():
+            number, fields = message.payload["trial"], message.payload
+            if number not in known:
+                known[number] = (fields["group"], {k: v for k, v in fields.items() if k not in _ENVELOPE})
+                log.carry_over([message])
+        found, started = len(known), time.monotonic()
+        for number, piece in enumerate(pieces):
+            if number not in known:
+                tell(len(known) / len(pieces), piece.group)
+                known[number] = (piece.group, dict(piece.compute()))
+                seed = f"{rehearsal.config.seed}/{number}"
+                log.trial(number, known[number][1], group=piece.group, seed=seed, status="done")
+                log.flush()
+        tables = tabled(rehearsal, [known[number] for number in sorted(known)])
+        log.result({"tables": [{"title": t.title, "header": t.header, "rows": t.rows} for t in tables]})
+    return Rehearsed(tables, len(pieces), len(known) - found, time.monotonic() - started, path)
+
+
+def tabled(rehearsal: Rehearsal, known: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[Shown, ...]:
+    """Every plan's table of what there is."""
+    groups: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
+    for group, numbers in known:
+        groups[group].append(numbers)
+    return tuple(plan.shown(groups) for plan in rehearsal.plans)
