@@ -15,6 +15,7 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 
 CHECKED_POINTS = 200
+MARGIN = 0.01  # by which errors may grow in a sample now and then, as long as they decay on the whole
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,8 @@ class Observer:
     def check_stable(self, samples: Samples, seen: Observation) -> float:
         """The largest spectral radius of the error's transition at the levels visited.
 
-        Raises ValueError where it reaches 1: there the residual would grow by itself.
+        Raises ValueError where it exceeds 1 in the (geometric) mean, or clearly anywhere: the residual would grow by
+        itself. Where a sensor shows nothing for a while, as below its floor, errors may stay as they are.
         """
         span = float(torch.diff(samples.time).median())
         chosen = torch.linspace(0, len(samples) - 1, min(len(samples), CHECKED_POINTS)).long()
@@ -131,11 +133,11 @@ class Observer:
         gain = self.gain.steady.reshape(-1, *self.gain.steady.shape[-2:])[0]
         radius = spectral_radius(linearised(self.stepper, levels, inputs, span, values), gain)
         worst = int(radius.argmax())
-        if not float(radius[worst]) < 1.0:
+        if not (float(radius[worst]) <= 1.0 + MARGIN and float(radius.log().mean()) < 0.0):
             at = float(samples.time[chosen[worst % len(chosen)]])
             raise ValueError(
                 f"expected an observer gain that lets errors decay, got one that lets them grow by "
-                f"{float(radius[worst]):.3g} a sample at {at:g} s; lower the gain or let it be designed"
+                f"{float(radius[worst]):.6g} a sample at {at:g} s; lower the gain or let it be designed"
             )
         return float(radius[worst])
 
