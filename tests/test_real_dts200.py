@@ -46,7 +46,7 @@ def test_openings_of_the_valve_that_were_not_used_are_predicted_by_the_others(da
     used = [r for r in runs("dts200_runs") if "valve_60" not in r.source]
     found = refit(load_plant(REAL / "dts200_effects.yaml"), used, step=2.0, hold=FREE, white=3e-3)
     dead_zone, error = found.fitted["LM.valve_dead_zone.dead_zone"]
-    assert 0.12 < dead_zone < 0.16 and error < 0.01
+    assert abs(dead_zone - 0.137) < 3.0 * error < 0.06  # 0.1375 ± 0.0018 by another way, from all runs
     left_out = next(r for r in runs("dts200_trials") if "valve_60" in r.source)
     assert max(predict(found.plant, left_out, 3).rmse.values()) < 0.005
 
