@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -114,10 +115,42 @@ def test_a_sine_is_averaged_exactly() -> None:
 
 @pytest.mark.parametrize("head", [1e-4, -1e-4])
 def test_laminar_flow_is_linear_below_its_head_and_torricellian_above(head: float) -> None:
-    low = effect("laminar_flow").flow(local(head).root(number(head)), local(head), values(transition_head=1.0))
-    assert float(low) == pytest.approx(head, rel=1e-3)
-    high = effect("laminar_flow").flow(number(1.0), local(1.0), values(transition_head=1e-4))
-    assert float(high) == pytest.approx(1.0, rel=1e-4)
+    law = effect("laminar_flow")
+    for sharpness in (2.0, 5.0):
+        shape = {"sharpness": sharpness}
+        low = law.flow(local(head).root(number(head)), local(head), values(transition_head=1.0, **shape))
+        assert float(low) == pytest.approx(head, rel=1e-3)
+        high = law.flow(number(1.0), local(1.0), values(transition_head=1e-4, **shape))
+        assert float(high) == pytest.approx(1.0, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("head_0", "sharpness", "law", "off"),
+    [
+        (0.1, 2.0, lambda x: 1.0 / math.sqrt(1.0 + 1.0 / x), 1e-5),
+        (0.104, 2.7, lambda x: math.tanh(math.sqrt(x)), 0.02),  # a coefficient that rises with the Reynolds number
+        (0.092, 6.0, lambda x: min(1.0, math.sqrt(x)), 0.05),  # linear below one head
+    ],
+)
+def test_the_sharpness_of_a_laminar_transition_holds_other_known_laws(
+    head_0: float, sharpness: float, law: Callable[[float], float], off: float
+) -> None:
+    for head in (0.005, 0.02, 0.08, 0.16, 0.32):
+        p = values(transition_head=head_0, sharpness=sharpness)
+        factor = float(effect("laminar_flow").flow(number(1.0), local(head), p))
+        assert factor == pytest.approx(law(head / 0.1), rel=off)
+
+
+def test_a_limited_pump_has_a_kink_or_a_knee() -> None:
+    full, limit = 1e-4, 5e-5
+    for flow in (0.0, 1e-5, 4e-5, 5e-5, 8e-5):
+        here = local(0.1)
+        hard = effect("pump_saturation").flow(number(flow), here, values(limit=limit, knee=0.0))
+        assert float(hard) == min(flow, limit)
+        soft = effect("pump_saturation").flow(number(flow), here, values(limit=limit, knee=0.125))
+        assert float(soft) == pytest.approx(flow / (1.0 + (flow / limit) ** 16) ** (1 / 16), rel=1e-9, abs=1e-15)
+    unlimited = effect("pump_saturation").flow(number(9e-5), local(0.1), values(limit=full, knee=0.5))
+    assert float(unlimited) == 9e-5
 
 
 def test_an_exponent_of_one_is_a_linear_law() -> None:

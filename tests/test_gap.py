@@ -105,7 +105,7 @@ def test_a_known_cause_is_named_with_its_size_and_closes_the_gap(ar: float) -> N
 
 
 def test_two_causes_are_named_together() -> None:
-    values = {"Q2.pump_gain.factor": 1.12, "h1.sensor_bias.bias": 0.012}
+    values = {"Q2.pump_gain.factor": 1.12, "h1.sensor_bias.bias": 0.03}
     answer = diagnose(believed(), recorded(values, 31), settings=Settings(SMALL))
     assert answer.verdict == "named"
     assert {(c.effect, c.location) for c in answer.causes} == {("pump_gain", "Q2"), ("sensor_bias", "h1")}

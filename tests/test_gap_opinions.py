@@ -12,7 +12,7 @@ from fdi_torch.gap.fitting import Candidate, Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.folds import FOLDS, STRETCHES, held_out_cost
 from fdi_torch.gap.subject import subject_of
-from fdi_torch.gap.where import spectral_line
+from fdi_torch.gap.where.line import spectral_line
 from tests.test_gap import believed, noise, recorded
 
 
@@ -43,4 +43,5 @@ def test_a_line_in_the_spectrum_is_found_and_a_slow_misfit_is_none() -> None:
 def test_evidence_is_tempered_by_what_the_best_explanation_leaves() -> None:
     assert temperature(4e5) == pytest.approx(101.0)
     assert temperature(4e5, 100.0) == pytest.approx(6.0)
-    assert temperature(200.0, 0.0) == 1.0
+    assert temperature(200.0, 0.0) == pytest.approx(1.001)
+    assert temperature(4e6, 0.0) == pytest.approx(21.0), "five millionths of a gap part nobody"

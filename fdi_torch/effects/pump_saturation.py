@@ -10,11 +10,15 @@ from fdi_torch.plant.description import PlantDescription, Pump
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
 from fdi_torch.plant.reach import Reach, inside
 
+DRY = 1e-12  # m^3/s, or as a share: no flow
+SHARPEST = 1e-3  # rounding below which the limit is a kink
+
 
 class PumpSaturation(Effect):
-    """The flow is min(q, q_max); nominal is the limit of the plant file, where it changes nothing.
+    """The flow is min(q, q_max), or rounded off towards it: q / (1 + (q/q_max)^(1/r))^r with r = k (1 - q_max/q_full);
+    nominal is the limit of the plant file, where it changes nothing.
 
-    Typical: 60 to 90 % of the believed limit. Nothing shows while the commands stay below it.
+    Typical: 60 to 90 % of the believed limit, a knee k of 0 to 0.3. Nothing shows while the commands stay below it.
     """
 
     name = "pump_saturation"
@@ -27,13 +31,20 @@ class PumpSaturation(Effect):
         pump = plant.component(place)
         assert isinstance(pump, Pump)
         full = pump.max_flow
-        return (Parameter("limit", "m^3/s", full, 0.0, full, meaning="the most that the pump delivers"),)
+        return (
+            Parameter("limit", "m^3/s", full, 0.0, full, meaning="the most that the pump delivers"),
+            Parameter("knee", "1", 0.0, 0.0, 1.0, meaning="how far the limit is rounded off"),
+        )
 
     def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
         pump = plant.component(place)
         assert isinstance(pump, Pump)
         commanded = tuple(min(max(pump.gain * u, 0.0), pump.max_flow) for u in reach.commands[pump.channel])
-        return [{"limit": limit} for limit in inside((commanded[0], commanded[1]), 7)]
+        return [{"limit": limit, "knee": 0.1} for limit in inside((commanded[0], commanded[1]), 7)]
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
-        return torch.minimum(flow, p["limit"])
+        least = torch.minimum(flow, p["limit"])
+        share = least / torch.clamp(torch.maximum(flow, p["limit"]), min=DRY)
+        round_off = p["knee"] * (1.0 - p["limit"] / local.constants["max_flow"])
+        near = torch.exp(torch.log(torch.clamp(share, min=DRY)) / torch.clamp(round_off, min=SHARPEST))
+        return least * torch.exp(-round_off * torch.log(1.0 + near))

@@ -33,12 +33,10 @@ def answered(found: Finding, holdouts: Sequence[Subject]) -> Answer:
     """holdouts: laid out for the same plant."""
     has_causes = found.verdict in ("named", "ambiguous")
     gap = max(found.gap, 1.0)
-    where = [(s.location, min(max(s.closes / gap, 0.0), 1.0)) for s in found.places]
+    where = [(s.location, max(1.0 - s.leaves / gap, 0.0)) for s in found.places]
     explanations = found.weighed.explanations
     if found.unnamed:
-        place = found.unnamed.candidate.placements[0].location
-        where = sorted(where, key=lambda w: w[0] != place)
-        explanations = (Explanation((), 1.0, place),)
+        explanations = (Explanation((), 1.0, found.places[0].location),)
     held = _held_out(found, holdouts)
     return Answer(
         verdict=found.verdict,

@@ -9,25 +9,26 @@ import torch
 from fdi_torch.gap.answer import Answer, CauseName, Explanation, Verdict
 from fdi_torch.gap.answering import answered
 from fdi_torch.gap.case import PLAIN, Case, Settings, case_of
-from fdi_torch.gap.evidence import opinions, temperature
+from fdi_torch.gap.evidence import opinions, plainest, temperature
 from fdi_torch.gap.finding import UNEXPLAINED, Finding, Weighed, in_order, whole_gap
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter, left_open
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_rounding
+from fdi_torch.gap.freeform import fitted_free_form
 from fdi_torch.gap.library import canonical, possible_places
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.subject import Subject
-from fdi_torch.gap.where import Suspect, refit, suspects
+from fdi_torch.gap.where.suspects import Suspect, suspects
 from fdi_torch.gap.which import Search, search
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.reach import Reach, reach_of_all, with_levels
+from fdi_torch.plant.reach import reach_of_all, with_levels
 from fdi_torch.recording import Recording
 
 CONTENT = 0.95
-REFITS = 3
 PATIENT = 40  # rounds for the recalibration, on which all else rests
-LEFT_SHARE, LEFT_LEAST = 2e-3, 150.0  # share of the gap, and chi-square units, worth asking the free forms about
+LEFT_SHARE, LEFT_LEAST = 2e-3, 150.0  # share of the gap, and chi-square units, worth asking other forms about
+AMONG_OTHERS_SHARE = 1e-2  # the same where one of the effects found is at the likeliest place
+SAME_PLACE_SHARE = 3e-2  # the same where one effect at the likeliest place leaves it: its equation is a little off
 FAR_BETTER = 0.35
-ALONE = 0.9  # share of the gap that one place closes to first order, at which it is tried alone
 Tell = Callable[[float, str], None]
 
 
@@ -59,11 +60,13 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
     found = search(fitter, null, options, case.most)
     tell(0.6, "where")
     weighed = _weighed(fitter, found, len(library), plant)
-    places, refits = _places(fitter, found, weighed.fits[0], plant, reach)
+    places = _places(fitter, found, weighed.fits[0], plant)
     rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
     rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]
     rounded += [(p.effect.name, p.location) for p in told]
-    unknown = None if case.named_only else _unnamed(fitter, weighed.fits[0], found, refits)
+    unknown = None
+    if not case.named_only and _unnamed(fitter, weighed.fits[0], found, places[0]):
+        unknown = fitted_free_form(fitter, found.null, places[0].location, places[0].periods, reach)
     standing = _content(weighed.explanations)
     verdict: Verdict = "unknown" if unknown else _verdict(standing, rounded)
     finding = Finding(
@@ -73,39 +76,35 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
     return answered(finding, case.held)
 
 
-def _places(
-    fitter: Fitter, found: Search, named: Fit, plant: PlantDescription, reach: Reach
-) -> tuple[list[Suspect], list[Fit]]:
-    """Every place with what it could close; the likeliest refitted in full where the library leaves something open."""
-    gap, left = whole_gap(fitter, found), left_open(fitter, found.best)
-    heat = temperature(found.null.cost - found.best.cost)
-    places = suspects(fitter, found.null, possible_places(plant), reach, heat, waves=left > UNEXPLAINED * gap > 0.0)
-    alone = any(s.closes > ALONE * gap for s in places[:REFITS])
-    if left < max(LEFT_SHARE * gap, LEFT_LEAST) and not (_scattered(named) and alone):
-        return places, []
-    return places, [refit(fitter, found.null, s, reach) for s in places[:REFITS]]
-
-
-def _unnamed(fitter: Fitter, named: Fit, found: Search, refits: Sequence[Fit]) -> Fit | None:
-    """The free discrepancy of one place that closes what no effect of the library does, if there is one.
-
-    Equations that differ a little leave a little open, and a free discrepancy at the same place cannot do much
-    better; where one place alone does far better than all that has a name, or nothing named does, it has no name. So
-    too where one place alone does what otherwise takes effects at several.
-    """
-    if not refits:
-        return None
-    best = min(refits, key=lambda f: f.cost)
+def _places(fitter: Fitter, found: Search, named: Fit, plant: PlantDescription) -> list[Suspect]:
+    """Every place with what it leaves open, the likeliest first; looked at closely where the library leaves much."""
     gap, left = whole_gap(fitter, found), left_open(fitter, named)
-    if left_open(fitter, best) > UNEXPLAINED * gap:
-        best = refits[0]  # no place alone does it: the likeliest one to first order
-    free = left_open(fitter, best)
+    much = left > UNEXPLAINED * gap > 0.0
+    closely = left > max(LEFT_SHARE * gap, LEFT_LEAST) or _scattered(named)
+    return suspects(fitter, found.null, possible_places(plant), waves=much, closely=closely)
+
+
+def _unnamed(fitter: Fitter, named: Fit, found: Search, place: Suspect) -> bool:
+    """Whether one place alone does what no effect of the library does.
+
+    Equations that differ a little leave a little open; where one place alone does far better than all that has a name,
+    or nothing named does, it has no name. So too where it does what otherwise takes effects at several other places.
+    """
+    gap, left, free = whole_gap(fitter, found), left_open(fitter, named), place.leaves
+    if left < LEFT_LEAST and not _scattered(named):
+        return False
     nothing_named = left > UNEXPLAINED * gap
-    far_better = free < FAR_BETTER * left and left - free > max(LEFT_SHARE * gap, LEFT_LEAST)
+    there = [at == place.location for _, at in named.key]
+    share = SAME_PLACE_SHARE if there == [True] else AMONG_OTHERS_SHARE if any(there) else LEFT_SHARE
+    worth_asking = max(share * gap, LEFT_LEAST)
+    far_better = free < FAR_BETTER * left and left - free > worth_asking
     little = 0.5 * max(LEFT_SHARE * gap, LEFT_LEAST)
     single = min((left_open(fitter, f) for f in found.fits if len(f.key) == 1), default=gap)
-    one_for_many = _scattered(named) and free < left + little and single > left + 4.0 * little
-    return best if nothing_named or far_better or one_for_many else None
+    elsewhere = _scattered(named) and all(at != place.location for _, at in named.key)
+    # A small gap is closed by many forms of one place as well as by a few effects at several.
+    large = LEFT_SHARE * gap > LEFT_LEAST
+    one_for_many = large and elsewhere and free < left + little and single > left + 4.0 * little
+    return nothing_named or far_better or one_for_many
 
 
 def _scattered(fit: Fit) -> bool:
@@ -130,7 +129,8 @@ def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
 
 def _weighed(fitter: Fitter, found: Search, choices: int, plant: PlantDescription) -> Weighed:
     """All fits of the search by their probabilities; names of one thing count once."""
-    heat = temperature(found.null.cost - found.best.cost, left_open(fitter, found.best))
+    gap = found.null.cost - found.best.cost
+    heat = temperature(gap, left_open(fitter, plainest(found.fits, gap)))
     best: dict[frozenset[CauseName], Fit] = {}
     for fit in found.fits:
         key = frozenset(canonical(c, plant) for c in fit.key)

@@ -6,7 +6,10 @@ J is the fit's chi-square with the tolerances' share, H its curvature. No librar
 a slightly other formula leaves a share of the gap that grows with the gap, so T = 1 + min(G / 4000, R / 20) for a gap
 of G chi-square units of which the best explanation leaves R open: every further thousandth of the gap left open costs
 two nats, however many samples there are; but where the best leaves next to nothing, its equations are right, and what
-counts is how many times as much the others leave.
+counts is how many times as much the others leave. Not below G / 200000: five millionths of a gap part nobody.
+
+R is what the plainest good explanation leaves, not what further effects that close a few thousandths of the gap make of
+it: what a law misses is of that size, and something can always be found that takes it up.
 """
 
 from __future__ import annotations
@@ -20,7 +23,8 @@ from torch import Tensor
 from fdi_torch.gap.fitting import Fit, Fitter
 from fdi_torch.gap.folds import held_out_cost
 
-MISMATCH, MULTIPLES = 4000.0, 20.0
+MISMATCH, MULTIPLES, LEAST = 4000.0, 20.0, 200000.0
+FAINT = 2e-3  # share of the gap that a further effect closes, below which it may as well be a law's misfit
 SECOND = 0.1  # weight of the second opinion: enough to keep a cause from being named against it
 HEARD = 25.0  # nats of evidence behind the best beyond which no second opinion is asked for
 LOG_PRIOR_EFFECT = math.log(0.1)  # odds of one more thing being wrong, before the data
@@ -30,7 +34,18 @@ LOG_PRIOR_SAME_PLACE = math.log(1e-4)
 
 def temperature(gap: float, left: float = math.inf) -> float:
     """gap: chi-square between the recalibrated plant and the best explanation. left: what that leaves open."""
-    return 1.0 + min(max(gap, 0.0) / MISMATCH, max(left, 0.0) / MULTIPLES)
+    gap = max(gap, 0.0)
+    return 1.0 + min(gap / MISMATCH, max(left, gap / LEAST * MULTIPLES) / MULTIPLES)
+
+
+def plainest(fits: Sequence[Fit], gap: float) -> Fit:
+    """The best of the fits with as few effects as leave only a faint share of the gap to those with more."""
+    best = min(f.cost for f in fits)
+    for effects in sorted({len(f.key) for f in fits}):
+        fit = min((f for f in fits if len(f.key) == effects), key=lambda f: f.cost)
+        if fit.cost - best < FAINT * gap:
+            return fit
+    return min(fits, key=lambda f: f.cost)
 
 
 def log_evidence(fitter: Fitter, fit: Fit, heat: float, choices: int) -> float:

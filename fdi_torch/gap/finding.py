@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from fdi_torch.gap.answer import CauseName, Explanation, Verdict
 from fdi_torch.gap.fitting import Fit, Fitter, left_open
-from fdi_torch.gap.where import Suspect
+from fdi_torch.gap.where.suspects import Suspect
 from fdi_torch.gap.which import Search
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.reach import Reach

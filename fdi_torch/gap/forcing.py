@@ -28,6 +28,9 @@ class Forcing:
 
     union: the plant with every effect that is tried. present: prefixes of those that are there. values: its constants
     as bound to one lane.
+
+    Along the trajectory, at the middle of each step: levels (1, K) m of each tank, commands of each actuator, pumps and
+    pipes: what flows through each, m^3/s; still: the rates without what is tried, m/s.
     """
 
     def __init__(
@@ -40,33 +43,36 @@ class Forcing:
     ) -> None:
         self.union, self.present, self.values, self.experiment = union, frozenset(present), values, experiment
         self._path = levels.unsqueeze(0)
-        self._levels = list((0.5 * (levels[:, 1:] + levels[:, :-1])).unsqueeze(1).unbind(0))
+        self.levels = list((0.5 * (levels[:, 1:] + levels[:, :-1])).unsqueeze(1).unbind(0))
         network = union.showing(self.present)
         actuation = Actuation(network, experiment, [])
         self._clock = actuation.clock
-        self._commands = actuation.commands(values, 1)
-        now = self._now(network, values, self._commands)
-        self._pumps = network.pump_flows(now)
-        self._pipes = network.pipe_flows(now)
-        gathered = network.gathered(now, self._pumps, self._pipes)
-        self._gathered = [net.expand(self._levels[0].shape) for net in gathered]
+        self.commands = actuation.commands(values, 1)
+        now = self._now(network, values, self.commands)
+        self.pumps = network.pump_flows(now)
+        self.pipes = network.pipe_flows(now)
+        gathered = network.gathered(now, self.pumps, self.pipes)
+        self._gathered = [net.expand(self.levels[0].shape) for net in gathered]
         self._net = network.spilled(now, self._gathered)
-        self._rates, self._by_inflow = self._inflow_slopes(network)
+        self.still, self._by_inflow = self._inflow_slopes(network)
         self._readings = Sight(network, experiment, []).read(self._path, values)[0]
 
     def rates(self, placement: Placement, starts: Starts) -> Tensor:
         """How the rates change with an effect, (tanks, M, K) in m/s. starts: its parameters, short names, (M, 1)."""
         network, values, lanes = self._with(placement, starts)
-        shape = (lanes, self._levels[0].shape[-1])
+        shape = (lanes, self.levels[0].shape[-1])
         if placement.effect.stage is Stage.STORAGE:
-            rates = network.level_rates(self._now(network, values, self._commands), self._net)
-            return torch.stack([(a - b).expand(shape) for a, b in zip(rates, self._rates, strict=True)])
-        inflows = self._inflows(network, placement, values, lanes)
+            rates = network.level_rates(self._now(network, values, self.commands), self._net)
+            return torch.stack([(a - b).expand(shape) for a, b in zip(rates, self.still, strict=True)])
+        return self.by_inflows(self._inflows(network, placement, values, lanes), lanes)
+
+    def by_inflows(self, inflows: Sequence[Tensor | None], lanes: int) -> Tensor:
+        """How the rates change with what more flows into each tank, (M, K) or (1, K) m^3/s; None for nothing."""
         changed = []
         for row in self._by_inflow:
-            total = inflows[0].new_zeros(shape)
+            total = self.levels[0].new_zeros(lanes, self.levels[0].shape[-1])
             for slope, inflow in zip(row, inflows, strict=True):
-                if slope is not None:
+                if slope is not None and inflow is not None:
                     total += slope * inflow
             changed.append(total)
         return torch.stack(changed)
@@ -83,11 +89,11 @@ class Forcing:
         return network, values, max(len(s) for s in starts.values())
 
     def _now(self, network: TankNetwork, values: PlaceValues, commands: Sequence[Tensor]) -> Moment:
-        return network.moment(self._levels, commands, self._clock, values)
+        return network.moment(self.levels, commands, self._clock, values)
 
     def _inflows(self, network: TankNetwork, placement: Placement, values: PlaceValues, lanes: int) -> Sequence[Tensor]:
         """By how much more flows into each tank, (M, K) or (1, K) m^3/s."""
-        plant, place, commands = network.description, placement.location, self._commands
+        plant, place, commands = network.description, placement.location, self.commands
         if placement.effect.stage is Stage.BALANCE:
             net = list(self._gathered)
             network.move_by_effect(net, placement, self._now(network, values, commands))
@@ -99,19 +105,19 @@ class Forcing:
         for i, pump in enumerate(plant.pumps):
             if pump.name == place:
                 flow = network.pump_flow(now, pump)
-                network.move(more, OUTSIDE, pump.target, flow - self._pumps[i])
+                network.move(more, OUTSIDE, pump.target, flow - self.pumps[i])
         for j, pipe in enumerate(plant.pipes):
             if pipe.name == place:
                 flow = network.pipe_flow(now, pipe)
-                network.move(more, pipe.source, pipe.target, flow - self._pipes[j])
+                network.move(more, pipe.source, pipe.target, flow - self.pipes[j])
         return more
 
     def _inflow_slopes(self, network: TankNetwork) -> tuple[list[Tensor], list[Row]]:
         """Rates, and by how much each tank's rate rises with what flows into each tank, 1/m^2."""
 
-        now = self._now(network, self.values, self._commands)
+        now = self._now(network, self.values, self.commands)
 
         def rates(net: Sequence[Tensor]) -> Sequence[Tensor]:
             return network.level_rates(now, network.spilled(now, net))
 
-        return partials(rates, self._gathered, self._levels[0].shape)
+        return partials(rates, self._gathered, self.levels[0].shape)

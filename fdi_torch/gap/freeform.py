@@ -13,7 +13,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.fitting import Fit
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor
@@ -24,7 +24,7 @@ from fdi_torch.plant.signals import Clock
 LOCAL_NODES, TIME_NODES = 8, 16
 HEAD_NODES = 14
 PRIOR = 0.2
-HARMONICS = 3
+ROUNDS = 16
 UNIT = 0.01  # size of a coefficient at which its effect on the readings is taken
 
 
@@ -127,6 +127,14 @@ def free_form(
 ) -> tuple[Placement, ...]:
     """The free discrepancy of a place; periods (s): of what comes and goes by itself."""
     return tuple(Placement(e, place) for e in _free_at(place, plant, reach, periods))
+
+
+def fitted_free_form(fitter: Fitter, fit: Fit, place: str, periods: Sequence[float], reach: Reach) -> Fit:
+    """The free discrepancy of one place beside what a fit has, about the moving trajectory."""
+    plant = fitter.subject.plant
+    placements = free_form(place, plant, reach, periods)
+    start = {f"{p.prefix}.{c.name}": 0.0 for p in placements for c in p.effect.parameters(p.location, plant)}
+    return fitter.fit(Candidate(placements, (start,)), fit, rounds=ROUNDS)
 
 
 def shape_of(fit: Fit) -> dict[str, object]:

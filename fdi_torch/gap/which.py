@@ -18,6 +18,7 @@ POLISH = 20
 PROMISE = 10.0  # chi-square units, of the evidence, that an effect has to promise, to first order, to be fitted
 # Of the gap, and chi-square units: what noise alone may leave open. Then only what is beside the best is looked for.
 EXPLAINED_SHARE, EXPLAINED_LEAST = 1e-3, 60.0
+WORTH_TRYING = 1e-4  # of the gap, that a fit with one effect less leaves more, from which it is tried again
 HOPELESS = 0.5  # of the gap left open by the best pair, at which a third effect will not explain it either
 SETTLED_SHARE = 0.02  # of the gap left open by the best single, below which lesser promises are not followed
 
@@ -63,7 +64,24 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEE
         if len(fits) == before:
             break
         _polish(fitter, fits, depth)
+    _without_one(fitter, fits, settled)
     return Search(null, tuple(sorted(fits.values(), key=lambda f: f.cost)), screens)
+
+
+def _without_one(fitter: Fitter, fits: dict[Key, Fit], settled: float) -> None:
+    """Each effect of the best fits taken away in turn, the others from where they are: what was found only beside an
+    effect that does nothing is found without it too.
+    """
+    for depth in range(max(len(key) for key in fits), 1, -1):
+        for fit in _parents(fits.values(), depth, 1):
+            for left in fit.candidate.placements:
+                rest = tuple(p for p in fit.candidate.placements if p is not left)
+                start = {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] != left.prefix}
+                key = fit.key - {(left.effect.name, left.location)}
+                known = fits.get(key)
+                if known is None or known.cost > fit.cost + WORTH_TRYING * (fits[frozenset()].cost - fit.cost):
+                    again = fitter.fit(Candidate(rest, (start,)), fit, target=_best(fits), settled=settled)
+                    _keep(fits, again)
 
 
 def _polish(fitter: Fitter, fits: dict[Key, Fit], effects: int) -> None:

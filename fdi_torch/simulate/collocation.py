@@ -99,6 +99,24 @@ class Collocation:
                 break
         return found
 
+    def driven(self, theta: Tensor, levels: Tensor, tank: int, rounds: int = 8, tolerance: float = 1e-5) -> Tensor:
+        """levels (L, K+1, tanks) with that of one tank as the model has it while all others are what they are."""
+        levels = levels.clone()
+        for _ in range(rounds):
+            path = levels.movedim(1, 2)
+            rates, by_level, _ = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), theta)
+            own, step = path[:, tank], self.experiment.steps
+            inverse = 1.0 / (1.0 - 0.5 * step * by_level[:, tank, tank])
+            misfit = step * rates[:, tank] - torch.diff(own)
+            still = own.new_zeros(len(own), 1, 1)
+            found = scan_in_time((2.0 * inverse - 1.0)[:, None, None], (inverse * misfit)[:, None, None], still)[
+                :, 0, 0
+            ]
+            levels[..., tank] += found
+            if float(found.abs().max()) < tolerance:
+                break
+        return levels
+
     def rates(self, middle: Tensor, theta: Tensor) -> Tensor:
         """dh/dt (L, K, tanks) at given mid-step levels (L or 1, K, tanks)."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))

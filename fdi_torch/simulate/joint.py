@@ -49,6 +49,11 @@ class Joint:
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
         return self._joined([part.settle(own, piece, rounds, tolerance) for part, own, piece in pieces])
 
+    def driven(self, theta: Tensor, levels: Tensor, tank: int) -> Tensor:
+        """levels (L, N, tanks) with that of one tank as the model has it while all others are what they are."""
+        pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
+        return torch.cat([part.driven(own, piece, tank) for part, own, piece in pieces], dim=1)
+
     def rates(self, middle: Tensor, theta: Tensor) -> Tensor:
         """dh/dt (L, N-1, tanks) at given mid-step levels; 0 at the joints."""
         pieces = torch.split(_with_last(middle), self._nodes, dim=1)

@@ -1,0 +1,100 @@
+"""Forms of which a discrepancy may be put together: signals along a recording, many more than any one needs.
+
+What depends on a local variable bends or jumps at some of its values; what keeps a memory lags, sticks or dies away;
+what comes from elsewhere sets in, stops or creeps at some time, or comes and goes in a period.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from fdi_torch.simulate.scan import scan_in_time
+
+LAGS = (3.0, 10.0, 30.0, 100.0, 300.0)  # s
+FADES = (10.0, 40.0, 160.0)  # s, of what a step up, or a step down, leaves behind
+BANDS = (0.03, 0.08, 0.16, 0.3)  # of the signal's range, within which it sticks
+STROKES = (8.0, 25.0, 80.0)  # s, through the signal's range
+HEATS = (150.0, 500.0)  # s, over which its own recent past weakens (or strengthens) a flow
+RAMPS = 12  # in time, evenly
+
+
+def bends(x: Tensor, ends: tuple[float, float], count: int) -> list[Tensor]:
+    """1, x, and x beyond each of `count` - 2 values between the ends."""
+    at = torch.linspace(*ends, count, dtype=x.dtype).tolist()
+    return [torch.ones_like(x), x - at[0], *((x - c).clamp(min=0.0) for c in at[1:-1])]
+
+
+def jumps(x: Tensor, ends: tuple[float, float], count: int) -> list[Tensor]:
+    """Whether x is beyond each of `count` values between the ends."""
+    return [(x >= c).to(x.dtype) for c in torch.linspace(*ends, count + 2, dtype=x.dtype).tolist()[1:-1]]
+
+
+def memories(x: Tensor, step: Tensor) -> list[Tensor]:
+    """How x differs from what lags behind it; what its steps leave behind."""
+    change = torch.diff(x, prepend=x[:1])
+    risen, fallen = change.clamp(min=0.0), (-change).clamp(min=0.0)
+    lagging = [lagged(x, step, tau) - x for tau in LAGS]
+    fading = [faded(y, step, tau) for tau in FADES for y in (risen, fallen)]
+    return [*lagging, *fading]
+
+
+def sticks(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
+    """How x differs from what follows it only within a band."""
+    return [stuck(x, share * (ends[1] - ends[0])) - x for share in BANDS]
+
+
+def slews(x: Tensor, step: Tensor, ends: tuple[float, float]) -> list[Tensor]:
+    """How x differs from what follows it no faster than through its range in some time."""
+    return [slewed(x, step, (ends[1] - ends[0]) / time) - x for time in STROKES]
+
+
+def tirings(x: Tensor, step: Tensor, ends: tuple[float, float]) -> list[Tensor]:
+    """x times its own recent mean."""
+    scale = max(abs(ends[0]), abs(ends[1]), 1e-12)
+    return [x * lagged(x, step, tau) / scale for tau in HEATS]
+
+
+def courses(time: Tensor, duration: float, periods: Sequence[float], steps: int) -> list[Tensor]:
+    """1, steps and ramps in time, and waves."""
+    stepped = [(time >= duration * j / steps).to(time.dtype) for j in range(1, steps)]
+    ramps = [(time / duration - j / RAMPS).clamp(min=0.0) for j in range(RAMPS)]
+    waves = [wave(2.0 * math.pi * time / period) for period in periods for wave in (torch.sin, torch.cos)]
+    return [torch.ones_like(time), *stepped, *ramps, *waves]
+
+
+def lagged(x: Tensor, step: Tensor, tau: float) -> Tensor:
+    """First order, from rest at the first value; at the end of each step."""
+    keep = torch.exp(-step / tau)
+    return _scanned(keep, (1.0 - keep) * x, x[0])
+
+
+def faded(x: Tensor, step: Tensor, tau: float) -> Tensor:
+    """What has come in at each step, dying away."""
+    return _scanned(torch.exp(-step / tau), x, torch.zeros_like(x[0]))
+
+
+def stuck(x: Tensor, band: float) -> Tensor:
+    """The play operator: it stays until x is further than the band, and then follows the band behind."""
+    held, found = float(x[0]), []
+    for value in x.tolist():
+        held = min(max(held, value - band), value + band)
+        found.append(held)
+    return x.new_tensor(found)
+
+
+def slewed(x: Tensor, step: Tensor, rate: float) -> Tensor:
+    """It moves towards x by no more than rate times step."""
+    held, found = float(x[0]), []
+    for value, most in zip(x.tolist(), (rate * step).tolist(), strict=True):
+        held += min(max(value - held, -most), most)
+        found.append(held)
+    return x.new_tensor(found)
+
+
+def _scanned(keep: Tensor, added: Tensor, first: Tensor) -> Tensor:
+    shape = (1, 1, 1, -1)
+    return scan_in_time(keep.reshape(shape), added.reshape(shape), first.reshape(1, 1, 1))[0, 0, 0, 1:]

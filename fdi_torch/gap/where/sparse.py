@@ -1,0 +1,53 @@
+"""Of how few of many forms a discrepancy can be put together, and what that says for it.
+
+Coefficients c ~ N(0, 1/a_j) with a variance each, found by their evidence (MacKay, 1992; Tipping, 2001, "Sparse
+Bayesian learning"): what is not needed goes to nothing and costs nothing. For a residual r with columns C, C'C = G,
+C'r = b and noise of variance T,
+
+    log E = b'S b / (2 T^2) + log det(S) / 2 + sum log(a) / 2,   S = (G / T + diag(a))^-1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+SEEN = 1e-6  # chi-square units below which a column does nothing
+LOW, HIGH = 1e-8, 1e12
+
+
+@dataclass(frozen=True)
+class Sparse:
+    """Of B problems: log evidence (B,) against no coefficients at all, and closes (B,), chi-square units."""
+
+    evidence: Tensor
+    closes: Tensor
+
+
+def sparse(gram: Tensor, score: Tensor, heat: float, rounds: int) -> Sparse:
+    """gram (B, M, M), score (B, M); heat: the variance T."""
+    size = torch.diagonal(gram, dim1=-2, dim2=-1).clamp(min=0.0)
+    live, size = size > SEEN, torch.sqrt(size.clamp(min=1e-12))
+    unit = gram / size.unsqueeze(-1) / size.unsqueeze(-2)
+    told, aim = unit / heat, score / size / heat
+    first = score.shape[-1] / (aim * heat).abs().amax(dim=-1, keepdim=True).clamp(min=1e-9) ** 2
+    precision = torch.where(live, first.expand_as(aim), HIGH)
+    for _ in range(rounds):
+        mean, used, _ = _posterior(told, aim, precision)
+        found = used / (mean * mean).clamp(min=1e-30)
+        precision = torch.where(live, found.clamp(LOW, HIGH), HIGH)
+    mean, used, half_log_det = _posterior(told, aim, precision)
+    evidence = 0.5 * (aim * mean).sum(-1) - half_log_det + 0.5 * torch.log(precision).sum(-1) - used.sum(-1)
+    fitted = (mean.unsqueeze(-2) @ unit @ mean.unsqueeze(-1)).flatten()
+    return Sparse(evidence, 2.0 * heat * (aim * mean).sum(-1) - fitted)
+
+
+def _posterior(told: Tensor, aim: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean (B, M), how far each coefficient is told (B, M), and half the log determinant of the curvature (B,)."""
+    root = torch.linalg.cholesky(told + torch.diag_embed(precision + 1e-9))
+    covariance = torch.cholesky_inverse(root)
+    mean = (covariance @ aim.unsqueeze(-1)).squeeze(-1)
+    used = (1.0 - precision * torch.diagonal(covariance, dim1=-2, dim2=-1)).clamp(1e-12, 1.0)
+    return mean, used, torch.log(torch.diagonal(root, dim1=-2, dim2=-1)).sum(-1)

@@ -1,0 +1,184 @@
+"""What the forms of a component's discrepancy do to the readings, to first order about the trajectory that was read.
+
+The linearised plant turns each form into readings; what constants and start levels within their tolerances could do as
+well is taken out of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.fitting import Fit, Fitter
+from fdi_torch.gap.forcing import Forcing
+from fdi_torch.gap.where.components import Component, Ends, Signals, component_at, of_reading
+from fdi_torch.gap.where.followed import between, followed
+from fdi_torch.gap.where.forms import courses
+from fdi_torch.plant.description import OUTSIDE, Sensor
+from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.joint import Joint, with_blanks
+from fdi_torch.simulate.scan import product, scan_in_time
+
+MOST_ROWS = 1000  # of a channel; more samples are taken together, for no form is as fast
+SAMPLES_A_STEP = 25  # of a course in time, at least
+
+
+@dataclass(frozen=True)
+class Regression:
+    """gram (M, M) = C'C and score (M,) = C'r of a component's columns C beside what the readings r hold against the
+    model without them; unexplained = r'r, of which noise makes up `noise`."""
+
+    gram: Tensor
+    score: Tensor
+    unexplained: float
+    noise: float
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """One recording, about levels (1, K+1, tanks)."""
+
+    engine: Collocation
+    theta: Tensor
+    near: Linearised
+    along: Forcing
+
+    @property
+    def middle(self) -> Tensor:
+        nodes = self.engine.experiment.nodes
+        return 0.5 * (nodes[1:] + nodes[:-1])
+
+    def seen(self, rates: Tensor) -> Tensor:
+        """What changes (tanks, M, K) of the rates do to the readings, (S, C, M)."""
+        gain, transition = self.near.gain.permute(0, 2, 3, 1), self.near.transition.permute(0, 2, 3, 1)
+        still = rates.new_zeros(1, *rates.shape[:2])
+        paths = scan_in_time(transition, product(gain, rates.unsqueeze(0)), still)
+        return self.engine.look(self.near.levels, self.theta).along(paths, [-1] * rates.shape[1])[0].permute(2, 0, 1)
+
+
+class Survey:
+    """The regressions of all components of a subject, beside the constants of a fit.
+
+    periods: of waves, s. steps: in time, over all recordings.
+    """
+
+    def __init__(self, fitter: Fitter, fit: Fit, periods: Sequence[float], steps: int) -> None:
+        self.fitter, self.fit, self.periods = fitter, fit, tuple(periods)
+        self.engine = fitter.engine(fit.candidate, list(fit.effect_values))
+        self.theta, self.levels = fit.theta.unsqueeze(0), followed(fitter.subject, fit)
+        self.near = self.engine.linearise(self.theta, self.levels)
+        self.pieces = self._pieces(replace(self.near, levels=self.levels))
+        parts, samples = len(self.pieces), len(fitter.subject.readings)
+        self.steps = max(min(steps, samples // SAMPLES_A_STEP) // parts, 2)
+
+    def of(self, place: str) -> Regression:
+        plant = self.fitter.subject.plant
+        sensors = [s.name for s in plant.sensors]
+        if place in sensors:
+            return self._of_sensor(sensors.index(place), plant.sensors[sensors.index(place)])
+        return self._regressed(self._columns(component_at(place, plant)), self.near)
+
+    def _pieces(self, near: Linearised) -> list[_Piece]:
+        whole = self.engine
+        parts = whole.apart(self.theta, near) if isinstance(whole, Joint) else [(whole, self.theta, near)]
+        found = []
+        for engine, theta, own in parts:
+            values = engine.network.bind(engine.space, theta.unsqueeze(-2))
+            present = [p.prefix for p in engine.network.placements]
+            path = own.levels[0].T.contiguous()
+            found.append(_Piece(engine, theta, own, Forcing(engine.network, present, values, path, engine.experiment)))
+        return found
+
+    def _columns(self, component: Component) -> Tensor:
+        """(S, C, M), not whitened."""
+        seen = [
+            {n: x.reshape(-1).expand(len(p.middle)) for n, x in component.signals(p.along).items()} for p in self.pieces
+        ]
+        ends = Ends(seen)
+        shared: list[Tensor] = []
+        own: list[Tensor] = []
+        for piece, s in zip(self.pieces, seen, strict=True):
+            step = piece.engine.experiment.steps
+            in_time = [s[component.in_time] * c for c in self._courses(piece.middle, piece)]
+            changes = [self._moved(piece, component, torch.stack(f)) for f in (component.flows(s, step, ends), in_time)]
+            if component.areas:
+                areas = torch.stack(component.areas(s, step, ends))
+                tank = self._tank(component.target)
+                rates = areas.new_zeros(len(changes[0]), *areas.shape).index_copy_(0, tank, areas.unsqueeze(0))
+                changes.insert(0, rates)
+            columns = piece.seen(torch.cat(changes, dim=1))
+            shared.append(columns[..., : -len(in_time)])
+            own.append(columns[..., -len(in_time) :])
+        return _side_by_side(shared, own)
+
+    def _moved(self, piece: _Piece, component: Component, flows: Tensor) -> Tensor:
+        """Flows (M, K) from one end to the other -> how the rates change, (tanks, M, K)."""
+        inflows: list[Tensor | None] = [None] * len(self.fitter.subject.plant.tanks)
+        for end, sign in ((component.source, -1.0), (component.target, 1.0)):
+            if end != OUTSIDE:
+                inflows[int(self._tank(end))] = sign * flows
+        return piece.along.by_inflows(inflows, len(flows))
+
+    def _courses(self, time: Tensor, piece: _Piece) -> list[Tensor]:
+        return courses(time, float(piece.engine.experiment.nodes[-1]), self.periods, self.steps)
+
+    def _tank(self, name: str) -> Tensor:
+        return torch.tensor([[t.name for t in self.fitter.subject.plant.tanks].index(name)])
+
+    def _of_sensor(self, channel: int, sensor: Sensor) -> Regression:
+        """About what the model makes of the sensor's tank while the others are as they were read."""
+        levels = self.engine.driven(self.theta, self.levels, int(self._tank(sensor.tank)))
+        seen: list[Signals] = []
+        first = 0
+        for piece in self.pieces:
+            nodes, times = piece.engine.experiment.nodes, piece.engine.experiment.sample_times
+            own = levels[0, first : first + len(nodes), int(self._tank(sensor.tank))]
+            seen.append({"reading": sensor.gain * between(times, nodes, own) + sensor.offset, "time": times})
+            first += len(nodes)
+        ends = Ends(seen)
+        shared: list[Tensor] = []
+        own_columns: list[Tensor] = []
+        for piece, s in zip(self.pieces, seen, strict=True):
+            step = piece.engine.experiment.sample_intervals
+            in_time = self._courses(s["time"], piece)
+            for forms, into in ((of_reading(s, step, ends), shared), (in_time, own_columns)):
+                column = levels.new_zeros(len(step), self.fitter.subject.readings.shape[1], len(forms))
+                column[:, channel] = torch.stack(forms, dim=1)
+                into.append(column)
+        return self._regressed(_side_by_side(shared, own_columns), self.engine.linearise(self.theta, levels))
+
+    def _regressed(self, columns: Tensor, near: Linearised) -> Regression:
+        """columns (S, C, M) beside what can be done with the constants."""
+        space, theta, mask = self.fit.space, self.fit.theta, self.fitter.subject.mask
+        residual, jacobian = self.fitter.white(near)
+        scale = self.fitter.box(space)[2]
+        pull = (scale / space.std(theta)).nan_to_num(0.0)
+        off = ((theta - space.nominal(theta)) / space.std(theta)).nan_to_num(0.0)
+        each = max(len(mask) // MOST_ROWS, 1)
+        c = _together(self.fitter.noise.whiten(columns, mask), each).flatten(0, 1)
+        r = _together(residual[0], each).flatten()
+        j = _together(jacobian[0] * scale, each).flatten(0, 1)
+        basis, _ = torch.linalg.qr(torch.cat([j, torch.diag(pull + 1e-9)]))
+        left = torch.cat([r, -off])
+        left = left - basis @ (basis.T @ left)
+        shared = basis[: len(r)].T @ c
+        noise = float(mask[: len(mask) // each * each].sum()) / each
+        return Regression(c.T @ c - shared.T @ shared, c.T @ left[: len(r)], float(left @ left), noise)
+
+
+def _side_by_side(shared: Sequence[Tensor], own: Sequence[Tensor]) -> Tensor:
+    """Recordings one after the other; what each has for itself stands in columns of its own."""
+    rows, widths = [], [o.shape[-1] for o in own]
+    for k, (s, o) in enumerate(zip(shared, own, strict=True)):
+        before, after = (o.new_zeros(*o.shape[:-1], sum(w)) for w in (widths[:k], widths[k + 1 :]))
+        rows.append(torch.cat([s, before, o, after], dim=-1))
+    return with_blanks(rows, dim=0)
+
+
+def _together(x: Tensor, each: int) -> Tensor:
+    """(S, ...) -> sums over so many samples, of unit variance again."""
+    whole = len(x) // each * each
+    return x[:whole].reshape(-1, each, *x.shape[1:]).sum(dim=1) / each**0.5
