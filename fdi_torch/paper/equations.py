@@ -52,7 +52,7 @@ EQUATIONS = (
     Equation((26,), "the fault-free plant from known start levels", ("simulate.record:clean_readings",)),
     Equation((27,), "a leak: Torricelli's law through a hole", ("effects.leak:Leak.inflow",)),
     Equation((28,), "plugging: a share of a pipe's flow is lost", ("effects.plugging:Plugging.flow",)),
-    Equation((29,), "the balance of each tank with all faults", ("plant.network:TankNetwork.net_inflows",)),
+    Equation((29,), "the balance of each tank with all faults", ("plant.network:TankNetwork.gathered",)),
     Equation((30,), "a leak's size as a share of a pipe's capacity", ("plant.description:Tank",)),
     Equation((31,), "the five fault parameters",
              ("effects.leak:Leak", "effects.net_outlet:NetOutlet", "effects.openness:Openness")),
