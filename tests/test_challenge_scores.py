@@ -142,7 +142,7 @@ def test_it_says_how_far_it_is_and_how_long_it_will_take(tmp_path: Path) -> None
     said: list[tuple[float, str]] = []
     run(sealed(tmp_path), Counting(), tell=lambda share, text: said.append((share, text)))
     assert [share for share, _ in said] == pytest.approx([n / 9 for n in range(1, 10)])
-    assert said[-1][1].endswith("9 of 9 answers, 0 s left") and "fdi says named of case0001" in said[0][1]
+    assert said[-1][1].endswith("9 of 9 answers, 0 s left") and "fdi says named of case0001" in said[2][1]
 
 
 def test_a_crash_is_a_wrong_answer_and_ends_nothing(tmp_path: Path) -> None:

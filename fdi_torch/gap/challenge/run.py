@@ -63,7 +63,7 @@ def challenge(
     kinds = ("left_out",) if leave_out else tuple(kinds)
     stop = time.perf_counter() + 60 * minutes
     seal(cases, seed, out, rig, kinds, library, leave_out, tell)
-    diagnoses = {"fdi": diagnose, **(rivals or {}), "always_null": always_null, "random": random_pair(rig.plant, seed)}
+    diagnoses = {"always_null": always_null, "random": random_pair(rig.plant, seed), "fdi": diagnose, **(rivals or {})}
     answer_all(diagnoses, cases, out, rig, each, stop, code, tell)
     return judged(tuple(diagnoses), cases, out, rig)
 
