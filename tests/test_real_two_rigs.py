@@ -47,7 +47,7 @@ def test_the_cascade_predicts_a_quarter_that_its_numbers_never_saw(quarter: int)
 @pytest.mark.slow
 def test_overflow_and_clip_of_the_cascade_are_found() -> None:
     plant = load_plant(REAL / "cascaded_tanks_nominal.yaml")
-    answer = diagnose(plant, cascade(), settings=Settings(library=("all",)))
+    answer = diagnose(plant, cascade(), settings=Settings(library=("all",), named_only=True))
     causes = {(c.effect, c.location): c for c in answer.causes}
     assert causes["sensor_saturation", "level"].parameters["limit"].value == 10.0
     assert 0.3 < causes["overflow", "upper"].parameters["to_lower"].value < 1.0

@@ -66,7 +66,19 @@ class Messages:
 
         A field of value None is left out. Raises ValueError for a time that is not finite and for names taken already.
         """
-        self.settle()
+        with self._lock:
+            self.settle()
+            self._write(topic, fields, t, units, about, wall)
+
+    def _write(
+        self,
+        topic: str,
+        fields: Named,
+        t: float | None,
+        units: Mapping[str, str] | None,
+        about: Mapping[str, str] | None = None,
+        wall: bool = False,
+    ) -> None:
         if "t" in fields:
             raise ValueError(f"{topic}: expected the time as argument, got it among the fields; remove it there")
         t = self._latest if t is None else float(t)
@@ -87,20 +99,21 @@ class Messages:
 
         What it holds must not change any more. The first of a topic is written at once, so that errors show.
         """
-        if topic not in self._described:
-            self.write(topic, fields(), t, units=units)
-            return
-        self._put_off.append((topic, fields, t, units))
-        self._put_off_bytes += size
-        if len(self._put_off) >= _TOGETHER or self._put_off_bytes > _TOGETHER_BYTES:
-            self.settle()
+        with self._lock:
+            if topic not in self._described:
+                self.write(topic, fields(), t, units=units)
+                return
+            self._put_off.append((topic, fields, t, units))
+            self._put_off_bytes += size
+            if len(self._put_off) >= _TOGETHER or self._put_off_bytes > _TOGETHER_BYTES:
+                self.settle()
 
     def settle(self) -> None:
-        """Writes what was put off."""
+        """Writes what was put off, in its order, though another thread puts off more meanwhile."""
         with self._lock:
             put_off, self._put_off, self._put_off_bytes = self._put_off, [], 0
             for topic, fields, t, units in put_off:
-                self.write(topic, fields(), t, units=units)
+                self._write(topic, fields(), t, units)
 
     def samples(
         self,

@@ -412,3 +412,16 @@ def test_what_is_put_off_comes_before_what_follows(tmp_path: Path) -> None:
         log.say("done")
     *generations, last = read_run(tmp_path / "a.mcap").messages()
     assert [m.payload["generation"] for m in generations] == list(range(200)) and last.topic == "/log"
+
+
+def test_what_is_put_off_while_the_clock_writes_keeps_its_order(tmp_path: Path) -> None:
+    def slow(number: int) -> dict[str, int]:
+        time.sleep(0.002)  # the clock is still at it when the next comes
+        return {"problem": 0, "generation": number}
+
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED, flush_seconds=0.01) as log:
+        for number in range(200):
+            log.later("/estimator/de/population", lambda number=number: slow(number), number)
+            time.sleep(0.0005)
+    told = [orjson.loads(m.data)["generation"] for m in read_run(tmp_path / "a.mcap").messages()]
+    assert told == list(range(200))
