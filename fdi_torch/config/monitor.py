@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from fdi_torch.config.estimation import full_name
-from fdi_torch.config.files import find_file, read_extended, with_overrides, write_yaml
-from fdi_torch.config.plant import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.config.problems import explain
 from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.config.run import OutputConfig
 from fdi_torch.config.strict import Seconds, Strict
+from fdi_torch.config.understood import understood, values_in
 from fdi_torch.monitor.prepare import GainWish
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.plant.description import PlantDescription
@@ -97,17 +95,9 @@ class MonitorRun:
 
 def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:
     """A monitor file with some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
-    file = find_file(str(path), Path.cwd())
-    data = dict(with_overrides(read_extended(file), overrides))
-    try:
-        config = MonitorConfig.model_validate(data)
-    except ValidationError as error:
-        raise explain(error, str(file)) from None
-    plant = config.plant
-    known = build_plant(plant, str(file)) if isinstance(plant, dict) else load_plant(plant, file.parent)
-    config = _in_full(config, known)
-    text = write_yaml({**data, "plant": plant_mapping(known)})
-    return MonitorRun(config, known, file.parent, str(file), text)
+    data, file = values_in(path, overrides)
+    config, plant, text = understood(MonitorConfig, data, file.parent, str(file))
+    return MonitorRun(_in_full(config, plant), plant, file.parent, str(file), text)
 
 
 def _in_full(config: MonitorConfig, plant: PlantDescription) -> MonitorConfig:

@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BeforeValidator, Field
 
 from fdi_torch.config.estimation import full_name
-from fdi_torch.config.files import find_file, read_extended, with_overrides, write_yaml
 from fdi_torch.config.monitor import WindowConfig
-from fdi_torch.config.plant import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.config.problems import explain
 from fdi_torch.config.run import OutputConfig
 from fdi_torch.config.strict import Seconds, Share, Strict, quantity
+from fdi_torch.config.understood import understood, values_in
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.monitor.prepare import with_shapes
@@ -117,18 +115,12 @@ class Rehearsal:
 
 def load_rehearsal(path: str | Path, overrides: Iterable[str] = ()) -> Rehearsal:
     """A rehearsal file with some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
-    file = find_file(str(path), Path.cwd())
-    data = dict(with_overrides(read_extended(file), overrides))
-    try:
-        config = RehearsalConfig.model_validate(data)
-    except ValidationError as error:
-        raise explain(error, str(file)) from None
-    given = config.plant
-    plant = build_plant(given, str(file)) if isinstance(given, dict) else load_plant(given, file.parent)
+    data, file = values_in(path, overrides)
+    config, plant, text = understood(RehearsalConfig, data, file.parent, str(file))
     plans = tuple(_plans(config, plant))
     if not plans:
         raise ValueError(f"{file}: expected false_alarms, faults_found, naming or rivals, got none of them; add one")
-    return Rehearsal(config, plant, plans, str(file), write_yaml({**data, "plant": plant_mapping(plant)}))
+    return Rehearsal(config, plant, plans, str(file), text)
 
 
 def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:

@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from fdi_torch.config.estimation import EstimationConfig
-from fdi_torch.config.files import DEFAULT_RUN, find_file, read_extended, with_overrides, write_yaml
-from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.files import DEFAULT_RUN
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.config.simulation import SimulationConfig
 from fdi_torch.config.strict import Strict
+from fdi_torch.config.understood import understood, values_in
 from fdi_torch.plant.description import PlantDescription
 
 
@@ -68,24 +67,11 @@ def load_run(path: str | Path | None = None, overrides: Iterable[str] = ()) -> R
 
     Raises ConfigError with one sentence for each thing that is wrong.
     """
-    file = DEFAULT_RUN if path is None else find_file(str(path), Path.cwd())
-    return build_run(with_overrides(read_extended(file), overrides), file.parent, str(file))
+    data, file = values_in(DEFAULT_RUN if path is None else path, overrides)
+    return build_run(data, file.parent, str(file))
 
 
 def build_run(data: Mapping[str, Any], base: Path, source: str) -> Run:
     """A run from a mapping as in a run file. `base` is where its paths start."""
-    try:
-        config = RunConfig.model_validate(dict(data))
-    except ValidationError as error:
-        raise explain(error, source) from None
-    plant = _plant(config.plant, base, source)
-    text = write_yaml({**data, "plant": plant_mapping(plant)})
+    config, plant, text = understood(RunConfig, data, base, source)
     return Run(config, plant, base, source, text)
-
-
-def _plant(wanted: Any, base: Path, source: str) -> PlantDescription:
-    if isinstance(wanted, str):
-        return load_plant(wanted, base)
-    if isinstance(wanted, dict):
-        return build_plant({"name": "plant", **wanted}, f"{source}: plant")
-    raise ConfigError([f"{source}: plant: expected a shipped plant, a plant file or a plant, got {wanted!r}"])

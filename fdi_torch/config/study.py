@@ -11,11 +11,12 @@ import torch
 from pydantic import BeforeValidator, Field, ValidationError
 
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
-from fdi_torch.config.files import find_file, read_extended, with_overrides, write_yaml
+from fdi_torch.config.files import write_yaml
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.run import Run, build_run
 from fdi_torch.config.simulation import planned_recording
 from fdi_torch.config.strict import Seconds, Share, Strict, quantity
+from fdi_torch.config.understood import values_in
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting, set_up
@@ -74,8 +75,8 @@ class Study:
 
 def load_study(path: str | Path, overrides: list[str] | None = None) -> Study:
     """A study file, some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
-    file = find_file(str(path), Path.cwd())
-    return build_study(with_overrides(read_extended(file), overrides or []), file.parent, str(file))
+    data, file = values_in(path, overrides or ())
+    return build_study(data, file.parent, str(file))
 
 
 def build_study(data: Mapping[str, Any], base: Path, source: str) -> Study:

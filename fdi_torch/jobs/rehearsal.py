@@ -11,12 +11,9 @@ from typing import Any
 
 from fdi_torch.config.rehearsal import Rehearsal
 from fdi_torch.jobs.log_paths import free_path
-from fdi_torch.jobs.study import earlier
+from fdi_torch.jobs.study import carried_over, earlier
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.monitor.rehearsal.pieces import Shown
-
-PIECE = "/study/trial"
-_ENVELOPE = ("t", "trial", "group", "seed", "status")
 
 
 @dataclass(frozen=True)
@@ -41,15 +38,13 @@ def rehearse(
     before = earlier(path, rehearsal.text) if resume else None
     path = path if resume else free_path(path.parent, rehearsal.name)
     pieces = [piece for plan in rehearsal.plans for piece in plan.pieces()]
-    seeds, known = {"seed": rehearsal.config.seed}, {}
+    seeds = {"seed": rehearsal.config.seed}
     with RunLog(
         path, "rehearsal", config_text=rehearsal.text, config=rehearsal.resolved, seeds=seeds, listener=listener
     ) as log:
-        for message in before.messages([PIECE]) if before else ():
-            number, fields = message.payload["trial"], message.payload
-            if number not in known:
-                known[number] = (fields["group"], {k: v for k, v in fields.items() if k not in _ENVELOPE})
-                log.carry_over([message])
+        known: dict[int, tuple[str, Mapping[str, Any]]] = {
+            n: (done.setting, done.numbers) for n, done in carried_over(log, before).items()
+        }
         found, started = len(known), time.monotonic()
         for number, piece in enumerate(pieces):
             if number not in known:

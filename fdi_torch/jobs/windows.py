@@ -159,12 +159,12 @@ def window_of(fitting: Fitting, std: Tensor, suspects: set[str]) -> Window:
 
 
 def _mean_level(fitting: Fitting, tank: str, data: Readings) -> Tensor:
-    """Of a window's readings, m; 0 for a tank that no sensor sees."""
+    """Of a window's readings, m; NaN for a tank that no sensor sees, so that it does not pass for an empty one."""
     for i, sensor in enumerate(fitting.plant.sensors):
         if sensor.tank == tank:
             mean = (data.values[:, i] * data.weight[:, i]).sum() / data.weight[:, i].sum().clamp(min=1.0)
             return ((mean - sensor.offset) / sensor.gain).clamp(min=0.0)
-    return data.values.new_zeros(())
+    return data.values.new_full((), torch.nan)
 
 
 def _empty(fitting: Fitting, place: str, levels: Tensor) -> bool:
