@@ -20,17 +20,20 @@ from fdi_torch.effects import build_network, place
 from fdi_torch.monitor.change import ChangedObserver, Window
 from fdi_torch.monitor.continuity import continuous
 from fdi_torch.monitor.detection import make_detector
+from fdi_torch.monitor.doubts import residual_doubts
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.following import MonitorState
+from fdi_torch.monitor.gain import hand_gain
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.noise import Noise, learn_noise
-from fdi_torch.monitor.observer import bound
+from fdi_torch.monitor.observer import Observation, bound
 from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.prepare import fault_free_part, prepare, usual_faults
 from fdi_torch.monitor.samples import Samples, take
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.monitor.stepper import Stepper
+from fdi_torch.monitor.whitening import fit_whitening
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.equilibrium import equilibrium
 
@@ -190,6 +193,22 @@ def test_gaps_jumps_bursts_and_unknown_inputs_are_told_and_survived() -> None:
     assert "the clock jumps back by 499 s" in events[1].text
     assert "an input is unknown" in events[2].text
     assert float(state.samples.time[-1]) == float(time[-1])
+
+
+def test_an_offset_of_the_observer_is_told_where_it_is_sure_and_matters() -> None:
+    """Noise of 1 mm in 3600 samples: 0.05 mm off is sure but means nothing, 0.5 mm off is told."""
+    noise = torch.randn(3600, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    residual = 1e-3 * noise + torch.tensor([0.0, 5e-5, 5e-4], dtype=torch.float64)
+    whitening = fit_whitening(residual)
+    assert bool((whitening.mean != 0.0).all())
+    white = whitening(residual + whitening.mean)
+    assert white.mean(0).tolist() == pytest.approx(whitening.offset.tolist())
+    one = torch.ones(1, 3, dtype=torch.float64)
+    seen = Observation(torch.arange(3600.0), residual, residual, one, 3)
+    noise_of_it = Noise(one[0], one[0], 1.0, whitening, hand_gain(torch.eye(3, dtype=torch.float64)))
+    detector = make_detector("fixed", 1e7, 1.0, 3, torch.Generator())
+    [doubt] = residual_doubts(load_plant("three_tank"), noise_of_it, detector, seen)
+    assert "h3 lies 0.04" in doubt and "cm off the observer throughout" in doubt
 
 
 def test_a_sample_that_comes_twice_is_taken_once() -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.monitor.change import ChangedObserver, Window
-from fdi_torch.monitor.detection import Detector
+from fdi_torch.monitor.detection import DRIFT, Detector
 from fdi_torch.monitor.gain import kalman_gain, start_uncertainty
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
@@ -24,18 +24,22 @@ from fdi_torch.plant.network import TankNetwork
 STILL = 1e-3
 # By how much a fault must explain more than none, in units of BIC; the rest must then be noise.
 CONVINCING = 30.0
+# An offset of the white residual is told from here on, in its standard deviations: half the drift that a CUSUM allows.
+OFFSET = 0.5 * DRIFT
+SURELY = 4.0  # standard errors of it
 QUESTION = "does the recording start faulty? Name another fault_free part"
 
 
 def residual_doubts(plant: PlantDescription, noise: Noise, detector: Detector, seen: Observation) -> list[str]:
-    """Alarms within it, and readings that lie off the observer throughout."""
+    """Alarms within it, and readings that lie off the observer throughout, by more than chance and enough to matter."""
     doubts = []
     alarms = detector.alarms(noise.whitening(seen.steady_residual)).nonzero().flatten()
     if len(alarms):
         first = f"the first at {float(seen.time[alarms[0]]):g} s"
         doubts.append(f"the part taken for fault-free raises {len(alarms)} alarms itself, {first}: {QUESTION}")
-    for sensor, mean in zip(plant.sensors, noise.whitening.mean.tolist(), strict=True):
-        if mean != 0.0:
+    white, least = noise.whitening, max(OFFSET, SURELY * noise.whitening.samples**-0.5)
+    for sensor, mean, offset in zip(plant.sensors, white.mean.tolist(), white.offset.tolist(), strict=True):
+        if abs(offset) > least:
             unit, scale = display_unit(sensor.unit)
             off = f"{sensor.name} lies {scale * mean:.3g} {unit} off the observer throughout"
             doubts.append(f"in the fault-free part {off}; this is taken for the plant's own: calibrate a constant")

@@ -66,6 +66,14 @@ class MonitorState:
         off = (self.believed != self.healthy).tolist()
         return [e for e, columns in enumerate(observer.effects) if any(off[c] for c in columns)]
 
+    def without_each(self, observer: ChangedObserver) -> Tensor:
+        """What is believed, each time without one of the faults that stand, (standing, P)."""
+        standing = self.standing(observer)
+        theta = self.believed.repeat(len(standing), 1)
+        for lane, e in enumerate(standing):
+            theta[lane, list(observer.effects[e])] = self.healthy[list(observer.effects[e])]
+        return theta
+
     def before(self, moment: float) -> int:
         """The last sample before a moment, so that at least two follow; the first where there is none."""
         return max(min(int((self.samples.time < moment).sum()) - 1, len(self.samples) - 3), 0)
@@ -152,9 +160,7 @@ def _run(
     beside it.
     """
     first, standing = len(state.samples) - len(window), state.standing(observer)
-    theta = state.believed.repeat(1 + len(standing), 1)
-    for lane, e in enumerate(standing, start=1):
-        theta[lane, list(observer.effects[e])] = state.healthy[list(observer.effects[e])]
+    theta = torch.cat([state.believed[None], state.without_each(observer)])
     onsets = before.new_tensor([onset, *[LONG_AGO] * len(standing)])
     changes = Changes(theta, onsets, torch.tensor([incipient, *[False] * len(standing)]))
     starts = torch.cat([window.state[None], blind[standing]])

@@ -75,10 +75,7 @@ def _rest(finding: Finding) -> float:
 
 def _share(observer: ChangedObserver, window: Window, state: MonitorState, change: Finding) -> float:
     """The effect of a change of the standing faults over those of the faults themselves, since its onset."""
-    standing = state.standing(observer)
-    theta = torch.cat([change.value[None], state.believed.repeat(len(standing), 1)])
-    for lane, e in enumerate(standing, start=1):
-        theta[lane, list(observer.effects[e])] = state.healthy[list(observer.effects[e])]
+    theta = torch.cat([change.value[None], state.without_each(observer)])
     sudden = torch.zeros(len(theta), dtype=torch.bool)
     lanes = Changes(theta, torch.full((len(theta),), change.onset, dtype=theta.dtype), sudden)
     base = observer.white(window, state.believed, unchanged(state.believed))

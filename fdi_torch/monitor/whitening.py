@@ -36,6 +36,12 @@ class Whitening:
     def order(self) -> int:
         return len(self.coefficients)
 
+    @property
+    def offset(self) -> Tensor:
+        """What the mean alone adds to every white residual, W (I - sum A) m, (C,); known to 1 / sqrt(samples)."""
+        eye = torch.eye(len(self.mean), dtype=self.mean.dtype)
+        return self.whitener @ (eye - self.coefficients.sum(0)) @ self.mean
+
     def __call__(self, residual: Tensor) -> Tensor:
         """residual (*batch, S, C) -> white (*batch, S, C), NaN where it, or one before it that counts, is missing."""
         return self.filter(residual - self.mean)
