@@ -47,12 +47,14 @@ everywhere = pytest.mark.parametrize(("plant", "place"), PLACES)
 
 
 def random_inputs(plant: PlantDescription) -> Recording:
-    """Each channel steps every 20 s between a fifth and nine tenths of its full scale."""
+    """Each channel steps every 20 s between a fifth and nine tenths of its full scale; the pumps begin at rest."""
     generator = torch.Generator().manual_seed(7)
     full = {pump.channel: pump.max_flow / pump.gain for pump in plant.pumps}
     scale = torch.tensor([full.get(c, 1.0) for c in plant.channels()], dtype=torch.float64)
     steps = 0.2 + 0.7 * torch.rand(SAMPLES // 4 + 1, len(scale), generator=generator, dtype=torch.float64)
     time = torch.arange(SAMPLES, dtype=torch.float64) * SAMPLE
+    for channel in full:
+        steps[0, plant.channels().index(channel)] = 0.0
     return blank_recording(plant, scale * steps.repeat_interleave(4, dim=0)[:SAMPLES], time)
 
 

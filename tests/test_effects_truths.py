@@ -66,6 +66,18 @@ def test_pump_lag_passes_on_the_exact_mean_whatever_the_step() -> None:
     assert sum(fine) / 40 == pytest.approx(expected, rel=1e-13)
 
 
+@pytest.mark.parametrize("step", [0.5, 1.0, 3.0])
+def test_a_hose_takes_its_own_volume_once_whatever_the_step(step: float) -> None:
+    """2 for 6 s, rest for 6 s, 2 for 6 s through a hose of 5: the second stroke loses nothing."""
+    stroke, rest = [2.0] * round(6.0 / step), [0.0] * round(6.0 / step)
+    sent = [0.0, *stroke, *rest, *stroke]
+    out = through(effect("pump_priming"), sent, step, values(volume=5.0))
+    assert sum(out) * step == pytest.approx(sum(sent) * step - 5.0)
+    assert out[-len(stroke) :] == stroke and out[0] == 0.0
+    running = through(effect("pump_priming"), stroke, step, values(volume=5.0))
+    assert running == stroke  # a pump that runs at the first sample has a full hose
+
+
 def test_sensor_lag_stays_a_time_constant_behind_a_ramp() -> None:
     seen = read(effect("sensor_lag"), [0.3 * k for k in range(200)], 1.0, values(time_constant=7.0))
     assert seen[-1] == pytest.approx(0.3 * 199 - 0.3 * 7.0, rel=1e-9)

@@ -73,6 +73,17 @@ def test_windows_with_open_drains_are_told_and_sized_from_levels_and_commands_al
     assert seen >= 4
 
 
+def test_a_hose_that_fills_is_no_leak(data: Path, tmp_path: Path) -> None:
+    """The first stroke of exp5: 80 cm^3 pumped at R while its level stands."""
+    found = windows_of(
+        load_run(REAL / "dts200_exp5_windows.yaml", ["recordings.0.stop=40 s", f"output.folder={tmp_path}"])
+    )
+    states = {f.name: f for f in found.windows[0].faults}
+    assert states["R.leak.size"].state == "absent"
+    assert states["qR.pump_priming.volume"].state == "present"
+    assert 55e-6 < states["qR.pump_priming.volume"].size < 90e-6
+
+
 @pytest.mark.slow
 def test_the_valve_the_pump_and_the_offset_of_the_sensors_are_named_where_they_are(data: Path) -> None:
     plant = load_plant(REAL / "dts200_nominal.yaml")

@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from fdi_torch.config.run import build_run
-from fdi_torch.jobs.windows import Window, WindowFault, cut_up, state_of, stretches_of, windows_of
+from fdi_torch.config.run import Run, build_run
+from fdi_torch.estimate.stretches import stretches_of
+from fdi_torch.estimate.windows import Window, WindowFault, cut_up, state_of
+from fdi_torch.jobs.windows import windows_of
 from fdi_torch.recording import Recording
 
 
@@ -35,6 +37,11 @@ def test_windows_that_are_apart_are_two_stretches() -> None:
     assert len(stretches_of([window(0.0, "present"), window(20.0, "present")])) == 2
 
 
+def test_windows_of_another_recording_go_on_with_nothing() -> None:
+    first, second = window(10.0, "present"), window(0.0, "present")
+    assert [(s.start, s.stop) for s in stretches_of([first, second])] == [(10.0, 20.0), (0.0, 10.0)]
+
+
 def test_a_size_that_its_error_covers_is_absent_and_one_that_nothing_tells_is_unknown() -> None:
     assert state_of(0.2, 0.01, 1.0) == "present"
     assert state_of(0.2, 0.12, 1.0) == "absent"
@@ -49,20 +56,35 @@ def test_windows_lie_side_by_side_and_share_a_sample() -> None:
     assert [(float(c.time[0]), float(c.time[-1])) for c in cuts] == [(0.0, 30.0), (30.0, 60.0), (60.0, 90.0)]
 
 
-def test_a_leak_that_opens_halfway_is_in_the_windows_after_it(tmp_path: Path) -> None:
+def leaking(folder: Path, duration: str, step: str) -> Run:
+    """A leak from 200 s on, windows of 100 s."""
     simulated = {
         "plant": "three_tank",
         "simulate": {
             "inputs": {"Q1": "50 cm^3/s", "Q2": "40 cm^3/s"},
-            "duration": "400 s",
+            "duration": duration,
             "faults": {"T1.leak": 0.3, "T1.leak.onset": "200 s"},
             "noise": {"std": {"h1": "1 mm", "h2": "1 mm", "h3": "1 mm"}},
             "start_levels": {"T1": "30 cm", "T2": "15 cm", "T3": "20 cm"},
         },
-        "estimate": {"parameters": ["T1.leak", "T3.leak"], "calibrate": [], "windows": "100 s"},
-        "output": {"folder": str(tmp_path)},
+        "estimate": {
+            "parameters": ["T1.leak", "T3.leak"],
+            "calibrate": [],
+            "windows": "100 s",
+            "step": {"refine": step},
+        },
+        "output": {"folder": str(folder)},
     }
-    found = windows_of(build_run(simulated, tmp_path, "windows.yaml"))
+    return build_run(simulated, folder, "windows.yaml")
+
+
+def test_the_step_is_the_one_asked_for(tmp_path: Path) -> None:
+    assert windows_of(leaking(tmp_path, "100 s", "0.7 s")).step == 0.7
+
+
+def test_a_leak_that_opens_halfway_is_in_the_windows_after_it(tmp_path: Path) -> None:
+    found = windows_of(leaking(tmp_path, "400 s", "auto"))
+    assert 0.1 <= found.step <= 5.0  # no longer than a twentieth of a window
     assert [[f.state for f in w.faults] for w in found.windows] == [["absent"] * 2] * 2 + [["present", "absent"]] * 2
     (leak,) = found.stretches
     assert (leak.start, leak.stop) == (200.0, 400.0)

@@ -3,41 +3,51 @@
 from __future__ import annotations
 
 from fdi_torch.cli.screen import Screen
-from fdi_torch.jobs.windows import WindowFault, WindowsResult
+from fdi_torch.estimate.stretches import Stretch
+from fdi_torch.estimate.windows import WindowFault
+from fdi_torch.jobs.windows import WindowsResult
+from fdi_torch.parameters import display_unit
 
-MARKS = {"present": "present", "absent": "-", "cannot tell": "?"}
+TELLING = 10.0  # a standard error of more than so many sizes says nothing
+MARKS = {"absent": "-", "cannot tell": "?"}
 
 
 def show_windows(found: WindowsResult, screen: Screen) -> None:
-    """A line a window and a line a stretch; sizes are shares of the reference, flows cm^3/s at the mean level."""
-    names = [fault.name for fault in found.windows[0].faults] if found.windows else []
-    header = ["from, s", "to, s"]
-    for name in names:
-        header += [name, "std error", ""]
-    rows = [
-        [f"{w.start:g}", f"{w.stop:g}", *(cell for fault in w.faults for cell in _cells(fault))] for w in found.windows
-    ]
-    screen.table("windows (?: cannot tell, as where a tank is empty)", header, rows, left=0)
+    """A line a window, and a line a stretch; sizes without a unit are shares of the reference, flows at mean levels."""
+    names = [_name(fault) for fault in found.windows[0].faults] if found.windows else []
+    rows = [[f"{w.start:g}", f"{w.stop:g}", *(_cell(fault) for fault in w.faults)] for w in found.windows]
+    screen.table("windows (?: cannot tell, as where a tank is empty)", ["from, s", "to, s", *names], rows, left=0)
     screen.say()
     rows = []
     for s in found.stretches:
         flow = "" if s.flow is None else f"{1e6 * s.flow:.3g}"
-        rows.append([s.name, f"{s.start:g}", f"{s.stop:g}", *_size(s.size, s.std), flow])
+        rows.append([_name(s), f"{s.start:g}", f"{s.stop:g}", *_size(s, "> "), flow])
     screen.table("present", ("fault", "from, s", "to, s", "size", "std error", "flow, cm^3/s"), rows)
+    screen.say(f"step of the simulation: {found.step:g} s")
     screen.say(f"log: {found.log}")
     screen.result(
         {
             "format": "fdi_torch.windows/1",
             "windows": found.windows,
             "stretches": found.stretches,
+            "step": found.step,
             "log": str(found.log),
         }
     )
 
 
-def _size(size: float, std: float) -> tuple[str, str]:
-    return (f"{size:.3f}", f"{std:.2g}") if std < 10.0 else (f"> {size:.3g}", "")
+def _size(found: WindowFault | Stretch, beyond: str) -> tuple[str, str]:
+    """Size and standard error in the unit in which people read them; `beyond` before a size that has none."""
+    _, scale = display_unit(found.unit)
+    size, std = scale * found.size, scale * found.std
+    shown = f"{size:.3f}" if found.unit == "1" else f"{size:.4g}"
+    return (shown, f"{std:.2g}") if std < TELLING * max(abs(size), 1.0) else (f"{beyond}{shown}", "")
 
 
-def _cells(fault: WindowFault) -> tuple[str, str, str]:
-    return f"{fault.size:.3f}", f"{fault.std:.2g}" if fault.std < 10.0 else "", MARKS[fault.state]
+def _name(found: WindowFault | Stretch) -> str:
+    unit, _ = display_unit(found.unit)
+    return f"{found.name}, {unit}" if unit else found.name
+
+
+def _cell(fault: WindowFault) -> str:
+    return " ± ".join(part for part in _size(fault, "> ") if part) if fault.state == "present" else MARKS[fault.state]

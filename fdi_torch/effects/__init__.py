@@ -29,6 +29,7 @@ from fdi_torch.effects.pump_gain import PumpGain
 from fdi_torch.effects.pump_lag import PumpLag
 from fdi_torch.effects.pump_offset import PumpOffset
 from fdi_torch.effects.pump_oscillation import PumpOscillation
+from fdi_torch.effects.pump_priming import PumpPriming
 from fdi_torch.effects.pump_saturation import PumpSaturation
 from fdi_torch.effects.sensor_bias import SensorBias
 from fdi_torch.effects.sensor_curvature import SensorCurvature
@@ -59,6 +60,7 @@ EFFECTS: tuple[Effect, ...] = (
     PumpLag(),
     PumpDelay(),
     PumpDeadZone(),
+    PumpPriming(),
     ValveLag(),
     ValveDeadZone(),
     ValveCharacteristic(),

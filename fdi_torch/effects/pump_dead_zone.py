@@ -38,4 +38,5 @@ class PumpDeadZone(Effect):
         return [{"dead_zone": share * full} for share in (0.03, 0.1, 0.25, 0.5, 0.9)]
 
     def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
-        return torch.clamp(value - p["dead_zone"], min=0.0), memory
+        # At rest and at a dead zone of 0 the clamp alone would have a slope: less than nothing is pumped.
+        return torch.where(value > 0.0, torch.clamp(value - p["dead_zone"], min=0.0), torch.zeros_like(value)), memory
