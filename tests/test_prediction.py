@@ -9,6 +9,7 @@ from fdi_torch.config.plant import build_plant, load_plant
 from fdi_torch.gap.in_turn import in_turn
 from fdi_torch.gap.prediction import predict
 from fdi_torch.gap.refit import refit
+from fdi_torch.gap.spread import spread
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.recording import Recording
 
@@ -116,6 +117,18 @@ def test_several_recordings_share_what_does_not_vary_and_held_constants_stay() -
     held = refit(tank(), runs, white=1e-4, hold=["Q.*"])
     assert held.plant.pumps[0].gain == 1.0 and held.plant.tolerances["Q.gain"] == 0.2
     assert held.rmse["h"] > found.rmse["h"]
+
+
+def test_what_each_recording_has_for_itself_is_told_with_how_much_it_differs() -> None:
+    runs = [filling(0.9, 0.0, 1), filling(1.0, 0.0, 2, "b"), filling(1.1, 0.0, 3, "c")]
+    found = refit(tank(), runs, white=1e-4, vary=["Q.*"])
+    gains = [own for own in found.own if own.name == "Q.gain"]
+    assert [own.source for own in gains] == ["a", "b", "c"]
+    for own, truth in zip(gains, (0.9, 1.0, 1.1), strict=True):
+        assert abs(own.value - truth) < 4.0 * own.std < 0.05
+    told = spread(gains, 0.2)
+    assert told is not None and told.std == pytest.approx(0.1, rel=0.05) and told.low < 0.1 < told.high
+    assert "Q.gain" not in found.fitted and found.plant.pumps[0].gain == 1.0
 
 
 def test_a_file_is_predicted_by_what_the_others_say() -> None:

@@ -15,6 +15,7 @@ from fdi_torch.effects import build_network
 from fdi_torch.gap.in_turn import Trial, in_turn
 from fdi_torch.gap.prediction import START_SAMPLES
 from fdi_torch.gap.refit import Refit, refit
+from fdi_torch.gap.spread import spread
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -29,6 +30,12 @@ def add_refit_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--white", metavar="STD", type=float, help="with --refit: slow errors count like fast ones, of that size, SI"
+    )
+    parser.add_argument(
+        "--vary",
+        metavar="NAME,...",
+        default="",
+        help="with --refit: each recording has its own value of these; how much they differ is told (* is any name)",
     )
     parser.add_argument(
         "--in-turn",
@@ -53,8 +60,10 @@ def run_refit(
     screen: Screen,
 ) -> int:
     hold = [name for name in arguments.hold.split(",") if name]
-    found = refit(plant, recordings, leave_out, arguments.step, hold, arguments.white)
+    vary = [name for name in arguments.vary.split(",") if name]
+    found = refit(plant, recordings, leave_out, arguments.step, hold, arguments.white, vary)
     _show(found, screen)
+    _show_own(found, screen)
     if arguments.adopt:
         Path(arguments.adopt).write_text(dump_plant(found.plant), encoding="utf-8")
         screen.note(f"plant file as fitted: {arguments.adopt}")
@@ -65,7 +74,7 @@ def run_refit(
                 plant,
                 recordings,
                 holdouts or recordings,
-                lambda rest: refit(plant, rest, leave_out, arguments.step, hold, arguments.white).plant,
+                lambda rest: refit(plant, rest, leave_out, arguments.step, hold, arguments.white, vary).plant,
                 arguments.start_samples,
                 advance,
             )
@@ -77,6 +86,7 @@ def run_refit(
             "rmse": dict(found.rmse),
             "parameters": found.parameters,
             "fitted": {n: {"value": v, "std": s} for n, (v, s) in found.fitted.items()},
+            "own": found.own,
             "in_turn": trials,
         }
     )
@@ -96,6 +106,24 @@ def _show(found: Refit, screen: Screen) -> None:
         rows.append([name, f"{scale * value:.4g}", f"{scale * error:.2g}", "" if unit == "1" else unit])
     screen.table("fitted to all recordings", ("parameter", "value", "std error", "unit"), rows)
     screen.say(f"{found.parameters} numbers fitted, start levels among them")
+
+
+def _show_own(found: Refit, screen: Screen) -> None:
+    """What each recording has for itself, and how much it differs from one to the next."""
+    constants = build_network(found.plant).constants
+    rows = []
+    for name in dict.fromkeys(own.name for own in found.own):
+        unit, scale = display_unit(constants[name].unit)
+        each = [own for own in found.own if own.name == name]
+        for own in each:
+            numbers = [f"{scale * own.value:.4g}", f"{scale * own.std:.2g}", unit]
+            rows.append([name, Path(own.source).name, f"{own.start:g}", *numbers])
+        told = spread(each, constants[name].std)
+        if told:
+            interval = f"{scale * told.std:.2g} (95 %: {scale * told.low:.2g} to {scale * told.high:.2g})"
+            rows.append([name, f"mean and spread of {told.count}", "", f"{scale * told.mean:.4g}", interval, unit])
+    if rows:
+        screen.table("each recording's own", ("parameter", "recording", "from, s", "value", "std error", "unit"), rows)
 
 
 def _show_trials(trials: Sequence[Trial], plant: PlantDescription, screen: Screen) -> None:

@@ -18,11 +18,13 @@ from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter
 from fdi_torch.gap.floor import Noise, estimate_noise
 from fdi_torch.gap.limits import limits_of
+from fdi_torch.gap.spread import Own
 from fdi_torch.gap.standard_errors import standard_errors
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.reach import reach_of_all
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.joint import own_name
 
 ROUNDS = 60
 TURNS = 3  # of the noise and the fit under it
@@ -33,7 +35,8 @@ WIDE = 0.5  # of a range
 class Refit:
     """plant: with effects and constants as fitted. rmse: by sensor, in SI; before: of the plant as it was, its
     constants and start levels fitted. parameters: how many were fitted, start levels included. fitted: value and
-    standard error, misfit included, of what all recordings have in common.
+    standard error, misfit included, of what all recordings have in common. own: of what each has for itself, but for
+    start levels.
     """
 
     plant: PlantDescription
@@ -41,6 +44,7 @@ class Refit:
     rmse: Mapping[str, float]
     parameters: int
     fitted: Mapping[str, tuple[float, float]]
+    own: Sequence[Own] = ()
 
 
 def refit(
@@ -50,23 +54,26 @@ def refit(
     step: float | None = None,
     hold: Collection[str] = (),
     white: float | None = None,
+    vary: Collection[str] = (),
 ) -> Refit:
     """step: of the simulation, s; None for half the sampling interval. leave_out: effects that the plant is to lose.
 
     hold: patterns of constants that stay as the plant file has them. white: errors count as white noise of that size
     (SI) in every reading, whatever is left of the fast ones; that is what a free run asks for where equations are not
-    quite the rig's, while the noise itself lets fast errors count for more than slow ones.
+    quite the rig's, while the noise itself lets fast errors count for more than slow ones. vary: patterns of constants
+    with a tolerance that each recording is to have for itself, beside those that the plant file says.
     """
     kept = tuple(e for e in plant.effects if e.effect not in leave_out)
     placed = [Placement(effect(e.effect), e.location, e.parameters) for e in kept]
     prefixes = {p.prefix for p in placed}
     tolerances = {n: v for n, v in plant.tolerances.items() if n.count(".") == 1 or n.rpartition(".")[0] in prefixes}
-    held = {n for n in tolerances for pattern in hold if fnmatchcase(n, pattern)}
+    held = _matching(tolerances, hold)
+    varying = dict.fromkeys([*plant.varying, *_matching(tolerances, vary)])
     bare = replace(
         plant,
         effects=kept,
         tolerances={n: v for n, v in tolerances.items() if n not in held},
-        varying=tuple(n for n in plant.varying if n not in held),
+        varying=tuple(n for n in varying if n not in held),
     )
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     step = step or 0.5 * float(torch.median(torch.diff(recordings[0].time)))
@@ -86,7 +93,13 @@ def refit(
         found = {n: v for n, v in fit.effect_values.items() if n in start}
         start = {n: v for n, v in found.items() if n not in _undetermined(fitter, fit)}
     better = replace(_with(bare, fit), tolerances=tolerances, varying=plant.varying)
-    return Refit(better, _rmse(fitter, null), _rmse(fitter, fit), len(fit.space), _errors(fitter, fit))
+    return Refit(
+        better, _rmse(fitter, null), _rmse(fitter, fit), len(fit.space), _errors(fitter, fit), _own(fitter, fit)
+    )
+
+
+def _matching(names: Collection[str], patterns: Collection[str]) -> list[str]:
+    return [n for n in names if any(fnmatchcase(n, pattern) for pattern in patterns)]
 
 
 def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
@@ -101,10 +114,24 @@ def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
 
 def _errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
     """Values with standard errors, misfit included, of what all recordings have in common."""
+    own = set(fitter.subject.own)
+    return {n: each for n, each in _all_errors(fitter, fit).items() if n.partition("@")[0] not in own}
+
+
+def _all_errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
     misfit = max(1.0, (fit.cost / float(fitter.subject.mask.sum())) ** 0.5)
     stds = standard_errors(fitter, fit)
-    own = set(fitter.subject.own)
-    return {n: (v, misfit * stds[n]) for n, v in fit.values.items() if n.partition("@")[0] not in own}
+    return {n: (v, misfit * stds[n]) for n, v in fit.values.items()}
+
+
+def _own(fitter: Fitter, fit: Fit) -> tuple[Own, ...]:
+    """What varies from recording to recording, by name and then in the recordings' order."""
+    errors, parts = _all_errors(fitter, fit), fitter.subject.parts
+    return tuple(
+        Own(name, part.recording.source, float(part.recording.time[0]), *errors[own_name(name, k)])
+        for name in fitter.subject.plant.varying
+        for k, part in enumerate(parts)
+    )
 
 
 def _start(
