@@ -7,6 +7,7 @@ dimension of a tensor `(*batch, P)`. All values are SI. This file is the only im
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -20,8 +21,10 @@ _units: pint.UnitRegistry[float] = pint.UnitRegistry(autoconvert_offset_to_baseu
 _units.define("duty = [] ")
 _units.define("lps = litre / second")
 _units.define("percent = 0.01 = pct")
+for _short, _long in {"gpm": "gallon / minute", "gph": "gallon / hour", "lpm": "l / minute", "lph": "l / hour"}.items():
+    _units.define(f"{_short} = {_long}")
 
-SI_UNITS = ("m", "s", "V", "m^2", "m^3", "m^3/s", "m/s", "1")
+SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
 
 
 @dataclass(frozen=True)
@@ -153,42 +156,55 @@ def si_unit_of(unit: str) -> str:
             continue
         return candidate
     raise ValueError(
-        f"expected a unit of level, flow, time, volts or share, got '{unit}'; write for example cm, cm3_s, V, pct"
+        "expected a unit of level, pressure, flow, time, voltage, current, frequency or share, "
+        f"got '{unit}'; write for example cm, mbar, cm3_s, V, mA, pct"
     )
 
 
 def display_unit(si_unit: str) -> tuple[str, float]:
     """The unit in which people read such a quantity, and how many of it one SI unit is: 'm' -> ('cm', 100.0)."""
-    shown = {"m": "cm", "m^2": "cm^2", "m^3": "cm^3", "m^3/s": "cm^3/s", "m^3/s/V": "cm^3/s/V", "V/m": "V/cm"}
-    unit = shown.get(si_unit, si_unit)
+    unit = _SHOWN.get(si_unit, si_unit)
     return ("" if unit == "1" else unit), 1.0 if unit == si_unit else 1.0 / unit_factor(unit, si_unit)
 
 
 def header_unit(header: str) -> tuple[str, str] | None:
-    """Splits a CSV header of the form name_unit: 'Q1_cm3_s' -> ('Q1', 'cm3_s'); None where no unit stands in it.
+    """Splits a CSV header of the form name_unit, name [unit] or name (unit): 'Q1_cm3_s' -> ('Q1', 'cm3_s').
 
-    The shortest name whose rest is a unit wins: `qL_cmd_lps` is (`qL_cmd`, `lps`), `Q1_cm3_s` is (`Q1`, `cm3_s`).
+    None where no unit stands in it. The shortest name whose rest is a unit wins: `qL_cmd_lps` is (`qL_cmd`, `lps`),
+    `Q1_cm3_s` is (`Q1`, `cm3_s`). `tank_A` is a name: amperes are written mA, or in brackets.
     """
+    bracketed = _BRACKETED.match(header)
     parts = header.split("_")
-    for split in range(1, len(parts)):
-        unit = "_".join(parts[split:])
+    splits = [("_".join(parts[:i]), "_".join(parts[i:])) for i in range(1, len(parts)) if parts[i:] != ["A"]]
+    for name, unit in [bracketed.groups()] if bracketed else splits:
         try:
             si_unit_of(unit)
         except ValueError:
             continue
-        return "_".join(parts[:split]), unit
+        return name, unit
     return None
 
 
-_HEADER_UNITS = {
-    "cm3_s": "cm^3/s",
-    "m3_s": "m^3/s",
-    "l_min": "litre/minute",
-    "m3_h": "m^3/hour",
-    "pct": "percent",
-    "1": "",
+_SHOWN = {
+    "m": "cm",
+    "m^2": "cm^2",
+    "m^3": "cm^3",
+    "m^3/s": "cm^3/s",
+    "m^3/s/V": "cm^3/s/V",
+    "m^3/s/A": "cm^3/s/mA",
+    "V/m": "V/cm",
+    "Pa": "mbar",
+    "Pa/m": "mbar/cm",
+    "A": "mA",
+    "A/m": "mA/cm",
 }
+_BRACKETED = re.compile(r"^(.+?)[\s_]*[\[(]\s*([^\])]+?)\s*[\])]$")
+_VOLUME_A_TIME = re.compile(r"^((?:[cdm]?m|ft|in)3|m?[lL]|gal)_(s|min|h)$")  # no / in the headers of some loggers
+_CUBE = re.compile(r"(?<=[a-z])([23])(?![0-9])")
 
 
 def _pint_unit(unit: str) -> str:
-    return _HEADER_UNITS.get(unit, unit)
+    """'cm3_s' -> 'cm^3/s', 'm3/h' -> 'm^3/h'; '1' -> no unit."""
+    if unit == "1":
+        return ""
+    return _CUBE.sub(r"^\1", _VOLUME_A_TIME.sub(r"\1/\2", unit))

@@ -61,6 +61,25 @@ def test_volts_and_duty_are_told_by_the_units_of_the_gains() -> None:
     assert load_plant("three_tank_leak").channel_units() == {"pwm1": "1", "pwm3": "1"}
 
 
+@pytest.mark.parametrize(
+    ("gain", "unit", "reading"),
+    [("98.1 mbar/m", "Pa", 9810.0), ("1.42 psi/m", "Pa", 9790.56), ("16 mA/m", "A", 0.016), ("2 %/cm", "1", 2.0)],
+)
+def test_a_sensor_reads_a_pressure_a_current_or_a_share(gain: str, unit: str, reading: float) -> None:
+    plant = build_plant(changed("sensors.h1.gain", gain), "p.yaml")
+    assert (plant.sensors[0].unit, plant.sensors[0].gain) == (unit, pytest.approx(reading, rel=1e-4))
+    assert build_plant(yaml.safe_load(dump_plant(plant)), "again") == plant
+
+
+@pytest.mark.parametrize(
+    ("gain", "unit", "flow"), [("10 l/min/mA", "A", 1 / 6), ("1 cm^3/s/Hz", "1/s", 1e-6), ("5 l/min", "1", 1 / 12000)]
+)
+def test_a_pump_follows_a_current_a_frequency_or_a_duty(gain: str, unit: str, flow: float) -> None:
+    plant = build_plant(changed("pumps.Q1.gain", gain), "p.yaml")
+    assert (plant.channel_units(), plant.pumps[0].gain) == ({"Q1": unit}, pytest.approx(flow))
+    assert build_plant(yaml.safe_load(dump_plant(plant)), "again") == plant
+
+
 def test_quadruple_tank_splits_each_pump_by_its_valve() -> None:
     """gamma_i k_i into the lower tank and (1 - gamma_i) k_i across into the upper one (Johansson 2000, eq. 1)."""
     gains = {p.target: (p.channel, p.gain * 1e6) for p in load_plant("quadruple_tank").pumps}
@@ -105,7 +124,7 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
         ("pipes.P12.area", "0 cm^2", "pipes.P12.area: expected a positive number, got 0.0 m\\^2"),
         ("pumps.Q9", {"max_flow": "1 l/s"}, "p.yaml: pumps.Q9.target: expected a value, got nothing; add it"),
         ("pumps.Q1.target", "T9", "pumps.Q1.target: expected one of the tanks T1, T2, got 'T9'"),
-        ("pumps.Q1.gain", "3 kg", "pumps.Q1.gain: expected a quantity in 1 or m\\^3/s/V or m\\^3/s, got '3 kg'"),
+        ("pumps.Q1.gain", "3 kg", "pumps.Q1.gain: expected a quantity in 1 or m\\^3/s/V or m\\^3/s/A or .* got '3 kg'"),
         ("pumps.T1", {"target": "T1", "max_flow": "1 l/s"}, "expected each name once, got 'T1' twice"),
         ("sensors.h1.tank", "T9", "sensors.h1.tank: expected one of the tanks T1, T2, got 'T9'"),
         ("sensors.h1.gain", 0, "sensors.h1.gain: expected a number other than 0, got 0"),

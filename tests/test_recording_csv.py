@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from fdi_torch.parameters import header_unit, si_unit_of, unit_factor
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.recordings.source import ChannelSource
@@ -34,6 +35,35 @@ def test_a_header_with_units_needs_no_mapping(tmp_path: Path) -> None:
     torch.testing.assert_close(recording.inputs[:, 0], torch.tensor([50e-6, 50e-6, 60e-6], dtype=torch.float64))
     torch.testing.assert_close(recording.outputs[:, 0], torch.tensor([0.10, 0.11, 0.12], dtype=torch.float64))
     assert (recording.input_units, recording.output_units) == (("m^3/s",), ("m",))
+
+
+@pytest.mark.parametrize(
+    ("header", "name", "unit", "factor"),
+    [
+        ("h1 [mm]", "h1", "m", 1e-3),
+        ("Level left (cm)", "Level left", "m", 1e-2),
+        ("F3_gph", "F3", "m^3/s", 3.785411784e-3 / 3600),
+        ("F_gpm", "F", "m^3/s", 3.785411784e-3 / 60),
+        ("F_L_min", "F", "m^3/s", 1e-3 / 60),
+        ("F [m3/h]", "F", "m^3/s", 1 / 3600),
+        ("F_m3_h", "F", "m^3/s", 1 / 3600),
+        ("L1_psi", "L1", "Pa", 6894.757293168361),
+        ("L3_mbar", "L3", "Pa", 100.0),
+        ("L_inch", "L", "m", 0.0254),
+        ("y [mA]", "y", "A", 1e-3),
+        ("pump_Hz", "pump", "1/s", 1.0),
+        ("tank_A_cm", "tank_A", "m", 1e-2),
+    ],
+)
+def test_headers_as_loggers_write_them(header: str, name: str, unit: str, factor: float) -> None:
+    found = header_unit(header)
+    assert found is not None and found[0] == name
+    assert (si_unit_of(found[1]), unit_factor(found[1], unit)) == (unit, pytest.approx(factor))
+
+
+@pytest.mark.parametrize("header", ["tank_A", "F3_xyz", "h1", "Level (left)"])
+def test_a_header_may_have_no_unit(header: str) -> None:
+    assert header_unit(header) is None
 
 
 def test_sha256_is_that_of_the_file(tmp_path: Path) -> None:

@@ -16,11 +16,11 @@ from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Sh
 from fdi_torch.effects import effect
 from fdi_torch.names import unknown
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import COMMAND_UNITS, OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import fits
 
-PUMP_GAIN_UNITS = ("1", "m^3/s/V", "m^3/s")
-SENSOR_UNITS = {"1": "m", "V/m": "V", "1/m": "1"}
+SENSOR_UNITS = {"1": "m", "Pa/m": "Pa", "V/m": "V", "A/m": "A", "1/m": "1"}
+"""Unit of a sensor's gain -> SI unit of its reading."""
 
 
 def _start_level(value: Any) -> float | None:
@@ -51,13 +51,13 @@ class PipeConfig(Strict):
 class PumpConfig(Strict):
     target: str = Field(description="the tank it fills")
     max_flow: Flow = Field(description="what it can deliver at most, m^3/s")
-    gain: Amount = Field(1.0, description="flow for a command of 1: no unit, or cm^3/s/V, or cm^3/s for a duty")
+    gain: Amount = Field(1.0, description="flow for a command of 1: none, l/min/V, l/min/mA, l/min/Hz; l/min of a duty")
     command: str | None = Field(None, description="its input channel, where that is not its name")
 
 
 class SensorConfig(Strict):
     tank: str = Field(description="the tank whose level it reads")
-    gain: Amount = Field(1.0, description="reading for a level of 1: no unit, or V/cm, or 1/cm")
+    gain: Amount = Field(1.0, description="reading for a level of 1: no unit, or in mbar/cm, V/cm, mA/cm, %/cm")
     offset: Amount | None = Field(None, description="reading at level 0, in the reading's unit")
     channel: str | None = Field(None, description="its output channel, where that is not its name")
     low: Amount | None = Field(None, description="it never reads less, in the reading's unit")
@@ -123,7 +123,7 @@ def _description(config: PlantConfig) -> PlantDescription:
 
 
 def _pump(name: str, pump: PumpConfig) -> Pump:
-    gain, unit = _amount_in_one_of(f"pumps.{name}.gain", pump.gain, PUMP_GAIN_UNITS)
+    gain, unit = _amount_in_one_of(f"pumps.{name}.gain", pump.gain, tuple(COMMAND_UNITS))
     return Pump(name, pump.target, pump.max_flow, gain, pump.command, unit)
 
 

@@ -57,7 +57,7 @@ def _pipe_mapping(pipe: Pipe) -> dict[str, Any]:
 
 
 def _pump_mapping(pump: Pump) -> dict[str, Any]:
-    shown = {"1": "1", "m^3/s/V": "cm^3/s/V", "m^3/s": "cm^3/s"}[pump.gain_unit]
+    shown = {"m^3/s/V": "cm^3/s/V", "m^3/s": "cm^3/s"}.get(pump.gain_unit, pump.gain_unit)
     plain = pump.gain_unit == "1" and pump.gain == 1.0
     return _given(
         target=pump.target,

@@ -10,7 +10,7 @@ from fdi_torch.plant.description import PlantDescription, Pump
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
 from fdi_torch.plant.signals import Clock
 
-SLOWNESS_UNITS = {"m^3/s": "s^2/m^3", "V": "s/V", "1": "s"}
+SLOWNESS_UNITS = {"m^3/s": "s^2/m^3", "V": "s/V", "A": "s/A", "1/s": "s^2", "1": "s"}
 
 
 class ActuatorSlew(Effect):

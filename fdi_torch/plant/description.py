@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 OUTSIDE = "outside"
+COMMAND_UNITS = {"1": "m^3/s", "m^3/s/V": "V", "m^3/s/A": "A", "m^3": "1/s", "m^3/s": "1"}
+"""Unit of a pump's gain -> SI unit of its command: a flow, volts, amperes, revolutions or cycles, a share (duty)."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +74,13 @@ class Pump:
 
     @property
     def command_unit(self) -> str:
-        """SI unit of the command: a flow, volts, or a share (duty)."""
-        return {"1": "m^3/s", "m^3/s/V": "V", "m^3/s": "1"}[self.gain_unit]
+        """SI unit of the command."""
+        return COMMAND_UNITS[self.gain_unit]
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """reading = gain x level + offset. unit: SI unit of the reading ('m' for a level sensor, 'V' for volts)."""
+    """reading = gain x level + offset. unit: SI unit of the reading ('m', 'Pa', 'V', 'A' or '1')."""
 
     name: str
     tank: str

@@ -255,4 +255,4 @@ def write_csv(recording: Recording, path: Path) -> Path:
     return path
 
 
-_FILE_UNITS = {"m": "cm", "m^3/s": "cm3_s", "1": "pct"}
+_FILE_UNITS = {"m": "cm", "m^3/s": "cm3_s", "Pa": "mbar", "A": "mA", "1/s": "Hz", "1": "pct"}
