@@ -8,6 +8,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription, Pump
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.signals import Clock
 
 SLOWNESS_UNITS = {"m^3/s": "s^2/m^3", "V": "s/V", "A": "s/A", "1/s": "s^2", "1": "s"}
@@ -31,9 +32,8 @@ class ActuatorSlew(Effect):
         component = plant.component(place)
         unit = component.command_unit if isinstance(component, Pump) else "1"
         full = component.max_flow / component.gain if isinstance(component, Pump) else 1.0
-        return (
-            Parameter("slowness", SLOWNESS_UNITS[unit], 0.0, 0.0, 120.0 / full, meaning="time to move by one unit"),
-        )
+        slowest = 120.0 * time_scale(plant) / full
+        return (Parameter("slowness", SLOWNESS_UNITS[unit], 0.0, 0.0, slowest, meaning="time to move by one unit"),)
 
     def remember(self, value: Tensor, p: Values) -> Memory:
         return (value,)

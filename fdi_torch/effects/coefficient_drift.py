@@ -8,6 +8,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.pace import time_scale
 
 SMALL = 1e-4
 
@@ -26,9 +27,10 @@ class CoefficientDrift(Effect):
     mistaken_for = ("unmetered_flow", "plugging", "sensor_drift", "flow_exponent")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        rate, slowing, settled = (share / time_scale(plant) for share in (3e-4, -5e-4, 1e-2))
         return (
-            Parameter("rate", "1/s", 0.0, -3e-4, 3e-4, meaning="share of the flow gained each second, at first"),
-            Parameter("settling", "1/s", 0.0, -5e-4, 1e-2, meaning="how fast the change comes to rest"),
+            Parameter("rate", "1/s", 0.0, -rate, rate, meaning="share of the flow gained each second, at first"),
+            Parameter("settling", "1/s", 0.0, slowing, settled, meaning="how fast the change comes to rest"),
         )
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:

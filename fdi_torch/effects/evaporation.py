@@ -7,6 +7,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.pace import length_scale, time_scale
 
 
 class Evaporation(Effect):
@@ -30,7 +31,8 @@ class Evaporation(Effect):
     )
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("rate", "m/s", 0.0, 0.0, 2e-5, meaning="fall of the level in a still tank"),)
+        fastest = 2e-5 * length_scale(plant) / time_scale(plant)
+        return (Parameter("rate", "m/s", 0.0, 0.0, fastest, meaning="fall of the level in a still tank"),)
 
     def inflow(self, local: Local, p: Values) -> Tensor:
         return -p["rate"] * local.constants["area"]

@@ -7,6 +7,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Stage, Values
+from fdi_torch.plant.pace import time_scale
 
 
 class PumpDelay(Effect):
@@ -23,7 +24,7 @@ class PumpDelay(Effect):
     mistaken_for = ("pump_lag", "actuator_slew", "sensor_delay", "sensor_lag")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("delay", "s", 0.0, 0.0, 60.0, meaning="how late the pump acts"),)
+        return (Parameter("delay", "s", 0.0, 0.0, 60.0 * time_scale(plant), meaning="how late the pump acts"),)
 
     def delay(self, p: Values) -> Tensor:
         return p["delay"]

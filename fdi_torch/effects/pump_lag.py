@@ -9,6 +9,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.signals import Clock
 
 
@@ -26,7 +27,8 @@ class PumpLag(Effect):
     mistaken_for: ClassVar[tuple[str, ...]] = ("pump_delay", "actuator_slew", "sensor_lag", "sensor_delay")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("time_constant", "s", 0.0, 0.0, 60.0, meaning="time to 63 % of a step"),)
+        slowest = 60.0 * time_scale(plant)
+        return (Parameter("time_constant", "s", 0.0, 0.0, slowest, meaning="time to 63 % of a step"),)
 
     def remember(self, value: Tensor, p: Values) -> Memory:
         return (value,)

@@ -8,11 +8,13 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription, Pump
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.reach import Reach
 from fdi_torch.plant.signals import Clock
 
-FULL_FOR = 20.0  # s at full command: the largest hose
-STARTS = (0.5, 2.0, 6.0)  # s at full command
+# Seconds at full command, on a plant whose time scale is 1 s: the largest hose, and where a fit begins.
+FULL_FOR = 20.0
+STARTS = (0.5, 2.0, 6.0)
 
 
 class PumpPriming(Effect):
@@ -33,12 +35,12 @@ class PumpPriming(Effect):
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         pump = _pump(plant, place)
         unit = {"m^3/s": "m^3", "1": "s"}.get(pump.command_unit, f"{pump.command_unit}*s")
-        high = FULL_FOR * pump.max_flow / pump.gain
+        high = FULL_FOR * time_scale(plant) * pump.max_flow / pump.gain
         return (Parameter("volume", unit, 0.0, 0.0, high, meaning="what is pumped before any reaches the tank"),)
 
     def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
         pump = _pump(plant, place)
-        return [{"volume": seconds * pump.max_flow / pump.gain} for seconds in STARTS]
+        return [{"volume": seconds * time_scale(plant) * pump.max_flow / pump.gain} for seconds in STARTS]
 
     def remember(self, value: Tensor, p: Values) -> Memory:
         empty = torch.zeros_like(p["volume"] * value)

@@ -7,6 +7,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Stage, Values
+from fdi_torch.plant.pace import time_scale
 
 
 class SensorDelay(Effect):
@@ -23,7 +24,7 @@ class SensorDelay(Effect):
     mistaken_for = ("sensor_lag", "pump_delay", "sensor_hysteresis")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("delay", "s", 0.0, 0.0, 60.0, meaning="how late it reads"),)
+        return (Parameter("delay", "s", 0.0, 0.0, 60.0 * time_scale(plant), meaning="how late it reads"),)
 
     def delay(self, p: Values) -> Tensor:
         return p["delay"]

@@ -8,6 +8,7 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.signals import Clock
 
 
@@ -25,7 +26,7 @@ class SensorDrift(Effect):
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         sensor = plant.component(place)
         assert isinstance(sensor, Sensor)
-        rate = 3e-4 * reading_span(plant, sensor)
+        rate = 3e-4 / time_scale(plant) * reading_span(plant, sensor)
         return (Parameter("rate", f"{sensor.unit}/s", 0.0, -rate, rate, meaning="what it reads too much, each second"),)
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:

@@ -11,6 +11,7 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.reach import Reach
 from fdi_torch.plant.signals import Clock
 
@@ -31,9 +32,10 @@ class SensorOscillation(Effect):
         sensor = plant.component(place)
         assert isinstance(sensor, Sensor)
         high = 0.3 * reading_span(plant, sensor)
+        pace = time_scale(plant)
         return (
             Parameter("amplitude", sensor.unit, 0.0, 0.0, high, meaning="half the swing"),
-            Parameter("period", "s", 60.0, 2.0, 3600.0, meaning="of the swing"),
+            Parameter("period", "s", 60.0 * pace, 2.0 * pace, 3600.0 * pace, meaning="of the swing"),
             Parameter("phase", "1", 0.0, -math.pi, math.pi, meaning="of the swing at t = 0, in radians"),
         )
 
@@ -41,7 +43,7 @@ class SensorOscillation(Effect):
         sensor = plant.component(place)
         assert isinstance(sensor, Sensor)
         amplitude = 0.01 * reading_span(plant, sensor)
-        periods = (5.0, 10.0, 30.0, 60.0, 120.0, 300.0)
+        periods = [time_scale(plant) * seconds for seconds in (5.0, 10.0, 30.0, 60.0, 120.0, 300.0)]
         return [{"amplitude": amplitude, "period": t, "phase": phase} for t in periods for phase in (-1.5, 1.5)]
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:

@@ -8,6 +8,7 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import flow_scale
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.reach import Reach
 
 
@@ -28,7 +29,7 @@ class UnmeteredFlow(Effect):
         return (
             Parameter("flow", "m^3/s", 0.0, -flow, flow, meaning="what flows in (negative: what is drawn)"),
             Parameter("begin", "s", 0.0, 0.0, meaning="when it begins"),
-            Parameter("duration", "s", 600.0, 0.0, meaning="how long it lasts"),
+            Parameter("duration", "s", 600.0 * time_scale(plant), 0.0, meaning="how long it lasts"),
         )
 
     def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:

@@ -12,6 +12,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.equilibrium import RESOLUTION
 
@@ -132,7 +133,8 @@ def _inflows(
     """Net inflow of each tank long after every onset, m^3/s."""
     values = network.bind(space, theta)
     late = levels.new_tensor(1e9)
-    clock = Clock(late, levels.new_ones(()), levels.new_tensor(RESOLUTION))
+    pace = time_scale(network.description)
+    clock = Clock(late, levels.new_tensor(pace), levels.new_tensor(RESOLUTION * pace))
     wanted = [channels[channel] for _, channel in network.actuators()]
     commands, _ = network.commands(wanted, network.remember_commands(wanted, clock, values), clock, values)
     now = network.moment(levels.unbind(), commands, clock, values)

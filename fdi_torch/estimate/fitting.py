@@ -14,6 +14,7 @@ from fdi_torch.estimate.objectives import Objective, Problem, Term
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.choose import adaptive_engine, make_engine
 from fdi_torch.simulate.engine import Engine, Readings
@@ -27,7 +28,7 @@ EngineKind = Literal["auto", "reference", "compiled"]
 # A start level that is estimated is searched this share of its tank's height about the first readings.
 START_SEARCH_SHARE = 0.05
 FIRST_READINGS = 5
-# An adaptive solver sees inputs that run linearly as their means over so many seconds.
+# An adaptive solver sees inputs that run linearly as their means over so long; in units of the plant's time scale.
 LONGEST_STEP = 1.0
 
 
@@ -65,7 +66,8 @@ class Fitting:
         """An engine for each recording, in steps no longer than `step` s, or by an adaptive solver about as exact."""
         engines = []
         for network, own, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True):
-            experiment = lay_out(recording, self.plant.channels(), LONGEST_STEP if adaptive else step)
+            longest = LONGEST_STEP * time_scale(self.plant) if adaptive else step
+            experiment = lay_out(recording, self.plant.channels(), longest)
             if adaptive:
                 engines.append(adaptive_engine(network, own, experiment, step))
             else:

@@ -15,13 +15,15 @@ from fdi_torch.estimate.objectives import Objective, Problem
 from fdi_torch.estimate.refine import Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.uncertainty import Estimate, make_estimate
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.simulate.engine import Engine
 from fdi_torch.simulate.steps import choose_step, probe_points
 
 # A refinement that stopped at the last digits of its cost is converged when this few standard errors are left to go.
 LEFT_TO_GO = 0.1
-# Finer steps than this change no standard error that a recording could support.
-FINEST_STEP = 0.01
+# Steps in units of the plant's time scale. Finer ones change no standard error that a recording could support;
+# the first of a look round is this long at most.
+FINEST_STEP, FIRST_STEP = 0.01, 5.0
 # What a slow engine makes do with: a search that ends where refinement can go on, and an adaptive solver for that.
 NEAR_SHARE, NEAR_COST, ROUGH_ERROR = 0.2, 1e-2, 0.1
 ADAPTIVE_STEPS = (2.0, 0.05)
@@ -123,7 +125,7 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
     """The steps of search and refinement: those asked for, or the longest whose error over the box is small enough."""
     points = probe_points(low, high)
     spans = [float(r.time[-1] - r.time[0]) for r in fitting.recordings]
-    longest = max(min(spans) / 20.0, 1e-6)
+    longest, scale = max(min(spans) / 20.0, 1e-6), time_scale(fitting.plant)
     shortest = min(range(len(spans)), key=spans.__getitem__)
     beginning = fitting.beginning(PROBE_SAMPLES)
 
@@ -133,13 +135,13 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
     columns = fitting.columns[shortest]
     own_points = points[:, columns]
     coarse = settings.search_step
-    readings = engine_at(min(longest, 5.0)).readings(own_points)
+    readings = engine_at(min(longest, FIRST_STEP * scale)).readings(own_points)
     spread = readings.flatten(0, 1).std(dim=0).clamp(min=1e-12)
     if coarse is None:
-        coarse = choose_step(engine_at, own_points, settings.search_tolerance * spread, longest, quantile=0.9)
-    fine = ADAPTIVE_STEPS[-1] if settings.adaptive else settings.refine_step
+        coarse = choose_step(engine_at, own_points, settings.search_tolerance * spread, longest, scale, 0.9)
+    fine = ADAPTIVE_STEPS[-1] * scale if settings.adaptive else settings.refine_step
     if fine is None:
-        fine = choose_step(engine_at, own_points, settings.refine_tolerance * spread, coarse, quantile=0.9)
+        fine = choose_step(engine_at, own_points, settings.refine_tolerance * spread, coarse, scale, 0.9)
     return coarse, fine
 
 
@@ -186,7 +188,7 @@ def refine_to_convergence(
         return best_of(levenberg_marquardt(linearise, theta, low, high, settings.refine, on_iteration))
 
     refinement = run(starts, step)
-    while settings.refine_step is None and step > 2.0 * FINEST_STEP:
+    while settings.refine_step is None and step > 2.0 * FINEST_STEP * time_scale(fitting.plant):
         finer = run(refinement.theta, 0.5 * step)
         coarse_std = information_std(fitting.problem(step, "likelihood"), refinement.theta)
         fine_std = information_std(fitting.problem(0.5 * step, "likelihood"), finer.theta)
@@ -215,8 +217,9 @@ def refine_adaptively(
         return best_of(levenberg_marquardt(problem.linearise, theta, low, high, stop, on_iteration))
 
     refinement = run(fitting.problem(coarse, settings.objectives[1]), starts, NEAR_ENOUGH)
+    scale = time_scale(fitting.plant)
     for step in ADAPTIVE_STEPS:
-        problem = fitting.problem(step, settings.objectives[1], adaptive=True)
+        problem = fitting.problem(step * scale, settings.objectives[1], adaptive=True)
         refinement = run(problem, refinement.theta, CLOSE if step == ADAPTIVE_STEPS[-1] else NEAR_ENOUGH)
     return refinement
 

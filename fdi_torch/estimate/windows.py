@@ -17,6 +17,7 @@ from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.objectives import Problem, Term
 from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.steps import choose_step, probe_points
@@ -77,7 +78,8 @@ def window_step(fittings: Sequence[Fitting], std: Tensor) -> float:
         return busiest.engines(step)[0]
 
     points = probe_points(*search_box(busiest))
-    return choose_step(engine_at, points, STEP_ERROR * std, float(time[-1] - time[0]) / 20.0, quantile=0.9)
+    longest, scale = float(time[-1] - time[0]) / 20.0, time_scale(busiest.plant)
+    return choose_step(engine_at, points, STEP_ERROR * std, longest, scale, quantile=0.9)
 
 
 def window_of(fitting: Fitting, std: Tensor, suspects: Collection[str], step: float) -> Window:

@@ -9,6 +9,7 @@ import torch
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.pace import length_scale, time_scale
 from fdi_torch.simulate.build import BuildError
 from fdi_torch.simulate.compiled import CompiledEngine
 from fdi_torch.simulate.engine import Engine
@@ -55,9 +56,11 @@ def adaptive_engine(network: TankNetwork, space: ParameterSpace, experiment: Exp
     For a few lanes it is far cheaper than so many steps in Python would be.
     """
     drawn = replace(experiment, resolution=torch.full_like(experiment.resolution, step))
-    rtol = 2.5e-6 * step * step
+    plant = network.description
+    rtol = 2.5e-6 * (step / time_scale(plant)) ** 2
+    atol = 0.01 * rtol * length_scale(plant)
     why = f"reference engine (torchdiffeq, dopri5 at {rtol:.0e}): asked for"
-    return ReferenceEngine(network, space, drawn, "dopri5", rtol, 0.01 * rtol, why, every_node=False)
+    return ReferenceEngine(network, space, drawn, "dopri5", rtol, atol, why, every_node=False)
 
 
 def _fastest(compiled: CompiledEngine, simulations: float, device: str) -> Engine:

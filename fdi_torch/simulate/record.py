@@ -11,23 +11,26 @@ from torch import Tensor
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.pace import length_scale, time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.integrate import ReferenceEngine
 
-# Roots and rims are drawn as for steps of a hundredth of a second: far sharper than any estimator's.
+# In units of the plant's time scale. Roots and rims are drawn as for steps far shorter than any estimator's.
 RESOLUTION = 0.01
 LONGEST_STEP = 1.0
-TOLERANCE = 1e-10  # relative; a hundredth of it in m
+TOLERANCE = 1e-10  # relative; a hundredth of it of the plant's length scale
 
 
 def clean_readings(network: TankNetwork, planned: Recording, values: Mapping[str, float]) -> Tensor:
     """Noise-free readings (T, N) with some constants changed by name, by an adaptive solver at 1e-10."""
     space = ParameterSpace(network.constants[name] for name in values)
     theta = torch.tensor([[float(value) for value in values.values()]], dtype=planned.time.dtype)
-    experiment = lay_out(planned, network.description.channels(), LONGEST_STEP)
-    sharp = replace(experiment, resolution=theta.new_tensor(RESOLUTION))
-    engine = ReferenceEngine(network, space, sharp, method="dopri5", rtol=TOLERANCE, atol=0.01 * TOLERANCE)
+    plant = network.description
+    pace, atol = time_scale(plant), 0.01 * TOLERANCE * length_scale(plant)
+    experiment = lay_out(planned, plant.channels(), LONGEST_STEP * pace)
+    sharp = replace(experiment, resolution=theta.new_tensor(RESOLUTION * pace))
+    engine = ReferenceEngine(network, space, sharp, method="dopri5", rtol=TOLERANCE, atol=atol)
     return engine.readings(theta)[0]
 
 

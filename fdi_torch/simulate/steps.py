@@ -9,6 +9,7 @@ from torch import Tensor
 
 from fdi_torch.simulate.engine import Engine
 
+# Steps to try, in units of the plant's time scale.
 LADDER = (20.0, 10.0, 5.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
 PROBES = 64
 
@@ -22,14 +23,20 @@ def probe_points(low: Tensor, high: Tensor, count: int = PROBES) -> Tensor:
 
 
 def choose_step(
-    engine_at: Callable[[float], Engine], points: Tensor, tolerance: Tensor, longest: float, quantile: float = 1.0
+    engine_at: Callable[[float], Engine],
+    points: Tensor,
+    tolerance: Tensor,
+    longest: float,
+    scale: float,
+    quantile: float = 1.0,
 ) -> float:
     """The longest step (s) of the ladder at which readings of `points` (N, P) are right to `tolerance` (C,).
 
     Right: they differ from those at a quarter of the step by no more, at that quantile of the points. The step is
-    never longer than `longest`; the shortest of the ladder is returned where none suffices.
+    never longer than `longest`; the shortest of the ladder is returned where none suffices. scale: the plant's time
+    scale, s.
     """
-    ladder = [step for step in LADDER if step <= longest] or [longest]
+    ladder = [scale * rung for rung in LADDER if scale * rung <= longest] or [longest]
     for step in ladder[:-1]:
         error = (engine_at(step).readings(points) - engine_at(step / 4.0).readings(points)).abs().amax(dim=1)
         worst = torch.nan_to_num(error / tolerance, nan=torch.inf).amax(dim=1)

@@ -1,0 +1,98 @@
+"""A rig scaled in metres and seconds gives the scaled answers: nothing assumes the size of a laboratory bench."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from rigs import blank_recording, three_tank
+
+from fdi_torch.config import load_plant
+from fdi_torch.effects import EFFECTS, all_placements, build_network, placements_for
+from fdi_torch.estimate.fitting import set_up
+from fdi_torch.estimate.hybrid import estimate_parameters
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.pace import length_scale, time_scale
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.equilibrium import equilibrium
+from fdi_torch.simulate.record import clean_readings, with_noise
+
+SCALES = [(0.01, 1.0), (100.0, 1.0), (1.0, 0.05), (1.0, 60.0), (0.1, 0.05), (20.0, 60.0)]
+FAULTS = {"T1.leak.size": 0.2, "P13.plugging.size": 0.3}
+scaled_rigs = pytest.mark.parametrize(("metres", "seconds"), SCALES)
+
+
+def scaled(plant: PlantDescription, metres: float, seconds: float) -> PlantDescription:
+    """The same rig of other lengths, on a planet and with pumps that make it run at another pace."""
+    tanks = tuple(
+        replace(t, area=t.area * metres**2, height=t.height * metres, start_level=(t.start_level or 0.3) * metres)
+        for t in plant.tanks
+    )
+    pipes = tuple(replace(p, area=p.area * metres**2, elevation=p.elevation * metres) for p in plant.pipes)
+    pumps = tuple(replace(p, max_flow=p.max_flow * metres**3 / seconds) for p in plant.pumps)
+    return replace(plant, tanks=tanks, pipes=pipes, pumps=pumps, gravity=plant.gravity * metres / seconds**2)
+
+
+def experiment(metres: float, seconds: float) -> tuple[PlantDescription, Recording]:
+    plant = scaled(three_tank(), metres, seconds)
+    time = torch.arange(201, dtype=torch.float64) * 2.0
+    flow = 35e-6 + 25e-6 * ((time // 100.0) % 2 == 0).to(time)
+    inputs = torch.stack([flow, 100e-6 - flow], dim=1)
+    return plant, blank_recording(plant, inputs * metres**3 / seconds, time * seconds)
+
+
+def test_shipped_rigs_are_the_measure() -> None:
+    for name in ("three_tank", "dts200", "cascaded_tanks", "quadruple_tank", "three_tank_leak"):
+        plant = load_plant(name)
+        assert (time_scale(plant), length_scale(plant)) == (1.0, 1.0), name
+
+
+@scaled_rigs
+def test_ranges_of_effects_scale_with_the_rig(metres: float, seconds: float) -> None:
+    usual, other = three_tank(), scaled(three_tank(), metres, seconds)
+    per_unit = {"1": 1.0, "m": metres, "m^2": metres**2, "s": seconds, "1/s": 1 / seconds, "m/s": metres / seconds}
+    per_unit |= {"m^3": metres**3, "m^3/s": metres**3 / seconds, "1/m": 1 / metres, "s^2/m^3": seconds**2 / metres**3}
+    allowed = 1.01 * math.sqrt(10.0) ** 2  # both scales are right to half a power of ten
+    for placement in all_placements(usual):
+        here = placement.effect.parameters(placement.location, usual)
+        there = placement.effect.parameters(placement.location, other)
+        for a, b in zip(here, there, strict=True):
+            for end in ("nominal", "low", "high"):
+                expected, got = getattr(a, end) * per_unit[a.unit], getattr(b, end)
+                where = f"{placement.prefix}.{a.name}.{end}: {got:g} instead of {expected:g}"
+                same = got == expected or abs(math.log(got / expected)) < math.log(allowed)
+                assert same, where
+    assert {p.effect.name for p in all_placements(usual)} <= {e.name for e in EFFECTS}
+
+
+@scaled_rigs
+def test_levels_scale_with_the_rig(metres: float, seconds: float) -> None:
+    readings = []
+    for m, s in ((1.0, 1.0), (metres, seconds)):
+        plant, blank = experiment(m, s)
+        network = build_network(plant, placements_for(FAULTS))
+        readings.append(clean_readings(network, blank, FAULTS) / m)
+        rest = equilibrium(build_network(plant), blank.inputs[0])
+        readings.append(rest / m)
+    usual, usual_rest, other, other_rest = readings
+    torch.testing.assert_close(other, usual, rtol=1e-7, atol=1e-8)
+    torch.testing.assert_close(other_rest, usual_rest, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize(("metres", "seconds"), [(0.01, 60.0), (100.0, 0.05)])
+def test_faults_and_their_errors_do_not_depend_on_the_rig_s_size(metres: float, seconds: float) -> None:
+    found = []
+    for m, s in ((1.0, 1.0), (metres, seconds)):
+        plant, blank = experiment(m, s)
+        network = build_network(plant, placements_for(FAULTS))
+        clean = clean_readings(network, blank, FAULTS)
+        std = torch.full((3,), 1e-3 * m, dtype=torch.float64)
+        recording = with_noise(blank, clean, std, torch.Generator().manual_seed(3), network)
+        found.append(estimate_parameters(set_up(plant, [recording], FAULTS)))
+    usual, other = (f.estimate for f in found)
+    apart = (other.value - usual.value)[:2].abs() / usual.std[:2]
+    assert float(apart.max()) < 0.05, (usual.value, other.value)
+    torch.testing.assert_close(other.std[:2], usual.std[:2], rtol=0.02, atol=0.0)
+    assert found[0].diagnosis.kind == found[1].diagnosis.kind == "multiple faults"
