@@ -14,6 +14,7 @@ from fdi_torch.estimate.refine import Linearisation, RefineSettings, levenberg_m
 from fdi_torch.monitor.change import ChangedObserver, Changes, Window, unchanged
 from fdi_torch.monitor.hypothesis import Fault, Finding, Hypothesis
 from fdi_torch.monitor.starting import return_starts, returns, signatures, swing_start
+from fdi_torch.monitor.swinging import period_step, swings_of, told_at, with_phase_errors, within_a_turn
 
 SIZE_STEP = 1e-4  # of a parameter's range: for slopes
 ITERATIONS = 12
@@ -28,11 +29,12 @@ def isolate(
     incipient: bool = True,
     deepest: int = DEEPEST,
     healthy: Tensor | None = None,
+    known: Finding | None = None,
 ) -> list[Finding]:
     """All single changes of `faults`, then of the best ones together with another; best first.
 
     One change a window: faults that come together share their onset. healthy (P,): without a fault; what is believed in
-    beyond it may also go away together.
+    beyond it may also go away together. known: what an earlier look at this change found, which is a start as well.
     """
     ways = (False, True) if incipient else (False,)
     steady = [Hypothesis((f.size,), late) for late in ways for f in faults if not f.shape]
@@ -48,9 +50,12 @@ def isolate(
     back = [] if healthy is None else returns(believed, healthy, faults)
     if healthy is not None and back:
         starts = torch.cat([starts, return_starts(observer, window, believed, healthy, back)])
-    found = fit(observer, window, believed, [*singles, *back], starts, _misfit(base))
+    again = [] if known is None else [known.hypothesis]
+    if known is not None:
+        starts = torch.cat([starts, _point(known)[None]])
+    found = _closest(fit(observer, window, believed, [*singles, *back, *again], starts, _misfit(base)))
     for _ in range(1, deepest):
-        best = sorted(found, key=lambda finding: finding.score)[:2]
+        best = found[:2]
         wider = {b.hypothesis.beside(f): b for b in best for f in faults if f.size not in b.hypothesis.columns}
         # The best so far go on too: what more steps of the fit gain is no evidence for another fault.
         kept = [h for h in wider if h not in {f.hypothesis for f in found}]
@@ -58,13 +63,23 @@ def isolate(
             break
         wider |= {b.hypothesis: b for b in best}
         kept += [b.hypothesis for b in best]
-        again = torch.stack([torch.cat([wider[h].value, wider[h].value.new_tensor([wider[h].onset])]) for h in kept])
-        found += fit(observer, window, believed, kept, again, _misfit(base))
+        starts = torch.stack([_point(wider[h]) for h in kept])
+        found = _closest([*found, *fit(observer, window, believed, kept, starts, _misfit(base))])
+    told = [searched(f, len(faults)) for f in found if not needless(f, believed)]
+    return doubted(told, _misfit(base))
+
+
+def _closest(found: Sequence[Finding]) -> list[Finding]:
+    """The best fit of each hypothesis, best first."""
     closest: dict[Hypothesis, Finding] = {}
     for finding in sorted(found, key=lambda finding: finding.score):
         closest.setdefault(finding.hypothesis, finding)
-    told = [searched(f, len(faults)) for f in closest.values() if not needless(f, believed)]
-    return doubted(told, _misfit(base))
+    return list(closest.values())
+
+
+def _point(finding: Finding) -> Tensor:
+    """Where a fit starts from what an earlier one found, (P+1,)."""
+    return torch.cat([finding.value, finding.value.new_tensor([finding.onset])])
 
 
 def needless(finding: Finding, believed: Tensor) -> bool:
@@ -107,7 +122,7 @@ def doubted(found: Sequence[Finding], base: float) -> list[Finding]:
 def refit(observer: ChangedObserver, window: Window, believed: Tensor, findings: Sequence[Finding]) -> list[Finding]:
     """The same hypotheses on another window, from the values found before."""
     base = _misfit(observer.white(window, believed, unchanged(believed)))
-    starts = torch.stack([torch.cat([f.value, f.value.new_tensor([f.onset])]) for f in findings])
+    starts = torch.stack([_point(f) for f in findings])
     return doubted(fit(observer, window, believed, [f.hypothesis for f in findings], starts, base), base)
 
 
@@ -125,28 +140,35 @@ def fit(
     for i, hypothesis in enumerate(hypotheses):
         free[i, hypothesis.free] = True
     late = torch.tensor([h.incipient for h in hypotheses])
+    first, last = window.samples.time[0], window.samples.time[-2]
+    swings, middle = swings_of(observer.space.names), 0.5 * float(first + last)
 
     def linearise(point: Tensor, lanes: Tensor) -> Linearisation:
-        return _expansion(observer, window, believed, point, free[lanes], late[lanes])
+        return _expansion(observer, window, believed, point, free[lanes], late[lanes], middle)
 
-    first, last = window.samples.time[0], window.samples.time[-2]
     held = torch.cat([believed, first[None]]).repeat(len(starts), 1)
     for i, hypothesis in enumerate(hypotheses):
         held[i, list(hypothesis.gone)] = starts[i, list(hypothesis.gone)]
     low = torch.where(free, torch.cat([observer.space.low(believed), first[None]]), held)
     high = torch.where(free, torch.cat([observer.space.high(believed), last[None]]), held)
+    starts = told_at(torch.where(free, starts.clamp(low, high), held), swings, free, middle)
+    for _, phase in swings:  # once round in either direction, so that no fit ends at a seam
+        low[:, phase] = torch.where(free[:, phase], starts[:, phase] - 2.0 * math.pi, low[:, phase])
+        high[:, phase] = torch.where(free[:, phase], starts[:, phase] + 2.0 * math.pi, high[:, phase])
     settings = RefineSettings(iterations=ITERATIONS, decrease_tolerance=1e-3, step_tolerance=1e-6)
-    refined = levenberg_marquardt(linearise, torch.where(free, starts, held), low, high, settings)
+    refined = levenberg_marquardt(linearise, starts, low, high, settings)
     final = linearise(refined.theta, torch.arange(len(hypotheses)))
     sure = certainty(final.curvature, held=~free)
+    theta = within_a_turn(told_at(refined.theta, swings, free, -middle), swings, free)
+    std = with_phase_errors(sure, theta, swings, free, middle)
     readings = window.readings
     return [
         Finding(
             hypothesis,
-            refined.theta[i, :-1],
-            sure.std[i, :-1],
-            float(refined.theta[i, -1]),
-            float(sure.std[i, -1]),
+            theta[i, :-1],
+            std[i, :-1],
+            float(theta[i, -1]),
+            float(std[i, -1]),
             2.0 * (float(final.cost[i]) - base) + int(free[i].sum()) * math.log(readings),
             float(final.cost[i]),
             readings,
@@ -156,22 +178,36 @@ def fit(
 
 
 def _expansion(
-    observer: ChangedObserver, window: Window, believed: Tensor, point: Tensor, free: Tensor, late: Tensor
+    observer: ChangedObserver,
+    window: Window,
+    believed: Tensor,
+    point: Tensor,
+    free: Tensor,
+    late: Tensor,
+    middle: float,
 ) -> Linearisation:
-    """Half the sum of squares of the white innovations about points (L, P+1), slopes by central differences."""
+    """Half the sum of squares of the white innovations about points (L, P+1), slopes by central differences.
+
+    Free phases are those at `middle` s.
+    """
     count, width = point.shape
+    swings, length = swings_of(observer.space.names), float(window.samples.time[-1] - window.samples.time[0])
     steps = torch.cat([SIZE_STEP * observer.space_width(), 0.5 * torch.diff(window.samples.time).median()[None]])
+    steps = steps.repeat(count, 1)
+    for period, _ in swings:
+        steps[:, period] = period_step(point[:, period], length)
     which = free.nonzero()  # (K, 2): lane, column
+    step = steps[which[:, 0], which[:, 1]]
     ahead, behind = point[which[:, 0]].clone(), point[which[:, 0]].clone()
     rows = torch.arange(len(which))
-    ahead[rows, which[:, 1]] += steps[which[:, 1]]
-    behind[rows, which[:, 1]] -= steps[which[:, 1]]
-    lanes = torch.cat([point, ahead, behind])
-    slow = torch.cat([late, late[which[:, 0]], late[which[:, 0]]])
+    ahead[rows, which[:, 1]] += step
+    behind[rows, which[:, 1]] -= step
+    own = torch.cat([torch.arange(count), which[:, 0], which[:, 0]])
+    lanes, slow = told_at(torch.cat([point, ahead, behind]), swings, free[own], -middle), late[own]
     changes = Changes(lanes[:, :-1], lanes[:, -1], slow)
     white = torch.cat([observer.white(window, believed, part).flatten(1) for part in observer.blocks(window, changes)])
     error = white[:count]
-    slope = (white[count : count + len(which)] - white[count + len(which) :]) / (2.0 * steps[which[:, 1]]).unsqueeze(1)
+    slope = (white[count : count + len(which)] - white[count + len(which) :]) / (2.0 * step).unsqueeze(1)
     gradient, curvature = error.new_zeros(count, width), error.new_zeros(count, width, width)
     gradient[which[:, 0], which[:, 1]] = (slope * error[which[:, 0]]).sum(-1)
     for lane in range(count):

@@ -157,7 +157,7 @@ class Monitor:
             return self._reconsider(state, change)
         if change is not None and self._within_window(state, change):
             # Was the last change only taken for the wrong one? One change explaining all is preferred to two.
-            found = self._explanations(state, self._look_back(state, change), change.before)
+            found = self._explanations(state, self._look_back(state, change), change.before, change.finding)
             if found[0].fits:
                 return self._revise(state, change, "isolated", found)
         return self._isolate(state)
@@ -166,7 +166,7 @@ class Monitor:
         """The last change estimated again, or named anew; if nothing explains all, only for a clearly better name."""
         if not self._within_window(state, change):
             return replace(state, change=replace(change, next_look=float("inf"))), []
-        found = self._explanations(state, self._look_back(state, change), change.before)
+        found = self._explanations(state, self._look_back(state, change), change.before, change.finding)
         same = [f for f in found if f.hypothesis == change.finding.hypothesis]
         followed = state.adjusted > change.finding.onset  # its sizes have been: no single change is what happened
         close = followed or (same and same[0].score - found[0].score < CLEARLY)
@@ -215,10 +215,12 @@ class Monitor:
         since = max(now - finding.onset, self.settings.confirm, 1.0)
         return finding.onset + self.settings.revise * since
 
-    def _explanations(self, state: MonitorState, start: float, believed: Tensor) -> list[Finding]:
-        """Of what came since `start`, best first."""
-        s, healthy = self.settings, self._healthy(believed)
-        return isolate(self.observer, state.window(start), believed, self.faults, s.incipient, s.together, healthy)
+    def _explanations(
+        self, state: MonitorState, start: float, believed: Tensor, known: Finding | None = None
+    ) -> list[Finding]:
+        """Of what came since `start`, best first. known: what was found of it before."""
+        s, healthy, window = self.settings, self._healthy(believed), state.window(start)
+        return isolate(self.observer, window, believed, self.faults, s.incipient, s.together, healthy, known)
 
     def _believe(self, state: MonitorState, change: Change) -> MonitorState:
         """Feeds the newest parameters back."""

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from fdi_torch.monitor.change import ChangedObserver, Changes, Window
 from fdi_torch.monitor.hypothesis import Fault, Hypothesis
+from fdi_torch.monitor.swinging import strongest_periods
 
 ONSETS = 24  # moments tried in a window before the fit makes them continuous
 TRIAL_SIZE = 0.02  # of a parameter's range: for signatures
-MOST_PERIODS, SWING_ONSETS = 48, 6  # tried for an oscillation
+MOST_PERIODS, SWING_ONSETS = 32, 6  # tried for an oscillation
 MANY = 4  # faults that stand: of more than these not every set is tried for having gone
 
 
@@ -94,15 +95,14 @@ def signatures(
 def swing_start(
     observer: ChangedObserver, window: Window, believed: Tensor, hypothesis: Hypothesis, base: Tensor
 ) -> Tensor:
-    """The same (1, P+1) for an oscillation: its period from a grid half a swing of the window apart, amplitude and
+    """The same (1, P+1) for an oscillation: its period from those at which the residual has most power, amplitude and
     phase by least squares on the signatures of a sine and a cosine.
     """
     size, period, phase = hypothesis.columns[0], *hypothesis.shape
     first, last = float(window.samples.time[0]), float(window.samples.time[-1])
     sampling, bounds = float(torch.diff(window.samples.time).median()), observer.space.parameters[period]
     fastest, slowest = max(4.0 * sampling, bounds.low), min(2.0 * (last - first), bounds.high)
-    count = min(max(int(2.0 * (last - first) / fastest), 2), MOST_PERIODS)
-    periods = 1.0 / torch.linspace(1.0 / slowest, 1.0 / fastest, count, dtype=believed.dtype)
+    periods = strongest_periods(base[0], sampling, fastest, slowest, MOST_PERIODS)
     onsets = _onsets(window, SWING_ONSETS)
     grid = torch.cartesian_prod(periods, onsets, believed.new_tensor([0.0, 0.5 * torch.pi]))
     theta = believed.repeat(len(grid), 1)
