@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from rigs import blank_recording, three_tank
 
-from fdi_torch.config import load_plant
+from fdi_torch.config import load_plant, load_run
+from fdi_torch.config.monitor import MonitorConfig
+from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.understood import understood
 from fdi_torch.effects import EFFECTS, all_placements, build_network, placements_for
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.hybrid import estimate_parameters
+from fdi_torch.jobs.run_setup import fitting_of, recordings_of, wanted_space
+from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import length_scale, time_scale
 from fdi_torch.recording import Recording
@@ -96,3 +102,19 @@ def test_faults_and_their_errors_do_not_depend_on_the_rig_s_size(metres: float, 
     assert float(apart.max()) < 0.05, (usual.value, other.value)
     torch.testing.assert_close(other.std[:2], usual.std[:2], rtol=0.02, atol=0.0)
     assert found[0].diagnosis.kind == found[1].diagnosis.kind == "multiple faults"
+
+
+def test_times_of_a_monitor_that_nobody_chose_follow_the_plant() -> None:
+    slow = plant_mapping(scaled(three_tank(), 1.0, 60.0))
+    given = {"recording": {"file": "any.csv"}, "fault_free": ["0 s", "1 h"], "window": {"confirm": "90 s"}}
+    config, _, _ = understood(MonitorConfig, given | {"plant": slow}, Path(), "slow.yaml")
+    usual, _, _ = understood(MonitorConfig, given, Path(), "usual.yaml")
+    assert (usual.window.lookback, usual.window.confirm, usual.false_alarms_every, usual.step) == (300, 90, 20000, 1)
+    assert (config.window.lookback, config.window.confirm, config.false_alarms_every) == (30000, 90, 2e6)
+    assert config.step == usual_step(scaled(three_tank(), 1.0, 60.0)) == 100
+
+
+def test_an_onset_is_sought_within_the_recording() -> None:
+    run = load_run(overrides=["estimate.parameters=[T1.leak, T1.leak.onset]", "simulate.duration=400 s"])
+    fitting = fitting_of(run, wanted_space(run), recordings_of(run))
+    assert (fitting.space["T1.leak.onset"].low, fitting.space["T1.leak.onset"].high) == (0.0, 400.0)

@@ -13,7 +13,7 @@ from fdi_torch.config.estimation import full_name
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.config.run import OutputConfig
-from fdi_torch.config.strict import Seconds, Strict
+from fdi_torch.config.strict import BenchSeconds, Seconds, Strict
 from fdi_torch.config.understood import understood, values_in
 from fdi_torch.monitor.prepare import GainWish
 from fdi_torch.monitor.settings import MonitorSettings
@@ -21,9 +21,11 @@ from fdi_torch.plant.description import PlantDescription
 
 
 class WindowConfig(Strict):
-    lookback: Seconds = Field(300.0, description="how far before an alarm a change is sought, s")
-    confirm: Seconds = Field(60.0, description="how long after an alarm the faults are told apart, s")
-    longest: Seconds = Field(1000.0, description="no window reaches further back, s")
+    """Times that are not given are those of a bench, by ten longer or shorter for other plants (`plant.pace`)."""
+
+    lookback: BenchSeconds = Field(300.0, description="how far before an alarm a change is sought, s")
+    confirm: BenchSeconds = Field(60.0, description="how long after an alarm the faults are told apart, s")
+    longest: BenchSeconds = Field(1000.0, description="no window reaches further back, s")
     stride: Seconds | None = Field(
         None, description="between windows that are fitted one by one, s; by default longest"
     )
@@ -65,10 +67,10 @@ class MonitorConfig(Strict):
         "changes", description="single changes after alarms, or all faults window after window by that estimator"
     )
     detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="what raises alarms")
-    false_alarms_every: Seconds = Field(20000.0, description="mean time between false alarms, s")
+    false_alarms_every: BenchSeconds = Field(20000.0, description="mean time between false alarms, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
     observer: ObserverConfig = Field(default_factory=ObserverConfig, description="by default by the noise")
-    step: Seconds = Field(1.0, description="longest integration step, s")
+    step: BenchSeconds = Field(1.0, description="longest integration step, s")
     output: OutputConfig = Field(default_factory=OutputConfig)
     seed: int = Field(0, ge=0, description="of the simulation that sets the threshold of the GLR")
 

@@ -14,7 +14,7 @@ from fdi_torch.config.estimation import full_name
 from fdi_torch.config.monitor import WindowConfig
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.run import OutputConfig
-from fdi_torch.config.strict import Seconds, Share, Strict, quantity
+from fdi_torch.config.strict import BenchSeconds, Share, Strict, quantity
 from fdi_torch.config.understood import understood, values_in
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import Fitting, set_up
@@ -41,7 +41,7 @@ class NoiseConfig(Strict):
 class FalseAlarmConfig(Strict):
     noises: dict[str, NoiseConfig] = Field(min_length=1, description="each by a name")
     runs: int = Field(500, ge=1, description="free of faults")
-    lasts: Seconds = Field(3600.0, gt=0, description="each of them, and the one that noise is learnt from, s")
+    lasts: BenchSeconds = Field(3600.0, gt=0, description="each of them, and the one that noise is learnt from, s")
     calibrations: int = Field(8, ge=1, description="other runs that noise is learnt from, one after the other")
 
 
@@ -50,8 +50,8 @@ class FaultsFoundConfig(Strict):
     sizes: list[Share] = Field([0.02, 0.05, 0.1, 0.2], min_length=1, description="shares of the fault's range")
     runs: int = Field(500, ge=1, description="of each size")
     named: int = Field(100, ge=0, description="how many of them the monitor follows to name the fault")
-    onset: Seconds = Field(300.0, description="when the fault opens, s")
-    lasts: Seconds = Field(900.0, description="each run, s")
+    onset: BenchSeconds = Field(300.0, description="when the fault opens, s")
+    lasts: BenchSeconds = Field(900.0, description="each run, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
 
 
@@ -62,8 +62,8 @@ class NamingConfig(Strict):
     share: Share = Field(0.5, description="by which commands change each minute, of themselves")
     runs: int = Field(200, ge=1, description="of each loop")
     times: float = Field(3.0, gt=0, description="the smallest size that can be isolated")
-    onset: Seconds = Field(300.0, description="when the fault opens, s")
-    lasts: Seconds = Field(900.0, description="each run, s")
+    onset: BenchSeconds = Field(300.0, description="when the fault opens, s")
+    lasts: BenchSeconds = Field(900.0, description="each run, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
 
 
@@ -80,8 +80,8 @@ class RehearsalConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
     inputs: list[str] = Field(description="constant commands, one for each channel")
     reading_noise: str = Field("1 mm", description="standard deviation of every reading")
-    sampling: Seconds = Field(1.0, gt=0, description="between readings, s")
-    false_alarms_every: Seconds = Field(20000.0, description="mean time between false alarms asked for, s")
+    sampling: BenchSeconds = Field(1.0, gt=0, description="between readings, s")
+    false_alarms_every: BenchSeconds = Field(20000.0, description="mean time between false alarms asked for, s")
     detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="what raises alarms under naming")
     false_alarms: FalseAlarmConfig | None = Field(None, description="how often without a fault")
     faults_found: FaultsFoundConfig | None = Field(None, description="how soon, how surely and under which name")

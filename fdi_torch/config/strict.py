@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
@@ -45,6 +45,10 @@ def quantity(value: Any, unit: str) -> float:
     return number
 
 
+def _each_in_seconds(value: Any) -> Any:
+    return [quantity(v, "s") for v in value] if isinstance(value, list) else value
+
+
 def _of(unit: str) -> tuple[BeforeValidator, Any]:
     return BeforeValidator(lambda value: quantity(value, unit)), Field(json_schema_extra={"unit": unit})
 
@@ -54,7 +58,25 @@ Length = Annotated[float, *_of("m")]
 Area = Annotated[float, *_of("m^2")]
 Flow = Annotated[float, *_of("m^3/s")]
 Seconds = Annotated[float, *_of("s")]
+_ON_A_BENCH = "the default is for tanks on a bench"
+BenchSeconds = Annotated[Seconds, _ON_A_BENCH]
+BenchSteps = Annotated[list[float], BeforeValidator(_each_in_seconds), _ON_A_BENCH]
 Acceleration = Annotated[float, *_of("m/s^2")]
 
 Amount = float | str
 """A quantity whose unit depends on what it belongs to; turned into SI where that is known."""
+
+
+Config = TypeVar("Config", bound=Strict)
+
+
+def at_pace(config: Config, scale: float) -> Config:
+    """The same, with times that nobody chose and that are meant for a bench multiplied by a plant's time scale."""
+    changes: dict[str, Any] = {}
+    for name, field in type(config).model_fields.items():
+        value = getattr(config, name)
+        if isinstance(value, Strict):
+            changes[name] = at_pace(value, scale)
+        elif _ON_A_BENCH in field.metadata and name not in config.model_fields_set:
+            changes[name] = [scale * v for v in value] if isinstance(value, list) else scale * value
+    return config.model_copy(update=changes) if scale != 1.0 else config

@@ -5,23 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import torch
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
 from fdi_torch.config.files import write_yaml
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.run import Run, build_run
 from fdi_torch.config.simulation import planned_recording
-from fdi_torch.config.strict import Seconds, Share, Strict, quantity
+from fdi_torch.config.strict import BenchSeconds, BenchSteps, Share, Strict, at_pace
 from fdi_torch.config.understood import values_in
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.estimate.refine import RefineSettings
 from fdi_torch.names import unknown
+from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.reach import bounded
 from fdi_torch.study.plan import (
     ESTIMATORS,
     Estimator,
@@ -33,10 +35,6 @@ from fdi_torch.study.plan import (
     mode_faults,
     uniform_faults,
 )
-
-
-def _seconds(value: Any) -> Any:
-    return [quantity(v, "s") for v in value] if isinstance(value, list) else value
 
 
 class StudyConfig(Strict):
@@ -52,12 +50,12 @@ class StudyConfig(Strict):
     )
     starts: int = Field(2, ge=1, description="members of the search that are refined")
     searches: int = Field(3, ge=1, description="at most, for trials whose residuals stay above their noise")
-    search_step: Seconds = Field(5.0, gt=0, description="integration step of the search, s")
+    search_step: BenchSeconds = Field(5.0, gt=0, description="integration step of the search, s")
     search_every: int = Field(5, ge=1, description="the search sees every so manieth reading")
-    steps: Annotated[list[float], BeforeValidator(_seconds)] = Field(
+    steps: BenchSteps = Field(
         [1.0, 0.1], min_length=1, description="integration steps of the refinement, coarse to fine, s"
     )
-    data_step: Seconds = Field(0.01, gt=0, description="integration step of the noise-free readings, s")
+    data_step: BenchSeconds = Field(0.01, gt=0, description="integration step of the noise-free readings, s")
     population: int = Field(40, ge=4, description="of the search")
     evaluations: int = Field(2000, ge=4, description="of the search, each time")
     tolerance: float = Field(1e-5, gt=0, description="without noise: a larger error is a failure, share of the range")
@@ -86,7 +84,7 @@ def build_study(data: Mapping[str, Any], base: Path, source: str) -> Study:
     varied = data["study"]
     run = build_run({key: value for key, value in data.items() if key != "study"}, base, source)
     try:
-        config = StudyConfig.model_validate(varied)
+        config = at_pace(StudyConfig.model_validate(varied), time_scale(run.plant))
     except ValidationError as error:
         raise explain(error, f"{source}: study") from None
     text = run.text + write_yaml({"study": varied})
@@ -121,6 +119,7 @@ def _fitting(run: Run) -> Fitting:
         raise ConfigError([f"{run.source}: estimate.parameters: expected at least one, got none"])
     network = build_network(run.plant, placements_of([p.name for p in estimate.parameters], run.plant))
     space = estimated_space(estimate, network.constants, run.plant, real_data=False)
+    space = bounded(space, simulated.duration)
     unbounded = [p.name for p in space if not (abs(p.low) < torch.inf and abs(p.high) < torch.inf)]
     if unbounded:
         raise ConfigError(

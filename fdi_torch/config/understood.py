@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -12,10 +12,9 @@ from fdi_torch.config.files import find_file, read_extended, with_overrides, wri
 from fdi_torch.config.plant import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError, explain
-from fdi_torch.config.strict import Strict
+from fdi_torch.config.strict import Config, at_pace
 from fdi_torch.plant.description import PlantDescription
-
-Config = TypeVar("Config", bound=Strict)
+from fdi_torch.plant.pace import time_scale
 
 
 def values_in(path: str | Path, overrides: Iterable[str] = ()) -> tuple[dict[str, Any], Path]:
@@ -36,6 +35,7 @@ def understood(
     except ValidationError as error:
         raise explain(error, source) from None
     plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
+    config = at_pace(config, time_scale(plant))
     return config, plant, write_yaml({**data, "plant": plant_mapping(plant)})
 
 

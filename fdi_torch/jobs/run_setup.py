@@ -18,6 +18,7 @@ from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
 from fdi_torch.estimate.hybrid import HybridSettings
 from fdi_torch.estimate.refine import RefineSettings
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.reach import bounded
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.record import clean_readings, with_noise
 
@@ -86,6 +87,7 @@ def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording
     """These parameters on these recordings, with all tensors on the device that the run file asks for."""
     device = usable_device(run.config.device)
     recordings = [part.recording.to(device) for part in loaded]
+    space = bounded(space, max(float(r.time[-1]) for r in recordings))
     with tensors_on(device):
         fitting = set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
     expect_enough_samples(recordings, fitting.space)

@@ -10,7 +10,7 @@ from torch import Tensor
 from fdi_torch.monitor.gain import Gain, Linear, hand_gain, riccati
 from fdi_torch.monitor.observer import bound
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.stepper import LONGEST_STEP, PlantState, Stepper, slopes
+from fdi_torch.monitor.stepper import PlantState, Stepper, slopes
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 
@@ -33,7 +33,7 @@ class Adapted:
 class JointModel:
     """Levels and parameters as one state z = (x, theta); the parameters stand still."""
 
-    def __init__(self, network: TankNetwork, space: ParameterSpace, longest_step: float = LONGEST_STEP) -> None:
+    def __init__(self, network: TankNetwork, space: ParameterSpace, longest_step: float | None = None) -> None:
         if network.command_memory() or network.reading_memory():
             raise ValueError("expected a plant without memory in actuators and sensors; leave such effects out")
         self.stepper, self.network, self.space = Stepper(network, longest_step), network, space

@@ -12,7 +12,7 @@ from fdi_torch.monitor.gain import Gain
 from fdi_torch.monitor.observer import first_levels
 from fdi_torch.monitor.running import run_lanes
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.stepper import LONGEST_STEP, Stepper
+from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
@@ -89,7 +89,7 @@ class ChangedObserver:
         space: ParameterSpace,
         gain: Gain,
         whitening: Whitening,
-        longest_step: float = LONGEST_STEP,
+        longest_step: float | None = None,
     ) -> None:
         self.stepper = Stepper(network, longest_step)
         self.network, self.space, self.gain, self.whitening = network, space, gain, whitening

@@ -11,7 +11,7 @@ from torch import Tensor
 from fdi_torch.monitor.gain import Gain, Linear, kalman_gain, linearised, riccati, start_uncertainty
 from fdi_torch.monitor.observer import Observation, Observer, bound, first_levels
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.stepper import LONGEST_STEP, Stepper
+from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.whitening import Whitening, score_whitenings
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
@@ -42,7 +42,7 @@ def learn_noise(
     space: ParameterSpace | None = None,
     theta: Tensor | None = None,
     levels: Tensor | None = None,
-    longest_step: float = LONGEST_STEP,
+    longest_step: float | None = None,
 ) -> tuple[Noise, Observation]:
     """The ratio of process to measurement noise and the colour of the residual that are the most likely together.
 
@@ -70,7 +70,7 @@ def noise_of_gain(
     fault_free: Samples,
     space: ParameterSpace | None = None,
     theta: Tensor | None = None,
-    longest_step: float = LONGEST_STEP,
+    longest_step: float | None = None,
 ) -> tuple[Noise, Observation]:
     """For an observer whose gain is given: the colour of its residual. What of it is process noise stays open (NaN)."""
     seen = Observer(network, gain, space, theta, longest_step).run(fault_free)
@@ -134,7 +134,7 @@ def operating_point(
     samples: Samples,
     space: ParameterSpace | None = None,
     theta: Tensor | None = None,
-    longest_step: float = LONGEST_STEP,
+    longest_step: float | None = None,
 ) -> Linear:
     """The plant over one sampling interval about the middle of what a recording visits."""
     values = bound(network, space, theta)

@@ -10,7 +10,7 @@ from torch import Tensor
 from fdi_torch.monitor.gain import Gain, linearised, spectral_radius
 from fdi_torch.monitor.running import run_lanes
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.stepper import LONGEST_STEP, Stepper
+from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 
@@ -64,7 +64,7 @@ class Observer:
         gain: Gain,
         space: ParameterSpace | None = None,
         theta: Tensor | None = None,
-        longest_step: float = LONGEST_STEP,
+        longest_step: float | None = None,
     ) -> None:
         self.stepper, self.gain = Stepper(network, longest_step), gain
         self.values = bound(network, space, theta)

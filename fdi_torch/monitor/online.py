@@ -23,7 +23,6 @@ from fdi_torch.monitor.noise import Noise
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.monitor.standing import CLEARLY, held_since, slight_change, trusted
-from fdi_torch.monitor.stepper import LONGEST_STEP
 from fdi_torch.monitor.telling import rivals_of, tell, with_nominals
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
@@ -53,7 +52,7 @@ class Monitor:
         noise: Noise,
         detector: Detector,
         settings: MonitorSettings | None = None,
-        longest_step: float = LONGEST_STEP,
+        longest_step: float | None = None,
         watched: int | None = None,
     ) -> None:
         if not len(space):

@@ -20,7 +20,7 @@ from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.online import SHAPE, Monitor, faults_of
 from fdi_torch.monitor.samples import Samples, take
 from fdi_torch.monitor.settings import MonitorSettings
-from fdi_torch.monitor.stepper import LONGEST_STEP
+from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import TankNetwork
@@ -61,7 +61,7 @@ def prepare(
     chart: Chart = "cusum",
     time_between_false_alarms: float = 20000.0,
     settings: MonitorSettings | None = None,
-    step: float = LONGEST_STEP,
+    step: float | None = None,
     seed: int = 0,
     start: StartLevels = "free",
     ranges: Mapping[str, tuple[float, float]] | None = None,
@@ -70,8 +70,10 @@ def prepare(
     """A monitor for `faults` (parameters such as 'T1.leak.size'; the usual ones where none is named).
 
     calibrate: constants fitted to the fault-free recording first, their tolerances as priors. start: what is known of
-    the levels then. ranges: of faults whose usual range does not suit. Raises ValueError.
+    the levels then. step: longest of the integration, s. ranges: of faults whose usual range does not suit.
+    Raises ValueError.
     """
+    step = usual_step(plant) if step is None else step
     watched = with_shapes(list(faults) or usual_faults(plant), plant)
     network = build_network(plant, placements_for(watched))
     values = calibration(plant, fault_free, calibrate, step, start) if calibrate else {}

@@ -10,12 +10,20 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.signals import Clock
 
-# RK4 at this step is right to 1e-3 cm on the paper's plant, far below what sensors resolve.
-LONGEST_STEP = 1.0
+# In units of the plant's time scale. RK4 at this step is right to 1e-3 cm on the paper's plant, far below what sensors
+# resolve.
+_USUAL_STEP = 1.0
+
+
+def usual_step(plant: PlantDescription) -> float:
+    """The longest integration step of an observer where none is asked for, s."""
+    return _USUAL_STEP * time_scale(plant)
 
 
 @dataclass(frozen=True)
@@ -28,13 +36,14 @@ class PlantState:
 
 
 class Stepper:
-    """One sampling interval of a plant by RK4 (3/8 rule) in steps no longer than `longest` s.
+    """One sampling interval of a plant by RK4 (3/8 rule) in steps no longer than `longest` s (None: `usual_step`).
 
     Held inputs are exact, linear ones are taken at their mean over each step. Raises ValueError for a plant whose
     believed effects are late by a fixed time: their past is not a state.
     """
 
-    def __init__(self, network: TankNetwork, longest: float = LONGEST_STEP) -> None:
+    def __init__(self, network: TankNetwork, longest: float | None = None) -> None:
+        longest = usual_step(network.description) if longest is None else longest
         if not longest > 0:
             raise ValueError(f"expected a positive integration step, got {longest} s")
         late = [p.prefix for p in network.placements if p.effect.delays]

@@ -19,9 +19,11 @@ from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.objectives import Objective, Problem, Term, spread_of
 from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.simulate.engine import Readings
 
-# Steps (s) of the search and of the refinement: a window's worth of error is far below noise of 30 dB.
+# Steps of the search and of the refinement, in units of the plant's time scale: a window's worth of error is far below
+# noise of 30 dB.
 SEARCH_STEP, REFINE_STEP = 5.0, 0.5
 SEARCH = EvolutionSettings(population=40, evaluations=2000)
 REFINE = RefineSettings(iterations=60, decrease_tolerance=1e-6)
@@ -119,7 +121,8 @@ def _searched(window: WindowData, before: Tensor, seed: int) -> tuple[Tensor, Te
     low, high = window.box
     objective: Objective = "correlation" if window.moves() else "likelihood"
     span = float(window.fitting.recordings[0].time[-1] - window.fitting.recordings[0].time[0])
-    problem = window.problem(min(SEARCH_STEP, span / 20.0), objective)
+    longest = SEARCH_STEP * time_scale(window.fitting.plant)
+    problem = window.problem(min(longest, span / 20.0), objective)
     seeds = problem_seeds(seed, (window.runs,), low.device)
     found = evolve(problem.cost, low, high, SEARCH, seeds, first_guess=before.clamp(low, high).unsqueeze(1))
     return _distant(found.population, found.cost, (high - low)[0]), found.best_cost
@@ -141,7 +144,7 @@ def _distant(population: Tensor, cost: Tensor, width: Tensor) -> Tensor:
 def _refined(window: WindowData, starts: Tensor) -> WindowEstimate:
     """The best of the refinements from every start (R, K, P)."""
     each, (low, high) = starts.shape[1], window.box
-    problem = window.problem(REFINE_STEP, "likelihood")
+    problem = window.problem(REFINE_STEP * time_scale(window.fitting.plant), "likelihood")
     refined = levenberg_marquardt(
         lambda theta, members: problem.linearise(theta, members // each),
         starts,

@@ -70,11 +70,14 @@ def reach_of_all(recordings: Sequence[Recording], plant: PlantDescription) -> Re
     return Reach(max(r.duration for r in each), widest("commands"), widest("readings"), widest("levels"))
 
 
-def bounded(space: ParameterSpace, duration: float) -> ParameterSpace:
-    """The same space with onsets, ramps and the like, which may otherwise last for ever, kept within the recording."""
+def bounded(space: ParameterSpace, last: float) -> ParameterSpace:
+    """The same space with onsets, ramps and the like, which may otherwise last for ever, kept within the recording.
+
+    last: when it ends, s.
+    """
     endless = [p.name for p in space if p.unit == "s" and math.isinf(p.high)]
     for name in endless:
-        space = space.with_changes(name, high=max(duration, space[name].nominal))
+        space = space.with_changes(name, high=max(last, space[name].nominal))
     return space
 
 

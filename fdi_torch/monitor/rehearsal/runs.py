@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fdi_torch.monitor.changing import ONSET, RAMP, ChangingNetwork
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.stepper import LONGEST_STEP, PlantState, Stepper
+from fdi_torch.monitor.stepper import PlantState, Stepper, usual_step
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 
@@ -55,7 +55,7 @@ class Rig:
         self.network, self.changing = network, ChangingNetwork(network, space.names)
         self.space, self.inputs, self.levels, self.reading_std = space, inputs, levels, reading_std
         self.sampling, self.wander, self.colour, self.controller = sampling, wander, colour, controller
-        self._stepper = Stepper(self.changing, min(sampling, LONGEST_STEP))
+        self._stepper = Stepper(self.changing, min(sampling, usual_step(network.description)))
         onsets = [f"{name.rpartition('.')[0]}.onset" for name in space.names]
         self._onsets = [name for name in dict.fromkeys(onsets) if name in self.changing.constants and self._held(name)]
         names = [*(f"after {name}" for name in space.names), ONSET, RAMP, *self._onsets]
