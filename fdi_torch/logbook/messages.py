@@ -15,15 +15,18 @@ from typing import Any
 import numpy as np
 import orjson
 
+from fdi_torch.logbook.block import Block, Timed, block_of
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, plain
 from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, Topic, json_schema, named_kinds, topic_definition
-from fdi_torch.logbook.sink import EPOCH_NS, Timed, log_time_of
+from fdi_torch.logbook.sink import EPOCH_NS, log_time_of
 
 Named = Mapping[str, Any]
 Fields = Callable[[], Named]
 _RESERVED = ("t", NON_FINITE, WALL, "masked")
 _BLOCK = 4096
+_FEW = 32
+"""So few samples are written faster one by one."""
 _TOGETHER, _TOGETHER_BYTES = 64, 1 << 22
 
 
@@ -47,6 +50,9 @@ class Messages:
         self._sequence: dict[str, int] = {}
 
     def put(self, messages: Iterable[Timed]) -> None:
+        raise NotImplementedError
+
+    def put_block(self, block: Block) -> None:
         raise NotImplementedError
 
     def wall(self) -> dict[str, int]:
@@ -162,23 +168,34 @@ class Messages:
         if not np.isfinite(time).all():
             raise ValueError(f"{signals[0][0]}: expected finite times, got NaN or infinity; drop those samples")
         self.settle()
+        topics = [topic for topic, *_ in signals]
         for first in range(0, len(time), _BLOCK):
-            clock = time[first : first + _BLOCK].astype(np.float64)
-            seconds, log_times = clock.tolist(), (EPOCH_NS + np.rint(clock * 1e9).astype(np.int64)).tolist()
-            encoded = [self._encode_block(signal, seconds, first) for signal in signals]
-            self.put(self._in_turn([topic for topic, *_ in signals], log_times, encoded))
+            last = first + _BLOCK
+            clock = time[first:last].astype(np.float64)
+            log_times = EPOCH_NS + np.rint(clock * 1e9).astype(np.int64)
+            blocks = [values[first:last].astype(np.float64) for _, values, *_ in signals]
+            hidden = [
+                np.zeros(0, bool) if mask is None else ~mask[first:last] & np.isfinite(block)
+                for block, (*_, mask, _) in zip(blocks, signals, strict=True)
+            ]
+            for topic, _, names, units, _, about in signals:
+                numbers = dict.fromkeys(names, 0.0)
+                self._channel(topic, numbers, numbers, dict(zip(names, units, strict=True)), about)
+            named = [names for _, _, names, *_ in signals]
+            channels, sequences = self._follow(topics, len(clock))
+            whole = all(np.isfinite(block).all() for block in blocks) and not any(part.any() for part in hidden)
+            if whole and len(clock) > _FEW:
+                self.put_block(block_of(channels, sequences, named, blocks, clock, log_times))
+            else:
+                encoded = [_rows(*parts, clock.tolist()) for parts in zip(named, blocks, hidden, strict=True)]
+                self.put(_in_turn(channels, sequences, log_times.tolist(), encoded))
         self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
 
-    def _in_turn(
-        self, topics: Sequence[str], log_times: Sequence[int], encoded: Sequence[Sequence[bytes]]
-    ) -> Iterator[Timed]:
-        """One message of each topic a sample."""
-        streams = []
-        for topic, payloads in zip(topics, encoded, strict=True):
-            channel, first = self._described[topic][1], self._sequence.get(topic, 0)
-            self._sequence[topic] = first + len(payloads)
-            streams.append(zip(repeat(channel), log_times, log_times, count(first), payloads, strict=False))
-        return chain.from_iterable(zip(*streams, strict=True))
+    def _follow(self, topics: Sequence[str], count: int) -> tuple[list[Channel], list[int]]:
+        """The channels of so many more messages of each topic, and the sequence numbers of the first ones."""
+        sequences = [self._sequence.get(topic, 0) for topic in topics]
+        self._sequence.update({topic: first + count for topic, first in zip(topics, sequences, strict=True)})
+        return [self._described[topic][1] for topic in topics], sequences
 
     def follow_on(self, channel: Channel, sequence: int, t: float) -> None:
         """Number and describe what comes as if the message (channel, sequence, t) had just been written."""
@@ -229,22 +246,31 @@ class Messages:
         self._sequence[topic] = number + 1
         return number
 
-    def _encode_block(self, signal: tuple[Any, ...], clock: list[float], first: int) -> list[bytes]:
-        topic, values, names, units, mask, about = signal
-        block = values[first : first + len(clock)].astype(np.float64)
-        keys = ("t", *names)
-        numbers = dict.fromkeys(names, 0.0)
-        self._channel(topic, numbers, numbers, dict(zip(names, units, strict=True)), about)
-        rows = zip(clock, *block.T.tolist(), strict=True)
-        uncounted = np.zeros(0) if mask is None else ~mask[first : first + len(clock)] & np.isfinite(block)
-        if np.isfinite(block).all() and not uncounted.any():
-            return [orjson.dumps(dict(zip(keys, row, strict=True))) for row in rows]
-        return [orjson.dumps(_row(keys, row, uncounted[i : i + 1])) for i, row in enumerate(rows)]
-
 
 def units_of(units: Mapping[str, str] | None) -> dict[str, str]:
     """Units as channel metadata: {"h1": "m"} -> {"unit.h1": "m"}."""
     return {f"unit.{name}": unit for name, unit in (units or {}).items()}
+
+
+def _in_turn(
+    channels: Sequence[Channel],
+    sequences: Sequence[int],
+    log_times: Sequence[int],
+    encoded: Sequence[Sequence[bytes]],
+) -> Iterator[Timed]:
+    """One message of each channel a sample."""
+    streams = [
+        zip(repeat(channel), log_times, log_times, count(first), payloads, strict=False)
+        for channel, first, payloads in zip(channels, sequences, encoded, strict=True)
+    ]
+    return chain.from_iterable(zip(*streams, strict=True))
+
+
+def _rows(names: Sequence[str], block: np.ndarray, hidden: np.ndarray, clock: list[float]) -> list[bytes]:
+    """Payloads of samples (B, N) among which some are not finite, or hidden (B, N) by the mask."""
+    keys = ("t", *names)
+    rows = zip(clock, *block.T.tolist(), strict=True)
+    return [orjson.dumps(_row(keys, row, hidden[i : i + 1])) for i, row in enumerate(rows)]
 
 
 def _row(keys: Sequence[str], row: Sequence[float], uncounted: np.ndarray) -> dict[str, Any]:

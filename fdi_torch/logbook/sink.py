@@ -15,10 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
+from fdi_torch.logbook.block import Block, Timed
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.chunk import Chunk, Described
 from fdi_torch.logbook.scan import MAGIC
@@ -30,9 +32,6 @@ EPOCH_NS = 946_684_800 * 10**9  # 2000-01-01T00:00:00Z: plant time 0; leaves roo
 STRETCH = 1000
 """So many messages of signals in a row, a recording, end with a chunk."""
 _FOOTER = struct.Struct("<BQQQ")
-
-Timed = tuple[Channel, int, int, int, bytes]
-"""Channel, log time and publish time in ns, sequence number and payload of a message."""
 
 
 @dataclass(frozen=True)
@@ -118,14 +117,45 @@ class Sink:
             if told is None or channel is not last:
                 last, told = channel, self._channels.get(channel) or self._register(channel)
             if told.is_signal:
-                self._signals += 1
-                if self._perhaps is not None:
-                    self.mark, self._perhaps = self.mark or self._perhaps, None
+                self._count_signals(1)
             elif self._signals:
                 self._end_of_signals()
             self._chunk.message(told, log_time, publish_time, sequence, data)
             if self._chunk.size > CHUNK_BYTES:
                 self.flush()
+
+    def block(self, block: Block) -> None:
+        """The messages of a block, to the same bytes as one after the other."""
+        first, samples = 0, len(block.ends)
+        while first < samples:
+            # The first sample of a chunk brings the descriptions of its channels.
+            self.messages(block.messages(first, first + 1))
+            first += 1
+            told = [self._channels[channel] for channel in block.channels]
+            alike = len({channel.is_signal for channel in told}) == 1
+            if first == 1:
+                block.number([channel.channel.id for channel in told])
+            if alike and all(map(self._chunk.describes, told)):
+                first = self._take(block, first, told)
+
+    def _take(self, block: Block, first: int, told: Sequence[Described]) -> int:
+        """Whole samples of a block from the first on, as many as leave the chunk room for more. The next one."""
+        ends = block.ends
+        start = int(ends[first - 1, -1])
+        last = int(np.searchsorted(ends[:, -1], start + CHUNK_BYTES - self._chunk.size, "right"))
+        if last <= first:
+            return first
+        if told[0].is_signal:
+            self._count_signals((last - first) * len(told))
+        starts = np.append(start, ends[first:last].ravel()[:-1]).reshape(last - first, -1) - start
+        records = block.data[start : ends[last - 1, -1]].tobytes()
+        self._chunk.block([channel.channel.id for channel in told], block.log_times[first:last], records, starts)
+        return last
+
+    def _count_signals(self, more: int) -> None:
+        self._signals += more
+        if self._perhaps is not None:
+            self.mark, self._perhaps = self.mark or self._perhaps, None
 
     def _end_of_signals(self) -> None:
         if self._signals >= STRETCH:

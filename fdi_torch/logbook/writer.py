@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.logbook.block import Block, Timed
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.copying import joined
 from fdi_torch.logbook.errors import LogError, log_error
@@ -31,7 +32,7 @@ from fdi_torch.logbook.payload import as_array
 from fdi_torch.logbook.provenance import environment, git_state
 from fdi_torch.logbook.reader import Message
 from fdi_torch.logbook.schemas import FORMAT_VERSION
-from fdi_torch.logbook.sink import Sink, Timed
+from fdi_torch.logbook.sink import Sink
 from fdi_torch.logbook.terminate import Terminated
 from fdi_torch.logbook.topics import Topics
 
@@ -163,6 +164,15 @@ class RunLog(Topics):
         with self._lock:
             sink = self._open_sink()
             sink.messages(messages if self._listener is None else self._heard(messages, self._listener))
+            self._note_progress()
+
+    def put_block(self, block: Block) -> None:
+        """Many samples, to the same bytes."""
+        if self._listener is not None:
+            self.put(block)
+            return
+        with self._lock:
+            self._open_sink().block(block)
             self._note_progress()
 
     def carry_over(self, messages: Iterable[Message]) -> int:

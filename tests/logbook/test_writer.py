@@ -425,3 +425,45 @@ def test_what_is_put_off_while_the_clock_writes_keeps_its_order(tmp_path: Path) 
             time.sleep(0.0005)
     told = [orjson.loads(m.data)["generation"] for m in read_run(tmp_path / "a.mcap").messages()]
     assert told == list(range(200))
+
+
+SPECIAL = [0.0, -0.0, 5e-324, 1e16, 1e-7, 123456789.0, 1 / 3, 1.7976931348623157e308, 1e21, 2.0**53]
+
+
+@pytest.mark.parametrize(
+    "topics",
+    [("/plant/input", "/plant/output"), ("/plant/truth", "/observer/residual"), ("/plant/output", "/plant/truth")],
+)
+def test_many_samples_at_once_are_the_same_bytes_as_one_by_one(tmp_path: Path, topics: tuple[str, str]) -> None:
+    rng = np.random.default_rng(0)
+    numbers = rng.integers(-(2**63), 2**63 - 1, 60_000).view(np.float64)  # of every size: random bits
+    numbers = np.concatenate([numbers[np.isfinite(numbers)][:49_990], SPECIAL]).reshape(10_000, 5)
+    signals = [
+        (topics[0], numbers[:, :2], ["a", 'ü"{},'], ["1", "1"], None, None),
+        (topics[1], numbers[:, 2:], ["x", "y", "z"], ["1"] * 3, None, None),
+    ]
+    clock = np.cumsum(rng.random(10_000))
+    for name, listener in (("together", None), ("alone", lambda channel, time, data: None)):
+        with RunLog(tmp_path / f"{name}.mcap", "train", **FIXED, listener=listener) as log:
+            log.say("before")
+            log.recording_blocks(signals, clock)
+            log.say("after")
+    assert (tmp_path / "together.mcap").read_bytes() == (tmp_path / "alone.mcap").read_bytes()
+    found = [list(message.payload.values())[1:] for message in read_run(tmp_path / "together.mcap").messages(topics)]
+    assert np.array_equal(np.concatenate(found).view(np.int64), numbers.ravel().view(np.int64))
+
+
+def test_the_commit_and_whether_the_code_was_changed_since(tmp_path: Path) -> None:
+    def git(*arguments: str) -> str:
+        who = ("-c", "user.name=A", "-c", "user.email=a@b")
+        done = subprocess.run(["git", "-C", tmp_path, *who, *arguments], capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    git("init")
+    (tmp_path / "code.py").write_text("x = 1\n")
+    git("add", "code.py")
+    git("commit", "-m", "first")
+    (tmp_path / "new.py").write_text("nobody knows it yet\n")
+    assert git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "changed": "no"}
+    (tmp_path / "code.py").write_text("x = 22\n")
+    assert git_state(tmp_path)["changed"] == "yes"
