@@ -7,18 +7,30 @@ from pathlib import Path
 
 import torch
 
+from fdi_torch.cli.options import seconds
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.estimation import full_name
 from fdi_torch.config.plant import load_plant
+from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.config.recordings import RecordingConfig, read_recording
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
 from fdi_torch.monitor.prepare import usual_faults
 from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.recording import Recording
+
+EXAMPLES = """
+examples:
+  fdi diagnosability --plant three_tank --input '50 cm^3/s,50 cm^3/s'             two constant flows for 1000 s
+  fdi diagnosability --plant rig.yaml --input run.csv --noise '2 mm'              the inputs of a recording
+  fdi diagnosability --plant rig.yaml --input '20 m^3/h,50 %' --duration '1 day' --faults A.leak,link.plugging
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EXAMPLES
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
     parser.add_argument("--faults", metavar="NAME,NAME", help="such as T1.leak.size; by default the usual ones")
     parser.add_argument(
@@ -27,10 +39,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         help="a recording whose inputs are used, or constant inputs such as '50 cm^3/s,50 cm^3/s'",
     )
-    parser.add_argument("--duration", metavar="SECONDS", type=float, default=1000.0, help="of constant inputs")
-    parser.add_argument("--noise", metavar="AMOUNT", default="1 mm", help="standard deviation of every reading")
-    parser.add_argument("--false-alarm", metavar="RATE", type=float, default=0.001)
-    parser.add_argument("--miss", metavar="RATE", type=float, default=0.05)
+    parser.add_argument(
+        "--duration",
+        metavar="TIME",
+        type=seconds,
+        help="of constant inputs, such as '2 h' (1000 s on a bench, longer on slower plants)",
+    )
+    parser.add_argument(
+        "--noise",
+        metavar="AMOUNT",
+        default="1 mm",
+        help="standard deviation of every reading: of the level ('1 mm', the default), or 'h1 = 1 mm, p2 = 2 mV'",
+    )
+    parser.add_argument(
+        "--false-alarm", metavar="SHARE", type=float, default=0.001, help="of tests without a fault (0.001)"
+    )
+    parser.add_argument("--miss", metavar="SHARE", type=float, default=0.05, help="of tests with the fault (0.05)")
     parser.add_argument("--calibrate", metavar="NAME,NAME", default="", help="constants uncertain by their tolerance")
 
 
@@ -38,13 +62,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant = load_plant(arguments.plant)
     named = [full_name(name.strip(), plant) for name in (arguments.faults or "").split(",") if name.strip()]
     faults = named or usual_faults(plant)
-    noise = [parse_quantity(arguments.noise, sensor.unit) for sensor in plant.sensors]
     recording, constant = _inputs(arguments, plant)
     found = diagnosability(
         plant,
         faults,
         recording,
-        torch.tensor(noise, dtype=torch.float64),
+        torch.tensor(reading_noise(arguments.noise, plant), dtype=torch.float64),
         calibrate=[name for name in arguments.calibrate.split(",") if name],
         start="equilibrium" if constant else "free",
         false_alarm=arguments.false_alarm,
@@ -64,7 +87,9 @@ def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Rec
         wanted = ", ".join(f"{name} in {unit}" for name, unit in units.items())
         raise ValueError(f"--input: expected a file or {len(units)} amounts ({wanted}), got '{arguments.input}'")
     values = [parse_quantity(text.strip(), unit) for text, unit in zip(amounts, units.values(), strict=True)]
-    time = torch.arange(0.0, arguments.duration + 0.5, dtype=torch.float64)
+    pace = time_scale(plant)
+    duration = 1000.0 * pace if arguments.duration is None else arguments.duration
+    time = torch.arange(0.0, duration + 0.5 * pace, pace, dtype=torch.float64)
     inputs = torch.tensor(values, dtype=torch.float64).expand(len(time), len(values))
     columns = tuple(sensor.column for sensor in plant.sensors)
     readings = time.new_zeros(len(time), len(columns))

@@ -6,7 +6,7 @@ import argparse
 
 import orjson
 
-from fdi_torch.cli.options import add_config, add_live, live
+from fdi_torch.cli.options import add_config, add_live, live, seconds
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.monitor import load_monitor
 from fdi_torch.jobs.monitor import Listening, watch
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--follow", action="store_true", help="the file is still being written: events as its samples come"
     )
     parser.add_argument(
-        "--idle", metavar="S", type=float, default=60.0, help="--follow: end after so many seconds without a sample"
+        "--idle", metavar="TIME", type=seconds, default=60.0, help="--follow: end after so long without a sample (60 s)"
     )
     add_live(parser)
 

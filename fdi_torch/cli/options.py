@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 from fdi_torch.cli.screen import Screen
 from fdi_torch.logbook import Listener, serve
+from fdi_torch.parameters import parse_quantity
 
 LIVE = "127.0.0.1:8765"
 
@@ -21,6 +22,18 @@ def add_config(parser: argparse.ArgumentParser, required: bool = False) -> None:
         default=[],
         help="change one value of it, as in --set estimate.search.population=40; may be repeated",
     )
+
+
+def seconds(text: str) -> float:
+    """A time on the command line: '90 s', '1.5 h', or a bare number of seconds."""
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return parse_quantity(text, "s")
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a time such as 90 or '1.5 h', got '{text}'") from None
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:

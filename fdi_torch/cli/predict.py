@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from fdi_torch.cli import DONE
+from fdi_torch.cli.options import seconds
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant import load_plant
 from fdi_torch.config.recordings import RecordingConfig, load_recordings, named_recordings
@@ -44,8 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--start-samples", metavar="N", type=int, default=START_SAMPLES, help=f"for the start levels ({START_SAMPLES})"
     )
-    parser.add_argument("--from", metavar="S", dest="start", type=float, help="first time used of each file, s")
-    parser.add_argument("--to", metavar="S", dest="stop", type=float, help="last time used of each file, s")
+    parser.add_argument("--from", metavar="TIME", dest="start", type=seconds, help="first time used of each file")
+    parser.add_argument("--to", metavar="TIME", dest="stop", type=seconds, help="last time used: 300, or '2 h'")
     parser.add_argument("--picture", metavar="FILE", help="draw the run (PNG or SVG); of several, the last")
     parser.add_argument("--beside", metavar="PLANT", help="another plant, drawn beside it, such as the one before")
     parser.add_argument(
@@ -64,7 +65,13 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     screen.say(f"free run of {plant.name}, start levels from the first {arguments.start_samples} samples")
     screen.table(
         "root mean square error",
-        ("recording", "from, s", "to, s", *(f"{s.name}, {display_unit(s.unit)[0]}" for s in plant.sensors), "start at"),
+        (
+            "recording",
+            "from, s",
+            "to, s",
+            *(f"{s.name}, {display_unit(s.unit)[0] or 'share'}" for s in plant.sensors),
+            "start at",
+        ),
         [_row(plant, recording, prediction) for recording, prediction in found],
     )
     if arguments.picture:

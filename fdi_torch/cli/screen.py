@@ -14,8 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 SECONDS_BETWEEN_LINES = 2.0
-PLAIN_WIDTH = 160
-"""Characters in a line where nobody has set a width, as in a pipe."""
+ENDLESS = 1 << 16  # characters in a line of a pipe or a file
 
 
 class Advance(Protocol):
@@ -30,7 +29,7 @@ class Screen:
     def __init__(self, json: bool = False, quiet: bool = False) -> None:
         self.json = json
         self.quiet = quiet
-        self._out = Console(width=None if sys.stdout.isatty() else PLAIN_WIDTH, highlight=False, soft_wrap=True)
+        self._out = Console(width=None if sys.stdout.isatty() else ENDLESS, highlight=False, soft_wrap=True)
         self._err = Console(stderr=True, highlight=False, soft_wrap=True)
 
     def say(self, text: str = "") -> None:
@@ -39,12 +38,18 @@ class Screen:
             self._out.print(text, markup=False)
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> None:
-        """Rows of words and numbers, the first `left` columns flush left; not beside JSON."""
+        """Rows of words and numbers, the first `left` columns flush left; not beside JSON.
+
+        Where a terminal is too narrow words are folded and numbers stay whole; elsewhere lines are as long as they are.
+        """
         if self.json:
             return
-        table = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
+        if title:
+            self.say(title)
+        table = Table(box=None, pad_edge=False, header_style="bold")
         for i, name in enumerate(header):
-            table.add_column(name, justify="left" if i < left else "right", no_wrap=True)
+            is_word = i < left
+            table.add_column(name, justify="left" if is_word else "right", overflow="fold", no_wrap=not is_word)
         for row in rows:
             table.add_row(*row)
         self._out.print(table, soft_wrap=False)

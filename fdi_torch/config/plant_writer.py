@@ -9,6 +9,21 @@ from fdi_torch.config.plant import SENSOR_UNITS, absolute_units, effect_paramete
 from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 
+_UNITS = {
+    "m": ("cm", "mm", "m", "ft", "in"),
+    "m^2": ("cm^2", "mm^2", "m^2", "ft^2", "in^2"),
+    "m^3/s": ("cm^3/s", "l/min", "m^3/h", "gallon/min"),
+    "m^3/s/V": ("cm^3/s/V", "l/min/V", "m^3/h/V"),
+    "m^3/s/A": ("cm^3/s/mA", "l/min/mA", "m^3/h/mA"),
+    "m/s^2": ("cm/s^2",),
+    "Pa": ("mbar", "kPa"),
+    "Pa/m": ("mbar/cm", "kPa/m"),
+    "A": ("mA",),
+    "A/m": ("mA/m", "mA/cm"),
+    "1/m": ("1/m", "%/m", "%/cm"),
+}
+"""SI unit -> units in which numbers are often round, the usual one first."""
+
 
 def dump_plant(plant: PlantDescription) -> str:
     """A plant file that reads back as the same description."""
@@ -17,26 +32,24 @@ def dump_plant(plant: PlantDescription) -> str:
 
 def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
     """The description as the mapping that `build_plant` reads."""
-    data: dict[str, Any] = {"name": plant.name, "gravity": _text(plant.gravity, "m/s^2", "cm/s^2")}
+    data: dict[str, Any] = {"name": plant.name, "gravity": _text(plant.gravity, "m/s^2")}
     data["tanks"] = {t.name: _tank_mapping(t) for t in plant.tanks}
     data["pipes"] = {p.name: _pipe_mapping(p) for p in plant.pipes}
     data["pumps"] = {p.name: _pump_mapping(p) for p in plant.pumps}
     data["sensors"] = {s.name: _sensor_mapping(s) for s in plant.sensors}
     units = absolute_units(plant)
-    data["tolerances"] = {
-        name: _text(v, units.get(name, "1"), units.get(name, "1")) for name, v in plant.tolerances.items()
-    }
+    data["tolerances"] = {name: _text(v, units.get(name, "1")) for name, v in plant.tolerances.items()}
     data["varying"] = list(plant.varying)
     data["effects"] = [_effect_mapping(placed, plant) for placed in plant.effects]
     return {key: value for key, value in data.items() if value}
 
 
 def _tank_mapping(tank: Tank) -> dict[str, Any]:
-    start = None if tank.start_level is None else _text(tank.start_level, "m", "cm")
+    start = None if tank.start_level is None else _text(tank.start_level, "m")
     outside = None if tank.overflow_to == OUTSIDE else tank.overflow_to
     return _given(
-        area=_text(tank.area, "m^2", "cm^2"),
-        height=_text(tank.height, "m", "cm"),
+        area=_text(tank.area, "m^2"),
+        height=_text(tank.height, "m"),
         start_level=start,
         overflow_to=outside,
         leak_reference=tank.leak_reference,
@@ -47,9 +60,9 @@ def _pipe_mapping(pipe: Pipe) -> dict[str, Any]:
     return _given(
         source=pipe.source,
         target=pipe.target,
-        area=_text(pipe.area, "m^2", "cm^2"),
+        area=_text(pipe.area, "m^2"),
         discharge_coefficient=pipe.discharge_coefficient,
-        elevation=_text(pipe.elevation, "m", "cm") if pipe.elevation else None,
+        elevation=_text(pipe.elevation, "m") if pipe.elevation else None,
         free_fall=pipe.free_fall or None,
         valve=pipe.valve,
         unrecorded=pipe.unrecorded,
@@ -57,26 +70,24 @@ def _pipe_mapping(pipe: Pipe) -> dict[str, Any]:
 
 
 def _pump_mapping(pump: Pump) -> dict[str, Any]:
-    shown = {"m^3/s/V": "cm^3/s/V", "m^3/s": "cm^3/s"}.get(pump.gain_unit, pump.gain_unit)
     plain = pump.gain_unit == "1" and pump.gain == 1.0
     return _given(
         target=pump.target,
-        max_flow=_text(pump.max_flow, "m^3/s", "cm^3/s"),
-        gain=None if plain else _text(pump.gain, pump.gain_unit, shown),
+        max_flow=_text(pump.max_flow, "m^3/s"),
+        gain=None if plain else _text(pump.gain, pump.gain_unit),
         command=pump.command,
     )
 
 
 def _sensor_mapping(sensor: Sensor) -> dict[str, Any]:
     gain_unit = next(gain for gain, unit in SENSOR_UNITS.items() if unit == sensor.unit)
-    shown = {"m": "cm"}.get(sensor.unit, sensor.unit)
 
     def reading(value: float | None) -> str | float | None:
-        return None if value is None else _text(value, sensor.unit, shown)
+        return None if value is None else _text(value, sensor.unit)
 
     return _given(
         tank=sensor.tank,
-        gain=None if sensor.gain == 1.0 and sensor.unit == "m" else _text(sensor.gain, gain_unit, gain_unit),
+        gain=None if sensor.gain == 1.0 and sensor.unit == "m" else _text(sensor.gain, gain_unit),
         offset=reading(sensor.offset) if sensor.offset else None,
         channel=sensor.channel,
         low=reading(sensor.low),
@@ -86,7 +97,7 @@ def _sensor_mapping(sensor: Sensor) -> dict[str, Any]:
 
 def _effect_mapping(placed: PlacedEffect, plant: PlantDescription) -> dict[str, Any]:
     known = effect_parameters(placed.effect, placed.location, plant)
-    values = {name: _text(value, known[name].unit, known[name].unit) for name, value in placed.parameters.items()}
+    values = {name: _text(value, known[name].unit) for name, value in placed.parameters.items()}
     return {"effect": placed.effect, "location": placed.location, "parameters": values}
 
 
@@ -94,9 +105,12 @@ def _given(**fields: Any) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if value is not None}
 
 
-def _text(value: float, unit: str, shown: str) -> str | float:
-    """'160 cm^2' where that reads back as the same number, else the number in SI to the last bit."""
+def _text(value: float, unit: str) -> str | float:
+    """'160 cm^2' in the first unit in which that is short and reads back the same, else SI to the last bit."""
     if unit == "1":
         return value
-    short = f"{value / parse_quantity(f'1 {shown}', unit):.9g} {shown}"
-    return short if parse_quantity(short, unit) == value else f"{value!r} {unit}"
+    for shown in (*_UNITS.get(unit, ()), unit):
+        short = f"{value / parse_quantity(f'1 {shown}', unit):.9g} {shown}"
+        if parse_quantity(short, unit) == value:
+            return short
+    return f"{value!r} {unit}"

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field
 from fdi_torch.config.estimation import full_name
 from fdi_torch.config.monitor import WindowConfig
 from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.config.run import OutputConfig
 from fdi_torch.config.strict import BenchSeconds, Share, Strict, quantity
 from fdi_torch.config.understood import understood, values_in
@@ -79,7 +80,7 @@ class RivalConfig(Strict):
 class RehearsalConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
     inputs: list[str] = Field(description="constant commands, one for each channel")
-    reading_noise: str = Field("1 mm", description="standard deviation of every reading")
+    reading_noise: str = Field("1 mm", description="standard deviation: 1 mm (of the level), or h1 = 1 mm, p2 = 2 mV")
     sampling: BenchSeconds = Field(1.0, gt=0, description="between readings, s")
     false_alarms_every: BenchSeconds = Field(20000.0, description="mean time between false alarms asked for, s")
     detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="what raises alarms under naming")
@@ -163,7 +164,7 @@ def _rig(
     network, inputs, noise = build_network(plant, placements_for(names)), _inputs(c, plant), noise or NoiseConfig()
     space = ParameterSpace(network.constants[name] for name in names)
     levels = equilibrium(network, inputs)
-    std = torch.tensor([parse_quantity(c.reading_noise, s.unit) for s in plant.sensors], dtype=torch.float64)
+    std = torch.tensor(reading_noise(c.reading_noise, plant), dtype=torch.float64)
     controller = None
     if loop == "open":
         controller = moving_commands(inputs, c.naming.share if c.naming else 0.0)

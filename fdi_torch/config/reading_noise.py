@@ -1,0 +1,42 @@
+"""How noisy readings are said to be, in one short text for all sensors or for each."""
+
+from __future__ import annotations
+
+from fdi_torch.names import unknown
+from fdi_torch.parameters import parse_quantity
+from fdi_torch.plant.description import PlantDescription, Sensor
+
+
+def reading_noise(text: str, plant: PlantDescription) -> list[float]:
+    """Standard deviation of each sensor's readings in its SI unit.
+
+    '1 mm' is of the level, whatever the sensor reads; '0.01 mA' is for plants whose sensors all read milliamperes;
+    'p1 = 2 mV, h2 = 1 mm' names each sensor. Raises ValueError.
+    """
+    if "=" not in text:
+        return [_std(text, sensor) for sensor in plant.sensors]
+    given = {name.strip(): amount.strip() for name, _, amount in (part.partition("=") for part in text.split(","))}
+    names = [sensor.name for sensor in plant.sensors]
+    for name in given:
+        if name not in names:
+            raise ValueError(f"noise: {unknown('a sensor', name, names)}")
+    missing = [name for name in names if name not in given]
+    if missing:
+        raise ValueError(f"noise: expected one for each of {', '.join(names)}, got none for {', '.join(missing)}")
+    return [_std(given[sensor.name], sensor) for sensor in plant.sensors]
+
+
+def _std(text: str, sensor: Sensor) -> float:
+    try:
+        std = parse_quantity(text, sensor.unit)
+    except ValueError:
+        try:
+            std = parse_quantity(text, "m") * abs(sensor.gain)
+        except ValueError:
+            raise ValueError(
+                f"noise of {sensor.name}: expected an amount in {sensor.unit} or of the level, such as '1 mm', "
+                f"got '{text}'"
+            ) from None
+    if not std > 0:
+        raise ValueError(f"noise of {sensor.name}: expected a positive standard deviation, got '{text}'")
+    return std
