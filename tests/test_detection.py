@@ -46,6 +46,21 @@ def test_false_alarms_come_as_often_as_asked_for(chart: str) -> None:
     assert abs(count - expected) < 3.0 * math.sqrt(expected) + 0.04 * expected
 
 
+@pytest.mark.parametrize("chart", CHARTS)
+def test_the_first_alarm_from_a_moment_on_is_one_of_all_alarms(chart: str) -> None:
+    detector = make_detector(chart, 200.0, 1.0, 3, torch.Generator().manual_seed(1))  # type: ignore[arg-type]
+    white = noise(40, 1000, 3, seed=5)
+    white[:, 600:] += 0.5
+    white[3, 700] = torch.nan
+    since = torch.arange(40) * 15
+    first, early = detector.first_from(white, since)
+    for run, raised in enumerate(detector.alarms(white)):
+        moments = raised.nonzero().flatten().tolist()
+        assert early[run] == sum(m < since[run] for m in moments)
+        assert first[run] == next(m for m in moments if m >= since[run])
+    assert detector.first_from(torch.zeros(1, 50, 3), torch.tensor([0]))[0].tolist() == [NEVER]
+
+
 def test_simulated_threshold_agrees_with_the_exact_one() -> None:
     found = threshold_of(highest(largest, 3, torch.Generator().manual_seed(0)), 5000.0)
     assert found == pytest.approx(fixed_threshold(5000.0, 3), abs=0.03)

@@ -6,12 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
+from scipy import stats
 
 from fdi_torch.cli import MISUSE, main
 from fdi_torch.config.rehearsal import load_rehearsal
 from fdi_torch.jobs.rehearsal import rehearse
 from fdi_torch.logbook import read_run
-from fdi_torch.monitor.rehearsal.false_alarms import mean_time
+from fdi_torch.monitor.rehearsal.false_alarms import mean_time, student
 
 RIVALS = """
 inputs: [50 cm^3/s, 50 cm^3/s]
@@ -60,6 +61,7 @@ def test_misuse_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_times_between_false_alarms_come_with_the_spread_of_calibrations() -> None:
+    assert student(7) == pytest.approx(float(stats.t.ppf(0.975, 7)), rel=1e-3)
     mean, low, high = mean_time([90] * 8, 20000.0, 90.0)
     assert mean == 20000.0 and low == pytest.approx(20000.0 / (1.0 + 1.96 / 720**0.5)) and high > mean
     assert mean_time([60, 120] * 4, 20000.0, 90.0)[1] < low

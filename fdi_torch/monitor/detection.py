@@ -41,6 +41,22 @@ class Detector:
         first = above.to(torch.int8).argmax(dim=-1)
         return torch.where(above.any(dim=-1), first, torch.full_like(first, NEVER))
 
+    def first_from(self, white: Tensor, since: Tensor) -> tuple[Tensor, Tensor]:
+        """Index of the first alarm at or after sample `since` (*batch), NEVER where there is none, and how many came
+        before it, after each of which the detector starts afresh; both (*batch).
+        """
+        rest = torch.nan_to_num(white, nan=0.0)
+        index = torch.arange(rest.shape[-2], device=rest.device)
+        early = torch.zeros_like(since)
+        while True:
+            first = self.first_alarm(rest)
+            before = (first != NEVER) & (first < since)
+            if not bool(before.any()):
+                return first, early
+            early = early + before
+            seen = before.unsqueeze(-1) & (index <= first.unsqueeze(-1))
+            rest = torch.where(seen.unsqueeze(-1), 0.0, rest)
+
     def alarms(self, white: Tensor) -> Tensor:
         """(*batch, S), True where an alarm is raised. After each the detector starts afresh with the next sample."""
         rest = torch.nan_to_num(white, nan=0.0)

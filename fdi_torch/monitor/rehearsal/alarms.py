@@ -91,10 +91,8 @@ def delays(rig: Rig, noise: Noise, charts: Sequence[Detector], samples: Samples,
     white = white_residuals(rig, noise, samples)
     found = []
     for detector in charts:
-        raised = detector.alarms(white)
-        late = samples.time >= course.onset.unsqueeze(1)
-        after = raised & late
-        first = torch.where(after.any(1), after.to(torch.int8).argmax(1), NEVER)
+        since = (samples.time < course.onset.unsqueeze(1)).sum(1)
+        first, early = detector.first_from(white, since)
         when = torch.where(first == NEVER, torch.inf, samples.time[first.clamp(min=0)])
-        found.append(Delays(detector.chart, when - course.onset, (raised & ~late).any(1)))
+        found.append(Delays(detector.chart, when - course.onset, early > 0))
     return found

@@ -14,6 +14,7 @@ from fdi_torch.monitor.rehearsal.pieces import Numbers, Piece, Shown, seeded
 from fdi_torch.monitor.rehearsal.runs import Rig, fault_free
 from fdi_torch.monitor.samples import Samples
 
+NORMAL = 1.959964  # of a 95 % interval
 PART = 250  # runs side by side
 NAME = "false alarms"
 
@@ -72,12 +73,21 @@ class FalseAlarmPlan:
         return Shown(f"false alarms, {self.every:g} s between them asked for", header, tuple(rows))
 
 
+def student(freedom: int) -> float:
+    """The factor of a 95 % interval whose spread is known from `freedom` + 1 values (Abramowitz & Stegun 26.7.5)."""
+    z, n = NORMAL, float(freedom)
+    first, second = (z**3 + z) / 4.0, (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0
+    third = (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0
+    return z + first / n + second / n**2 + third / n**3
+
+
 def mean_time(counts: Sequence[int], every: float, expected: float) -> tuple[float, float, float]:
     """Mean time between false alarms over calibrations, s, and its 95 % interval; counts vary by chance and by
     calibration, both of which their spread holds (that of Poisson counts at least).
     """
-    mean = statistics.fmean(counts)
-    variance = max(statistics.variance(counts), mean) if len(counts) > 1 else mean
-    error = 1.96 * (variance / len(counts)) ** 0.5
+    mean, error = statistics.fmean(counts), NORMAL * statistics.fmean(counts) ** 0.5
+    if len(counts) > 1:
+        error = max(error, student(len(counts) - 1) * statistics.stdev(counts))
+    error /= len(counts) ** 0.5
     mean = max(mean, 0.5)
     return every * expected / mean, every * expected / (mean + error), every * expected / max(mean - error, 0.5)
