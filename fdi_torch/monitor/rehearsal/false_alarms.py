@@ -14,7 +14,7 @@ from fdi_torch.monitor.rehearsal.pieces import Numbers, Piece, Shown, seeded
 from fdi_torch.monitor.rehearsal.runs import Rig, fault_free
 from fdi_torch.monitor.samples import Samples
 
-NORMAL = 1.959964  # of a 95 % interval
+NORMAL = 1.96  # of a 95 % interval
 PART = 250  # runs side by side
 NAME = "false alarms"
 
