@@ -35,7 +35,8 @@ VALUE_LANES, TANGENT_LANES = 32, 16
 class _Job(ctypes.Structure):
     """`struct Job` of kernel.hpp."""
 
-    _fields_ = [(n, ctypes.c_int64) for n in _INTEGERS] + [(n, ctypes.c_void_p) for n in _ARRAYS]
+    _fields_ = [(n, ctypes.c_int64) for n in _INTEGERS]
+    _fields_ += [("tolerance", ctypes.c_double)] + [(n, ctypes.c_void_p) for n in _ARRAYS]
 
 
 class CompiledEngine:
@@ -50,7 +51,8 @@ class CompiledEngine:
     def __init__(self, network: TankNetwork, space: ParameterSpace, experiment: Experiment, why: str = "") -> None:
         self.network, self.space, self.experiment, self.why = network, space, experiment, why
         shares = experiment.sample_share
-        self._inner = bool(((shares > 0) & (shares < 1)).any())
+        inner = bool(((shares > 0) & (shares < 1)).any())
+        self._form = experiment.tolerance is not None, inner
         self._tables: dict[torch.dtype, dict[str, Tensor]] = {}
 
     def levels(self, theta: Tensor) -> Tensor:
@@ -89,11 +91,11 @@ class CompiledEngine:
 
     def prepare(self, tangent: bool = False, dtype: torch.dtype = torch.float64) -> None:
         """Compiles ahead of the first use."""
-        _kernel(self.network, self.space.names, tangent, self._inner, _REALS[dtype])
+        _kernel(self.network, self.space.names, tangent, *self._form, _REALS[dtype])
 
     def is_built(self, tangent: bool = False, dtype: torch.dtype = torch.float64) -> bool:
         """Whether the kernel lies in the cache already."""
-        return is_cached(_source(self.network, self.space.names, tangent, self._inner, _REALS[dtype]))
+        return is_cached(_source(self.network, self.space.names, tangent, *self._form, _REALS[dtype]))
 
     @property
     def _sensors(self) -> int:
@@ -113,7 +115,7 @@ class CompiledEngine:
     ) -> None:
         lanes = self._lanes(theta)
         tangent = mode in ("linearise", "gram")
-        run, lifted = _kernel(self.network, self.space.names, tangent, self._inner, _REALS[theta.dtype])
+        run, lifted = _kernel(self.network, self.space.names, tangent, *self._form, _REALS[theta.dtype])
         arrays = self._experiment(theta)
         arrays |= {"theta": lanes, "out": out, "jacobian": jacobian, "lifted": lifted.to(theta)}
         per_problem = max(len(lanes), 1)
@@ -139,7 +141,7 @@ class CompiledEngine:
             "jacobian_bytes": 0 if jacobian is None else jacobian.nbytes,
         }
         pointers = {name: None if a is None else a.data_ptr() for name, a in arrays.items()}
-        run(ctypes.byref(_Job(**sizes, **pointers)))
+        run(ctypes.byref(_Job(**sizes, tolerance=self.experiment.tolerance or 0.0, **pointers)))
 
     def _lanes(self, theta: Tensor) -> Tensor:
         if theta.dtype not in _REALS or theta.device.type != "cpu":
@@ -191,15 +193,17 @@ class CompiledEngine:
 
 
 @lru_cache(maxsize=128)
-def _source(network: TankNetwork, names: tuple[str, ...], tangent: bool, inner: bool, real: str) -> str:
+def _source(network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool, inner: bool, real: str) -> str:
     lanes = TANGENT_LANES if tangent else VALUE_LANES
-    return emit(build_program(network, names, tangent), inner, real, lanes)
+    return emit(build_program(network, names, tangent, within), inner, real, lanes)
 
 
 @lru_cache(maxsize=128)
-def _kernel(network: TankNetwork, names: tuple[str, ...], tangent: bool, inner: bool, real: str) -> tuple[Any, Tensor]:
+def _kernel(
+    network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool, inner: bool, real: str
+) -> tuple[Any, Tensor]:
     """The compiled function, and the numbers of the equations that it is handed."""
-    run = load_library(_source(network, names, tangent, inner, real)).run
+    run = load_library(_source(network, names, tangent, within, inner, real)).run
     run.restype, run.argtypes = None, [ctypes.c_void_p]
-    lifted = build_program(network, names, tangent).graph.lifted
+    lifted = build_program(network, names, tangent, within).graph.lifted
     return run, torch.tensor(lifted or [0.0], dtype=torch.float64)

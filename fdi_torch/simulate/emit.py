@@ -38,6 +38,7 @@ def emit(program: Program, inner_samples: bool, real: str, lanes: int) -> str:
     defines = {
         "LANES": lanes,
         "TANGENT": int(program.tangent),
+        "WITHIN": int(program.within),
         "INNER_SAMPLES": int(inner_samples),
         "COLUMNS": columns,
         "WIDTH": columns + 3,
@@ -93,9 +94,11 @@ class _Writer:
 
     def sections(self) -> str:
         p = self.program
+        first = p.stages[0] if p.within else p.act + p.stages[0]
         texts = [
             self._section("settle_commands", [p.settle_commands]),
-            self._section("step", [p.act + p.stages[0], *p.stages[1:-1], p.stages[-1] + p.advance]),
+            *([self._section("act", [p.act])] if p.within else []),
+            self._section("step", [first, *p.stages[1:-1], p.stages[-1] + p.advance]),
             self._section("settle_readings", [p.settle_readings]),
             self._section("read", [p.read]),
         ]

@@ -12,6 +12,7 @@ from fdi_torch.plant.signals import CumulativeSignal
 from fdi_torch.recording import Hold, Recording
 
 BLOCK = 1 << 17
+_SHORTEST = 2000.0  # s for 1 m
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,10 @@ class Experiment:
     nodes (K+1,) s: the ends of the integration steps, which hit every switch of a held input they can.
     inputs (K, channels): each channel's exact mean over each step. signal: the same for any delayed interval.
     sample_times (S,) s; sample k lies at share `sample_share` (0..1] of step `sample_step` (the first at 0 of step 0).
-    resolution: the longest step, s.
+    resolution: the time below which roots and rims are drawn smooth, s; the longest step, or with
+    a tolerance the shortest of a lane's own.
+    tolerance: None, or m: each lane divides the steps by itself. At 1e-6 m and less, over random faults of three
+    tanks, the largest error of a level was 1.5 to 2 times this.
     """
 
     nodes: Tensor
@@ -31,6 +35,7 @@ class Experiment:
     sample_step: Tensor
     sample_share: Tensor
     resolution: Tensor
+    tolerance: float | None = None
 
     @property
     def steps(self) -> Tensor:
@@ -59,18 +64,20 @@ class Experiment:
         return torch.diff(times, prepend=times[:1] - first)
 
 
-def lay_out(recording: Recording, channels: tuple[str, ...], step: float) -> Experiment:
-    """The experiment that a recording was, in steps no longer than `step` (s).
+def lay_out(recording: Recording, channels: tuple[str, ...], step: float, tolerance: float | None = None) -> Experiment:
+    """The experiment that a recording was, in steps no longer than `step` (s), which lanes divide for a tolerance (m).
 
     channels: the plant's input channels, by name. Raises ValueError where the recording lacks one or does not know it.
     """
     if not step > 0:
         raise ValueError(f"expected a positive integration step, got {step} s")
+    if tolerance is not None and not tolerance > 0:
+        raise ValueError(f"expected a positive tolerance, got {tolerance} m")
     if len(recording) < 2:
         raise ValueError(f"{recording.source}: expected at least two samples, got {len(recording)}")
     inputs = _select(recording, channels)
     time = recording.time - recording.time[0]
-    nodes = grid_nodes(time, inputs, recording.hold, step)
+    nodes = grid_nodes(time, inputs, recording.hold, step, every=tolerance is not None)
     signal = CumulativeSignal(time, inputs, recording.hold)
     starts, steps = nodes[:-1], torch.diff(nodes)
     means = torch.empty(len(starts), len(channels), dtype=time.dtype, device=time.device)
@@ -86,14 +93,24 @@ def lay_out(recording: Recording, channels: tuple[str, ...], step: float) -> Exp
         sample_times=time,
         sample_step=index,
         sample_share=share,
-        resolution=steps.max(),
+        resolution=steps.max() if tolerance is None else steps.new_tensor(shortest_step(tolerance)),
+        tolerance=tolerance,
     )
 
 
-def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float) -> Tensor:
+def shortest_step(tolerance: float) -> float:
+    """The shortest step (s) that a lane may take for a tolerance (m).
+
+    A step over a root's kink is wrong by step^1.5, and so is a root drawn smooth for that step. The factor is that of
+    the largest error of fixed steps over random faults of three tanks.
+    """
+    return _SHORTEST * tolerance ** (2.0 / 3.0)
+
+
+def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float, every: bool = False) -> Tensor:
     """Step ends from the first to the last sample: at switches, and at samples where these are not denser than `step`.
 
-    Switches that come faster than half a step are averaged over instead.
+    every: at every sample. Switches that come faster than half a step are averaged over instead.
     """
     wanted = torch.ones_like(time, dtype=torch.bool)
     if hold == "zero_order":
@@ -101,7 +118,7 @@ def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float) -> Tensor:
         wanted[1:] = changed
         if int(changed.sum()) * step > 2.0 * float(time[-1]):
             wanted[1:] = False
-    dense = float(time[-1]) / (len(time) - 1) < 0.999 * step
+    dense = not every and float(time[-1]) / (len(time) - 1) < 0.999 * step
     anchors = time[wanted] if dense and hold == "zero_order" else time
     if dense and hold == "linear":
         anchors = time[:1]

@@ -43,6 +43,8 @@ class ReferenceEngine:
         why: str = "",
         every_node: bool = True,
     ) -> None:
+        if experiment.tolerance is not None:
+            raise ValueError("expected the same steps for all lanes in the reference engine, got a tolerance")
         self.network, self.space, self.experiment, self.why = network, space, experiment, why
         self.method, self.rtol, self.atol, self.every_node = method, rtol, atol, every_node
 

@@ -20,6 +20,7 @@ enum { MEMORY = COMMAND_MEMORY + READING_MEMORY, STATE = TANKS + MEMORY };
 struct Job {
     int64_t lanes, lanes_per_problem, steps, samples, signal_samples, mode, threads, gain_stride;
     int64_t out_bytes, jacobian_bytes;
+    double tolerance;                                        // of a lane's own step, m
     const real *theta, *nominal, *lifted, *resolution;
     const real *starts, *spans, *means;                      // (K), (K), (K, CHANNELS)
     const int64_t *first_sample;                             // (K + 1): step k holds samples first[k] .. first[k + 1]
@@ -42,6 +43,10 @@ struct Block {
     Lane seen[SENSORS], reading[SENSORS], reading_memory[SOME(READING_MEMORY)];
     Lane value, weight, centre;
     Lane squares[SENSORS][3];
+#if WITHIN
+    Lane part[2], pace, gone;                                // each lane's own step: its clock, its length, how far it is
+    Lane error[TANKS], stiffness[1];
+#endif
 #if TANGENT
     Lane row[SOME(ROWS)][COLUMNS];                           // what theta alone does to each output
     Lane d_level[COLUMNS][TANKS], d_before[COLUMNS][TANKS], d_sample[COLUMNS][TANKS];
@@ -131,6 +136,13 @@ static void copy_levels(Block &b, bool from_before) {
     std::memcpy(b.sample, from_before ? b.before : b.level, sizeof b.sample);
 #if TANGENT
     std::memcpy(b.d_sample, from_before ? b.d_before : b.d_level, sizeof b.d_sample);
+#endif
+}
+
+static inline void remember_levels(Block &b) {
+    std::memcpy(b.before, b.level, sizeof b.level);
+#if TANGENT
+    std::memcpy(b.d_before, b.d_level, sizeof b.d_level);
 #endif
 }
 
@@ -304,6 +316,9 @@ static void load(const Job &job, Block &b, const Rows &rows) {
     std::memset(b.end, 0, sizeof b.end);
     std::memset(b.past, 0, sizeof b.past);
     std::memset(b.squares, 0, sizeof b.squares);
+#if WITHIN
+    EACH_LANE b.pace[l] = INFINITY;
+#endif
 #if TANGENT
     std::memset(b.d_level, 0, sizeof b.d_level);
     std::memset(b.d_command_memory, 0, sizeof b.d_command_memory);
@@ -337,6 +352,59 @@ static bool has_inner_sample(const Job &job, int64_t k) {
     return false;
 }
 
+#if WITHIN
+// As `own_step` in own_steps.py. Returns whether any lane is on its way.
+static bool set_out(Block &b, real start, real span) {
+    int open = 0;
+    EACH_LANE {
+        const real rest = span - b.gone[l], pace = b.pace[l];
+        const real own = rest <= pace ? rest : rest < 2 * pace ? rest / 2 : pace;
+        b.part[0][l] = start + b.gone[l];
+        b.part[1][l] = rest > 0 ? own : span;
+        open += rest > 0;
+    }
+    return open;
+}
+
+static const real STABLE = 2.6, CALM = 2.2;
+
+// As `judged` in own_steps.py. Levels of no number are kept as they are.
+static void keep_or_undo(const Job &job, Block &b, real span) {
+    const real tolerance = job.tolerance, shortest = b.resolution;
+    Lane kept;
+    EACH_LANE {
+        real error = 0;
+        for (int i = 0; i < TANKS; ++i) error = std::fabs(b.error[i][l]) > error ? std::fabs(b.error[i][l]) : error;
+        const real own = b.part[1][l], pace = b.pace[l], stiffness = b.stiffness[0][l];
+        const real ratio = tolerance / (error + tolerance * real(1e-6)), cut = std::sqrt(ratio);
+        const real longer = real(0.9) * std::sqrt(cut), shorter = cut < real(0.05) ? real(0.05) : real(0.9) * cut;
+        const bool is_open = b.gone[l] < span, small = ratio >= 1 && !(own * stiffness > STABLE);
+        const real reach = own * (small ? (longer < 3 ? longer : 3) : shorter), stable = CALM / stiffness;
+        const real wanted = small && own < pace && reach < pace ? pace : reach, next = stable < wanted ? stable : wanted;
+        kept[l] = is_open && (small || own <= shortest) ? 1 : 0;
+        b.pace[l] = !is_open ? pace : next < shortest ? shortest : next;
+        b.gone[l] = kept[l] == 0 ? b.gone[l] : span - b.gone[l] <= own ? span : b.gone[l] + own;
+    }
+    for (int i = 0; i < TANKS; ++i) EACH_LANE b.level[i][l] = kept[l] != 0 ? b.level[i][l] : b.before[i][l];
+#if TANGENT
+    for (int p = 0; p < COLUMNS; ++p)
+        for (int i = 0; i < TANKS; ++i)
+            EACH_LANE b.d_level[p][i][l] = kept[l] != 0 ? b.d_level[p][i][l] : b.d_before[p][i][l];
+#endif
+}
+
+// A step of the grid, each lane in as many of its own as it needs.
+static void step_within(const Job &job, Block &b, const real *clock, const real *channel) {
+    act(b, clock, channel);
+    EACH_LANE b.gone[l] = 0;
+    while (set_out(b, clock[0], clock[1])) {
+        remember_levels(b);
+        step(b, clock, channel);
+        keep_or_undo(job, b, clock[1]);
+    }
+}
+#endif
+
 static void run_block(const Job &job, Block &b, const Rows &rows) {
     load(job, b, rows);
     prepare(b, nullptr, nullptr);
@@ -357,14 +425,13 @@ static void run_block(const Job &job, Block &b, const Rows &rows) {
         }
 #if INNER_SAMPLES
         const bool inner = has_inner_sample(job, k);
-        if (inner) {
-            std::memcpy(b.before, b.level, sizeof b.level);
-#if TANGENT
-            std::memcpy(b.d_before, b.d_level, sizeof b.d_level);
+        if (inner) remember_levels(b);
 #endif
-        }
-#endif
+#if WITHIN
+        step_within(job, b, clock, channel);
+#else
         step(b, clock, channel);
+#endif
 #if INNER_SAMPLES
         if (inner) end(b, clock, channel);
 #endif

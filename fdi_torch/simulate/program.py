@@ -25,6 +25,8 @@ class Program:
     """The sections; each is a tuple of outputs.
 
     prepare: level (at t = 0), command_delay, reading_delay. settle_commands, settle_readings: the memories at first.
+    within: each lane takes steps of its own within those of the grid; `stages` and `advance` are of such a step, with
+    an `error` for each level and the `stiffness` at its start, after `act`.
     act: action, next_command_memory. stages: stage k's levels and then its rates ('slope'), four of each in turn.
     advance: level. end: slope at the end of the step. read: reading, next_reading_memory.
     late_actuators, late_sensors: index of those that can be late, in the order of the delays.
@@ -32,6 +34,7 @@ class Program:
 
     graph: Graph
     tangent: bool
+    within: bool
     columns: int
     tanks: int
     actuators: int
@@ -53,19 +56,19 @@ class Program:
 
     @cached_property
     def step(self) -> Section:
-        """All that a step computes, in order."""
-        return self.act + tuple(o for stage in self.stages for o in stage) + self.advance
+        """All that a step of the grid computes, in order; one within it, without what the actuators do."""
+        return (() if self.within else self.act) + tuple(o for stage in self.stages for o in stage) + self.advance
 
 
 @lru_cache(maxsize=64)
-def build_program(network: TankNetwork, names: tuple[str, ...], tangent: bool) -> Program:
+def build_program(network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool = False) -> Program:
     """The program of a plant whose parameters `names` are columns of theta; `tangent`: with its Jacobian."""
-    return _Builder(network, names, tangent).program()
+    return _Builder(network, names, tangent, within).program()
 
 
 class _Builder:
-    def __init__(self, network: TankNetwork, names: tuple[str, ...], tangent: bool) -> None:
-        self.network, self.tangent = network, tangent
+    def __init__(self, network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool) -> None:
+        self.network, self.tangent, self.within = network, tangent, within
         self.graph = Graph()
         self.tracer = Tracer(self.graph)
         self.theta = [self.graph.input("theta", i, Varies.LANE) for i in range(len(names))]
@@ -95,6 +98,7 @@ class _Builder:
         return Program(
             graph=self.graph,
             tangent=self.tangent,
+            within=self.within,
             columns=len(self.theta),
             tanks=len(network.description.tanks),
             actuators=len(network.actuators()),
@@ -154,17 +158,29 @@ class _Builder:
         """The stages of a step, the levels after it, and the slopes there."""
         graph, network, tensor = self.graph, self.network, self.tracer.tensor
         actions = [o.node for o in act if o.place[0] == "action"]
-        held = [graph.input("action", a, Varies.BOTH if graph.nodes[n].varies & Varies.LANE else Varies.STEP)
-                for a, n in enumerate(actions)]  # fmt: skip
+        held = [
+            graph.input("action", a, Varies.BOTH if self.within or graph.nodes[n].varies & Varies.LANE else Varies.STEP)
+            for a, n in enumerate(actions)
+        ]
+        clock = self._own_clock() if self.within else self.clock
         levels = self._inputs("level", len(network.description.tanks))
         with self.tracer:
-            rates = network.rates([tensor(h) for h in levels], [tensor(a) for a in held], self.clock, self.values)
+            rates = network.rates([tensor(h) for h in levels], [tensor(a) for a in held], clock, self.values)
         moving: dict[int, Place] = {n: ("level", i) for i, n in enumerate(levels)}
         moving |= {held[o.place[1]]: o.place for o in act if o.place[0] == "action" and o.row}
         law = self._outputs("slope_right", [self.tracer.node(r) for r in rates], moving)
+        if self.within:
+            own = Stages(graph, law, levels, self.tracer.node(clock.step), {})
+            stages, advance = own.write()
+            return (stages[0] + own.stiffness(), *stages[1:]), advance + own.errors(), ()
         stages, advance = Stages(graph, law, levels, self.span[1], dict(zip(held, actions, strict=True))).write()
         uniform = {h: a for h, a in zip(held, actions, strict=True) if not graph.nodes[a].varies & Varies.LANE}
         return stages, advance, tuple(moved(graph, law, uniform, {}))
+
+    def _own_clock(self) -> Clock:
+        """That of a lane's own step."""
+        start, step = (self.tracer.tensor(n) for n in self._inputs("part", 2))
+        return Clock(start, step, self.clock.resolution)
 
     def _readings(self) -> tuple[Section, Section]:
         network, tensor, node = self.network, self.tracer.tensor, self.tracer.node

@@ -19,6 +19,7 @@ from fdi_torch.simulate.expression import Varies
 from fdi_torch.simulate.injection import Injection, expect_injectable
 from fdi_torch.simulate.integrate import hermite
 from fdi_torch.simulate.operations import OPERATIONS
+from fdi_torch.simulate.own_steps import judged, own_step
 from fdi_torch.simulate.program import Program, build_program
 from fdi_torch.simulate.section import Place, Row, Section
 
@@ -53,7 +54,7 @@ class TracedEngine:
         return gram_of(*self.linearise(theta), data)
 
     def observe(self, theta: Tensor, data: Readings, injection: Injection) -> Tensor:
-        program = build_program(self.network, self.space.names, False)
+        program = build_program(self.network, self.space.names, False, self.experiment.tolerance is not None)
         expect_injectable(self.experiment, injection, program.command_memory + program.reading_memory)
         lanes = theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
         run = _Run(program, self.network, self.experiment, lanes, injection)
@@ -62,7 +63,7 @@ class TracedEngine:
         return torch.stack(rows, dim=1).reshape(*theta.shape[:-1], len(rows), -1)
 
     def _simulate(self, theta: Tensor, tangent: bool, levels: bool = False) -> tuple[Tensor, Tensor | None]:
-        program = build_program(self.network, self.space.names, tangent)
+        program = build_program(self.network, self.space.names, tangent, self.experiment.tolerance is not None)
         run = _Run(
             program, self.network, self.experiment, theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
         )
@@ -113,6 +114,7 @@ class _Run:
             "resolution": [experiment.resolution.to(lanes)],
         }
         self.history: list[list[tuple[Tensor, Change]]] = []
+        self.pace = lanes.new_full((len(lanes),), torch.inf)
 
     def samples(self) -> Iterator[int]:
         """Runs; at each sample's turn the state holds 'sample' levels and the sample's number is handed out."""
@@ -133,7 +135,7 @@ class _Run:
                 yield s
             self._set_clock(e.nodes[k], e.steps[k])  # reading a sample has set another
             before = self._levels()
-            self._section(p.step)
+            self._step(k)
             if any(0.0 < shares[s] < 1.0 for s in mine):
                 self._section(p.end)
             for s in [s for s in mine if shares[s] > 0.0]:
@@ -181,6 +183,31 @@ class _Run:
     def full(self, change: Change) -> Tensor:
         """(P, L), zeros where nothing changes."""
         return self.lanes.new_zeros(self.lanes.shape[::-1]) if change is None else change.expand(self.lanes.shape[::-1])
+
+    def _step(self, k: int) -> None:
+        """A step of the grid: at once, or each lane in as many of its own as it needs."""
+        e, p, values = self.experiment, self.program, self.state.values
+        if e.tolerance is None:
+            return self._section(p.step)
+        self._section(p.act)
+        start, span = values["clock", 0], values["clock", 1]
+        gone = torch.zeros_like(self.pace)
+        while bool((gone < span).any()):
+            own = own_step(gone, self.pace, span)
+            values["part", 0], values["part", 1] = start + gone, own
+            before = self._levels()
+            self._section(p.step)
+            error = torch.stack([values["error", i].expand_as(own).abs() for i in range(p.tanks)]).amax(dim=0)
+            shortest = self.tables["resolution"][0]
+            stiffness = values["stiffness", 0]
+            kept, gone, self.pace = judged(own, error, stiffness, gone, self.pace, span, e.tolerance, shortest)
+            rows = zip(self._levels(), before, strict=True)
+            self.state.put("level", [self._either(kept, now, then) for now, then in rows])
+
+    def _either(self, yes: Tensor, x: tuple[Tensor, Change], y: tuple[Tensor, Change]) -> tuple[Tensor, Change]:
+        level = torch.where(yes, x[0], y[0])
+        both = x[1] is None and y[1] is None
+        return level, None if both else torch.where(yes, self.full(x[1]), self.full(y[1]))
 
     def _levels(self) -> list[tuple[Tensor, Change]]:
         return self.state.group("level", self.program.tanks)

@@ -1,0 +1,157 @@
+"""Steps of each lane's own: as exact as asked for, the same in both engines, and nobody's neighbour's business."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from rigs import paper_network as rig
+from torch import Tensor
+
+from fdi_torch.config.plant import load_plant
+from fdi_torch.effects import EFFECTS, all_placements
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.engine import Readings, gram_of
+from fdi_torch.simulate.experiment import Experiment, lay_out, shortest_step
+from fdi_torch.simulate.integrate import ReferenceEngine
+from fdi_torch.simulate.own_steps import judged, own_step
+from fdi_torch.simulate.traced import TracedEngine
+
+
+def experiment(tolerance: float | None, step: float = 20.0, samples: int = 41) -> Experiment:
+    """Pumps that switch each 100 s, samples each 20 s."""
+    time = 20.0 * torch.arange(samples, dtype=torch.float64)
+    flows = 90e-6 * torch.rand(41, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    nothing = torch.zeros(samples, 3, dtype=torch.float64)
+    units = ("m^3/s", "m^3/s"), ("m", "m", "m")
+    held = flows[torch.arange(samples) // 5 * 5]
+    recording = Recording(time, held, nothing, ("Q1", "Q2"), ("h1", "h2", "h3"), *units)
+    return lay_out(recording, ("Q1", "Q2"), step, tolerance)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Tensor:
+    network, space = rig()
+    levels = CompiledEngine(network, space, experiment(None, step=0.002)).levels(faults(space))
+    assert levels.max() > 1.0, "no level reaches a rim"
+    return levels
+
+
+def faults(space: ParameterSpace, count: int = 100) -> Tensor:
+    share = torch.rand(count, len(space), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return space.low() + (space.high().clamp(max=1.0) - space.low()) * share
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-7, 1e-8])
+def test_levels_are_as_exact_as_asked_for(tolerance: float, truth: Tensor) -> None:
+    network, space = rig()
+    error = (CompiledEngine(network, space, experiment(tolerance)).levels(faults(space)) - truth).abs().amax((1, 2))
+    assert float(error.max()) < 3.0 * tolerance
+    assert float(error.median()) < tolerance
+
+
+def test_a_fixed_step_as_short_as_the_shortest_is_no_better(truth: Tensor) -> None:
+    network, space = rig()
+    theta, tolerance = faults(space), 1e-6
+    own = CompiledEngine(network, space, experiment(tolerance)).levels(theta)
+    fixed = CompiledEngine(network, space, experiment(None, step=shortest_step(tolerance))).levels(theta)
+    assert float((own - truth).abs().max()) < 3.0 * float((fixed - truth).abs().max())
+
+
+def test_both_engines_take_the_same_steps() -> None:
+    network, space = rig()
+    e, theta = experiment(1e-6, samples=9), faults(space, 8)
+    compiled, traced = CompiledEngine(network, space, e), TracedEngine(network, space, e)
+    levels = traced.levels(theta)
+    assert float((compiled.levels(theta) - levels).abs().max()) < 1e-10 * float(levels.max())
+    readings, jacobian = compiled.linearise(theta)
+    other = traced.linearise(theta)
+    torch.testing.assert_close(readings, other[0], rtol=0, atol=1e-10)
+    torch.testing.assert_close(jacobian, other[1], rtol=1e-8, atol=1e-9 * float(jacobian.abs().max()))
+
+
+def test_slopes_are_those_of_fine_steps() -> None:
+    network, space = rig()
+    theta, own = faults(space, 40), experiment(1e-8)
+    fine = replace(experiment(None, step=0.005), resolution=own.resolution)
+    truth = CompiledEngine(network, space, fine).linearise(theta)[1]
+    found = CompiledEngine(network, space, own).linearise(theta)[1]
+    error = (found - truth).abs().amax((1, 2, 3)) / truth.abs().amax((1, 2, 3))
+    assert float(error.median()) < 2e-4
+    assert float(error.max()) < 1e-2
+
+
+def test_a_lane_depends_on_no_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, space = rig()
+    e, theta = experiment(1e-6), faults(space, 70)
+    engine = CompiledEngine(network, space, e)
+    broken = theta.clone()
+    broken[1::2] = torch.nan
+    data = Readings(torch.rand(41, 3).double(), torch.ones(41, 3).double())
+    for run in (engine.levels, lambda t: engine.linearise(t)[1], lambda t: engine.gram(t, data)):
+        together = run(theta)
+        assert torch.equal(run(broken)[::2], together[::2])
+        assert torch.equal(run(theta[40:41])[0], together[40])
+        assert not torch.isfinite(run(broken)[1::2]).all(dim=-1).all()
+        monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+        assert torch.equal(run(theta), together)
+        monkeypatch.undo()
+
+
+def test_sums_are_those_of_readings_and_jacobian() -> None:
+    network, space = rig()
+    engine, theta = CompiledEngine(network, space, experiment(1e-6)), faults(space, 20)
+    data = Readings(torch.rand(41, 3).double(), torch.ones(41, 3).double())
+    expected = gram_of(*engine.linearise(theta), data)
+    torch.testing.assert_close(engine.gram(theta, data), expected, rtol=1e-10, atol=0)
+
+
+def test_every_effect_keeps_its_meaning() -> None:
+    """All effects in one plant: memories and delays live on the grid's steps, flows on each lane's own."""
+    plant = load_plant("three_tank")
+    network = TankNetwork(plant, [p for effect in EFFECTS for p in all_placements(plant, [effect])[:1]])
+    names = [n for n in network.constants.names if n.count(".") == 2]
+    space = ParameterSpace(network.constants[n] for n in names)
+    theta = space.nominal().expand(2, -1)
+    own = experiment(1e-7)
+    fine = replace(experiment(None, step=0.01), resolution=own.resolution)
+    levels = CompiledEngine(network, space, fine).levels(theta)
+    assert float((CompiledEngine(network, space, own).levels(theta) - levels).abs().max()) < 1e-5
+    traced = TracedEngine(network, space, own).levels(theta)
+    torch.testing.assert_close(CompiledEngine(network, space, own).levels(theta), traced, rtol=0, atol=1e-10)
+
+
+def test_the_control_by_hand() -> None:
+    n = torch.tensor
+    assert own_step(n([0.0, 6.0, 7.5, 10.0]), n([4.0, 4.0, 4.0, 4.0]), n(10.0)).tolist() == [4.0, 4.0, 2.5, 10.0]
+    assert own_step(n([4.0]), n([4.0]), n(10.0)).tolist() == [3.0], "two of 3 s, rather than 4 s and 2 s"
+    cases = {  # own step, error, stiffness, gone, pace -> kept, how far, pace
+        "small error": (1.0, 1e-8, 0.1, 0.0, 1.0, True, 1.0, 0.9 * (1 / (0.01 + 1e-6)) ** 0.25),
+        "large error": (1.0, 1e-4, 0.1, 0.0, 1.0, False, 0.0, 0.1),
+        "no number": (1.0, torch.nan, torch.nan, 0.0, 1.0, True, 1.0, 3.0),
+        "shortest": (0.1, 1.0, 0.1, 0.0, 0.1, True, 0.1, 0.1),
+        "there already": (1.0, 1e-4, 0.1, 10.0, 1.0, False, 10.0, 1.0),
+        "near the limit of stability": (1.0, 1e-8, 2.0, 0.0, 1.0, True, 1.0, 1.1),
+        "beyond it": (1.0, 1e-8, 4.0, 0.0, 1.0, False, 0.0, 0.55),
+        "cut short by the grid": (0.5, 4e-7, 0.1, 9.5, 2.0, True, 10.0, 2.0),
+    }
+    columns = [torch.tensor(c, dtype=torch.float64) for c in zip(*(case[:5] for case in cases.values()), strict=True)]
+    own, error, stiffness, gone, pace = columns
+    kept, after, paces = judged(own, error, stiffness, gone, pace, n(10.0), 1e-6, n(0.1))
+    for i, (name, case) in enumerate(cases.items()):
+        assert (bool(kept[i]), float(after[i])) == case[5:7], name
+        assert float(paces[i]) == pytest.approx(case[7]), name
+
+
+def test_misuse_is_named() -> None:
+    network, space = rig()
+    with pytest.raises(ValueError, match="expected a positive tolerance, got 0"):
+        experiment(0.0)
+    with pytest.raises(
+        ValueError, match="expected the same steps for all lanes in the reference engine, got a tolerance"
+    ):
+        ReferenceEngine(network, space, experiment(1e-6))
