@@ -12,19 +12,23 @@ from pathlib import Path
 PACKAGES = ("torch", "torchdiffeq", "numpy", "scipy", "numba", "jax", "diffrax", "evosax", "evox")
 
 
-def describe(arguments: list[str]) -> str:
-    """Machine, load, versions, command and date, as a paragraph of Markdown."""
+def occasion(arguments: list[str]) -> str:
+    """Command, date and load, as a paragraph of Markdown."""
+    load = ", ".join(f"{x:.1f}" for x in os.getloadavg())
+    command = "python -m benchmarks " + " ".join(arguments[1:])
+    return f"`{command.strip()}` on {datetime.now(UTC):%Y-%m-%d %H:%M} UTC, load {load}.\n"
+
+
+def describe() -> str:
+    """Machine and versions, as a paragraph of Markdown."""
     cpu = next(
         (x.split(":")[1].strip() for x in _lines("/proc/cpuinfo") if x.startswith("model name")), platform.machine()
     )
     compiler = subprocess.run(["g++", "--version"], capture_output=True, text=True, check=False).stdout.split("\n")[0]
-    command = "python -m benchmarks " + " ".join(arguments[1:])
     versions = ", ".join(f"{name} {v}" for name in PACKAGES if (v := _version(name)))
-    load = ", ".join(f"{x:.1f}" for x in os.getloadavg())
     return (
-        f"`{command.strip()}` on {datetime.now(UTC):%Y-%m-%d %H:%M} UTC: {cpu}, {os.cpu_count()} cores, "
-        f"load {load}; Python {platform.python_version()}, {compiler}, {versions}. One thread each; CPU time, best of "
-        "several runs, compilation left out.\n"
+        f"{cpu}, {os.cpu_count()} cores; Python {platform.python_version()}, {compiler}, {versions}. One thread each, "
+        "CPU time, compilation left out: the median of rounds in which all take turns.\n"
     )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.timing import best_seconds
+from benchmarks.timing import seconds_in_rounds
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.monitor.change import ChangedObserver, Window
@@ -45,7 +45,7 @@ def isolation(observer: ChangedObserver, window: Window, slow: bool) -> dict[str
     """Every fault alone, sudden; or sudden and slow, alone and in pairs."""
     believed, count = observer.space.nominal(), len(observer.space)
     faults = [Fault(column) for column in range(count)]
-    spent = best_seconds(lambda: isolate(observer, window, believed, faults, slow, 2 if slow else 1))
+    (spent,) = seconds_in_rounds([lambda: isolate(observer, window, believed, faults, slow, 2 if slow else 1)])
     what = "sudden or slow, one or two" if slow else "sudden, one"
     return {"what": f"isolation, {count} faults, {what}", "samples": len(window), "seconds": spent}
 
@@ -67,7 +67,7 @@ def follow(network: TankNetwork, space: ParameterSpace, noise: Noise, chunk: int
         for first in range(1, len(samples), chunk):
             state, _ = watch.advance(state, samples.stretch(first, first + chunk))
 
-    spent = best_seconds(run, at_most=3)
+    (spent,) = seconds_in_rounds([run], rounds=3)
     return {"what": f"following, {len(space)} faults, {chunk:,} samples at a time", "samples": 10_000, "seconds": spent}
 
 

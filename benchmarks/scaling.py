@@ -8,7 +8,7 @@ import torch
 
 from benchmarks import memory
 from benchmarks.simulators import experiment, plant
-from benchmarks.timing import best_seconds
+from benchmarks.timing import seconds_in_rounds
 from fdi_torch.simulate.compiled import CompiledEngine
 from fdi_torch.simulate.engine import Readings
 
@@ -31,7 +31,7 @@ def measure(budget: float) -> list[Row]:
         for what, run in {"moments": engine.moments, "gram": engine.gram}.items():
             for lanes in LANES[what]:
                 theta = space.nominal().expand(lanes, -1).contiguous()
-                seconds = best_seconds(lambda run=run, theta=theta, data=data: run(theta, data), budget, 2)
+                (seconds,) = seconds_in_rounds([lambda run=run, theta=theta, data=data: run(theta, data)], budget, 3)
                 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
                 rows.append((f"{name}, {len(space)} parameters", what, lanes, lanes / seconds, peak))
     return rows

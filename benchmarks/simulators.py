@@ -26,6 +26,7 @@ from fdi_torch.simulate.integrate import ReferenceEngine
 
 NAMES = ("T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size")
 SAMPLES, INTERVAL = 11, 100.0
+SHARP = 0.02  # s; the steps for which the adaptive solvers' equations are as sharp
 Simulator = Callable[[np.ndarray], np.ndarray]
 
 
@@ -36,13 +37,13 @@ def plant() -> tuple[TankNetwork, ParameterSpace]:
     return network, ParameterSpace(network.constants[n] for n in NAMES)
 
 
-def experiment(step: float) -> Experiment:
+def experiment(step: float, tolerance: float | None = None) -> Experiment:
     time = INTERVAL * torch.arange(SAMPLES, dtype=torch.float64)
     flows = torch.full((SAMPLES, 2), INFLOW, dtype=torch.float64)
     nothing = torch.zeros(SAMPLES, 3, dtype=torch.float64)
     units = ("m^3/s", "m^3/s"), ("m", "m", "m")
     recording = Recording(time, flows, nothing, ("Q1", "Q2"), ("h1", "h2", "h3"), *units)
-    return lay_out(recording, ("Q1", "Q2"), step)
+    return lay_out(recording, ("Q1", "Q2"), step, tolerance)
 
 
 def random_faults(count: int, seed: int = 0) -> np.ndarray:
@@ -55,6 +56,12 @@ def fdi(step: float, dtype: torch.dtype = torch.float64) -> Simulator:
     engine = CompiledEngine(*plant(), experiment(step))
     engine.prepare(dtype=dtype)
     return lambda theta: engine.levels(torch.from_numpy(theta).to(dtype)).numpy()
+
+
+def fdi_own_steps(tolerance: float) -> Simulator:
+    """Steps of each trajectory's own, for a tolerance in m."""
+    engine = CompiledEngine(*plant(), experiment(INTERVAL, tolerance))
+    return lambda theta: engine.levels(torch.from_numpy(theta)).numpy()
 
 
 def fdi_float32(step: float) -> Simulator:
@@ -208,22 +215,19 @@ def diffrax(tolerance: float) -> Simulator:
     return lambda theta: np.asarray(run(theta))
 
 
-def scipy_lsoda(tolerance: float) -> Simulator:
+def scipy_lsoda(tolerance: float, sharp: float = SHARP) -> Simulator:
     """scipy.integrate.odeint (LSODA), one trajectory after the other, with the same sharp equations in Python."""
     from scipy.integrate import odeint
 
-    rates, (wp, wo) = make_rates(math.sqrt, max, lambda c, a, b: a if c else b), widths(SHARP)
+    rates, (wp, wo) = make_rates(math.sqrt, max, lambda c, a, b: a if c else b), widths(sharp)
     times = np.arange(SAMPLES) * INTERVAL
 
     def one(theta: np.ndarray) -> np.ndarray:
         t = theta.tolist()
-        law = lambda h, _: rates(*h.tolist(), *t, wp, wo, SHARP)  # noqa: E731
+        law = lambda h, _: rates(*h.tolist(), *t, wp, wo, sharp)  # noqa: E731
         return odeint(law, START, times, rtol=tolerance, atol=tolerance, mxstep=20000)
 
     return lambda theta: np.stack([one(t) for t in theta])
-
-
-SHARP = 0.02  # s; the steps for which the adaptive solvers' equations are as sharp
 
 
 def load_jax():  # type: ignore[no-untyped-def]

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks import memory
 from benchmarks.simulators import ADAPTIVE, FIXED, Simulator, random_faults
-from benchmarks.timing import best_seconds
+from benchmarks.timing import seconds_in_rounds
 
 LANES = (64, 1024, 16384)
 STEP, TOLERANCE = 10.0, 1e-6
@@ -33,7 +33,7 @@ def measure(budget: float) -> dict[str, Rows]:
 
 def _plant(simulators: dict[str, Callable[[], Simulator]], theta: np.ndarray, budget: float) -> Rows:
     truth = simulators[OURS]()(theta[:64])
-    rows: Rows = {}
+    able: dict[str, Simulator] = {}
     for name, make in simulators.items():
         try:
             simulate = make()
@@ -43,13 +43,17 @@ def _plant(simulators: dict[str, Callable[[], Simulator]], theta: np.ndarray, bu
         if name not in ADAPTIVE:
             error = np.abs(found - truth).max()
             assert error < (1e-3 if "float32" in name else 1e-9), f"{name}: levels differ by {error:.1e} m"
-        rows[name] = [_rate(name, simulate, theta[:lanes], budget) for lanes in LANES]
-    return rows
+        able[name] = simulate
+    columns = [_rates(able, theta[:lanes], budget) for lanes in LANES]
+    return {name: [column[name] for column in columns] for name in able}
 
 
-def _rate(name: str, simulate: Simulator, theta: np.ndarray, budget: float) -> float:
-    part = theta[:64] if "SciPy" in name else theta[:1024] if "diffrax" in name else theta
-    return len(part) / best_seconds(lambda: simulate(part), budget)
+def _rates(simulators: dict[str, Simulator], theta: np.ndarray, budget: float) -> dict[str, float]:
+    """Trajectories per CPU second of each; those that take one after the other are given some of the lanes only."""
+    parts = {n: theta[:64] if "SciPy" in n else theta[:1024] if "diffrax" in n else theta for n in simulators}
+    runs = [lambda run=run, part=parts[name]: run(part) for name, run in simulators.items()]
+    seconds = seconds_in_rounds(runs, budget)
+    return {name: len(parts[name]) / spent for name, spent in zip(simulators, seconds, strict=True)}
 
 
 def table(plants: dict[str, Rows]) -> str:
