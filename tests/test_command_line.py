@@ -156,3 +156,23 @@ def test_a_job_shows_life_before_its_libraries_are_loaded() -> None:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 2 and len(done.stderr.splitlines()) == lines
         assert done.stderr.startswith("fdi train: loading\n") == (not more)
+
+
+def test_kept_memory_is_not_asked_of_the_system_again() -> None:
+    program = """
+import resource
+from fdi_torch.cli.allocation import keep_memory
+
+def pages():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        bytearray(b"x") * (1 << 22)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+print(keep_memory(), pages())
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    able, pages = done.stdout.split()
+    if able == "False":
+        pytest.skip("not the GNU C library")
+    assert int(pages) < 4 * (1 << 22) / 4096  # mapped anew each time: twenty times the array's

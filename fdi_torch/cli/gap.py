@@ -12,6 +12,7 @@ import json
 from pathlib import Path
 
 from fdi_torch.cli import DONE
+from fdi_torch.cli.allocation import keep_memory
 from fdi_torch.cli.gap_refit import add_refit_arguments, run_refit
 from fdi_torch.cli.gap_text import next_steps, show, show_plan
 from fdi_torch.cli.screen import Screen
@@ -68,6 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    keep_memory()
     plant = load_plant(arguments.plant)
     recordings = named_recordings(arguments.recording, plant, Path.cwd())
     library = tuple(arguments.library.split(",")) if arguments.library else None

@@ -20,6 +20,7 @@ from torch import Tensor
 
 DECAY_SHARE = 0.3  # of a rounding step, over which its error is forgotten
 MOST_BINS = 512  # of a spectrum
+KEPT = 2  # sets of frequencies whose spectra are kept, 40 MB each: a recording's, and its hold-out's
 LEAST_SAMPLES = 20  # in a stretch that has a say in level and colour
 FAST_PERIOD = 30.0  # samples; slower parts of a residual may be the model's
 
@@ -83,14 +84,17 @@ def estimate_noise(
     """
     spectra = [_spectrum_of_all([residual[r][mask[r][:, c], c] for r in rows]) for c in range(residual.shape[1])]
     say = [not r for r in rounded] if rounded and not all(rounded) else [True] * len(spectra)
-    likelihoods = torch.stack([_likelihood(*s) for s in spectra])  # (C, colours, errors)
+    levels = [_levels(*s) for s in spectra]
+    likelihoods = torch.stack(
+        [_likelihood(*s, x) for s, x in zip(spectra, levels, strict=True)]
+    )  # (C, colours, errors)
     counts = [int(mask[:, c].sum()) for c in range(residual.shape[1])]
     likelihoods = likelihoods + torch.stack([_cost_of_error(n) for n in counts]).unsqueeze(1)
     best = likelihoods.min(dim=-1).values
     common = _chosen(best[torch.tensor(say)].sum(dim=0), int(mask.sum()))
     chosen = [common if ours else _chosen(best[c], counts[c]) for c, ours in enumerate(say)]
     errors = [int(x[i].argmin()) for x, i in zip(likelihoods, chosen, strict=True)]
-    level = torch.stack([_levels(*s)[i, j] for s, i, j in zip(spectra, chosen, errors, strict=True)])
+    level = torch.stack([x[i, j] for x, i, j in zip(levels, chosen, errors, strict=True)])
     return Noise(
         torch.sqrt(torch.clamp(level, min=torch.finfo(level.dtype).tiny)), _COLOURS.to(level)[torch.tensor(chosen)]
     )
@@ -127,23 +131,43 @@ def _fast_spectrum(x: Tensor, bins: int) -> tuple[Tensor, Tensor, int]:
     return power, torch.cos(2 * math.pi * frequency), width
 
 
-def _shape(cosine: Tensor) -> Tensor:
-    """(colours, errors, frequencies)"""
+@dataclass(frozen=True)
+class _Shapes:
+    """Spectra of innovation 1 for each colour and error at some frequencies (F,): their inverses (colours, errors, F),
+    and the mean of their logarithms (colours, errors).
+    """
+
+    cosine: Tensor
+    inverse: Tensor
+    mean_log: Tensor
+
+
+_known: list[_Shapes] = []
+
+
+def _shapes(cosine: Tensor) -> _Shapes:
+    """Kept for the last few sets of frequencies: all channels of a recording, and its next estimate, have the same."""
+    for known in _known:
+        if torch.equal(known.cosine, cosine):
+            return known
     a, error = _COLOURS.to(cosine).reshape(-1, 1, 1), _ERRORS.to(cosine).reshape(-1, 1)
-    return 1.0 / (1.0 - 2.0 * a * cosine + a * a) + error / (2.0 - 2.0 * cosine) ** 2
+    shape = 1.0 / (1.0 - 2.0 * a * cosine + a * a) + error / (2.0 - 2.0 * cosine) ** 2
+    found = _Shapes(cosine, 1.0 / shape, torch.log(shape).mean(dim=-1))
+    _known[:] = [found, *_known[: KEPT - 1]]
+    return found
 
 
 def _levels(power: Tensor, cosine: Tensor, width: int) -> Tensor:
     """Innovation variance for each colour and error, (colours, errors)."""
-    return (power / _shape(cosine)).mean(dim=-1)
+    return (_shapes(cosine).inverse @ power) / len(power)
 
 
-def _likelihood(power: Tensor, cosine: Tensor, width: int) -> Tensor:
+def _likelihood(power: Tensor, cosine: Tensor, width: int, levels: Tensor) -> Tensor:
     """Twice the negative log-likelihood for each colour and error; the taper leaves one frequency in 1.94
     independent.
     """
-    level = torch.log(torch.clamp(_levels(power, cosine, width), min=torch.finfo(power.dtype).tiny))
-    return 2.0 * (level + torch.log(_shape(cosine)).mean(dim=-1)) * len(power) * width / 1.94
+    level = torch.log(torch.clamp(levels, min=torch.finfo(power.dtype).tiny))
+    return 2.0 * (level + _shapes(cosine).mean_log) * len(power) * width / 1.94
 
 
 def _cost_of_error(count: int) -> Tensor:
