@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-LENGTH = 10  # steps taken one after the other in each block, and in blocks of blocks
+LENGTH = 8  # steps taken one after the other in each block, and in blocks of blocks
 
 
 def linear_scan(transition: Tensor, forcing: Tensor, first: Tensor) -> Tensor:
@@ -31,18 +31,24 @@ def scan_in_time(a: Tensor, b: Tensor, first: Tensor) -> Tensor:
     inner = _side_by_side(_in_blocks(a, blocks, one=True), _in_blocks(b, blocks, one=False))
     ends = inner[-1][..., :-1]
     start = scan_in_time(ends[:, :, m:], ends[:, :, :m], first)
-    x = torch.stack([y[:, :, :m] + product(y[:, :, m:], start) for y in inner], dim=-1)
-    return torch.cat([first.unsqueeze(-1), x.flatten(-2)[..., :count]], dim=-1)
+    x = b.new_empty(*b.shape[:-1], blocks * LENGTH + 1)
+    x[..., 0] = first
+    steps = x[..., 1:].unflatten(-1, (blocks, LENGTH)).unbind(-1)
+    for step, y in zip(steps, inner, strict=True):
+        step.copy_(product(y[:, :, m:], start).add_(y[:, :, :m]))
+    return x[..., : count + 1]
 
 
 def _in_blocks(x: Tensor, blocks: int, one: bool) -> Tensor:
     """(L, n, m, K) -> (LENGTH, L, n, m, blocks), the last block filled up with ones on the diagonal, or zeros."""
     lanes, n, m, count = x.shape
-    missing = blocks * LENGTH - count
-    if missing:
-        filler = torch.eye(n, m, dtype=x.dtype, device=x.device) if one else x.new_zeros(n, m)
-        x = torch.cat([x, filler.unsqueeze(-1).expand(lanes, n, m, missing)], dim=-1)
-    return x.reshape(lanes, n, m, blocks, LENGTH).permute(4, 0, 1, 2, 3).contiguous()
+    whole, rest = divmod(count, LENGTH)
+    found = x.new_empty(LENGTH, lanes, n, m, blocks)
+    found[..., :whole] = x[..., : whole * LENGTH].unflatten(-1, (whole, LENGTH)).permute(4, 0, 1, 2, 3)
+    if rest:
+        found[:rest, ..., whole] = x[..., whole * LENGTH :].permute(3, 0, 1, 2)
+        found[rest:, ..., whole] = torch.eye(n, m, dtype=x.dtype, device=x.device) if one else 0.0
+    return found
 
 
 def _side_by_side(a: Tensor, b: Tensor) -> list[Tensor]:
@@ -68,5 +74,5 @@ def product(a: Tensor, x: Tensor) -> Tensor:
     """a (L, n, n, K) times x (L, n, m, K) at every step, as an explicit sum: the same bits alone and in a batch."""
     total = a[:, :, 0, None] * x[:, None, 0]
     for j in range(1, a.shape[2]):
-        total += a[:, :, j, None] * x[:, None, j]
+        total.addcmul_(a[:, :, j, None], x[:, None, j])
     return total
