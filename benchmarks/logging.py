@@ -1,96 +1,146 @@
-"""What logging costs: CPU time spent in the log over that of the whole run, and bytes on disk."""
+"""What logging costs, over every command that logs: CPU time spent in the log over that of the run, and bytes on disk.
+
+Counted is the time of every method of the log and of what a search works out to log it, on each thread, and of the
+process that asks git. A command's seconds do not hold the imports.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import os
+import io
+import resource
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.run import load_run
-from fdi_torch.config.study import load_study
-from fdi_torch.jobs import study as study_job
-from fdi_torch.jobs import train as main_job
+from fdi_torch.cli import main
+from fdi_torch.jobs.train import Watch
 from fdi_torch.logbook import RunLog, read_run
 
-# Ways into the log. What one of them calls is within its time; the thread that flushes counts too.
-DOORS = ("__init__", "__enter__", "__exit__", "write", "recording", "population", "generation", "iteration", "estimate")
-DOORS += ("fault", "trial", "summary", "result", "result_arrays", "carry_over", "flush")
 Row = tuple[str, int, int, float, float]
 
-
-class ClockedLog(RunLog):
-    """A log that knows the CPU seconds spent in it: of each thread, and of the processes it starts (git)."""
-
-    seconds = 0.0
-    _depth = threading.local()
-
-
-def clocked(method: Callable[..., Any]) -> Callable[..., Any]:
-    @functools.wraps(method)
-    def run(log: ClockedLog, *arguments: Any, **named: Any) -> Any:
-        depth = getattr(ClockedLog._depth, "value", 0)
-        ClockedLog._depth.value = depth + 1
-        start = _thread_and_children()
-        try:
-            return method(log, *arguments, **named)
-        finally:
-            ClockedLog._depth.value = depth
-            if depth == 0:
-                ClockedLog.seconds += _thread_and_children() - start
-
-    return run
-
-
-def _thread_and_children() -> float:
-    ended = os.times()
-    return time.thread_time() + ended.children_user + ended.children_system
-
-
-for _name in DOORS:
-    setattr(ClockedLog, _name, clocked(getattr(RunLog, _name)))
-
-
-def _train(folder: str, *changes: str) -> Path:
-    return main_job.train(load_run(None, [f"output.folder={folder}", *changes])).log
-
-
-def _study(folder: str, *changes: str) -> Path:
-    return study_job.run_study(
-        load_study("configs/studies/table3_noise.yaml", [f"output.folder={folder}", *changes])
-    ).log
-
-
-RUNS: dict[str, Callable[[str], Path]] = {
-    "built-in run": _train,
-    "the same, ten times the search": lambda folder: _train(
-        folder, "estimate.search={evaluations: 200000, parameter_tolerance: 0, cost_tolerance: 0, patience: 100000}"
-    ),
-    "the same, 50,000 samples": lambda folder: _train(folder, "simulate.sample_time=20 ms"),
-    "study, 500 trials": lambda folder: _study(folder, "study.trials=500", "study.snr_db=[30]"),
+# A day of readings every ten seconds, of a leak in its middle.
+MONITOR = """
+plant: three_tank
+recording: {file: FILE}
+fault_free: [0 s, 1000 s]
+faults: [T1.leak.size, T3.leak.size, P13.plugging.size]
+"""
+LONG = "simulate.sample_time=20 ms"
+TEN_TIMES = "estimate.search={evaluations: 200000, parameter_tolerance: 0, cost_tolerance: 0, patience: 100000}"
+STUDY = ("study", "--config", "configs/studies/table3_noise.yaml", "--set", "study.snr_db=[30]", "--set")
+REHEARSAL = ("rehearse", "--config", "configs/rehearsals/false_alarms.yaml", "--set")
+RUNS: dict[str, tuple[str, ...]] = {
+    "train: the built-in run": ("train",),
+    "train: ten times the search": ("train", "--set", TEN_TIMES),
+    "train: 50,000 samples": ("train", "--set", LONG),
+    "study: 500 trials": (*STUDY, "study.trials=500"),
+    "monitor: 10,000 samples": ("monitor", "--config", "MONITOR"),
+    "rehearse: 20 runs of an hour": (*REHEARSAL, "false_alarms={noises: {white: {}}, runs: 20, sets: 2}"),
+    "gap: 2,000 samples, all effects": ("gap", "--plant", "three_tank", "--recording", "RECORDING"),
+    "challenge: 1 rig": ("challenge", "--cases", "1", "--kinds", "single", "--no-bic"),
 }
+"""MONITOR and RECORDING stand for files that are made first."""
+
+
+class Clock:
+    """CPU seconds of a group of methods: of each thread, and of the processes that they start."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._inside = threading.local()
+
+    def within(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        """The same method, its seconds counted unless another counted one has called it."""
+
+        @functools.wraps(method)
+        def run(*arguments: Any, **named: Any) -> Any:
+            if getattr(self._inside, "one", False):
+                return method(*arguments, **named)
+            self._inside.one, start = True, time.thread_time()
+            try:
+                return method(*arguments, **named)
+            finally:
+                self._inside.one = False
+                self.seconds += time.thread_time() - start
+
+        return run
+
+
+@contextlib.contextmanager
+def clocked(clock: Clock) -> Iterator[None]:
+    """While it lasts, the clock runs in every method of a log and in those that collect what a search logs."""
+    doors: list[tuple[type, str]] = [(Watch, "generation"), (Watch, "iteration")]
+    doors += [(RunLog, name) for name in dir(RunLog) if name in ("__init__", "__enter__", "__exit__") or name[0] != "_"]
+    own = {(kind, name): vars(kind).get(name) for kind, name in doors}
+    for kind, name in doors:
+        method = getattr(kind, name)
+        if callable(method) and not isinstance(vars(kind).get(name), staticmethod):
+            setattr(kind, name, clock.within(method))
+    try:
+        yield
+    finally:
+        for (kind, name), method in own.items():
+            if method is None and name in vars(kind):
+                delattr(kind, name)
+            elif method is not None:
+                setattr(kind, name, method)
 
 
 def measure(budget: float) -> list[Row]:
     """Run, messages, bytes of the log, CPU seconds of the run, CPU seconds of logging. Compilation comes first."""
-    rows: list[Row] = []
-    main_job.RunLog = study_job.RunLog = ClockedLog  # type: ignore[misc]
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            _train(folder)
-            for name, run in RUNS.items():
-                ClockedLog.seconds, start = 0.0, time.process_time()
-                log = run(folder)
-                total = time.process_time() - start
-                messages = sum(1 for _ in read_run(log).messages())
-                rows.append((name, messages, log.stat().st_size, total, ClockedLog.seconds))
-    finally:
-        main_job.RunLog = study_job.RunLog = RunLog  # type: ignore[misc]
-    return rows
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        files = prepared(folder)
+        run(("train",), folder / "compiled")
+        return [one(what, [files.get(word, word) for word in words], folder / str(k)) for k, (what, words) in runs()]
+
+
+def runs() -> Iterator[tuple[int, tuple[str, tuple[str, ...]]]]:
+    return iter(enumerate(RUNS.items()))
+
+
+def prepared(folder: Path) -> dict[str, str]:
+    """The files that jobs need."""
+    files = {}
+    for what, duration, fault in (("MONITOR", 10_000, 0.05), ("RECORDING", 2000, 0.0)):
+        sets = (f"simulate.duration={duration} s", f"simulate.faults={{T1.leak: {fault}}}")
+        words = [word for change in sets for word in ("--set", change)]
+        recording = run(("simulate", *words), folder / what, "*.csv")
+        files[what] = str(recording)
+        if what == "MONITOR":
+            files[what] = str(folder / "monitor.yaml")
+            Path(files[what]).write_text(MONITOR.replace("FILE", str(recording)), encoding="utf-8")
+    return files
+
+
+def one(what: str, words: list[str], folder: Path) -> Row:
+    clock, start, children = Clock(), time.process_time(), _children()
+    with clocked(clock):
+        log = run(words, folder)
+    asking = _children() - children  # git
+    total = time.process_time() - start + asking
+    messages = sum(1 for _ in read_run(log).messages())
+    return what, messages, log.stat().st_size, total, clock.seconds + asking
+
+
+def run(words: tuple[str, ...] | list[str], folder: Path, wanted: str = "*.mcap") -> Path:
+    """Runs a command silently; the largest file of the wanted kind that it wrote."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as said:
+        code = main([*words, "--out", str(folder), "--quiet"])
+    found = sorted(folder.rglob(wanted), key=lambda path: path.stat().st_size)
+    if not found:
+        raise RuntimeError(f"expected {wanted} of `fdi {' '.join(words)}`, got code {code}: {said.getvalue()}")
+    return found[-1]
+
+
+def _children() -> float:
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return spent.ru_utime + spent.ru_stime
 
 
 def table(rows: list[Row]) -> str:
@@ -101,5 +151,5 @@ def table(rows: list[Row]) -> str:
     for name, messages, size, total, logging in rows:
         share = 100 * logging / total
         volume = f"{messages:,} | {size / 1e3:,.0f} | {size / messages:.0f}"
-        lines.append(f"| {name} | {volume} | {total:.2f} | {logging:.3f} | {share:.2f} % |")
+        lines.append(f"| {name} | {volume} | {total:.2f} | {logging:.4f} | {share:.2f} % |")
     return "\n".join(lines)

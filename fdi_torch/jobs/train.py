@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.recordings import LoadedRecording
 from fdi_torch.config.run import Run
-from fdi_torch.estimate.evolution import Search
+from fdi_torch.estimate.evolution import Search, State
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
 from fdi_torch.estimate.refine import Progress
@@ -23,12 +24,13 @@ from fdi_torch.jobs.run_setup import (
     usable_device,
     wanted_space,
 )
-from fdi_torch.logbook import Listener, RunLog
+from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.report.fit_figure import fit_figure, save
 
 Tell = Callable[[float, str], None]
 STATE = "/estimator/de/population"
+GENERATION, ITERATION = "/estimator/de/generation", "/estimator/refine/iteration"
 
 
 @dataclass(frozen=True)
@@ -91,47 +93,41 @@ class Watch:
     """Logs each generation and iteration as it comes, and tells how far the work is."""
 
     def __init__(self, log: RunLog, space: ParameterSpace, settings: HybridSettings, tell: Tell) -> None:
-        self.log, self.space, self.settings, self.tell = log, space, settings, tell
+        self.log, self.settings, self.tell = log, settings, tell
+        self.names = space.names
         self.units = {p.name: p.unit for p in space}
         self.iterations = 0
 
     def generation(self, search: Search) -> None:
         state = search.state
-        best = dict(zip(self.space.names, state.population[0, 0].tolist(), strict=True))
-        cost = float(state.cost[0, 0])
-        self.log.generation(
-            state.generation,
-            cost,
-            best,
-            mean_cost=float(state.cost[0].mean()),
-            evaluations=state.evaluations,
-            units=self.units,
-        )
+        self.log.later(GENERATION, partial(self._generation, state), state.generation, self.units)
         if state_is_due(state.generation):
             self.log.population(state.generation, search.to_dict())
         share = 0.05 + 0.8 * state.evaluations / self.settings.search.evaluations
-        self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {cost:.3g}")
+        self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {float(state.cost[0, 0]):.3g}")
+
+    def _generation(self, state: State) -> dict[str, Any]:
+        """What is logged of a generation, worked out when its message is written."""
+        costs, population = as_array(state.cost)[0], as_array(state.population)[0]
+        told = {"problem": 0, "generation": state.generation, "best_cost": float(costs[0])}
+        told |= {"mean_cost": float(costs.mean()), "evaluations": state.evaluations}
+        return told | dict(zip(self.names, population[0].tolist(), strict=True))
 
     def iteration(self, progress: Progress) -> None:
         self.iterations += 1
-        for k, lane in enumerate(progress.lanes.tolist()):
-            values = dict(zip(self.space.names, progress.theta[k].tolist(), strict=True))
-            self.log.iteration(
-                progress.iteration,
-                float(progress.cost[k]),
-                values,
-                damping=float(progress.damping[k]),
-                accepted=bool(progress.accepted[k]),
-                problem=lane,
-                t=float(self.iterations),
-                units=self.units,
-            )
+        for k in range(len(progress.lanes)):
+            self.log.later(ITERATION, partial(self._iteration, progress, k), self.iterations, self.units)
         self.tell(0.9, f"refinement: iteration {progress.iteration}, cost {float(progress.cost.min()):.6g}")
+
+    def _iteration(self, progress: Progress, k: int) -> dict[str, Any]:
+        told = {"problem": int(progress.lanes[k]), "iteration": progress.iteration, "cost": float(progress.cost[k])}
+        told |= {"damping": float(progress.damping[k]), "accepted": bool(progress.accepted[k])}
+        return told | dict(zip(self.names, progress.theta[k].tolist(), strict=True))
 
 
 def state_is_due(generation: int) -> bool:
-    """Is the whole state of the search logged? So often that a resumed run repeats an eighth at most."""
-    return generation % (1 << max(0, generation.bit_length() - 4)) == 0
+    """Is the whole state of the search logged? So often that a resumed run repeats 16 generations or an eighth."""
+    return generation % (1 << max(4, generation.bit_length() - 4)) == 0
 
 
 def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[str, float]) -> None:

@@ -7,7 +7,7 @@ from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.follow import follow
 from fdi_torch.logbook.inspect import Inspection, inspect_log
 from fdi_torch.logbook.live import Live, serve
-from fdi_torch.logbook.payload import unpack
+from fdi_torch.logbook.payload import as_array, unpack
 from fdi_torch.logbook.reader import Message, Run, read_run
 from fdi_torch.logbook.recover import Recovery, recover
 from fdi_torch.logbook.replay import Replay, replay
@@ -31,6 +31,7 @@ __all__ = [
     "Terminated",
     "align",
     "arrays",
+    "as_array",
     "compare",
     "content_hash",
     "exit_on_sigterm",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, count, repeat
 from typing import Any
@@ -43,7 +44,7 @@ class Messages:
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
-        self._put_off: list[tuple[str, Fields, float, Mapping[str, str] | None]] = []
+        self._put_off: deque[tuple[str, Fields, float, Mapping[str, str] | None]] = deque()
         self._put_off_bytes = 0
         self._latest = 0.0
         self._described: dict[str, tuple[frozenset[str], Channel]] = {}
@@ -74,9 +75,9 @@ class Messages:
         """
         with self._lock:
             self.settle()
-            self._write(topic, fields, t, units, about, wall)
+            self.put([self._timed(topic, fields, t, units, about, wall)])
 
-    def _write(
+    def _timed(
         self,
         topic: str,
         fields: Named,
@@ -84,7 +85,7 @@ class Messages:
         units: Mapping[str, str] | None,
         about: Mapping[str, str] | None = None,
         wall: bool = False,
-    ) -> None:
+    ) -> Timed:
         if "t" in fields:
             raise ValueError(f"{topic}: expected the time as argument, got it among the fields; remove it there")
         t = self._latest if t is None else float(t)
@@ -96,7 +97,7 @@ class Messages:
         self._latest = max(self._latest, t)
         channel = self._channel(topic, fields, message, units, about)
         log_time = log_time_of(t)
-        self.put([(channel, log_time, log_time, self._next(topic), orjson.dumps(message))])
+        return channel, log_time, log_time, self._next(topic), orjson.dumps(message)
 
     def later(
         self, topic: str, fields: Fields, t: float, units: Mapping[str, str] | None = None, size: int = 0
@@ -105,21 +106,25 @@ class Messages:
 
         What it holds must not change any more. The first of a topic is written at once, so that errors show.
         """
-        with self._lock:
-            if topic not in self._described:
-                self.write(topic, fields(), t, units=units)
-                return
-            self._put_off.append((topic, fields, t, units))
-            self._put_off_bytes += size
-            if len(self._put_off) >= _TOGETHER or self._put_off_bytes > _TOGETHER_BYTES:
-                self.settle()
+        if topic not in self._described:
+            self.write(topic, fields(), t, units=units)
+            return
+        self._put_off.append((topic, fields, t, units))  # needs no lock, so that a search goes on at once
+        self._put_off_bytes += size
+        if len(self._put_off) >= _TOGETHER or self._put_off_bytes > _TOGETHER_BYTES:
+            self.settle()
 
     def settle(self) -> None:
         """Writes what was put off, in its order, though another thread puts off more meanwhile."""
         with self._lock:
-            put_off, self._put_off, self._put_off_bytes = self._put_off, [], 0
-            for topic, fields, t, units in put_off:
-                self._write(topic, fields(), t, units)
+            self._put_off_bytes = 0
+            if self._put_off:
+                self.put(self._settled())
+
+    def _settled(self) -> Iterator[Timed]:
+        while self._put_off:
+            topic, fields, t, units = self._put_off.popleft()
+            yield self._timed(topic, fields(), t, units)
 
     def samples(
         self,
@@ -219,6 +224,8 @@ class Messages:
     ) -> Channel:
         """The topic's channel; a new one where the message has fields that it does not describe."""
         known, channel = self._described.get(topic, (frozenset(), None))
+        if channel is not None and known.issuperset(fields):
+            return channel
         present = [name for name, value in fields.items() if value is not None]
         if channel is not None and known.issuperset(present):
             return channel

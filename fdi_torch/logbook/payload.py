@@ -9,6 +9,7 @@ many readers round, is refused. Arrays with a shape travel as base64 of little-e
 from __future__ import annotations
 
 import base64
+import binascii
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -63,7 +64,7 @@ def pack(name: str, array: Any) -> dict[str, Any]:
     if kind is None:
         raise ValueError(f"{name}: expected an array of numbers, got {values.dtype}; convert it")
     kind = "|u1" if values.dtype == np.uint8 else kind
-    text = base64.b64encode(values.astype(kind, copy=False).tobytes()).decode()
+    text = binascii.b2a_base64(values.astype(kind, copy=False).tobytes(), newline=False).decode()
     return {name: text, f"{name}_shape": list(values.shape), f"{name}_dtype": kind}
 
 
@@ -75,7 +76,9 @@ def unpack(message: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 def as_array(value: Any) -> np.ndarray:
     """A numpy array of a number, list, array or tensor on any device."""
-    return np.asarray(value.numpy(force=True) if hasattr(value, "detach") else value)
+    if not hasattr(value, "detach"):
+        return np.asarray(value)
+    return np.asarray(value.numpy(force=value.requires_grad or value.device.type != "cpu"))
 
 
 def _unpack_one(name: str, message: Mapping[str, Any]) -> np.ndarray:

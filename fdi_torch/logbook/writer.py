@@ -27,7 +27,6 @@ from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.copying import joined
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.flat import flatten
-from fdi_torch.logbook.messages import Fields
 from fdi_torch.logbook.payload import as_array
 from fdi_torch.logbook.provenance import environment, git_state
 from fdi_torch.logbook.reader import Message
@@ -151,14 +150,6 @@ class RunLog(Topics):
             self._open_sink().cut()
             self._note_progress()
 
-    def later(
-        self, topic: str, fields: Fields, t: float, units: Mapping[str, str] | None = None, size: int = 0
-    ) -> None:
-        self._open_sink()
-        super().later(topic, fields, t, units, size)
-        if self._waiting_since is None:
-            self._waiting_since = time.monotonic()
-
     def put(self, messages: Iterable[Timed]) -> None:
         """Encoded messages; the methods of `Topics` end here."""
         with self._lock:
@@ -213,7 +204,9 @@ class RunLog(Topics):
         while not self._stop.wait(self._flush_seconds / 2):
             with self._lock:
                 since = self._waiting_since
-                if since is not None and time.monotonic() - since >= self._flush_seconds / 2:
+                if since is None and self._put_off:
+                    self._waiting_since = time.monotonic()
+                elif since is not None and time.monotonic() - since >= self._flush_seconds / 2:
                     try:
                         self.flush()
                     except LogError:
