@@ -8,15 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_torch.recordings.csv_files import (
-    bind,
-    channels_in_si,
-    header_of,
-    open_csv,
-    parse_carefully,
-    positions_of,
-    time_source,
-)
+from fdi_torch.recordings.csv_cells import parse_carefully
+from fdi_torch.recordings.csv_files import bind, bind_clock, channels_in_si, columns_of
+from fdi_torch.recordings.csv_text import heading_of, open_csv
 from fdi_torch.recordings.source import ChannelSource
 
 
@@ -36,10 +30,15 @@ class GrowingCsv:
         mapping = mapping or {}
         self.path = path
         with open_csv(path) as handle:
-            self._header, self._delimiter, self._line = header_of(path, handle)
-        self._clock = bind(path, self._header, "t", mapping.get("t") or time_source(self._header), "s")
-        self._inputs = [bind(path, self._header, name, mapping.get(name)) for name in inputs]
-        self._outputs = [bind(path, self._header, name, mapping.get(name)) for name in outputs]
+            heading, _ = heading_of(path, handle)
+            self._encoding = handle.encoding
+        if self._encoding == "utf-16":
+            raise ValueError(f"{path}: expected a file that is followed in UTF-8, got UTF-16; let it be written so")
+        self._clock = bind_clock(path, heading.names, mapping.get("t"))
+        self._inputs = [bind(path, heading.names, name, mapping.get(name)) for name in inputs]
+        self._outputs = [bind(path, heading.names, name, mapping.get(name)) for name in outputs]
+        self._columns = columns_of(path, heading, [self._clock, *self._inputs, *self._outputs])
+        self._line, self._first = heading.lines, None
         self.input_units = tuple(b.si_unit for b in self._inputs)
         self.output_units = tuple(b.si_unit for b in self._outputs)
         with path.open("rb") as raw:
@@ -54,15 +53,21 @@ class GrowingCsv:
             data = raw.read()
         whole = data[: data.rfind(b"\n") + 1]
         self._place += len(whole)
-        positions = positions_of([self._clock, *self._inputs, *self._outputs])
         rows, troubles = [], []
-        for line in whole.decode("utf-8", errors="replace").splitlines():
+        for line in whole.decode(self._encoding, errors="replace").splitlines():
             try:
-                row = parse_carefully(self.path, [line], self._header, self._delimiter, self._line, positions)
+                row = parse_carefully([line], self._columns, self._line)
                 rows += [values for values in row if np.isfinite(values[0])]
             except ValueError as error:
                 troubles.append(str(error))
             self._line += 1
-        table = np.array(rows).reshape(len(rows), len(positions))
-        inputs, outputs = (channels_in_si(table, positions, bounds) for bounds in (self._inputs, self._outputs))
-        return table[:, 0] * self._clock.factor, inputs, outputs, troubles
+        table = np.array(rows).reshape(len(rows), len(self._columns.positions))
+        inputs, outputs = (channels_in_si(table, self._columns, bounds) for bounds in (self._inputs, self._outputs))
+        return self._seconds(table[:, 0]), inputs, outputs, troubles
+
+    def _seconds(self, clock: np.ndarray) -> np.ndarray:
+        if not self._clock.stamps:
+            return clock * self._clock.factor
+        if self._first is None and len(clock):
+            self._first = clock[0]
+        return np.round(clock - self._first, 6) if len(clock) else clock

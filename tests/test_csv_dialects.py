@@ -1,0 +1,92 @@
+"""CSV files as loggers, spreadsheets and historians write them: each is read, or refused in a sentence with a fix."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.csv_files import read_csv
+from fdi_torch.recordings.csv_growing import GrowingCsv
+from fdi_torch.recordings.source import ChannelSource
+
+PLAIN = "t_s,Q1_cm3_s,h1_cm\n0,50.5,10\n5,50.5,11\n10,20,12.5\n"
+STAMPED = "time;Q1_cm3_s;h1_cm\n{};50,5;10\n{};50,5;11\n{};20;12,5\n"
+
+
+def read(folder: Path, text: str | bytes, encoding: str = "utf-8", **mapping: ChannelSource) -> Recording:
+    path = folder / "run.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode(encoding))
+    return read_csv(path, ["Q1"], ["h1"], mapping)
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        (PLAIN, "utf-8-sig"),
+        (PLAIN, "utf-16"),
+        ("# Zulauf für Behälter 1\n" + PLAIN, "cp1252"),
+        (PLAIN.replace(",", "\t"), "utf-8"),
+        (PLAIN.replace("\n", "\r\n"), "utf-8"),
+        (PLAIN.replace(",", ";").replace(".", ","), "utf-8"),
+        ("sep=;\n" + PLAIN.replace(",", ";"), "utf-8"),
+        (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "t,Q1,h1\ns,cm3/s,cm"), "utf-8"),
+        (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "n,Time [s],Q1 (cm3/s),h1 [cm]").replace("\n", "\n1,")[:-2], "utf-8"),
+        (STAMPED.format("2026-03-29 00:30:00", "2026-03-29 00:30:05", "2026-03-29T00:30:10.000"), "utf-8"),
+        (STAMPED.format("2026-03-29T00:59:55Z", "2026-03-29T03:00:00+02:00", "2026-03-29 03:00:05+0200"), "utf-8"),
+    ],
+)
+def test_each_says_the_same(tmp_path: Path, text: str, encoding: str) -> None:
+    recording = read(tmp_path, text, encoding)
+    torch.testing.assert_close(recording.time, torch.tensor([0.0, 5.0, 10.0], dtype=torch.float64), rtol=0, atol=0)
+    torch.testing.assert_close(recording.inputs[:, 0], torch.tensor([50.5e-6, 50.5e-6, 20e-6], dtype=torch.float64))
+    torch.testing.assert_close(recording.outputs[:, 0], torch.tensor([0.10, 0.11, 0.125], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("word", ["#N/A", "#DIV/0!", "Bad Input", "NaN", ""])
+def test_words_for_nothing_read_are_missing_readings(tmp_path: Path, word: str) -> None:
+    assert read(tmp_path, PLAIN.replace("12.5", word)).mask.flatten().tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (PLAIN.replace("50.5", '"50,5"'), "got '50,5'; write it with a point"),
+        (PLAIN.replace("t_s", "t").replace("\n5,", "\n29/03/2026,"), "row 2, column t: expected a time stamp such as"),
+        (
+            PLAIN.replace("h1_cm", "h1_cm,h1_mm").replace("\n", ",1\n"),
+            "expected one column for h1, got h1_cm and h1_mm",
+        ),
+        (PLAIN.replace("Q1_cm3_s", "h1_cm"), "expected a column for Q1"),
+        ("Logger 7\n" + PLAIN, "row 1: expected a header line .* put # before what stands above"),
+        (
+            STAMPED.format("2026-10-25 02:59:55", "2026-10-25 02:00:00", "2026-10-25 02:00:05"),
+            r"its offset \(\+01:00\)",
+        ),
+        (b"PK\x03\x04\x00\x00", "got a zip archive or an Excel workbook; save the sheet as CSV"),
+        (b"PAR1\x00\x00", "got a Parquet file"),
+        (b"t_s\x00\x00", "got something that is no text"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_with_a_fix(tmp_path: Path, text: str | bytes, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        read(tmp_path, text)
+
+
+def test_a_column_without_unit_is_asked_for_by_the_channel_s_name(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"columns: \{h1: \{column: level, unit: \.\.\.\}\}"):
+        read(tmp_path, PLAIN.replace("h1_cm", "level"), h1=ChannelSource("level"))
+
+
+def test_stamps_are_followed_from_the_first_on(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("time,Q1_cm3_s,h1_cm\n2026-03-29T08:00:00Z,50,10\n2026-03-29T08:00:05Z,50,11\n")
+    growing = GrowingCsv(path, ["Q1"], ["h1"])
+    assert growing.new()[0].tolist() == [0.0, 5.0]
+    with path.open("a") as file:
+        file.write("2026-03-29T08:01:00.5Z,50,12\nsoon,50,12\n")
+    seconds, _, readings, troubles = growing.new()
+    assert (seconds.tolist(), readings.tolist()) == ([60.5], [[0.12]])
+    assert "row 5, column time: expected a time stamp" in troubles[0]
