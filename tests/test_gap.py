@@ -131,12 +131,20 @@ def test_the_library_offers_62_effects_at_places_of_the_three_tanks() -> None:
     assert canonical(("plugging", "OUT2"), believed()) == ("leak", "T2")
 
 
+def test_a_pair_of_tanks_is_known_in_either_order() -> None:
+    assert [p.location for p in library_of(believed(), ("cross_flow@T2-T1",))] == ["T1-T2"]
+
+
 @pytest.mark.parametrize(
     ("names", "left_out", "message"),
     [
         (("pump_lagg",), (), "the nearest is 'pump_lag'"),
         (("pump_lag@T1",), (), "expected a place of kind pump, got T1"),
         (("pump_lag",), ("pump_lag",), "expected at least one effect"),
+        (("pump_lag@Q9",), (), "library: pump_lag@Q9: expected a place of plant three_tank .*got 'Q9'"),
+        (("pump_lag@",), (), "expected a place after the @"),
+        (("all", "pump_lag"), (), "expected 'all' by itself"),
+        (("pump_lag",), ("leak@T1",), "expected an effect without a place"),
     ],
 )
 def test_a_wrong_library_is_said(names: tuple[str, ...], left_out: tuple[str, ...], message: str) -> None:

@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     keep_memory()
     plant = load_plant(arguments.plant)
     recordings = named_recordings(arguments.recording, plant, Path.cwd())
-    library = tuple(arguments.library.split(",")) if arguments.library else None
+    library = _names(arguments.library) or None
     if arguments.plan:
         with one_thread():
             return show_plan(plan(plant, recordings[0], arguments.noise, library), screen)
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     if arguments.most < 1:
         raise ValueError(f"--most: expected at least one effect, got {arguments.most}")
     holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
-    left_out = tuple(name for name in arguments.leave_out.split(",") if name)
+    left_out = _names(arguments.leave_out)
     if arguments.refit:
         with one_thread():
             return run_refit(plant, recordings, holdouts, left_out, arguments, screen)
@@ -98,6 +98,10 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     screen.say(f"log: {log} (fdi report {log} makes the page)")
     screen.result(answer.to_dict())
     return DONE
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
 
 
 def _keep(arguments: argparse.Namespace, plant: PlantDescription, answer: Answer, screen: Screen) -> Path | None:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from fdi_torch.effects import EFFECTS, effect
 from fdi_torch.gap.answer import CauseName
+from fdi_torch.names import unknown
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.plant.effect import Placement, fits
 
@@ -50,13 +51,19 @@ def library_of(
     the same as another one there. Raises ValueError for an effect or a place that does not exist.
     """
     wanted = STANDARD if names is None else tuple(e.name for e in EFFECTS) if tuple(names) == ("all",) else names
-    left_out = {effect(name).name for name in leave_out}
+    left_out = {effect(name).name for name in map(_plain, leave_out)}
     found: dict[str, Placement] = {}
     for entry in wanted:
-        name, _, at = entry.partition("@")
+        name, separator, at = (part.strip() for part in entry.partition("@"))
+        if name == "all":
+            raise ValueError(f"library: expected 'all' by itself, got {', '.join(wanted)}")
+        if separator and not at:
+            raise ValueError(f"library: {entry}: expected a place after the @, got none; name one, or leave the @ out")
         if name in left_out:
             continue
-        places = [at] if at else [p for p in possible_places(plant) if fits(effect(name), plant, p)]
+        places = (
+            [_known(entry, at, plant)] if at else [p for p in possible_places(plant) if fits(effect(name), plant, p)]
+        )
         for place in places:
             if not fits(effect(name), plant, place):
                 kinds = " or ".join(effect(name).places)
@@ -65,6 +72,22 @@ def library_of(
     if not found:
         raise ValueError("library: expected at least one effect that fits the plant, got none; name some")
     return tuple(found.values())
+
+
+def _plain(name: str) -> str:
+    """Raises ValueError for an effect at a place: one is denied everywhere."""
+    if "@" in name:
+        raise ValueError(f"leave-out: expected an effect without a place, got {name}; it is denied everywhere")
+    return name.strip()
+
+
+def _known(entry: str, place: str, plant: PlantDescription) -> str:
+    """A place of the plant; a pair of tanks in either order. Raises ValueError for one that it has not."""
+    turned = "-".join(reversed(place.split("-")))
+    for name in (place, turned):
+        if name in plant.locations():
+            return name
+    raise ValueError(f"library: {entry}: {unknown(f'a place of plant {plant.name}', place, plant.locations())}")
 
 
 def possible_places(plant: PlantDescription) -> tuple[str, ...]:

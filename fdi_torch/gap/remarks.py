@@ -23,12 +23,13 @@ def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
     """Of the inputs, the plant file, the parameters found, and the hold-outs."""
     subject = found.fitter.subject
     remarks = []
-    if all(float(torch.diff(column).abs().max()) == 0.0 for column in subject.recording.inputs.T):
+    inputs = [column for part in subject.parts for column in part.recording.inputs.T]
+    if all(float(torch.diff(column).abs().max()) == 0.0 for column in inputs):
         remarks.append(
             "the inputs never change, so that most effects cannot be told from another or from a constant within its "
             "tolerance; `fdi gap --plan` with inputs that step shows what they would tell"
         )
-    if len(subject.nuisance) == len(subject.plant.tanks):
+    if not subject.plant.tolerances:
         remarks.append(
             "the plant file lists no tolerances, so that every constant is taken to be exact and what is a little off "
             "looks like an effect; list them under tolerances, as in P13.discharge_coefficient: 3 %"
