@@ -48,7 +48,8 @@ class Parameter:
         if not self.low <= self.nominal <= self.high:
             raise ValueError(
                 f"{self.name}: expected low <= nominal <= high, "
-                f"got {self.low} <= {self.nominal} <= {self.high} {self.unit}"
+                f"got {self.low:g}, {self.nominal:g}, {self.high:g} {self.unit.removeprefix('1')}".rstrip()
+                + "; widen the range, or give a nominal within it"
             )
         if not self.std > 0:
             raise ValueError(f"{self.name}: expected a positive standard deviation, got {self.std} {self.unit}")

@@ -176,3 +176,25 @@ print(keep_memory(), pages())
     if able == "False":
         pytest.skip("not the GNU C library")
     assert int(pages) < 4 * (1 << 22) / 4096  # mapped anew each time: twenty times the array's
+
+
+@pytest.mark.parametrize(
+    ("command", "key"),
+    [
+        ("check", "tanks.NAME.area"),
+        ("train", "recordings.N.file"),
+        ("monitor", "fault_free"),
+        ("study", "study.trials"),
+    ],
+)
+def test_keys_of_a_file_are_listed(command: str, key: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        cli.main([command, "--keys"])
+    assert stopped.value.code == 0
+    assert key in {line.split()[0] for line in capsys.readouterr().out.splitlines()}
+
+
+def test_who_reads_may_stop_reading() -> None:
+    words = f"{sys.executable} -m fdi_torch check --keys | head -1"
+    done = subprocess.run(words, shell=True, capture_output=True, text=True, check=True)
+    assert (done.stdout.split()[0], done.stderr) == ("name", "")

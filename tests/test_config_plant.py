@@ -117,7 +117,7 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
         ("tanks.T1.area", "nan m^2", "p.yaml: tanks.T1.area: expected a finite quantity in m\\^2, got nan m\\^2"),
         ("tanks.T1.area", "-160 cm^2", "p.yaml: plant p: tanks.T1.area: expected a positive number, got -0.016 m\\^2"),
         ("tanks.T3", {"area": "1 m^2"}, "p.yaml: tanks.T3.height: expected a value, got nothing; add it"),
-        ("tanks", [], "p.yaml: tanks: expected a valid dictionary, got \\[\\]"),
+        ("tanks", [], "p.yaml: tanks: expected keys with values, got \\[\\]"),
         ("tanks", {}, "expected at least one tank, got none"),
         ("pipes.P12.target", "T9", "pipes.P12.target: expected one of the tanks T1, T2, outside, got 'T9'"),
         ("pipes.P12.target", "T1", "pipes.P12: expected two different ends, got T1 twice"),
@@ -147,7 +147,7 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
         (
             "effects",
             [{"effect": "leak", "location": "Q1"}],
-            "effects.0: expected a place of kind tank for leak, got Q1",
+            "effects.0: Q1.leak: expected a place of kind tank .* got pump Q1",
         ),
         ("effects", [{"effect": "leak", "location": "T9"}], "effects.0: plant p: expected one of .* got T9"),
     ],
@@ -171,8 +171,8 @@ def test_a_plant_file_is_found_by_shipped_name_by_folder_and_by_path(tmp_path: P
     [
         ("tanks: [", "line 1: expected YAML"),
         ("tanks: {}\nsensors: {h1: {tank: T1}, h1: {tank: T2}}", "line 2: expected each key once, got h1 twice"),
-        ("- 1", "expected keys and values, got list"),
-        ("", "got NoneType"),
+        ("- 1", "expected keys and values .* got list"),
+        ("", "got nothing"),
     ],
 )
 def test_a_file_without_a_mapping_is_refused(tmp_path: Path, text: str, sentence: str) -> None:

@@ -15,6 +15,7 @@ from fdi_torch.config.files import SHIPPED, read_yaml
 from fdi_torch.config.run import Run
 from fdi_torch.config.simulation import NoiseConfig, noise_std, planned_recording
 from fdi_torch.effects import build_network
+from fdi_torch.jobs.run_setup import wanted_space
 from fdi_torch.parameters import ParameterSpace
 
 PAPER = ["T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size"]
@@ -309,3 +310,32 @@ def test_shipped_runs_on_real_data_read_their_recordings(real_data: Path, monkey
         wanted = load_run(path)
         for part in load_recordings(wanted.config.recordings, wanted.plant, wanted.base):
             assert torch.isfinite(part.recording.inputs).all() and len(part.recording) > 20
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("parameters: [T1.leak]", "got 'parameters'; there is estimate.parameters"),
+        ("estimate: {seed: 3}", "got 'seed'.*; there is simulate.seed and seed"),
+        ("recordings: [{file:run.csv}]", "got 'file:run.csv'.*; part key and value by a colon and a space"),
+        ("recordings: run.csv", r"recordings: expected a list, as in \[run.csv\]"),
+        ("plant: {tanks: {T: {area: 1 m^2, height: 1 m}}, pipes: {P: {source: T, area: 1 cm^2, "
+         "discharge_coefficient: 60}}}\nrecordings: [run.csv]", "discharge_coefficient: expected less than or equal"),
+    ],
+)  # fmt: skip
+def test_what_stands_in_the_wrong_place_is_shown_the_right_one(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "run.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=sentence):
+        load_run(tmp_path / "run.yaml")
+
+
+def test_a_recording_may_be_its_file_s_name_alone(tmp_path: Path) -> None:
+    (tmp_path / "run.yaml").write_text("recordings: [run.csv]")
+    assert load_run(tmp_path / "run.yaml").config.recordings[0].file == "run.csv"
+
+
+@pytest.mark.parametrize(("name", "there"), [("Q1.leak", r"tank \(T1, T2, T3\), got pump Q1"), ("T1.plugging", "P13")])
+def test_an_effect_at_a_place_of_another_kind_is_refused(name: str, there: str) -> None:
+    run = load_run(overrides=[f"estimate.parameters=[{name}]"])
+    with pytest.raises(ConfigError, match=f"default.yaml: estimate.parameters: {name}: expected .*{there}"):
+        wanted_space(run)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from types import ModuleType
@@ -53,8 +54,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def command_line() -> NoReturn:
-    """The entry point `fdi`."""
-    sys.exit(main())
+    """The entry point `fdi`. Who reads may stop reading, as `| head` does."""
+    try:
+        code = main()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = DONE
+    sys.exit(code)
 
 
 def _overview() -> str:
@@ -77,6 +84,8 @@ def _run(name: str, words: list[str]) -> int:
     except KeyboardInterrupt:
         screen.complain(f"fdi {name}: interrupted; what was computed until now is kept")
         return INTERRUPTED
+    except BrokenPipeError:
+        raise
     except (ValueError, OSError) as error:
         if arguments.traceback:
             raise
@@ -87,7 +96,7 @@ def _run(name: str, words: list[str]) -> int:
 
 def _say_that_it_began(name: str, words: Sequence[str]) -> None:
     """A job's libraries take seconds to load where they are not there yet: its first sign of life comes before them."""
-    if name in LONG and "torch" not in sys.modules and not {"-h", "--help", "--quiet"} & set(words):
+    if name in LONG and "torch" not in sys.modules and not {"-h", "--help", "--keys", "--quiet"} & set(words):
         sys.stderr.write(f"fdi {name}: loading\n")
         sys.stderr.flush()
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from fdi_torch.cli.options import add_config
+from fdi_torch.cli.options import add_config, add_keys
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant import PlantConfig, load_plant
 from fdi_torch.config.recordings import RecordingConfig, known_parts, read_recording
 from fdi_torch.config.run import load_run
 from fdi_torch.parameters import display_unit
@@ -19,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", nargs="?", help="CSV or MCAP file whose columns are named as the plant's channels")
     parser.add_argument("--plant", metavar="NAME|FILE", help="a shipped plant such as three_tank, or a plant file")
     add_config(parser)
+    add_keys(parser, "a plant file", PlantConfig)
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

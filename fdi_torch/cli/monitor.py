@@ -8,14 +8,14 @@ import orjson
 
 from fdi_torch.cli.options import add_config, add_live, live, seconds
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.monitor import load_monitor
+from fdi_torch.config.monitor import MonitorConfig, load_monitor
 from fdi_torch.jobs.monitor import Listening, watch
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.prepare import Prepared
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, required=True)
+    add_config(parser, MonitorConfig, required=True)
     parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
     parser.add_argument(
         "--follow", action="store_true", help="the file is still being written: events as its samples come"

@@ -3,18 +3,43 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from fdi_torch.cli.screen import Screen
+from fdi_torch.config.reference import config_reference
+from fdi_torch.config.strict import Strict
 from fdi_torch.logbook import Listener, serve
 from fdi_torch.parameters import parse_quantity
 
 LIVE = "127.0.0.1:8765"
 
 
-def add_config(parser: argparse.ArgumentParser, required: bool = False) -> None:
+class ShowKeys(argparse.Action):
+    """Prints what may stand in a file, and ends."""
+
+    def __init__(self, models: Sequence[type[Strict]], **settings: Any) -> None:
+        super().__init__(nargs=0, **settings)
+        self.models = models
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        for model in self.models:
+            sys.stdout.write(config_reference(model) + "\n")
+        parser.exit()
+
+
+def add_keys(parser: argparse.ArgumentParser, what: str, *models: type[Strict]) -> None:
+    told = f"print every key of {what} with its default and meaning, and end"
+    parser.add_argument("--keys", action=ShowKeys, models=models, help=told)
+
+
+def add_config(parser: argparse.ArgumentParser, *models: type[Strict], required: bool = False) -> None:
+    """models: of what may stand in the file."""
     parser.add_argument("--config", metavar="FILE", required=required, help="run file (YAML)")
+    if models:
+        add_keys(parser, "such a file", *models)
     parser.add_argument(
         "--set",
         metavar="KEY=VALUE",

@@ -9,12 +9,12 @@ import argparse
 
 from fdi_torch.cli.options import add_config, add_live, live
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.rehearsal import load_rehearsal
+from fdi_torch.config.rehearsal import RehearsalConfig, load_rehearsal
 from fdi_torch.jobs.rehearsal import Rehearsed, rehearse
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, required=True)
+    add_config(parser, RehearsalConfig, required=True)
     parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
     parser.add_argument("--resume", action="store_true", help="go on from what a stopped run left in its log")
     add_live(parser)

@@ -7,14 +7,14 @@ from pathlib import Path
 
 from fdi_torch.cli.options import add_config, add_run, overrides
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.run import load_run
+from fdi_torch.config.run import RunConfig, load_run
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.recordings.csv_files import write_csv
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser)
+    add_config(parser, RunConfig)
     add_run(parser)
 
 

@@ -9,14 +9,14 @@ import argparse
 
 from fdi_torch.cli.options import add_config, add_live, add_run, live, overrides
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.study import load_study
+from fdi_torch.config.study import StudyFile, load_study
 from fdi_torch.jobs.study import StudyResult, run_study
 from fdi_torch.study.isolation import Isolation
 from fdi_torch.study.summary import Ratio, Score, Summary
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, required=True)
+    add_config(parser, StudyFile, required=True)
     add_run(parser)
     add_live(parser)
     parser.add_argument("--resume", action="store_true", help="go on from what a killed run left in its log")

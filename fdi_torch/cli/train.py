@@ -12,14 +12,14 @@ from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.options import add_config, add_live, add_run, live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.windows import show_windows
-from fdi_torch.config.run import load_run
+from fdi_torch.config.run import RunConfig, load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windows import windows_of
 from fdi_torch.parameters import display_unit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser)
+    add_config(parser, RunConfig)
     add_run(parser)
     add_live(parser)
     parser.add_argument("--resume", action="store_true", help="go on where a killed run of the same file stopped")

@@ -9,9 +9,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
+from fdi_torch.config.plant import effect_at
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
-from fdi_torch.effects import EFFECTS, all_placements, effect, placements_for
+from fdi_torch.effects import EFFECTS, all_placements, placements_for
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.names import unknown
 from fdi_torch.parameters import Parameter, ParameterSpace
@@ -86,10 +87,10 @@ class EstimationConfig(Strict):
 
 
 def full_name(name: str, plant: PlantDescription) -> str:
-    """'T1.leak' -> 'T1.leak.size': an effect's name stands for its size."""
+    """'T1.leak' -> 'T1.leak.size': an effect's name stands for its size. Raises ValueError where it cannot be there."""
     location, _, rest = name.partition(".")
     if rest in {e.name for e in EFFECTS}:
-        return f"{name}.{effect(rest).parameters(location, plant)[0].name}"
+        return f"{name}.{effect_at(rest, location, plant).parameters(location, plant)[0].name}"
     return name
 
 

@@ -36,7 +36,8 @@ def parse_yaml(text: bytes, source: str) -> dict[str, Any]:
         told = problem if problem.startswith("expected each key") else f"expected YAML, got {problem}"
         raise ConfigError([f"{source}: {line}{told}"]) from error
     if not isinstance(data, dict):
-        raise ConfigError([f"{source}: expected keys and values, got {type(data).__name__}"])
+        got = "nothing" if data is None else type(data).__name__
+        raise ConfigError([f"{source}: expected keys and values such as plant: three_tank, got {got}"])
     return data
 
 

@@ -17,7 +17,7 @@ from fdi_torch.effects import effect
 from fdi_torch.names import unknown
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import COMMAND_UNITS, OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.plant.effect import fits
+from fdi_torch.plant.effect import Effect, fits, place_kind
 
 SENSOR_UNITS = {"1": "m", "Pa/m": "Pa", "V/m": "V", "A/m": "A", "1/m": "1"}
 """Unit of a sensor's gain -> SI unit of its reading."""
@@ -25,6 +25,9 @@ SENSOR_UNITS = {"1": "m", "Pa/m": "Pa", "V/m": "V", "A/m": "A", "1/m": "1"}
 
 def _start_level(value: Any) -> float | None:
     return None if value in (None, "equilibrium") else quantity(value, "m")
+
+
+MOST_DISCHARGE = 10.0  # more is no orifice's coefficient, effective or not, but per cent without their sign
 
 
 class TankConfig(Strict):
@@ -41,7 +44,7 @@ class PipeConfig(Strict):
     source: str = Field(description="the tank it starts from")
     target: str = Field(OUTSIDE, description="the tank it leads to, or outside")
     area: Area = Field(description="of the orifice, m^2")
-    discharge_coefficient: Share = Field(description="of the orifice, without unit")
+    discharge_coefficient: Share = Field(le=MOST_DISCHARGE, description="of the orifice, without unit")
     elevation: Length = Field(0.0, description="of the orifice above both floors, m")
     free_fall: bool = Field(False, description="whether it pours into its target from above")
     valve: str | None = Field(None, description="the input channel with its measured opening, 0 to 1")
@@ -154,10 +157,19 @@ def _effect(index: int, config: EffectConfig, plant: PlantDescription) -> Placed
 
 def effect_parameters(name: str, location: str, plant: PlantDescription) -> dict[str, Parameter]:
     """The parameters of an effect at a place, by their short names. Raises ValueError where it cannot be there."""
+    return {p.name: p for p in effect_at(name, location, plant).parameters(location, plant)}
+
+
+def effect_at(name: str, location: str, plant: PlantDescription) -> Effect:
+    """The effect of that name. Raises ValueError where it cannot be at that place of the plant."""
     found = effect(name)
     if not fits(found, plant, location):
-        raise ValueError(f"expected a place of kind {' or '.join(found.places)} for {name}, got {location}")
-    return {p.name: p for p in found.parameters(location, plant)}
+        there = ", ".join(place for place in plant.locations() if fits(found, plant, place)) or "none there is"
+        raise ValueError(
+            f"{location}.{name}: expected a place of kind {' or '.join(found.places)} ({there}), "
+            f"got {place_kind(plant, location)} {location}"
+        )
+    return found
 
 
 def _tolerances(config: PlantConfig, plant: PlantDescription) -> dict[str, float]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from pydantic import ValidationError
@@ -16,23 +17,54 @@ class ConfigError(ValueError):
         self.problems = tuple(problems)
 
 
-def explain(error: ValidationError, source: str) -> ConfigError:
-    """Pydantic's findings as sentences."""
-    sentences = [f"{source}: {_path(e['loc'])}{_sentence(e)}" for e in error.errors(include_url=False)]
+class UnknownKeyError(ValueError):
+    """A key that is not known where it stands."""
+
+    def __init__(self, sentence: str, key: str) -> None:
+        super().__init__(sentence)
+        self.key = key
+
+
+def explain(error: ValidationError, source: str, known: Iterable[str] = ()) -> ConfigError:
+    """Pydantic's findings as sentences. known: the paths of all keys, for one that stands in the wrong place."""
+    known = list(known)
+    sentences = [f"{source}: {_path(e['loc'])}{_sentence(e, known)}" for e in error.errors(include_url=False)]
     return ConfigError(list(dict.fromkeys(sentences)))
+
+
+@contextmanager
+def told_in(source: str) -> Iterator[None]:
+    """What is wrong with a field is said with the file that has it."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError([p if p.startswith(source) else f"{source}: {p}" for p in error.problems]) from error
 
 
 def _path(location: tuple[int | str, ...]) -> str:
     return ".".join(str(part) for part in location) + ": " if location else ""
 
 
-def _sentence(found: Any) -> str:
+def _sentence(found: Any, known: Sequence[str]) -> str:
     if found["type"] == "missing":
         return "expected a value, got nothing; add it"
     if "error" in found.get("ctx", {}):
-        return str(found["ctx"]["error"])
+        return f"{found['ctx']['error']}{_elsewhere(found['ctx']['error'], known)}"
+    if found["type"] in ("list_type", "tuple_type"):
+        return f"expected a list, as in [{found['input']}], got {_shown(found['input'])}"
+    if found["type"] in ("dict_type", "model_type"):
+        return f"expected keys with values, got {_shown(found['input'])}"
     expected = found["msg"].replace("Input should be", "expected").replace("Input should have", "expected")
     return f"{expected}, got {_shown(found['input'])}"
+
+
+def _elsewhere(error: Exception, known: Sequence[str]) -> str:
+    if not isinstance(error, UnknownKeyError):
+        return ""
+    if ":" in error.key:
+        return "; part key and value by a colon and a space"
+    places = [path for path in known if path.rpartition(".")[2] == error.key and "NAME." not in path]
+    return f"; there is {' and '.join(places)}" if places else ""
 
 
 def _shown(value: Any) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from fdi_torch.config.files import find_data, find_file, read_extended
 from fdi_torch.config.problems import ConfigError, explain
@@ -67,6 +67,11 @@ class RecordingConfig(Strict):
         default_factory=dict, description="for channels (time is t) whose header is not name_unit"
     )
     start_levels: StartLevels = Field("free", description="free, equilibrium, or a mapping such as {T1: 50 cm}")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_name_alone_is_the_file(cls, data: Any) -> Any:
+        return {"file": data} if isinstance(data, str) else data
 
 
 @dataclass(frozen=True)

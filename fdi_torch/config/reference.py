@@ -8,7 +8,7 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 
-from fdi_torch.config.strict import Strict
+from fdi_torch.config.strict import Strict, is_for_a_bench
 
 Key = tuple[str, str, str]
 """Path of the key, its default as YAML would show it ('required' where there is none), its meaning."""
@@ -21,6 +21,7 @@ def keys(model: type[BaseModel], prefix: str = "") -> Iterator[Key]:
         inner, step = _inner(field.annotation)
         if inner is None:
             default = "required" if field.is_required() else _shown(field.get_default(call_default_factory=True))
+            default += " on a bench" if is_for_a_bench(field) else ""
             yield path, default, field.description or ""
         elif field.description:
             yield path, "", field.description

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic.fields import FieldInfo
 
+from fdi_torch.config.problems import UnknownKeyError
 from fdi_torch.names import unknown
 from fdi_torch.parameters import parse_quantity
 
@@ -21,7 +23,7 @@ class Strict(BaseModel):
         known = [field.alias or name for name, field in cls.model_fields.items()]
         for key in data if isinstance(data, dict) else ():
             if key not in known:
-                raise ValueError(unknown("a known key", str(key), known))
+                raise UnknownKeyError(unknown("a known key", str(key), known), str(key))
         return data
 
 
@@ -70,6 +72,11 @@ Amount = float | str
 Config = TypeVar("Config", bound=Strict)
 
 
+def is_for_a_bench(field: FieldInfo) -> bool:
+    """Whether a key's default is multiplied by the plant's time scale."""
+    return _ON_A_BENCH in field.metadata
+
+
 def at_pace(config: Config, scale: float) -> Config:
     """The same, with times that nobody chose and that are meant for a bench multiplied by a plant's time scale."""
     changes: dict[str, Any] = {}
@@ -77,6 +84,6 @@ def at_pace(config: Config, scale: float) -> Config:
         value = getattr(config, name)
         if isinstance(value, Strict):
             changes[name] = at_pace(value, scale)
-        elif _ON_A_BENCH in field.metadata and name not in config.model_fields_set:
+        elif is_for_a_bench(field) and name not in config.model_fields_set:
             changes[name] = [scale * v for v in value] if isinstance(value, list) else scale * value
     return config.model_copy(update=changes) if scale != 1.0 else config

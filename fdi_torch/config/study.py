@@ -13,7 +13,8 @@ from pydantic import Field, ValidationError
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
 from fdi_torch.config.files import write_yaml
 from fdi_torch.config.problems import ConfigError, explain
-from fdi_torch.config.run import Run, build_run
+from fdi_torch.config.reference import keys
+from fdi_torch.config.run import Run, RunConfig, build_run
 from fdi_torch.config.simulation import planned_recording
 from fdi_torch.config.strict import BenchSeconds, BenchSteps, Share, Strict, at_pace
 from fdi_torch.config.understood import values_in
@@ -61,6 +62,12 @@ class StudyConfig(Strict):
     tolerance: float = Field(1e-5, gt=0, description="without noise: a larger error is a failure, share of the range")
 
 
+class StudyFile(RunConfig):
+    """A run file with a block `study`."""
+
+    study: StudyConfig = Field(description="what is varied, and how often")
+
+
 @dataclass(frozen=True)
 class Study:
     """A study file understood. text: YAML that gives the same study, plant included."""
@@ -86,7 +93,7 @@ def build_study(data: Mapping[str, Any], base: Path, source: str) -> Study:
     try:
         config = at_pace(StudyConfig.model_validate(varied), time_scale(run.plant))
     except ValidationError as error:
-        raise explain(error, f"{source}: study") from None
+        raise explain(error, f"{source}: study", (path for path, _, _ in keys(StudyFile))) from None
     text = run.text + write_yaml({"study": varied})
     return Study(config, run, _plan(config, run), text)
 

@@ -12,6 +12,7 @@ from fdi_torch.config.files import find_file, read_extended, with_overrides, wri
 from fdi_torch.config.plant import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError, explain
+from fdi_torch.config.reference import keys
 from fdi_torch.config.strict import Config, at_pace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import time_scale
@@ -33,7 +34,7 @@ def understood(
     try:
         config = model.model_validate(dict(data))
     except ValidationError as error:
-        raise explain(error, source) from None
+        raise explain(error, source, (path for path, _, _ in keys(model))) from None
     plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
     config = at_pace(config, time_scale(plant))
     return config, plant, write_yaml({**data, "plant": plant_mapping(plant)})

@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 
 from fdi_torch.config.estimation import EstimationConfig, estimated_space, parameter_values, placements_of
-from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.problems import ConfigError, told_in
 from fdi_torch.config.recordings import LoadedRecording, load_recordings
 from fdi_torch.config.run import Run
 from fdi_torch.config.simulation import noise_std, planned_recording
@@ -35,13 +35,16 @@ def simulate_recording(run: Run) -> Recording:
     config = run.config.simulate
     if config is None:
         raise ValueError(f"{run.source}: expected simulate, got none; say what is to be simulated")
-    planned = planned_recording(config, run.plant)
-    placements = placements_of(config.faults, run.plant)
+    with told_in(run.source):
+        planned = planned_recording(config, run.plant)
+        placements = placements_of(config.faults, run.plant)
     network = build_network(run.plant, placements)
     levels, _ = start_levels(run.plant, network, planned, config.start_levels)
     tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(run.plant.tanks, levels, strict=True))
     network = build_network(replace(run.plant, tanks=tanks), placements)
-    clean = clean_readings(network, planned, parameter_values(config.faults, network.constants, run.plant))
+    with told_in(run.source):
+        values = parameter_values(config.faults, network.constants, run.plant)
+    clean = clean_readings(network, planned, values)
     seed = run.config.seed if config.seed is None else config.seed
     generator = torch.Generator().manual_seed(seed)
     return with_noise(planned, clean, noise_std(config.noise, run.plant, clean), generator, network)
@@ -66,7 +69,8 @@ def wanted_space(run: Run) -> ParameterSpace:
         network = build_network(run.plant, placements_of([p.name for p in config.parameters], run.plant))
     except ValueError as error:
         raise ConfigError([f"{run.source}: estimate.parameters: {error}"]) from error
-    return estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
+    with told_in(run.source):
+        return estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
 
 
 def usable_device(name: str) -> torch.device:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recordings import LoadedRecording, StartLevel
 from fdi_torch.config.run import Run
 from fdi_torch.estimate.stretches import Stretch, stretches_of
@@ -44,6 +45,7 @@ def windows_of(run: Run, tell: Callable[[float, str], None] = lambda share, text
         log_recordings(log, loaded, {})
         noise = [noise_of(part.recording, run.plant) for part in loaded]
         cuts = [(c, std) for part, std in zip(loaded, noise, strict=True) for c in cut_up(part.recording, length)]
+        _expect_windows(run, len(cuts))
         fittings = [fitting_of(run, space, [LoadedRecording(cut, free)]) for cut, _ in cuts]
         step = hybrid_settings(run.config.estimate).refine_step or window_step(fittings, noise[0])
         found = []
@@ -55,6 +57,12 @@ def windows_of(run: Run, tell: Callable[[float, str], None] = lambda share, text
         log.result({"step": step, "windows": [_plain(w) for w in found], "stretches": stretches})
     tell(1.0, "done")
     return result
+
+
+def _expect_windows(run: Run, count: int) -> None:
+    if not count:
+        got = f"{run.config.estimate.windows:g} s; shorten them"
+        raise ConfigError([f"{run.source}: estimate.windows: expected windows shorter than a recording, got {got}"])
 
 
 def _plain(window: Window) -> dict[str, object]:
