@@ -19,7 +19,7 @@ from fdi_torch.monitor.rehearsal.runs import Course, Rig, fault_free
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.settings import MonitorSettings
 
-PART = 250  # runs side by side
+PART = 50  # runs side by side
 NAME = "faults found"
 
 
