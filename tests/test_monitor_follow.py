@@ -17,6 +17,7 @@ import yaml
 from fdi_torch.cli import INTERRUPTED, main
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
+from fdi_torch.jobs.monitor import reaching
 from fdi_torch.logbook import RunLog, follow, read_run
 from fdi_torch.monitor.arrivals import Arrivals, Punctuality
 from fdi_torch.monitor.observer import bound
@@ -264,6 +265,35 @@ def test_a_file_that_cannot_be_followed_is_refused(tmp_path: Path, capsys: pytes
         log.sample("/plant/input", 0.0, {"Q1": 1.0, "Q2": 1.0})
     assert main(["monitor", "--config", config(tmp_path, recording={"file": "bare.mcap"}), "--follow", "--quiet"]) == 2
     assert "expected a unit, got none" in capsys.readouterr().err
+
+
+def test_a_wild_time_stamp_neither_ends_the_learning_nor_the_monitor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One stamp far ahead while learning and one afterwards, all rows at once: as if they came one by one."""
+    lines = [row(k, levels) for k, levels in enumerate(readings())]
+    for k in (20, 180):
+        lines[k] = row(1e6 + k, readings()[k])
+    (tmp_path / "rig.csv").write_text(HEADER + "".join(lines))
+    events = monitored(["--config", config(tmp_path), "--follow", "--idle", "0.2"], capsys)
+    assert texts(events).count("the clock jumps back") == 2
+    assert kinds(events)[:2] == ["alarm", "isolated"]
+    assert next(event for event in events if event["kind"] == "isolated")["faults"] == [FAULT]
+
+
+def test_the_part_to_learn_from_is_the_first_that_reaches_its_end() -> None:
+    def at(*times: float) -> list[tuple[float, list[float], list[float]]]:
+        return [(float(t), [], []) for t in times]
+
+    once = at(*range(101))
+    assert reaching(once, 100.0) == once and reaching(once[:-1], 100.0) == []
+    wild = [*at(*range(20)), *at(1e6), *at(*range(21, 300))]
+    assert [r[0] for r in reaching(wild, 100.0)] == [float(t) for t in range(21, 101)]
+    restarted = at(*range(120), *range(120))
+    assert reaching(restarted, 100.0) == once
+    gap = at(*range(60), *range(150, 170))
+    assert len(reaching(gap, 100.0)) == 70 and reaching(gap[:69], 100.0) == []
+    assert len(reaching(at(*range(50), *range(49, 101)), 100.0)) == 101
 
 
 def test_arrivals_come_in_batches_and_with_their_errors() -> None:

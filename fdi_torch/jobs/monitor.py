@@ -18,6 +18,7 @@ from fdi_torch.config.recordings import read_recording
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.monitor.arrivals import Arrivals, Punctuality
+from fdi_torch.monitor.continuity import GAP
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.following import MonitorState
 from fdi_torch.monitor.online import Monitor, Seen
@@ -97,15 +98,17 @@ def _follow(run: MonitorRun, watcher: _Watcher, listening: Listening, idle: floa
     arrivals = Arrivals(growing_rows(run.config.recording, run.plant, run.base, idle))
     early: list[Row] = []
     said: list[str] = []
+    learnt: list[Row] = []
     for batch in arrivals:
         early += [row for row in batch if not isinstance(row, str)]
         said += [row for row in batch if isinstance(row, str)]
         listening.tell(
             0.0, f"{early[-1][0]:g} s, learning until {run.config.fault_free[1]:g} s" if early else "waiting"
         )
-        if early and early[-1][0] >= run.config.fault_free[1]:
+        learnt = reaching(early, run.config.fault_free[1])
+        if learnt:
             break
-    watcher.begin(_prepared(run, _recording_of(early, run)))
+    watcher.begin(_prepared(run, _recording_of(learnt or early, run)))
     punctual = Punctuality(time.monotonic)
     first: list[Row | str] = [*said, *early]
     for batch in chain([first], arrivals):
@@ -261,6 +264,31 @@ def _samples_of(rows: Sequence[Row], run: MonitorRun) -> Samples:
     time, inputs, readings = (torch.tensor(column, dtype=torch.float64) for column in zip(*rows, strict=True))
     sensors = len(run.plant.sensors)
     return Samples(time, inputs.reshape(len(time), -1), readings.reshape(-1, sensors), run.config.recording.hold)
+
+
+def reaching(rows: Sequence[Row], until: float) -> list[Row]:
+    """The first of them without a jump back of their clock that reach a moment (s); none while they do not.
+
+    A single stamp far ahead does not reach it, a gap does once GAP samples have come after it.
+    """
+    stretch: list[Row] = []
+    steps: list[float] = []
+    beyond = 0
+    for row in rows:
+        step = row[0] - stretch[-1][0] if stretch else 0.0
+        if step == 0.0 and stretch:
+            continue
+        if step < 0.0:
+            stretch, steps, beyond = [], [], 0
+        elif stretch:
+            steps.append(step)
+        stretch.append(row)
+        if row[0] < until:
+            continue
+        beyond += 1
+        if beyond >= GAP or (beyond == 1 and steps and step <= GAP * sorted(steps)[len(steps) // 2]):
+            return stretch
+    return []
 
 
 def _recording_of(rows: Sequence[Row], run: MonitorRun) -> Recording:
