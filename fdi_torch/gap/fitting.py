@@ -15,13 +15,17 @@ from fdi_torch.gap.subject import Subject
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.pace import length_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint import Joint, own_name
 
 ROUNDS = 14
 SETTLED = 0.05  # chi-square units; smaller gains decide nothing
 PATIENCE, ENOUGH = 1, 4.0  # a start is given up that gains less than a quarter of its arrears after two rounds
-CORRECTIONS, FAR = 6, 1e-3  # of a trajectory that a step of the parameters moved; m from which it is worth one
+CORRECTIONS, FAR = (
+    6,
+    1e-3,
+)  # of a trajectory that a step of the parameters moved; m, on a bench, from which it is worth one
 Key = frozenset[tuple[str, str]]
 
 
@@ -69,6 +73,7 @@ class Fitter:
 
     def __init__(self, subject: Subject, noise: Noise) -> None:
         self.subject, self.noise = subject, noise
+        self.far = FAR * length_scale(subject.plant)
 
     def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation | Joint:
         """The plant with the candidate's effects; its space holds the nuisances and what is free."""
@@ -154,7 +159,7 @@ class Fitter:
     ) -> tuple[Tensor, Tensor, Linearised]:
         """theta (L, P), levels (L, K+1, n) -> where Levenberg-Marquardt ends, its cost (L,) and neighbourhood."""
         low, high, scale = self.box(engine.space)
-        near = _settled(engine, theta, engine.linearise(theta, levels))
+        near = _settled(engine, theta, engine.linearise(theta, levels), self.far)
         cost, gradient, curvature = self.normal(engine.space, theta, near, scale)
         damping = torch.full_like(cost, 1e-3)
         active = torch.isfinite(cost)
@@ -166,7 +171,7 @@ class Fitter:
             moved = torch.minimum(torch.maximum(theta[lanes] + step, low), high)
             moves = (moved - theta[lanes]).unsqueeze(1).unsqueeze(1)
             guess = near.levels[lanes] + (near.slopes[lanes] * moves).sum(-1)
-            tried = _settled(engine, moved, engine.linearise(moved, guess))
+            tried = _settled(engine, moved, engine.linearise(moved, guess), self.far)
             new_cost, new_gradient, new_curvature = self.normal(engine.space, moved, tried, scale)
             better = new_cost < cost[lanes]
             gain = torch.where(better, cost[lanes] - new_cost, torch.zeros_like(new_cost))
@@ -225,10 +230,10 @@ def left_open(fitter: Fitter, fit: Fit) -> float:
     return max(slow_excess(fitter.white(fit.near)[0][0]), 0.0)
 
 
-def _settled(engine: Collocation | Joint, theta: Tensor, near: Linearised) -> Linearised:
+def _settled(engine: Collocation | Joint, theta: Tensor, near: Linearised, far: float) -> Linearised:
     """The lanes whose trajectories were still far from the model's corrected until they are not, or no more."""
     for _ in range(CORRECTIONS):
-        lanes = (near.defect > FAR).nonzero().flatten()
+        lanes = (near.defect > far).nonzero().flatten()
         if not len(lanes):
             break
         near = _replaced(near, lanes, engine.linearise(theta[lanes], near.levels[lanes]))

@@ -17,11 +17,12 @@ from torch import Tensor
 from fdi_torch.gap.fitting import Fit, Fitter
 from fdi_torch.gap.subject import subject_of
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import lay_out
 
-DESIGNS, DURATION, SEED = 6, 1500.0, 0
-HOLDS = (60.0, 120.0, 250.0)  # s
+DESIGNS, SEED = 6, 0
+DURATION, HOLDS = 1500.0, (60.0, 120.0, 250.0)  # s, of tanks on a bench
 PARTED = 20.0  # chi-square units: odds of 20000 to 1
 HIGH, FULL = 0.8, 0.95  # of a pump's limit, and of a tank's height
 TINY = 1e-10
@@ -29,10 +30,10 @@ TINY = 1e-10
 
 def next_input(fitter: Fitter, first: Fit, second: Fit) -> Mapping[str, Any] | None:
     """The best of the designs under which no tank comes near its rim; None where none of them is safe."""
-    generator = torch.Generator().manual_seed(SEED)
+    generator, pace = torch.Generator().manual_seed(SEED), time_scale(fitter.subject.plant)
     best: Mapping[str, Any] | None = None
     for k in range(DESIGNS):
-        recording = _design(fitter, HOLDS[k % len(HOLDS)], generator)
+        recording = _design(fitter, pace * HOLDS[k % len(HOLDS)], generator)
         parted = _separation(fitter, first, second, recording)
         if parted is None:
             continue
@@ -49,10 +50,11 @@ def _design(fitter: Fitter, hold: float, generator: torch.Generator) -> Recordin
     """Random steps of all channels, none of which changes with another."""
     subject = fitter.subject
     interval = float(torch.median(torch.diff(subject.recording.time)))
-    time = torch.arange(0.0, DURATION, interval, dtype=torch.float64)
+    duration = time_scale(fitter.subject.plant) * DURATION
+    time = torch.arange(0.0, duration, interval, dtype=torch.float64)
     columns = []
     for low, high in _limits(fitter):
-        steps = torch.rand(int(DURATION / hold) + 2, generator=generator, dtype=torch.float64)
+        steps = torch.rand(int(duration / hold) + 2, generator=generator, dtype=torch.float64)
         shift = float(torch.rand(1, generator=generator, dtype=torch.float64))
         index = torch.clamp(torch.floor(time / hold + shift).long(), max=len(steps) - 1)
         columns.append(low + (high - low) * steps[index])

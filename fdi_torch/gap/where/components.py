@@ -16,6 +16,7 @@ from fdi_torch.gap.forcing import Forcing
 from fdi_torch.gap.where.forms import bends, jumps, memories, slews, sticks, tirings
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump
 from fdi_torch.plant.effect import place_kind
+from fdi_torch.plant.pace import time_scale
 
 Signals = dict[str, Tensor]
 
@@ -62,29 +63,29 @@ def component_at(place: str, plant: PlantDescription) -> Component:
     return _pipe(found, plant)
 
 
-def of_reading(s: Signals, step: Tensor, ends: Ends) -> list[Tensor]:
-    """Forms of a sensor's discrepancy; step: between samples, s."""
+def of_reading(s: Signals, step: Tensor, ends: Ends, pace: float) -> list[Tensor]:
+    """Forms of a sensor's discrepancy; step: between samples, s; pace: of the plant."""
     own = [*bends(s["reading"], ends("reading"), 12), s["reading"] * s["time"] / ends("time")[1]]
-    return [*own, *memories(s["reading"], step), *sticks(s["reading"], ends("reading"))]
+    return [*own, *memories(s["reading"], step, pace), *sticks(s["reading"], ends("reading"))]
 
 
 def _pump(pump: Pump, plant: PlantDescription) -> Component:
-    which, tank = plant.pumps.index(pump), _index(plant, pump.target)
+    which, tank, pace = plant.pumps.index(pump), _index(plant, pump.target), time_scale(plant)
 
     def signals(along: Forcing) -> Signals:
         return {"command": along.commands[which], "flow": along.pumps[which], "level": along.levels[tank]}
 
     def flows(s: Signals, step: Tensor, ends: Ends) -> list[Tensor]:
-        own = [*bends(s["command"], ends("command"), 9), *memories(s["flow"], step)]
+        own = [*bends(s["command"], ends("command"), 9), *memories(s["flow"], step, pace)]
         own += [s["flow"] * b for b in bends(s["level"], ends("level"), 6)]
-        own += slews(s["flow"], step, ends("flow"))
-        return [*own, *sticks(s["flow"], ends("flow")), *tirings(s["flow"], step, ends("flow"))]
+        own += slews(s["flow"], step, ends("flow"), pace)
+        return [*own, *sticks(s["flow"], ends("flow")), *tirings(s["flow"], step, ends("flow"), pace)]
 
     return Component(signals, flows, "flow", OUTSIDE, pump.target)
 
 
 def _pipe(pipe: Pipe, plant: PlantDescription) -> Component:
-    which = plant.pipes.index(pipe)
+    which, pace = plant.pipes.index(pipe), time_scale(plant)
     valve = len(plant.pumps) + sum(1 for p in plant.pipes[:which] if p.valve)
 
     def signals(along: Forcing) -> Signals:
@@ -96,12 +97,12 @@ def _pipe(pipe: Pipe, plant: PlantDescription) -> Component:
         return known | ({"opening": along.commands[valve]} if pipe.valve else {})
 
     def flows(s: Signals, step: Tensor, ends: Ends) -> list[Tensor]:
-        own = [*bends(s["root"], ends("root"), 16), *memories(s["flow"], step)]
+        own = [*bends(s["root"], ends("root"), 16), *memories(s["flow"], step, pace)]
         own += [s["flow"] * j for j in jumps(s["root"], ends("root"), 24)]
         if pipe.valve:
             own += [s["root"] * b for b in bends(s["opening"], ends("opening"), 9)]
-            own += memories(s["root"] * s["opening"], step)
-        return [*own, *sticks(s["flow"], ends("flow")), *tirings(s["flow"], step, ends("flow"))]
+            own += memories(s["root"] * s["opening"], step, pace)
+        return [*own, *sticks(s["flow"], ends("flow")), *tirings(s["flow"], step, ends("flow"), pace)]
 
     return Component(signals, flows, "flow", pipe.source, pipe.target)
 

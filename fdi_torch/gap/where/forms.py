@@ -2,6 +2,8 @@
 
 What depends on a local variable bends or jumps at some of its values; what keeps a memory lags, sticks or dies away;
 what comes from elsewhere sets in, stops or creeps at some time, or comes and goes in a period.
+
+Times are those of tanks on a bench, and multiples of them by `pace` for others (`plant.pace.time_scale`).
 """
 
 from __future__ import annotations
@@ -33,12 +35,12 @@ def jumps(x: Tensor, ends: tuple[float, float], count: int) -> list[Tensor]:
     return [(x >= c).to(x.dtype) for c in torch.linspace(*ends, count + 2, dtype=x.dtype).tolist()[1:-1]]
 
 
-def memories(x: Tensor, step: Tensor) -> list[Tensor]:
+def memories(x: Tensor, step: Tensor, pace: float) -> list[Tensor]:
     """How x differs from what lags behind it; what its steps leave behind."""
     change = torch.diff(x, prepend=x[:1])
     risen, fallen = change.clamp(min=0.0), (-change).clamp(min=0.0)
-    lagging = [lagged(x, step, tau) - x for tau in LAGS]
-    fading = [faded(y, step, tau) for tau in FADES for y in (risen, fallen)]
+    lagging = [lagged(x, step, pace * tau) - x for tau in LAGS]
+    fading = [faded(y, step, pace * tau) for tau in FADES for y in (risen, fallen)]
     return [*lagging, *fading]
 
 
@@ -47,15 +49,15 @@ def sticks(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
     return [stuck(x, share * (ends[1] - ends[0])) - x for share in BANDS]
 
 
-def slews(x: Tensor, step: Tensor, ends: tuple[float, float]) -> list[Tensor]:
+def slews(x: Tensor, step: Tensor, ends: tuple[float, float], pace: float) -> list[Tensor]:
     """How x differs from what follows it no faster than through its range in some time."""
-    return [slewed(x, step, (ends[1] - ends[0]) / time) - x for time in STROKES]
+    return [slewed(x, step, (ends[1] - ends[0]) / (pace * time)) - x for time in STROKES]
 
 
-def tirings(x: Tensor, step: Tensor, ends: tuple[float, float]) -> list[Tensor]:
+def tirings(x: Tensor, step: Tensor, ends: tuple[float, float], pace: float) -> list[Tensor]:
     """x times its own recent mean."""
     scale = max(abs(ends[0]), abs(ends[1]), 1e-12)
-    return [x * lagged(x, step, tau) / scale for tau in HEATS]
+    return [x * lagged(x, step, pace * tau) / scale for tau in HEATS]
 
 
 def courses(time: Tensor, duration: float, periods: Sequence[float], steps: int) -> list[Tensor]:

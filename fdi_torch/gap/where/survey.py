@@ -18,6 +18,7 @@ from fdi_torch.gap.where.components import Component, Ends, Signals, component_a
 from fdi_torch.gap.where.followed import between, followed
 from fdi_torch.gap.where.forms import courses
 from fdi_torch.plant.description import OUTSIDE, Sensor
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint import Joint, with_blanks
 from fdi_torch.simulate.scan import product, scan_in_time
@@ -141,10 +142,11 @@ class Survey:
         ends = Ends(seen)
         shared: list[Tensor] = []
         own_columns: list[Tensor] = []
+        pace = time_scale(self.fitter.subject.plant)
         for piece, s in zip(self.pieces, seen, strict=True):
             step = piece.engine.experiment.sample_intervals
             in_time = self._courses(s["time"], piece)
-            for forms, into in ((of_reading(s, step, ends), shared), (in_time, own_columns)):
+            for forms, into in ((of_reading(s, step, ends, pace), shared), (in_time, own_columns)):
                 column = levels.new_zeros(len(step), self.fitter.subject.readings.shape[1], len(forms))
                 column[:, channel] = torch.stack(forms, dim=1)
                 into.append(column)

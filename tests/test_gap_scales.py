@@ -1,0 +1,57 @@
+"""A rig that is slower and larger is diagnosed like the one on the bench."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.where.forms import memories, slews
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.pace import time_scale
+from fdi_torch.recording import Recording
+from tests.test_gap import SMALL, believed, recorded
+
+SLOWER, WIDER = 20.0, 1000.0
+FLOWS = WIDER / SLOWER  # A dh/dt = q
+
+
+def scaled_plant() -> PlantDescription:
+    plant = believed()
+    return replace(
+        plant,
+        tanks=tuple(replace(t, area=WIDER * t.area) for t in plant.tanks),
+        pipes=tuple(replace(p, area=FLOWS * p.area) for p in plant.pipes),
+        pumps=tuple(replace(p, max_flow=FLOWS * p.max_flow) for p in plant.pumps),
+    )
+
+
+def scaled(recording: Recording) -> Recording:
+    return replace(recording, time=SLOWER * recording.time, inputs=FLOWS * recording.inputs)
+
+
+def test_what_has_a_memory_has_it_for_as_long_as_the_plant_is_slow() -> None:
+    x = torch.rand(50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    step, ends = torch.full_like(x, 2.0), (0.0, 1.0)
+    for slow, fast in zip(memories(x, 10.0 * step, 10.0), memories(x, step, 1.0), strict=True):
+        assert slow == pytest.approx(fast, abs=1e-12)
+    for slow, fast in zip(slews(x, 10.0 * step, ends, 10.0), slews(x, step, ends, 1.0), strict=True):
+        assert slow == pytest.approx(fast, abs=1e-12)
+    assert time_scale(scaled_plant()) == 10.0 * time_scale(believed())  # the power of ten next to 20
+
+
+@pytest.mark.parametrize("left_out", [(), ("pump_lag",)])
+def test_a_rig_scaled_in_time_and_size_has_the_same_verdict(left_out: tuple[str, ...]) -> None:
+    bench = recorded({"Q1.pump_lag.time_constant": 15.0}, 5)
+    settings = Settings(SMALL, left_out)
+    small, large = (
+        diagnose(believed(), bench, settings=settings),
+        diagnose(scaled_plant(), scaled(bench), settings=settings),
+    )
+    assert large.verdict == small.verdict == ("unknown" if left_out else "named")
+    assert large.where[0][0] == small.where[0][0]
+    assert large.where[0][1] == pytest.approx(small.where[0][1], abs=0.02)
+    for cause in large.causes:
+        assert cause.parameters["time_constant"].value == pytest.approx(SLOWER * 15.0, rel=0.02)
