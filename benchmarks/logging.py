@@ -40,7 +40,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "train: 50,000 samples": ("train", "--set", LONG),
     "study: 500 trials": (*STUDY, "study.trials=500"),
     "monitor: 10,000 samples": ("monitor", "--config", "MONITOR"),
-    "rehearse: 20 runs of an hour": (*REHEARSAL, "false_alarms={noises: {white: {}}, runs: 20, sets: 2}"),
+    "rehearse: 20 runs of an hour": (*REHEARSAL, "false_alarms={noises: {white: {}}, runs: 20, calibrations: 2}"),
     "gap: 2,000 samples, all effects": ("gap", "--plant", "three_tank", "--recording", "RECORDING"),
     "challenge: 1 rig": ("challenge", "--cases", "1", "--kinds", "single", "--no-bic"),
 }
@@ -48,10 +48,10 @@ RUNS: dict[str, tuple[str, ...]] = {
 
 
 class Clock:
-    """CPU seconds of a group of methods: of each thread, and of the processes that they start."""
+    """CPU seconds of a group of methods, of each thread; asking: of the processes that a new log starts."""
 
     def __init__(self) -> None:
-        self.seconds = 0.0
+        self.seconds = self.asking = 0.0
         self._inside = threading.local()
 
     def within(self, method: Callable[..., Any]) -> Callable[..., Any]:
@@ -61,12 +61,14 @@ class Clock:
         def run(*arguments: Any, **named: Any) -> Any:
             if getattr(self._inside, "one", False):
                 return method(*arguments, **named)
-            self._inside.one, start = True, time.thread_time()
+            asks = method.__name__ == "__init__"  # git
+            self._inside.one, children, start = True, asks and _children(), time.thread_time()
             try:
                 return method(*arguments, **named)
             finally:
                 self._inside.one = False
                 self.seconds += time.thread_time() - start
+                self.asking += _children() - children if asks else 0.0
 
         return run
 
@@ -74,7 +76,7 @@ class Clock:
 @contextlib.contextmanager
 def clocked(clock: Clock) -> Iterator[None]:
     """While it lasts, the clock runs in every method of a log and in those that collect what a search logs."""
-    doors: list[tuple[type, str]] = [(Watch, "generation"), (Watch, "iteration")]
+    doors: list[tuple[type, str]] = [(Watch, "write")]
     doors += [(RunLog, name) for name in dir(RunLog) if name in ("__init__", "__enter__", "__exit__") or name[0] != "_"]
     own = {(kind, name): vars(kind).get(name) for kind, name in doors}
     for kind, name in doors:
@@ -119,13 +121,12 @@ def prepared(folder: Path) -> dict[str, str]:
 
 
 def one(what: str, words: list[str], folder: Path) -> Row:
-    clock, start, children = Clock(), time.process_time(), _children()
+    clock, start = Clock(), time.process_time()
     with clocked(clock):
         log = run(words, folder)
-    asking = _children() - children  # git
-    total = time.process_time() - start + asking
+    total = time.process_time() - start + clock.asking
     messages = sum(1 for _ in read_run(log).messages())
-    return what, messages, log.stat().st_size, total, clock.seconds + asking
+    return what, messages, log.stat().st_size, total, clock.seconds + clock.asking
 
 
 def run(words: tuple[str, ...] | list[str], folder: Path, wanted: str = "*.mcap") -> Path:

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fdi_torch.config.recordings import LoadedRecording
 from fdi_torch.config.run import Run
 from fdi_torch.estimate.evolution import Search, State
@@ -100,17 +102,22 @@ class Watch:
 
     def generation(self, search: Search) -> None:
         state = search.state
+        self.write(search)
+        share = 0.05 + 0.8 * state.evaluations / self.settings.search.evaluations
+        self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {float(state.cost[0, 0]):.3g}")
+
+    def write(self, search: Search) -> None:
+        """Into the log."""
+        state = search.state
         self.log.later(GENERATION, partial(self._generation, state), state.generation, self.units)
         if state_is_due(state.generation):
             self.log.population(state.generation, search.to_dict())
-        share = 0.05 + 0.8 * state.evaluations / self.settings.search.evaluations
-        self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {float(state.cost[0, 0]):.3g}")
 
     def _generation(self, state: State) -> dict[str, Any]:
         """What is logged of a generation, worked out when its message is written."""
         costs, population = as_array(state.cost)[0], as_array(state.population)[0]
         told = {"problem": 0, "generation": state.generation, "best_cost": float(costs[0])}
-        told |= {"mean_cost": float(costs.mean()), "evaluations": state.evaluations}
+        told |= {"mean_cost": float(np.add.reduce(costs)) / len(costs), "evaluations": state.evaluations}
         return told | dict(zip(self.names, population[0].tolist(), strict=True))
 
     def iteration(self, progress: Progress) -> None:

@@ -35,10 +35,12 @@ def copy_log(source: Path, target: Path, salvage: bool = False, extra: Extra | N
 def joined(sink: Sink, target: Path) -> None:
     """The file of a finished sink as it would be had nothing been cut: as it is up to the mark, then in full chunks."""
     assert sink.mark is not None
-    run = read_run(sink.path)
     other = sink.again(target)
     try:
-        copy_records(run, other, sink.mark.size)
+        if sink.tail is None:
+            copy_records(read_run(sink.path), other, sink.mark.size)
+        for what, given in sink.tail or ():
+            getattr(other, what)(*given)
     except BaseException:
         other.abandon()
         raise

@@ -18,7 +18,7 @@ import orjson
 
 from fdi_torch.logbook.block import Block, Timed, block_of
 from fdi_torch.logbook.channel import Channel
-from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, plain
+from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, as_it_is, plain
 from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, Topic, json_schema, named_kinds, topic_definition
 from fdi_torch.logbook.sink import EPOCH_NS, log_time_of
 
@@ -29,10 +29,6 @@ _BLOCK = 4096
 _FEW = 32
 """So few samples are written faster one by one."""
 _TOGETHER, _TOGETHER_BYTES = 64, 1 << 22
-
-
-class Ready(dict[str, Any]):
-    """Fields that are JSON values already, without a number that is not finite."""
 
 
 class Messages:
@@ -89,15 +85,17 @@ class Messages:
         if "t" in fields:
             raise ValueError(f"{topic}: expected the time as argument, got it among the fields; remove it there")
         t = self._latest if t is None else float(t)
-        message = {"t": t, **fields} if isinstance(fields, Ready) else plain({"t": t, **fields})
         if not math.isfinite(t):
             raise ValueError(f"{topic}: expected a finite time, got {t}; give the plant's time in s")
-        if wall:
-            message[WALL] = self.wall()
+        message: Named = {"t": t, **fields}
+        data = None if wall else as_it_is(message)
+        if data is None:
+            message = plain(message)
+            data = orjson.dumps({**message, WALL: self.wall()} if wall else message)
         self._latest = max(self._latest, t)
         channel = self._channel(topic, fields, message, units, about)
         log_time = log_time_of(t)
-        return channel, log_time, log_time, self._next(topic), orjson.dumps(message)
+        return channel, log_time, log_time, self._next(topic), data
 
     def later(
         self, topic: str, fields: Fields, t: float, units: Mapping[str, str] | None = None, size: int = 0

@@ -23,6 +23,7 @@ WALL = "wall"
 _EXACT = 2**53
 _ENTRY = re.compile(r"(?P<name>.+?)(\[(?P<index>\d+)\])?=(?P<value>nan|inf|-inf)")
 _PLAIN = frozenset({type(None), str, bool, float})
+_AS_IT_IS = frozenset({str, bool, int, float})
 _PACKED = {"f": "<f8", "i": "<i8", "u": "<i8", "b": "|b1"}
 _DTYPES = ("<f8", "<i8", "|u1", "|b1")
 
@@ -30,6 +31,27 @@ _DTYPES = ("<f8", "<i8", "|u1", "|b1")
 def encode(fields: Mapping[str, Any]) -> bytes:
     """JSON of plain numbers, strings, arrays and tensors; None is left out."""
     return orjson.dumps(plain(fields))
+
+
+def as_it_is(message: Mapping[str, Any]) -> bytes | None:
+    """JSON of a message that holds plain numbers, texts and flat lists of one kind of them; None of others.
+
+    It gives what `encode` gives, sooner: that a number was not finite, or was none, shows in the text as null.
+    """
+    kinds = set(map(type, message.values()))
+    if list in kinds:
+        for value in message.values():
+            if type(value) is list:
+                inside = set(map(type, value))
+                kinds |= inside if len(inside) < 2 else {object}  # integers among other numbers become such numbers
+        kinds.discard(list)
+    if not kinds <= _AS_IT_IS:
+        return None
+    try:
+        data = orjson.dumps(message, option=orjson.OPT_STRICT_INTEGER)
+    except TypeError:  # an integer that is too large; `encode` says so
+        return None
+    return None if b"null" in data else data
 
 
 def plain(fields: Mapping[str, Any]) -> dict[str, Any]:

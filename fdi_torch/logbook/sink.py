@@ -31,7 +31,12 @@ CHUNK_BYTES = 256 * 1024
 EPOCH_NS = 946_684_800 * 10**9  # 2000-01-01T00:00:00Z: plant time 0; leaves room for negative times
 STRETCH = 1000
 """So many messages of signals in a row, a recording, end with a chunk."""
+TAIL_BYTES = 4 << 20
+"""So much on disk is still kept in memory after the mark, to be written again without being read."""
 _FOOTER = struct.Struct("<BQQQ")
+
+Tail = list[tuple[str, tuple[Any, ...]]]
+"""What came since the mark: methods of the sink and what they were given."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,10 @@ class Mark:
 
 
 class Sink:
-    """An MCAP file being written. After an error of the disk it is dead and refuses further writes."""
+    """An MCAP file being written. After an error of the disk it is dead and refuses further writes.
+
+    mark: where the first chunk begins that was cut. tail: what came since then; None where that was much.
+    """
 
     def __init__(self, path: Path, library: str, profile: str = PROFILE, compress: bool = True) -> None:
         self._stream = Stream(path)
@@ -65,6 +73,7 @@ class Sink:
         self._signals = 0
         self._perhaps: Mark | None = None
         self.mark: Mark | None = None
+        self.tail: Tail | None = []
         self._head = (library, profile)
         self._write(MAGIC)
         self._write(_bytes(records.Header(profile, library)))
@@ -94,12 +103,14 @@ class Sink:
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         self.flush()
+        self._keep("metadata", name, values)
         data = _bytes(records.Metadata(name=name, metadata=dict(values)))
         self._metadata.append(records.MetadataIndex(offset=self.size, length=len(data), name=name))
         self._write(data)
 
     def attachment(self, name: str, media_type: str, data: bytes) -> None:
         self.flush()
+        self._keep("attachment", name, media_type, data)
         told: dict[str, Any] = {"name": name, "media_type": media_type, "create_time": EPOCH_NS, "log_time": EPOCH_NS}
         record = _bytes(records.Attachment(data=data, **told))
         self._attachments.append(
@@ -121,34 +132,39 @@ class Sink:
             elif self._signals:
                 self._end_of_signals()
             self._chunk.message(told, log_time, publish_time, sequence, data)
+            if self.tail is not None:
+                self.tail.append(("message", (channel, log_time, publish_time, sequence, data)))
             if self._chunk.size > CHUNK_BYTES:
                 self.flush()
 
-    def block(self, block: Block) -> None:
-        """The messages of a block, to the same bytes as one after the other."""
-        first, samples = 0, len(block.ends)
-        while first < samples:
+    def block(self, block: Block, first: int = 0, end: int | None = None) -> None:
+        """The messages of a block, samples first..end of it, to the same bytes as one after the other."""
+        end = len(block.ends) if end is None else end
+        numbered = False
+        while first < end:
             # The first sample of a chunk brings the descriptions of its channels.
             self.messages(block.messages(first, first + 1))
             first += 1
             told = [self._channels[channel] for channel in block.channels]
-            alike = len({channel.is_signal for channel in told}) == 1
-            if first == 1:
+            if not numbered:
                 block.number([channel.channel.id for channel in told])
-            if alike and all(map(self._chunk.describes, told)):
-                first = self._take(block, first, told)
+                numbered = True
+            if len({channel.is_signal for channel in told}) == 1 and all(map(self._chunk.describes, told)):
+                first = self._take(block, first, end, told)
 
-    def _take(self, block: Block, first: int, told: Sequence[Described]) -> int:
+    def _take(self, block: Block, first: int, end: int, told: Sequence[Described]) -> int:
         """Whole samples of a block from the first on, as many as leave the chunk room for more. The next one."""
         ends = block.ends
         start = int(ends[first - 1, -1])
-        last = int(np.searchsorted(ends[:, -1], start + CHUNK_BYTES - self._chunk.size, "right"))
+        last = min(end, int(np.searchsorted(ends[:, -1], start + CHUNK_BYTES - self._chunk.size, "right")))
         if last <= first:
             return first
         if told[0].is_signal:
             self._count_signals((last - first) * len(told))
         starts = np.append(start, ends[first:last].ravel()[:-1]).reshape(last - first, -1) - start
         records = block.data[start : ends[last - 1, -1]].tobytes()
+        if self.tail is not None:
+            self.tail.append(("block", (block, first, last)))
         self._chunk.block([channel.channel.id for channel in told], block.log_times[first:last], records, starts)
         return last
 
@@ -158,9 +174,21 @@ class Sink:
             self.mark, self._perhaps = self.mark or self._perhaps, None
 
     def _end_of_signals(self) -> None:
-        if self._signals >= STRETCH:
+        long, self._signals, self._perhaps = self._signals >= STRETCH, 0, None
+        if long:
             self.flush()
-        self._signals, self._perhaps = 0, None
+            self._forget()
+
+    def _keep(self, what: str, *given: Any) -> None:
+        if self.tail is not None and (self.mark or self._perhaps):
+            self.tail.append((what, given))
+
+    def _forget(self) -> None:
+        """What came before the mark stays as it is, and nobody needs the tail of what is too much for it."""
+        if self.mark is None and self._perhaps is None:
+            self.tail = []
+        elif self.mark is not None and self.size - self.mark.size > TAIL_BYTES:
+            self.tail = None
 
     def cut(self) -> None:
         """What waits goes to disk now, though its chunk is not full. Where signals end it would end anyway."""
@@ -191,6 +219,7 @@ class Sink:
         for number, count in counts.items():
             self._counts[number] = self._counts.get(number, 0) + count
         self._write(data)
+        self._forget()
 
     def finish(self) -> None:
         """Close the file as a whole one, on disk."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import orjson
 
-from fdi_torch.logbook.messages import Messages, Named, Ready
+from fdi_torch.logbook.messages import Messages, Named
 from fdi_torch.logbook.payload import as_array, pack
 from fdi_torch.logbook.sink import log_time_of
 
@@ -67,10 +67,10 @@ class Topics(Messages):
         kept = dict(arrays)
 
         def fields() -> Named:
-            ready = Ready(problem=problem, generation=generation)
+            told: dict[str, Any] = {"problem": problem, "generation": generation}
             for name, array in kept.items():
-                ready.update(pack(name, array))
-            return ready
+                told |= pack(name, array)
+            return told
 
         size = sum(getattr(array, "nbytes", 0) for array in kept.values())
         self.later("/estimator/de/population", fields, generation if t is None else t, size=size)

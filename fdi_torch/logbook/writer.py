@@ -1,7 +1,7 @@
 """RunLog: the log of one run or study, written so that a crash loses at most its last second.
 
 The run is written to `NAME.mcap.partial` and becomes `NAME.mcap` at its end. What waits in memory goes to disk after
-half a second at the latest, by a small thread, also while the run computes and says nothing. Chunks that it cut are
+0.7 s at the latest, by a small thread, also while the run computes and says nothing. Chunks that it cut are
 joined again at the end, so that equal configuration, data and seed give byte-identical files but for the wall-clock
 fields: `started` and `run_id` of `fdi_torch.run`, `ended` and `wall_seconds` of `fdi_torch.status`.
 """
@@ -64,7 +64,7 @@ class RunLog(Topics):
         env: Mapping[str, str] | None = None,
         git: Mapping[str, str] | None = None,
         clock: Callable[[], int] = time.time_ns,
-        flush_seconds: float = 0.5,
+        flush_seconds: float = 0.7,
         listener: Listener | None = None,
     ) -> None:
         super().__init__()

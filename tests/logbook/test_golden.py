@@ -26,6 +26,8 @@ COMMANDS = [
     ("study", "8eaefe247aa0b1f9", "b4b4ba56d7656891"),
     ("gap", "f6aabf6a3d422db2", "602075beedd8c92d"),
     ("monitor", "89e8a937099d6f32", "3f2ec0ba2ff55757"),
+    ("rehearsal", "787b29854bf52007", "64a16c5607bde079"),
+    ("challenge", "2b4036dd6b4553c9", "d5f2cce268fb4001"),
 ]
 LAYOUT = TESTS.parent / "docs/fdi_torch.foxglove-layout.json"
 
@@ -74,6 +76,22 @@ def test_each_commands_log_means_what_it_meant() -> None:
     (verdict,) = logs["gap"].messages(["/gap/verdict"])
     assert (verdict.payload["verdict"], verdict.payload["causes"]) == ("ambiguous", ["leak@T1"])
     assert {m.payload["event"] for m in logs["monitor"].messages(["/observer/alarm"])} == {"notice"}
+    pieces = [m.payload for m in logs["rehearsal"].messages(["/study/trial"])]
+    assert [piece["group"].partition("/")[0] for piece in pieces] == [
+        *["false alarms"] * 2, "faults found", "naming", "rivals"
+    ]  # fmt: skip
+    assert pieces[0]["expected"] == 0.12 and pieces[2]["fixed delay"] == [3.0, 4.0]
+    answers = [m.payload for m in logs["challenge"].messages(["/study/trial"]) if m.payload["by"] == "fdi"]
+    assert [(a["case"], a["status"], a["causes"]) for a in answers] == [
+        ("case0001", "named", answers[0]["truth"]), ("case0002", "no_gap", [])
+    ]  # fmt: skip
+
+
+def test_every_kind_of_log_that_is_written_has_a_golden_one() -> None:
+    """The kinds as the code names them, where it opens a log."""
+    jobs = "".join(path.read_text() for path in sorted((TESTS.parent / "fdi_torch/jobs").glob("*.py")))
+    kinds = re.findall(r'RunLog\(\s*path, "(\w+)"', jobs)
+    assert jobs.count("RunLog(") == len(kinds) and set(kinds) == {kind for kind, *_ in COMMANDS}
 
 
 def test_the_layout_shows_what_is_in_a_log() -> None:

@@ -18,7 +18,7 @@ import pytest
 from example_logs import FIXED, FROZEN, VERDICT, write_everything, write_finished
 from mcap.reader import make_reader
 
-from fdi_torch.logbook import LogError, RunLog, content_hash, read_run
+from fdi_torch.logbook import LogError, RunLog, content_hash, read_run, sink
 from fdi_torch.logbook.provenance import environment, git_state, sha256_of
 from fdi_torch.logbook.schemas import TOPICS
 from fdi_torch.logbook.terminate import Terminated
@@ -400,6 +400,24 @@ def test_chunks_cut_within_or_after_a_recording_leave_no_trace(tmp_path: Path, c
                 log.generation(generation, 1.0 / (1 + generation), {"x": 0.5})
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
     assert sum(1 for _ in read_run(tmp_path / "b.mcap").messages()) == 2005
+
+
+@pytest.mark.parametrize("kept", [sink.TAIL_BYTES, 0])
+def test_chunks_cut_between_messages_and_attachments_leave_no_trace(
+    tmp_path: Path, kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sink, "TAIL_BYTES", kept)  # beyond so much, what was cut is read from the file again
+    for name, cuts in (("a", ()), ("b", (1, 5, 2500, 4000))):
+        with RunLog(tmp_path / f"{name}.mcap", "train", **FIXED) as log:
+            for number in range(5000):
+                log.trial(number, {"x": number**0.5, "y": 1.0 / (1 + number), "z": float(number)})
+                if number in cuts:
+                    log.flush()
+                if number in (3, 3000):
+                    log.attach(f"{number}.txt", b"text")
+            tail = log._open_sink().tail
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+    assert (tail is None) == (kept == 0) and sum(1 for _ in read_run(tmp_path / "b.mcap").messages()) == 5000
 
 
 def test_what_is_put_off_comes_before_what_follows(tmp_path: Path) -> None:
