@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import subprocess
 import sys
@@ -41,12 +40,6 @@ def git_state(folder: Path | None = None) -> dict[str, str]:
     commit = next((line.split()[-1] for line in told if line.startswith("# branch.oid ")), "")
     changed = any(not line.startswith("#") for line in told)
     return {"commit": commit, "changed": "yes" if changed else "no" if commit else ""}
-
-
-def sha256_of(path: str | Path) -> str:
-    """SHA-256 of a file, read in pieces."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _git(folder: Path, *arguments: str) -> str:

@@ -38,8 +38,6 @@ from fdi_torch.logbook.topics import Topics
 Listener = Callable[[Channel, int, bytes], None]
 """Hears each message as it is logged: its channel, its log time in ns and its payload."""
 
-WALL_CLOCK = {"fdi_torch.run": ("started", "run_id"), "fdi_torch.status": ("ended", "wall_seconds")}
-
 
 class RunLog(Topics):
     """Context manager that logs a run. Messages are written by the methods of `Topics`.
