@@ -22,6 +22,7 @@ INCH = 0.8  # per unit of the drawing; a tank is one unit wide
 TALL = 1.4
 COLUMN, ROW = 1.95, 3.1
 LETTER = 0.1  # at most, of a word beside a sensor
+LINE, WITHIN = 0.2, 9  # height of a line; letters of a line within a tank
 Point = tuple[float, float]
 
 
@@ -91,15 +92,19 @@ class _Drawing:
         marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
         return [*marks, f"{100 * share:.0f} %"] if share >= 0.005 else marks
 
-    def words(self, name: str, point: Point, ha: str, va: str, width: int = 26) -> None:
-        """A component's name, and below it in colour what is wrong with it, in lines of so many letters."""
-        x, y = point
-        step = 0.2 if va == "top" else -0.2
+    def lines(self, name: str, width: int) -> list[tuple[str, str, str]]:
+        """Text, colour and weight of what is written at a component."""
         marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
         shares = self.said(name)[len(marks) :]
         marks = [line for text in marks for line in wrap(text, width, break_long_words=False)]
         lines = [(short(name, 16), INK, "normal"), *((text, MARK, "bold") for text in marks)]
-        lines += [(text, INK, "bold") for text in shares]
+        return [*lines, *((text, INK, "bold") for text in shares)]
+
+    def words(self, name: str, point: Point, ha: str, va: str, width: int = 26) -> None:
+        """A component's name, and below it in colour what is wrong with it, in lines of so many letters."""
+        x, y = point
+        step = LINE if va == "top" else -LINE
+        lines = self.lines(name, width)
         for k, (text, colour, weight) in enumerate(lines if va == "top" else reversed(lines)):
             self.axes.text(x, y - k * step, text, ha=ha, va=va, color=colour, weight=weight, fontsize=9.0, zorder=6)
 
@@ -125,13 +130,13 @@ class _Drawing:
             water = Rectangle((x - 0.5, y), 1.0, height, facecolor=MODEL, alpha=0.22, edgecolor="none", zorder=3)
             self.axes.add_patch(water)
             self.axes.plot([x - 0.5, x + 0.5], [y + height] * 2, color=MODEL, lw=1.2, zorder=4)
-            above = 0.05 if height < 0.3 else -0.24
-            self.axes.text(
-                x, y + height + above, f"{100 * level:.1f} cm", ha="center", color=MODEL, fontsize=9.0, zorder=6
-            )
+            place = height + (0.05 if height < 0.3 else -0.24)
+            free = TALL - 0.08 - LINE * len(self.lines(tank.name, WITHIN)) - 0.22  # below the words of the tank
+            place = max(min(place, free), 0.04)
+            self.axes.text(x, y + place, f"{100 * level:.1f} cm", ha="center", color=MODEL, fontsize=9.0, zorder=6)
         walls = [(x - 0.5, y + TALL), (x - 0.5, y), (x + 0.5, y), (x + 0.5, y + TALL)]
         self.axes.plot(*np.array(walls).T, color=self.colour(tank.name), lw=2.0, zorder=5, solid_joinstyle="miter")
-        self.words(tank.name, (x, y + TALL - 0.08), "center", "top", width=9)
+        self.words(tank.name, (x, y + TALL - 0.08), "center", "top", width=WITHIN)
 
     def pump(self, pump: Pump) -> None:
         x, y = self.corner(pump.target)

@@ -1,4 +1,7 @@
-"""How the page looks: one column of cards, light or dark as the reader's system is, and on paper."""
+"""How the page looks: one column of cards, light or dark as the reader's system is, and on paper.
+
+A table that is wider than its card scrolls, with a shadow at the side where there is more of it.
+"""
 
 STYLESHEET = """
 :root { color-scheme: light dark; --ink: #1f2933;
@@ -24,12 +27,17 @@ section { background: var(--paper); border: 1px solid var(--faint); border-radiu
 figure { margin: 0; min-width: 0; }
 figure.wide { grid-column: 1 / -1; }
 figure svg { display: block; width: 100%; height: auto; }
+figure.wide svg text { paint-order: stroke; stroke: var(--paper); stroke-width: .22em; stroke-linejoin: round; }
 figcaption { font-size: .85rem; color: var(--soft); }
 .note, .meta { color: var(--soft); font-size: .9rem; }
 .lead { font-size: 1.05rem; }
 .bad { color: var(--mark); font-weight: 600; }
 .good { color: var(--other); font-weight: 600; }
-.scroll { overflow-x: auto; max-width: 100%; }
+.scroll { overflow-x: auto; max-width: 100%;
+  background: linear-gradient(to right, var(--paper) 40%, transparent) 0 0 / 2.5rem 100% no-repeat local,
+    linear-gradient(to left, var(--paper) 40%, transparent) 100% 0 / 2.5rem 100% no-repeat local,
+    linear-gradient(to right, var(--faint), transparent) 0 0 / .9rem 100% no-repeat scroll,
+    linear-gradient(to left, var(--faint), transparent) 100% 0 / .9rem 100% no-repeat scroll; }
 table { border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .28rem .9rem .28rem 0; text-align: right; vertical-align: top; border-bottom: 1px solid var(--faint);
   overflow-wrap: normal; }
@@ -47,11 +55,12 @@ summary { cursor: pointer; color: var(--model); padding: .2rem 0; }
 ul { margin: .3rem 0; padding-left: 1.2rem; }
 @media (max-width: 480px) { main { padding: 1rem .6rem 2rem; } section { padding: .8rem .7rem; border-radius: 8px; }
   dl div { grid-template-columns: 1fr; gap: 0; } h2 { font-size: 1.3rem; }
-  table { font-size: .8rem; } th, td { padding-right: .55rem; } }
+  table { font-size: .8rem; } th, td { padding-right: .55rem; } th { white-space: normal; } td.l { min-width: 3em; } }
 @media print { :root { color-scheme: light; --ink: #000000; --soft: #444444; --faint: #bbbbbb; --paper: #ffffff;
   --ground: #ffffff; --model: #0b6cab; --mark: #b84a00; --other: #0b7558; }
   body { font-size: 10.5pt; } main { padding: 0; max-width: none; } section { border: 0; padding: 0; margin: 1rem 0; }
   figure, tr, dl div { break-inside: avoid; } h3 { break-after: avoid; }
-  .grid { grid-template-columns: repeat(2, 1fr); } .scroll { overflow: visible; }
+  .grid { grid-template-columns: repeat(2, 1fr); } .scroll { overflow: visible; background: none; }
+  table { font-size: 8.5pt; } th, td.r { white-space: normal; } th, td { padding-right: .5rem; }
   details::details-content { content-visibility: visible; display: block; } }
 """

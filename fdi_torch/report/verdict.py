@@ -13,6 +13,7 @@ KINDS = {
     "study": "Study",
     "gap": "Sim-to-real gap",
     "challenge": "Withheld check",
+    "rehearsal": "A monitor tried out",
 }
 
 
@@ -22,7 +23,7 @@ def kind_words(material: Material) -> str:
 
 def headline(material: Material) -> str:
     """The verdict; how the run ended where it has none."""
-    said = (gap_words, lambda m: fault_words(findings(m)), alarm_words, challenge_words, study_words)
+    said = (gap_words, lambda m: fault_words(findings(m)), alarm_words, challenge_words, rehearsal_words, study_words)
     for words in (of(material) for of in said):
         if words:
             return words
@@ -68,6 +69,13 @@ def challenge_words(material: Material) -> str:
         return ""
     right, wrong = (sum(bool(m.get(name)) for m in answers) for name in ("right", "named_wrong"))
     return f"{right} of {len(answers)} hidden causes told right, {wrong or 'none'} named and wrong"
+
+
+def rehearsal_words(material: Material) -> str:
+    """What was tried: pieces are grouped under the name of their rehearsal."""
+    groups = [str(m.get("group", "")) for m in material.of("/study/trial")] if material.kind == "rehearsal" else []
+    tried = _listed(list(dict.fromkeys(group.partition("/")[0] for group in groups)))
+    return tried[:1].upper() + tried[1:]
 
 
 def study_words(material: Material) -> str:

@@ -209,3 +209,15 @@ def write_challenge(path: Path) -> Path:
             verdict = "named" if kind != "unknown" else "unknown"
             log.trial(n, {**about, **judged, **numbers}, group=kind, seed=1, status=verdict)
     return path
+
+
+def write_rehearsal(path: Path) -> Path:
+    """Two tables; names that try to break the page, and a row that does not fit its header."""
+    header = ["size", "detector", "runs", "delay, s (5 .. 95 %)", "missed", "named right", "mostly wrong"]
+    rows = [["20 %", NASTY, "2", "4 (3 .. 4)", "0", "1 of 1 (21 .. 100 %)", ""], ["too short"]]
+    with RunLog(path, "rehearsal", config_text="faults_found: {}\n", **FIXED) as log:
+        log.trial(0, {"delay": [3.0, 4.0], "early": 0.0}, group="faults found/0.2", seed="0/0", status="done")
+        log.trial(1, {"fixed": 0.0}, group="naming/open", seed="0/1", status="done")
+        tables = [{"title": "faults found", "header": header, "rows": rows}, {"title": "rows of another kind"}]
+        log.result({"tables": tables})
+    return path

@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sample_runs import NASTY, material_of, write_challenge, write_gap, write_monitor, write_study, write_train
+from sample_runs import (
+    NASTY,
+    material_of,
+    write_challenge,
+    write_gap,
+    write_monitor,
+    write_rehearsal,
+    write_study,
+    write_train,
+)
 
 from fdi_torch.config import load_plant
 from fdi_torch.report.page import page, report_of
@@ -53,8 +62,8 @@ def measured(pages: list[Path], widths: list[int], folder: Path) -> list[dict[st
 
 
 def test_pages_fit_a_desk_and_a_phone(tmp_path: Path) -> None:
-    writers = (write_train, write_gap, write_monitor, write_study, write_challenge)
-    pages, plants = [], ("three_tank", "quadruple_tank", "dts200", "cascaded_tanks", "three_tank")
+    writers = (write_train, write_gap, write_monitor, write_study, write_challenge, write_rehearsal)
+    pages, plants = [], ("three_tank", "quadruple_tank", "dts200", "cascaded_tanks", "three_tank", "three_tank")
     for write, plant in zip(writers, plants, strict=True):
         material = material_of(write(tmp_path / f"{write.__name__}.mcap"), load_plant(plant))
         pages.append(tmp_path / f"{write.__name__}.html")
@@ -63,10 +72,11 @@ def test_pages_fit_a_desk_and_a_phone(tmp_path: Path) -> None:
     pages.append(tmp_path / "nasty.html")
     pages[-1].write_text(page([report_of(nasty)]), encoding="utf-8")
     found = measured(pages, [1280, 390], tmp_path)
-    assert [view["width"] for view in found] == [1280] * 6 + [390] * 6
+    assert [view["width"] for view in found] == [1280] * 7 + [390] * 7
     for view in found:
         assert view["needed"] <= view["width"], f"{view['title']} sticks out at {view['width']}"
-        assert view["pictures"] >= 2 and view["smallest"] > 40 and view["right"] <= view["width"]
+        assert view["pictures"] >= (1 if view["title"] == "Faults found and naming" else 2)
+        assert view["smallest"] > 40 and view["right"] <= view["width"]
         assert view["letters"] >= 8.5, f"{view['title']}: letters of {view['letters']} pixels at {view['width']}"
         assert view["scripts"] == 0
 

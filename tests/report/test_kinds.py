@@ -8,7 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sample_runs import GAP_ANSWER, NASTY, material_of, write_challenge, write_gap, write_monitor, write_study
+from sample_runs import (
+    GAP_ANSWER,
+    NASTY,
+    material_of,
+    write_challenge,
+    write_gap,
+    write_monitor,
+    write_rehearsal,
+    write_study,
+)
 
 from fdi_torch.config import load_plant
 from fdi_torch.logbook import RunLog, read_run
@@ -108,6 +117,15 @@ def test_a_challenge_page_shows_scores_confusion_and_misses(tmp_path: Path) -> N
     assert {"challenge_confusion_1", "challenge_unknown", "challenge_left_out"} <= names(made)
     text = page([made])
     assert "cannot be shown" not in text and NASTY not in text and "three_tank, effect left out" in text
+
+
+def test_a_rehearsal_page_shows_the_tables_of_the_command(tmp_path: Path) -> None:
+    made = report(write_rehearsal, tmp_path)
+    text = page([made])
+    assert headline(made.material) == "Faults found and naming"
+    assert titles(made)[:3] == ["The rig", "What the monitor did", "Configuration"]
+    assert "1 of 1 (21 .. 100 %)" in text and "too short" not in text.partition("Provenance")[0]
+    assert NASTY not in text
 
 
 def test_several_runs_share_a_page(tmp_path: Path) -> None:

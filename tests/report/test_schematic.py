@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -51,3 +52,17 @@ def test_guilty_components_and_shares_stand_on_the_drawing() -> None:
     svg = inline_svg(schematic(load_plant("three_tank"), overlay), "rig", "")
     assert all(f">{words}<" in svg for words in ("50.0 cm", "pump lag 8 s", "cross flow", "62 %"))
     assert svg.count("var(--mark)") > inline_svg(schematic(load_plant("three_tank")), "rig", "").count("var(--mark)")
+
+
+@pytest.mark.parametrize("level", [0.0, 0.2, 0.4, 0.5, 0.63])
+def test_no_word_within_a_tank_stands_on_another(level: float) -> None:
+    said = Overlay({"T1": level}, {"T1": ["leak 0.295"]}, {"T1": 1.0})
+    figure = schematic(load_plant("three_tank"), said)
+    figure.canvas.draw()
+    words = [
+        t for t in figure.axes[0].texts if t.get_text() in ("T1", "leak", "0.295", "100 %", f"{100 * level:.1f} cm")
+    ]
+    boxes = sorted((t.get_window_extent() for t in words), key=lambda box: box.y0)
+    assert len(boxes) == 5
+    for lower, upper in pairwise(boxes):
+        assert lower.y1 - upper.y0 < 0.25 * lower.height, "letters overlap"

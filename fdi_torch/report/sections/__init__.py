@@ -11,6 +11,7 @@ from fdi_torch.report.sections.gap_next import limits_section, next_input_sectio
 from fdi_torch.report.sections.isolation import isolation_section
 from fdi_torch.report.sections.monitor import event_section, residual_section
 from fdi_torch.report.sections.origin import configuration_section, health_section, provenance_section
+from fdi_torch.report.sections.rehearsal import rehearsal_section
 from fdi_torch.report.sections.rig import rig_section
 from fdi_torch.report.sections.search import refinement_section, search_section
 from fdi_torch.report.sections.signals import fit_section, inputs_section
@@ -34,6 +35,7 @@ SECTIONS: tuple[Maker, ...] = (
     scores_section,
     confusion_section,
     misses_section,
+    rehearsal_section,
     summary_section,
     isolation_section,
     error_section,

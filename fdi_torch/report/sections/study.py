@@ -69,7 +69,7 @@ def _parameters(material: Material, estimator: str, count: int) -> list[str]:
 def trials_section(material: Material) -> Section | None:
     """How often trials ended in which way, and every number of theirs by setting: each trial, and the median."""
     trials = material.of(TRIAL)
-    if not trials or material.kind == "challenge":
+    if not trials or material.kind in ("challenge", "rehearsal"):  # they have tables of their own
         return None
     groups = list(dict.fromkeys(str(m.get("group", "")) for m in trials))[:MOST_GROUPS]
     statuses = list(dict.fromkeys(str(m.get("status", "")) for m in trials))[:6]
