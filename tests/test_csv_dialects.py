@@ -34,6 +34,7 @@ def read(folder: Path, text: str | bytes, encoding: str = "utf-8", **mapping: Ch
         ("sep=;\n" + PLAIN.replace(",", ";"), "utf-8"),
         (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "t,Q1,h1\ns,cm3/s,cm"), "utf-8"),
         (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "n,Time [s],Q1 (cm3/s),h1 [cm]").replace("\n", "\n1,")[:-2], "utf-8"),
+        ("time_ms,Q1_cm3_s,h1_cm\n1790000000500,50.5,10\n1790000005500,50.5,11\n1790000010500,20,12.5\n", "utf-8"),
         (STAMPED.format("2026-03-29 00:30:00", "2026-03-29 00:30:05", "2026-03-29T00:30:10.000"), "utf-8"),
         (STAMPED.format("2026-03-29T00:59:55Z", "2026-03-29T03:00:00+02:00", "2026-03-29 03:00:05+0200"), "utf-8"),
     ],

@@ -2,7 +2,7 @@
 
 A header of the form name_unit (`t_s`, `Q1_cm3_s`, `h1_cm`) or name [unit] tells all; other headers are mapped by
 `ChannelSource`. Empty and non-finite cells are allowed in channels (a missing reading, an unknown command), never in
-time. Where time has no unit it is ISO time stamps; t = 0 is the first of them.
+time. Where time has no unit it is ISO time stamps; of these, and of seconds since 1970, the first is t = 0.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from fdi_torch.recordings.csv_text import Heading, heading_of, open_csv
 from fdi_torch.recordings.source import ChannelSource, file_sha256
 
 LINES_PER_BLOCK = 1 << 16
+SINCE_1970 = 1e8  # s; later than that is no rig's own clock
 TIME_NAMES = ("t", "time", "timestamp", "datetime", "date time", "date_time", "date/time")
 
 
@@ -172,7 +173,7 @@ def _blocks(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
 
 def _clock(seconds: np.ndarray, clock: Bound, columns: Columns) -> np.ndarray:
     place, first = f"{columns.path}: row {{}}, column {clock.header}", columns.heading.lines + 1
-    seconds = np.round(seconds - seconds[0], 6) if clock.stamps else seconds * clock.factor
+    seconds = from_first(seconds * clock.factor, seconds[0] * clock.factor, clock)
     if not np.isfinite(seconds).all():
         row = first + int(np.flatnonzero(~np.isfinite(seconds))[0])
         raise ValueError(f"{place.format(row)}: expected a time in every row, got none")
@@ -186,6 +187,11 @@ def _clock(seconds: np.ndarray, clock: Bound, columns: Columns) -> np.ndarray:
             f"{after:g} s after {before:g} s ({rows}); sort the rows or drop the repeated ones{summer}"
         )
     return seconds
+
+
+def from_first(seconds: np.ndarray, first: float, clock: Bound) -> np.ndarray:
+    """Time stamps, and numbers so large that they count from 1970, as seconds since the first; others as they are."""
+    return np.round(seconds - first, 6) if clock.stamps or first > SINCE_1970 else seconds
 
 
 def channels_in_si(table: np.ndarray, columns: Columns, bounds: Sequence[Bound]) -> np.ndarray:

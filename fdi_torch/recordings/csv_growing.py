@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fdi_torch.recordings.csv_cells import parse_carefully
-from fdi_torch.recordings.csv_files import bind, bind_clock, channels_in_si, columns_of
+from fdi_torch.recordings.csv_files import bind, bind_clock, channels_in_si, columns_of, from_first
 from fdi_torch.recordings.csv_text import heading_of, open_csv
 from fdi_torch.recordings.source import ChannelSource
 
@@ -38,7 +38,8 @@ class GrowingCsv:
         self._inputs = [bind(path, heading.names, name, mapping.get(name)) for name in inputs]
         self._outputs = [bind(path, heading.names, name, mapping.get(name)) for name in outputs]
         self._columns = columns_of(path, heading, [self._clock, *self._inputs, *self._outputs])
-        self._line, self._first = heading.lines, None
+        self._line = heading.lines
+        self._first: float | None = None
         self.input_units = tuple(b.si_unit for b in self._inputs)
         self.output_units = tuple(b.si_unit for b in self._outputs)
         with path.open("rb") as raw:
@@ -66,8 +67,7 @@ class GrowingCsv:
         return self._seconds(table[:, 0]), inputs, outputs, troubles
 
     def _seconds(self, clock: np.ndarray) -> np.ndarray:
-        if not self._clock.stamps:
-            return clock * self._clock.factor
-        if self._first is None and len(clock):
-            self._first = clock[0]
-        return np.round(clock - self._first, 6) if len(clock) else clock
+        seconds = clock * self._clock.factor
+        if self._first is None and len(seconds):
+            self._first = float(seconds[0])
+        return seconds if self._first is None else from_first(seconds, self._first, self._clock)
