@@ -182,7 +182,7 @@ def test_a_recording_with_an_unknown_input_is_cut_there(own_recording: list[str]
 def test_a_sensor_that_stands_still_is_named(own_recording: list[str], tmp_path: Path) -> None:
     header, *rows = own_recording
     stuck = [",".join([*row.split(",")[:-1], "50"]) for row in rows]
-    with pytest.raises(ValueError, match=r"default.csv: h3: expected readings that vary, got 0.5 throughout"):
+    with pytest.raises(ValueError, match=r"default.csv: h3: expected readings that vary, got 50 cm throughout"):
         train_on([header, *stuck], tmp_path)
 
 

@@ -6,11 +6,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from rigs import constant_inputs, three_tank
 from rigs import paper_network as rig
 from torch import Tensor
 
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import EFFECTS, all_placements
+from fdi_torch.estimate.fitting import set_up
+from fdi_torch.estimate.hybrid import HybridSettings, information_std, refine_to_convergence
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
@@ -155,3 +158,27 @@ def test_misuse_is_named() -> None:
         ValueError, match="expected the same steps for all lanes in the reference engine, got a tolerance"
     ):
         ReferenceEngine(network, space, experiment(1e-6))
+
+
+def test_a_long_recording_is_fitted_in_own_steps_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = three_tank()
+    recording = constant_inputs(plant, 400.0, 10.0)
+    network, space = rig(plant)
+    exact = CompiledEngine(network, space, lay_out(recording, plant.channels(), 0.05))
+    noise = 1e-3 * torch.randn(41, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    theta = torch.tensor([0.3, 0.4, 0.2, 0.7, 0.9], dtype=torch.float64)
+    read = replace(recording, outputs=exact.readings(theta) + noise, mask=torch.ones(41, 3, dtype=torch.bool))
+    fitting = set_up(plant, [read], list(space), "equilibrium")
+
+    def fitted() -> tuple[Tensor, Tensor]:
+        low, high = fitting.space.low().clamp(min=-1.0), fitting.space.high().clamp(max=1.0)
+        found, _ = refine_to_convergence(fitting, HybridSettings(), theta[None], low, high, 0.2, None)
+        return found.theta[0], information_std(fitting.problem(0.05), found.theta)
+
+    expected, std = fitted()
+    assert not fitting.takes_own_steps(0.1)
+    monkeypatch.setattr("fdi_torch.estimate.fitting.MANY_STEPS", 1000)
+    assert fitting.takes_own_steps(0.1) and not fitting.takes_own_steps(1.0)
+    found, own_std = fitted()
+    assert float(((found - expected).abs() / std).max()) < 0.1
+    torch.testing.assert_close(own_std, std, rtol=1e-2, atol=0)

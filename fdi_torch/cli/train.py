@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
 
 from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.options import add_config, add_live, add_run, live, overrides
@@ -16,6 +17,7 @@ from fdi_torch.config.run import RunConfig, load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windows import windows_of
 from fdi_torch.parameters import display_unit
+from fdi_torch.recording import Recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,7 +71,7 @@ def show(done: TrainResult, screen: Screen) -> None:
 def in_words(done: TrainResult) -> list[str]:
     """What the diagnosis says, one sentence a line."""
     diagnosis, final = done.result.diagnosis, done.result.estimate
-    lines = []
+    lines = not_counted(done.fitting.recordings)
     if diagnosis.faults:
         found = ", ".join(f.name for f in diagnosis.present) or "every suspect is nominal as far as can be told"
         lines.append(f"{diagnosis.kind}: {found}")
@@ -85,6 +87,19 @@ def in_words(done: TrainResult) -> list[str]:
     if not diagnosis.explained:
         ratio = diagnosis.unexplained_ratio
         lines.append(f"this model does not explain the recording: residuals are {ratio:.2g} times the sensors' noise")
+    return lines
+
+
+def not_counted(recordings: Sequence[Recording]) -> list[str]:
+    """What of each file does not count: readings that are missing or masked, and time without known inputs."""
+    lines = []
+    for source in dict.fromkeys(r.source for r in recordings):
+        masks = [r.mask for r in recordings if r.source == source]
+        missing, all_of_them = sum(int((~mask).sum()) for mask in masks), sum(mask.numel() for mask in masks)
+        if missing:
+            lines.append(f"{source}: {missing} of {all_of_them} readings are missing or masked and do not count")
+        if len(masks) > 1:
+            lines.append(f"{source}: an input is unknown now and then; fitted as {len(masks)} stretches without that")
     return lines
 
 

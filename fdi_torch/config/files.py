@@ -33,7 +33,7 @@ def parse_yaml(text: bytes, source: str) -> dict[str, Any]:
         where = getattr(error, "problem_mark", None)
         line = f"line {where.line + 1}: " if where else ""
         problem = getattr(error, "problem", None) or str(error)
-        told = problem if problem.startswith("expected each key") else f"expected YAML, got {problem}"
+        told = problem if problem.startswith("expected each key") else f"expected YAML, got something else: {problem}"
         raise ConfigError([f"{source}: {line}{told}"]) from error
     if not isinstance(data, dict):
         got = "nothing" if data is None else type(data).__name__

@@ -35,7 +35,10 @@ def understood(
         config = model.model_validate(dict(data))
     except ValidationError as error:
         raise explain(error, source, (path for path, _, _ in keys(model))) from None
-    plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
+    try:
+        plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
+    except ConfigError as error:  # a plant's own file is named already
+        raise ConfigError([f"{source}: {p}" if p.startswith("plant: ") else p for p in error.problems]) from error
     config = at_pace(config, time_scale(plant))
     return config, plant, write_yaml({**data, "plant": plant_mapping(plant)})
 

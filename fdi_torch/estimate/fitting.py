@@ -11,15 +11,16 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.objectives import Objective, Problem, Term
-from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.parameters import Parameter, ParameterSpace, display_unit
 from fdi_torch.plant.description import PlantDescription, Tank
+from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.pace import time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.choose import adaptive_engine, make_engine
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.equilibrium import equilibrium
-from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.experiment import lay_out, tolerance_like
 
 StartLevel = Literal["equilibrium", "free"] | float
 StartLevels = StartLevel | Mapping[str, StartLevel]
@@ -30,6 +31,8 @@ START_SEARCH_SHARE = 0.05
 FIRST_READINGS = 5
 # An adaptive solver sees inputs that run linearly as their means over so long; in units of the plant's time scale.
 LONGEST_STEP = 1.0
+# Each takes some 50 bytes, whatever the number of lanes.
+MANY_STEPS = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -66,14 +69,29 @@ class Fitting:
         """An engine for each recording, in steps no longer than `step` s, or by an adaptive solver about as exact."""
         engines = []
         for network, own, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True):
-            longest = LONGEST_STEP * time_scale(self.plant) if adaptive else step
-            experiment = lay_out(recording, self.plant.channels(), longest)
+            own_steps = not adaptive and self._takes_own_steps(recording, network, step)
+            longest = LONGEST_STEP * time_scale(self.plant) if adaptive or own_steps else step
+            tolerance = tolerance_like(step) if own_steps else None
+            experiment = lay_out(recording, self.plant.channels(), longest, tolerance)
             if adaptive:
                 engines.append(adaptive_engine(network, own, experiment, step))
             else:
                 device = recording.time.device.type
                 engines.append(make_engine(network, own, experiment, self.engine, device=device))
         return engines
+
+    def takes_own_steps(self, step: float) -> bool:
+        """Whether lanes divide the time between samples by themselves: costs are exact to their tolerance only."""
+        return any(
+            self._takes_own_steps(recording, network, step)
+            for recording, network in zip(self.recordings, self.networks, strict=True)
+        )
+
+    def _takes_own_steps(self, recording: Recording, network: TankNetwork, step: float) -> bool:
+        """Where a table of all steps would be large, and inputs are held between samples, so that nothing is lost."""
+        steps = float(recording.time[-1] - recording.time[0]) / step
+        held = recording.hold == "zero_order" and all(p.effect.stage is not Stage.COMMAND for p in network.placements)
+        return held and not self.is_slow and steps > max(MANY_STEPS, len(recording))
 
     def problem(self, step: float, objective: Objective = "likelihood", adaptive: bool = False) -> Problem:
         """Raises ValueError where the objective is correlation and readings that count stand still."""
@@ -164,14 +182,16 @@ def first_level(plant: PlantDescription, tank: str, recording: Recording) -> flo
 
 
 def _expect_variation(recording: Recording, plant: PlantDescription) -> None:
-    for name in (sensor.column for sensor in plant.sensors if sensor.column in recording.output_names):
-        column = recording.output_names.index(name)
+    for sensor in (s for s in plant.sensors if s.column in recording.output_names):
+        column = recording.output_names.index(sensor.column)
         seen = recording.outputs[recording.mask[:, column], column]
         if len(seen) and bool((seen == seen[0]).all()):
+            unit, scale = display_unit(sensor.unit)
+            value = f"{scale * float(seen[0]):g} {unit}"
             raise ValueError(
-                f"{recording.source}: {name}: expected readings that vary, got {float(seen[0]):g} throughout, whose "
-                f"correlation is undefined; set estimate.objective.search to likelihood, or leave the sensor out: "
-                f"columns: {{{name}: {{recorded: false}}}}"
+                f"{recording.source}: {sensor.column}: expected readings that vary, got {value} "
+                "throughout, whose correlation is undefined; set estimate.objective.search to likelihood, or leave "
+                f"the sensor out: columns: {{{sensor.column}: {{recorded: false}}}}"
             )
 
 

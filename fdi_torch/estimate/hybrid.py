@@ -185,7 +185,8 @@ def refine_to_convergence(
 
     def run(theta: Tensor, at: float) -> Refined:
         linearise = fitting.problem(at, settings.objectives[1]).linearise
-        return best_of(levenberg_marquardt(linearise, theta, low, high, settings.refine, on_iteration))
+        stop = near_enough(settings, CLOSE) if fitting.takes_own_steps(at) else settings.refine
+        return best_of(levenberg_marquardt(linearise, theta, low, high, stop, on_iteration))
 
     refinement = run(starts, step)
     while settings.refine_step is None and step > 2.0 * FINEST_STEP * time_scale(fitting.plant):
@@ -213,7 +214,7 @@ def refine_adaptively(
     """Refines from every start in coarse steps, and goes on from the best with an adaptive solver, then a tight one."""
 
     def run(problem: Problem, theta: Tensor, enough: float) -> Refined:
-        stop = replace(settings.refine, decrease_tolerance=max(settings.refine.decrease_tolerance, enough))
+        stop = near_enough(settings, enough)
         return best_of(levenberg_marquardt(problem.linearise, theta, low, high, stop, on_iteration))
 
     refinement = run(fitting.problem(coarse, settings.objectives[1]), starts, NEAR_ENOUGH)
@@ -222,6 +223,11 @@ def refine_adaptively(
         problem = fitting.problem(step * scale, settings.objectives[1], adaptive=True)
         refinement = run(problem, refinement.theta, CLOSE if step == ADAPTIVE_STEPS[-1] else NEAR_ENOUGH)
     return refinement
+
+
+def near_enough(settings: HybridSettings, decrease: float) -> RefineSettings:
+    """Stops where the cost would still fall by `decrease`: half the square of the way left, in standard errors."""
+    return replace(settings.refine, decrease_tolerance=max(settings.refine.decrease_tolerance, decrease))
 
 
 def best_of(refined: Refined) -> Refined:

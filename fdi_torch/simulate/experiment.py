@@ -107,18 +107,23 @@ def shortest_step(tolerance: float) -> float:
     return _SHORTEST * tolerance ** (2.0 / 3.0)
 
 
+def tolerance_like(step: float) -> float:
+    """The tolerance (m) for which a lane's own steps are about as exact as fixed ones of `step` (s)."""
+    return (step / _SHORTEST) ** 1.5
+
+
 def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float, every: bool = False) -> Tensor:
     """Step ends from the first to the last sample: at switches, and at samples where these are not denser than `step`.
 
     every: at every sample. Switches that come faster than half a step are averaged over instead.
     """
-    wanted = torch.ones_like(time, dtype=torch.bool)
+    wanted, span = torch.ones_like(time, dtype=torch.bool), float(time[-1] - time[0])
     if hold == "zero_order":
         changed = torch.diff(inputs, dim=0).abs().sum(dim=1) > 0
         wanted[1:] = changed
-        if int(changed.sum()) * step > 2.0 * float(time[-1]):
+        if int(changed.sum()) * step > 2.0 * span:
             wanted[1:] = False
-    dense = not every and float(time[-1]) / (len(time) - 1) < 0.999 * step
+    dense = not every and span / (len(time) - 1) < 0.999 * step
     anchors = time[wanted] if dense and hold == "zero_order" else time
     if dense and hold == "linear":
         anchors = time[:1]
