@@ -40,6 +40,13 @@ def test_standard_errors_are_the_cramer_rao_bound_of_table_3() -> None:
     assert found.std_by_correlation == pytest.approx([390e-6, 601e-6, 847e-6, 849e-6, 1300e-6], rel=0.01)
 
 
+def test_a_correlation_sees_neither_bias_nor_gain_of_a_sensor() -> None:
+    faults = ["T1.leak.size", "h1.sensor_bias.bias", "h2.sensor_gain.factor"]
+    found = diagnosability(PLANT, faults, steady(), millimetre(), at={"T1.leak.size": 0.3})
+    assert all(math.isfinite(std) for std in found.std) and math.isfinite(found.std_by_correlation[0])
+    assert found.std_by_correlation[1:] == (math.inf, math.inf)
+
+
 def test_plugging_of_the_outlet_and_a_leak_of_its_tank_are_one_and_the_reason_is_told() -> None:
     found = diagnosability(PLANT, SINGLES, steady(), millimetre())
     assert found.groups == (

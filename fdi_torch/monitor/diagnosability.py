@@ -23,6 +23,7 @@ from fdi_torch.recording import Recording
 
 # Signatures whose angle's sine is below this are one and the same.
 SAME = 1e-6
+ROUNDING = 1e-9  # what is left of a signature after less of it is none
 # A fault whose effect on a reading is this share of its largest effect on any does not show there.
 UNSEEN = 1e-9
 STEP = 0.25
@@ -120,7 +121,9 @@ def without_gain_and_offset(slopes: Tensor, readings: Tensor) -> Tensor:
         basis = torch.stack([torch.ones_like(readings[:, c]), readings[:, c] - readings[:, c].mean()], dim=1)
         basis = basis / torch.linalg.vector_norm(basis, dim=0).clamp(min=1e-12)
         q = torch.linalg.qr(basis).Q
-        projected.append(slopes[:, c] - q @ (q.mT @ slopes[:, c]))
+        rest = slopes[:, c] - q @ (q.mT @ slopes[:, c])
+        nothing = torch.linalg.vector_norm(rest, dim=0) <= ROUNDING * torch.linalg.vector_norm(slopes[:, c], dim=0)
+        projected.append(torch.where(nothing, 0.0, rest))
     return torch.stack(projected, dim=1)
 
 
