@@ -133,8 +133,8 @@ class Watch:
 
 
 def state_is_due(generation: int) -> bool:
-    """Is the whole state of the search logged? So often that a resumed run repeats 16 generations or an eighth."""
-    return generation % (1 << max(4, generation.bit_length() - 4)) == 0
+    """Is the whole state of the search logged? So often that a resumed run repeats 32 generations or an eighth."""
+    return generation % (1 << max(5, generation.bit_length() - 4)) == 0
 
 
 def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[str, float]) -> None:

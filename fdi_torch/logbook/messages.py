@@ -28,7 +28,7 @@ _RESERVED = ("t", NON_FINITE, WALL, "masked")
 _BLOCK = 4096
 _FEW = 32
 """So few samples are written faster one by one."""
-_TOGETHER, _TOGETHER_BYTES = 64, 1 << 22
+_TOGETHER, _TOGETHER_BYTES = 512, 1 << 22
 
 
 class Messages:
