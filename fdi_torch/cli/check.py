@@ -50,9 +50,13 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
 
 
 def _show_plant(plant: PlantDescription, screen: Screen) -> None:
-    counts = ((plant.tanks, "tanks"), (plant.pipes, "pipes"), (plant.pumps, "pumps"), (plant.sensors, "sensors"))
-    parts = ", ".join(f"{len(components)} {what}" for components, what in counts)
-    screen.say(f"plant {plant.name}: {parts}, {len(plant.tolerances)} constants with a tolerance")
+    counts = ((plant.tanks, "tank"), (plant.pipes, "pipe"), (plant.pumps, "pump"), (plant.sensors, "sensor"))
+    parts = ", ".join(_count(len(components), what) for components, what in counts)
+    screen.say(f"plant {plant.name}: {parts}, {_count(len(plant.tolerances), 'constant')} with a tolerance")
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _show(check: RecordingCheck, screen: Screen) -> None:

@@ -87,6 +87,7 @@ def in_words(done: TrainResult) -> list[str]:
     if not diagnosis.explained:
         ratio = diagnosis.unexplained_ratio
         lines.append(f"this model does not explain the recording: residuals are {ratio:.2g} times the sensors' noise")
+        lines.append("- next: fdi gap tells where the plant file falls short of it, and by which effect")
     return lines
 
 
