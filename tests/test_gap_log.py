@@ -16,6 +16,7 @@ from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.jobs.gap import run_gap
+from fdi_torch.jobs.gap_replay import settings_of
 from fdi_torch.logbook import own_signals, read_run
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.recordings.csv_files import write_csv
@@ -68,7 +69,18 @@ def test_a_key_that_a_gap_diagnosis_lacks_is_refused(
 ) -> None:
     words = ["replay", str(logged), "--set", "seed=3", "--out", str(tmp_path / "x.mcap"), "--quiet"]
     assert cli.main(words) == cli.MISUSE
-    assert "expected one of library, leave_out, step, most, got seed" in capsys.readouterr().err
+    assert "expected one of library, leave_out, step, most, named_only, got seed" in capsys.readouterr().err
+
+
+def test_every_setting_of_a_diagnosis_can_be_asked_anew(logged: Path) -> None:
+    run = read_run(logged)
+    assert settings_of(run) == Settings(LIBRARY)
+    words = ("library=leak@T1,pump_lag", "leave_out=pump_gain", "step=0.5", "most=2", "named_only=true")
+    assert settings_of(run, words) == Settings(("leak@T1", "pump_lag"), ("pump_gain",), 0.5, 2, True)
+    assert settings_of(run, ["library=", "step=null"]) == Settings(None)
+    for wrong in ("step=often", "step=-1", "most=1.5", "most=", "named_only=maybe"):
+        with pytest.raises(ValueError, match=f"--set {wrong}: expected"):
+            settings_of(run, [wrong])
 
 
 def test_the_command_says_it_in_a_sentence_and_keeps_everything(
