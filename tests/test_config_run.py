@@ -12,6 +12,7 @@ import yaml
 from fdi_torch.config import ConfigError, build_run, load_recordings, load_run, read_recording
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
 from fdi_torch.config.files import SHIPPED, read_yaml
+from fdi_torch.config.monitor import load_monitor
 from fdi_torch.config.run import Run
 from fdi_torch.config.simulation import NoiseConfig, noise_std, planned_recording
 from fdi_torch.effects import build_network
@@ -332,6 +333,24 @@ def test_what_stands_in_the_wrong_place_is_shown_the_right_one(tmp_path: Path, t
 def test_a_recording_may_be_its_file_s_name_alone(tmp_path: Path) -> None:
     (tmp_path / "run.yaml").write_text("recordings: [run.csv]")
     assert load_run(tmp_path / "run.yaml").config.recordings[0].file == "run.csv"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "sentence"),
+    [
+        ("faults", ["T1.leek"], "m.yaml: faults: expected a parameter .* got 'T1.leek'; the nearest is 'T1.leak'"),
+        ("faults", ["T1.plugging"], "m.yaml: faults: T1.plugging: expected a place of kind pipe or outlet"),
+        ("calibrate", ["P13.cd"], "m.yaml: calibrate: expected a parameter .* got 'P13.cd'"),
+        ("ranges", {"T1.leek": [0, 2]}, "m.yaml: ranges: expected a parameter .* got 'T1.leek'"),
+    ],
+)
+def test_a_monitor_file_that_names_what_the_plant_lacks_is_refused(
+    tmp_path: Path, field: str, value: Any, sentence: str
+) -> None:
+    given = {"recording": "run.csv", "fault_free": ["0 s", "1 h"], field: value}
+    (tmp_path / "m.yaml").write_text(yaml.safe_dump(given))
+    with pytest.raises(ConfigError, match=sentence):
+        load_monitor(tmp_path / "m.yaml")
 
 
 @pytest.mark.parametrize(("name", "there"), [("Q1.leak", r"tank \(T1, T2, T3\), got pump Q1"), ("T1.plugging", "P13")])

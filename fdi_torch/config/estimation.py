@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field
 from fdi_torch.config.plant import effect_at
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
-from fdi_torch.effects import EFFECTS, all_placements, placements_for
+from fdi_torch.effects import EFFECTS, all_placements, build_network, placements_for
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.names import unknown
 from fdi_torch.parameters import Parameter, ParameterSpace
@@ -92,6 +92,20 @@ def full_name(name: str, plant: PlantDescription) -> str:
     if rest in {e.name for e in EFFECTS}:
         return f"{name}.{effect_at(rest, location, plant).parameters(location, plant)[0].name}"
     return name
+
+
+def names_in_full(names: Iterable[str], plant: PlantDescription, field: str) -> list[str]:
+    """The same names, effects with their size. Raises ConfigError, naming the field, for one that the plant lacks."""
+    given = list(names)
+    try:
+        full = [full_name(name, plant) for name in given]
+        constants = build_network(plant, placements_for(full)).constants
+    except ValueError as error:
+        raise ConfigError([f"{field}: {error}"]) from error
+    for name, known in zip(given, full, strict=True):
+        if known not in constants:
+            raise ConfigError([f"{field}: {_unknown_parameter(name, constants, plant)}"])
+    return full
 
 
 def placements_of(names: Iterable[str], plant: PlantDescription) -> tuple[Placement, ...]:

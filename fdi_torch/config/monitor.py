@@ -9,8 +9,9 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from fdi_torch.config.estimation import full_name
+from fdi_torch.config.estimation import names_in_full
 from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.problems import told_in
 from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.config.run import OutputConfig
 from fdi_torch.config.strict import BenchSeconds, Seconds, Strict
@@ -99,11 +100,15 @@ def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:
     """A monitor file with some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
     data, file = values_in(path, overrides)
     config, plant, text = understood(MonitorConfig, data, file.parent, str(file))
-    return MonitorRun(_in_full(config, plant), plant, file.parent, str(file), text)
+    with told_in(str(file)):
+        config = _in_full(config, plant)
+    return MonitorRun(config, plant, file.parent, str(file), text)
 
 
 def _in_full(config: MonitorConfig, plant: PlantDescription) -> MonitorConfig:
     """'T1.leak' stands for the leak's size."""
-    ranges = {full_name(name, plant): ends for name, ends in config.ranges.items()}
-    faults = [full_name(name, plant) for name in config.faults]
+    ranged = names_in_full(config.ranges, plant, "ranges")
+    ranges = dict(zip(ranged, config.ranges.values(), strict=True))
+    faults = names_in_full(config.faults, plant, "faults")
+    names_in_full(config.calibrate, plant, "calibrate")
     return config.model_copy(update={"faults": faults, "ranges": ranges})
