@@ -16,6 +16,7 @@ from fdi_torch.monitor.detection import (
     largest,
     make_detector,
     more_alarms,
+    rate_error,
     window_lengths,
 )
 from fdi_torch.monitor.run_length import cusum_run_length, cusum_threshold, fixed_threshold, highest, threshold_of
@@ -44,6 +45,15 @@ def test_false_alarms_come_as_often_as_asked_for(chart: str) -> None:
     count = sum(int(detector.alarms(noise(100, 4000, 3, seed=s)).sum()) for s in range(3))
     expected = 3 * 100 * 4000 / 2000.0
     assert abs(count - expected) < 3.0 * math.sqrt(expected) + 0.04 * expected
+
+
+def test_how_far_one_recording_leaves_the_rate_of_false_alarms_off() -> None:
+    """Against thresholds learnt from many recordings: the rate of max |e| > h is known for every spread."""
+    asked, h = 20000.0, fixed_threshold(20000.0, 3)
+    spread = torch.stack([noise(1000, 3, seed=s).square().mean(0).sqrt() for s in range(400)])
+    rates = 2.0 * torch.special.ndtr(-h * spread).sum(1)
+    claimed = rate_error("fixed", asked, 3, 0.5, fit_whitening(noise(1000, 3), 0))
+    assert claimed == pytest.approx(float(rates.log().std()), rel=0.15)
 
 
 @pytest.mark.parametrize("chart", CHARTS)

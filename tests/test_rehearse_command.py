@@ -12,7 +12,7 @@ from fdi_torch.cli import MISUSE, main
 from fdi_torch.config.rehearsal import load_rehearsal
 from fdi_torch.jobs.rehearsal import rehearse
 from fdi_torch.logbook import read_run
-from fdi_torch.monitor.rehearsal.false_alarms import mean_time, student
+from fdi_torch.monitor.rehearsal.false_alarms import as_asked, mean_time, student
 
 RIVALS = """
 inputs: [50 cm^3/s, 50 cm^3/s]
@@ -65,6 +65,11 @@ def test_times_between_false_alarms_come_with_the_spread_of_calibrations() -> No
     mean, low, high = mean_time([90] * 8, 20000.0, 90.0)
     assert mean == 20000.0 and low == pytest.approx(20000.0 / (1.0 + 1.96 / 720**0.5)) and high > mean
     assert mean_time([60, 120] * 4, 20000.0, 90.0)[1] < low
+
+
+def test_a_count_agrees_with_what_was_asked_for_by_chance_and_by_its_calibration() -> None:
+    assert as_asked(109, 90.0, 0.0) and not as_asked(112, 90.0, 0.0) and not as_asked(70, 90.0, 0.0)
+    assert as_asked(65, 90.0, 0.15) and not as_asked(204, 90.0, 0.15)
 
 
 @pytest.mark.slow

@@ -108,25 +108,40 @@ def make_detector(
     raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
 
 
-def more_alarms(chart: Chart, run_length: float, channels: int, drift: float, learnt: Whitening) -> float:
+def more_alarms(chart: str, run_length: float, channels: int, drift: float, learnt: Whitening) -> float:
     """How many more false alarms a detector raises in the mean over recordings that its noise may be learnt from.
 
     Its rate grows as exp(s d) with an error d of ln of the residual's standard deviation, s = 10 to 25, so that an
     error with the variance v costs a factor exp(s^2 v / 2). Beyond MOST_MORE, which a few hundred samples of coloured
     noise reach, the mean is that of rare recordings, and no threshold would serve.
     """
+    steep, variance = _steepness(chart, run_length, channels, drift, learnt)
+    if chart == "glr":
+        # The direction of a chance excess is any: E sum u^4 = 3 / (C + 2).
+        variance = variance * 3.0 / (channels + 2.0)
+    return min(float(torch.exp(0.5 * steep**2 * variance).mean()), MOST_MORE)
+
+
+def rate_error(chart: str, run_length: float, channels: int, drift: float, learnt: Whitening) -> float:
+    """Standard error of ln of the rate of false alarms that one such recording leaves: s sqrt(v / C), for the channels
+    err each by itself and their alarms add.
+    """
+    steep, variance = _steepness(chart, run_length, channels, drift, learnt)
+    return float(steep * (variance.mean() / channels).sqrt())
+
+
+def _steepness(chart: str, run_length: float, channels: int, drift: float, learnt: Whitening) -> tuple[float, Tensor]:
+    """d ln rate / d ln of the residual's standard deviation, and the variance of the latter's error by channel."""
     if chart == "fixed":
-        steep, variance = fixed_threshold(run_length, channels) ** 2, torch.tensor([learnt.fast_error**2])
-    elif chart == "cusum":
+        fast = learnt.slow_error.new_full((channels,), learnt.fast_error**2)
+        return fixed_threshold(run_length, channels) ** 2, fast
+    if chart == "cusum":
         threshold, change = cusum_threshold(run_length, channels, drift), 1.01
         longer = cusum_run_length(threshold, drift) / cusum_run_length(threshold / change, drift / change)
-        steep, variance = math.log(longer) / math.log(change), learnt.slow_error**2
-    else:
-        # Of windows of n samples |sum e|^2 / n, chi-square of C channels, exceeds h as exp(-h / 2); h is about that of
-        # the largest of run_length such. The direction of a chance excess is any: E sum u^4 = 3 / (C + 2).
-        steep = 2.0 * math.log(run_length)
-        variance = learnt.slow_error**2 * 3.0 / (channels + 2.0)
-    return min(float(torch.exp(0.5 * steep**2 * variance).mean()), MOST_MORE)
+        return math.log(longer) / math.log(change), learnt.slow_error**2
+    # Of windows of n samples |sum e|^2 / n, chi-square of C channels, exceeds h as exp(-h / 2); h is about that of the
+    # largest of run_length such.
+    return 2.0 * math.log(run_length), learnt.slow_error**2
 
 
 def largest(white: Tensor) -> Tensor:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fdi_torch.monitor.detection import CHARTS
+from fdi_torch.monitor.detection import CHARTS, DRIFT, rate_error
 from fdi_torch.monitor.noise import learn_noise
 from fdi_torch.monitor.rehearsal.alarms import detectors, white_residuals
 from fdi_torch.monitor.rehearsal.pieces import Numbers, Piece, Shown, seeded
@@ -55,6 +56,9 @@ class FalseAlarmPlan:
                 before = counts.get(detector.chart, 0.0)
                 assert isinstance(before, float)
                 counts[detector.chart] = before + float(detector.alarms(white).sum())
+        for chart in CHARTS:
+            run_length = self.every / rig.sampling
+            counts[f"{chart} error"] = rate_error(chart, run_length, sensors, DRIFT, noise.whitening)
         return {**counts, "expected": self.runs * (self.samples - 1) * rig.sampling / self.every}
 
     def shown(self, found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Shown:
@@ -67,10 +71,21 @@ class FalseAlarmPlan:
                 mean, low, high = mean_time(counts, self.every, expected)
                 single = [self.every * expected / max(c, 1) for c in (max(counts), min(counts))]
                 alarms = f"{sum(counts)} ({expected * len(counts):.0f})"
-                times = (f"{mean:.0f}", f"{low:.0f} .. {high:.0f}", f"{single[0]:.0f} .. {single[1]:.0f}")
-                rows.append((kind, chart, str(len(counts)), alarms, *times))
-        header = ("noise", "detector", "calibrations", "alarms (asked)", "s between", "95 %", "single calibrations")
+                words = (f"{mean:.0f}", f"{low:.0f} .. {high:.0f}", f"{single[0]:.0f} .. {single[1]:.0f}")
+                errors = [float(n[f"{chart} error"]) for n in own]
+                within = sum(as_asked(c, expected, error) for c, error in zip(counts, errors, strict=True))
+                rows.append((kind, chart, str(len(counts)), alarms, *words, f"{within} of {len(counts)}"))
+        what = ("noise", "detector", "calibrations", "alarms (asked)")
+        header = (*what, "s between", "95 %", "single calibrations", "within own 95 %")
         return Shown(f"false alarms, {self.every:g} s between them asked for", header, tuple(rows))
+
+
+def as_asked(count: int, expected: float, rate_error: float) -> bool:
+    """Whether a count of false alarms agrees with what was asked for, to 95 %: by chance, and by how far the rate's
+    logarithm is off where noise is learnt from one recording.
+    """
+    error = NORMAL * (rate_error**2 + 1.0 / expected) ** 0.5
+    return abs(math.log(max(count, 0.5) / expected)) <= error
 
 
 def student(freedom: int) -> float:
