@@ -11,6 +11,7 @@ import torch
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.parameters import Parameter
+from fdi_torch.plant.description import PlacedEffect
 from fdi_torch.recording import Recording
 from tests.rigs import three_tank
 from tests.test_gap import believed, recorded
@@ -129,13 +130,19 @@ def test_an_unknown_input_is_refused_in_one_sentence() -> None:
 
 
 def test_a_library_that_names_a_place_the_plant_lacks_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"expected one of T1, .*, got Q9"):
+    with pytest.raises(ValueError, match=r"expected a place of plant three_tank \(T1, .*\), got 'Q9'"):
         diagnose(believed(), recorded(LAMINAR, 3, samples=100), settings=Settings(("pump_lag@Q9",)))
 
 
 def test_a_plant_without_tolerances_is_said() -> None:
     answer = diagnose(three_tank(), recorded(LAMINAR, 3, samples=300), settings=Settings(("laminar_flow",)))
     assert any("lists no tolerances" in remark for remark in answer.remarks) and not answer.constants
+
+
+def test_a_plant_file_with_an_effect_outside_its_range_is_said() -> None:
+    slow = replace(believed(), effects=(PlacedEffect("pump_lag", "Q1", {"time_constant": 400.0}),))
+    answer = diagnose(slow, recorded(LAMINAR, 3, samples=300), settings=Settings(("leak",)))
+    assert any("Q1.pump_lag.time_constant at 400 s, outside its sensible range" in r for r in answer.remarks)
 
 
 def test_constant_inputs_are_said_and_name_nothing_that_a_tolerance_explains_as_well() -> None:

@@ -8,12 +8,14 @@ from typing import Any
 
 import torch
 
+from fdi_torch.effects import effect
 from fdi_torch.gap.ceiling import guilty_places
 from fdi_torch.gap.closure import HeldOut
 from fdi_torch.gap.finding import Finding
 from fdi_torch.gap.freeform import shape_of
 from fdi_torch.gap.same_rig import other_rig
 from fdi_torch.parameters import display_unit
+from fdi_torch.plant.description import PlantDescription
 
 AT_END = 1e-3  # of a parameter's range
 SWINGS = 0.03  # amplitude of an oscillation worth a word, as a share of the free form's scale
@@ -34,7 +36,7 @@ def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
             "the plant file lists no tolerances, so that every constant is taken to be exact and what is a little off "
             "looks like an effect; list them under tolerances, as in P13.discharge_coefficient: 3 %"
         )
-    remarks += [*_at_their_ends(found), *_period(found)]
+    remarks += [*_believed_outside(subject.plant), *_at_their_ends(found), *_period(found)]
     return remarks + [sentence for h in held if (sentence := other_rig(found, h))]
 
 
@@ -49,6 +51,25 @@ def _period(found: Finding) -> list[str]:
         for period, share in waves
         if share > SWINGS
     ]
+
+
+def _believed_outside(plant: PlantDescription) -> list[str]:
+    """Parameters of the plant file's own effects that lie outside their sensible range."""
+    told = []
+    for placed in plant.effects:
+        for p in effect(placed.effect).parameters(placed.location, plant):
+            value, (unit, scale) = placed.parameters.get(p.name, p.nominal), display_unit(p.unit)
+            if not p.low <= value <= p.high:
+                name, ends = (
+                    f"{placed.location}.{placed.effect}.{p.name}",
+                    f"{scale * p.low:.4g} to {scale * p.high:.4g}",
+                )
+                told.append(
+                    f"the plant file has {name} at {scale * value:.4g} {unit}".rstrip()
+                    + f", outside its sensible range ({ends} {unit}".rstrip()
+                    + "): all that is found rests on it"
+                )
+    return told
 
 
 def _at_their_ends(found: Finding) -> list[str]:
