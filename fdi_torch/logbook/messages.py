@@ -42,11 +42,15 @@ class Messages:
         self._lock = threading.RLock()
         self._put_off: deque[tuple[str, Fields, float, Mapping[str, str] | None]] = deque()
         self._put_off_bytes = 0
+        self._due = False
         self._latest = 0.0
         self._described: dict[str, tuple[frozenset[str], Channel]] = {}
         self._sequence: dict[str, int] = {}
 
     def put(self, messages: Iterable[Timed]) -> None:
+        raise NotImplementedError
+
+    def flush(self) -> None:
         raise NotImplementedError
 
     def put_block(self, block: Block) -> None:
@@ -109,7 +113,9 @@ class Messages:
             return
         self._put_off.append((topic, fields, t, units))  # needs no lock, so that a search goes on at once
         self._put_off_bytes += size
-        if len(self._put_off) >= _TOGETHER or self._put_off_bytes > _TOGETHER_BYTES:
+        if self._due:
+            self.flush()
+        elif len(self._put_off) >= _TOGETHER or self._put_off_bytes > _TOGETHER_BYTES:
             self.settle()
 
     def settle(self) -> None:

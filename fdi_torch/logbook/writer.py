@@ -38,6 +38,9 @@ from fdi_torch.logbook.topics import Topics
 Listener = Callable[[Channel, int, bytes], None]
 """Hears each message as it is logged: its channel, its log time in ns and its payload."""
 
+_MOMENT = 0.05
+"""Seconds that the clock leaves to the run."""
+
 
 class RunLog(Topics):
     """Context manager that logs a run. Messages are written by the methods of `Topics`.
@@ -144,6 +147,7 @@ class RunLog(Topics):
     def flush(self) -> None:
         """Everything logged so far goes to disk."""
         with self._lock:
+            self._due = False
             self.settle()
             self._open_sink().cut()
             self._note_progress()
@@ -199,16 +203,23 @@ class RunLog(Topics):
         self._size = sink.size
 
     def _flush_by_clock(self) -> None:
+        """A run that logs something in the next moment writes by itself: two threads at a time hinder each other."""
         while not self._stop.wait(self._flush_seconds / 2):
-            with self._lock:
-                since = self._waiting_since
-                if since is None and self._put_off:
-                    self._waiting_since = time.monotonic()
-                elif since is not None and time.monotonic() - since >= self._flush_seconds / 2:
+            self._due = self._has_waited()
+            if self._due and not self._stop.wait(_MOMENT):
+                with self._lock:
                     try:
-                        self.flush()
+                        if self._due:
+                            self.flush()
                     except LogError:
                         return  # the sink is dead; the next write says so
+
+    def _has_waited(self) -> bool:
+        with self._lock:
+            since = self._waiting_since
+            if since is None and self._put_off:
+                self._waiting_since = time.monotonic()
+            return since is not None and time.monotonic() - since >= self._flush_seconds / 2
 
     def _write_start(self, sink: Sink) -> None:
         sink.metadata("fdi_torch.run", self._run)
