@@ -174,3 +174,22 @@ def test_an_unknown_oscillation_is_said_with_its_period() -> None:
     period = float(remark.split("period of ")[1].split(" s")[0])
     assert period == pytest.approx(90.0, rel=0.03)  # the grid of periods is 5 % wide
     assert answer.curves[0]["variable"].startswith("time within each")
+
+
+def test_sensors_of_several_units_are_told_each_in_its_own_and_together_in_levels_of_their_noise() -> None:
+    plant, volts = believed(), 20.0  # a metre of level
+    mixed = replace(plant, sensors=(*plant.sensors[:2], replace(plant.sensors[2], unit="V", gain=volts)))
+
+    def in_volts(r: Recording) -> Recording:
+        return replace(r, outputs=r.outputs * torch.tensor([1.0, 1.0, volts]), output_units=("m", "m", "V"))
+
+    files = recorded(LAMINAR, 3), recorded(LAMINAR, 5, samples=500)
+    alike = diagnose(plant, *files, Settings(LIBRARY)).closure
+    closure = diagnose(mixed, *(in_volts(r) for r in files), Settings(LIBRARY)).closure
+    assert alike["unit"] == "cm" and closure["unit"] == "noise levels"
+    assert list(closure["units"].values()) == ["cm", "cm", "V"]
+    assert closure["noise_floor"] == pytest.approx(1.0, rel=1e-9)
+    assert closure["augmented"] == pytest.approx(1.0, abs=0.05)
+    in_cm = alike["per_sensor"]["h3"]["recalibrated"]
+    assert closure["per_sensor"]["h3"]["recalibrated"] == pytest.approx(volts * 1e-2 * in_cm, rel=1e-3)
+    assert closure["closed"] == pytest.approx(1.0, abs=0.02)

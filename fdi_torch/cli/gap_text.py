@@ -80,7 +80,8 @@ def next_steps(
         steps.append(f"these inputs cannot show at their typical size: {shown}{more}")
     if twins:
         first = " and ".join(f"{c['effect']} at {c['location']}" for c in twins[0]["between"])
-        steps.append(f"these inputs cannot tell apart {len(twins)} pairs of effects, such as {first}")
+        many = f"{len(twins)} pairs of effects, such as {first}" if len(twins) > 1 else first
+        steps.append(f"these inputs cannot tell apart {many}")
     return steps
 
 
@@ -138,7 +139,8 @@ def _closure(closure: Mapping[str, Any], screen: Screen) -> None:
         each = [f"{closure['per_sensor'][s][stage]:.3g}" for s in sensors]
         rows.append([name, f"{closure[stage]:.3g}", *each])
     files = ", ".join(Path(source).name for source in closure["holdouts"])
-    screen.table(f"error of free runs on {files}, {closure['unit']}", ("plant", "all", *sensors), rows)
+    header = sensors if len(set(closure["units"].values())) == 1 else [f"{s}, {closure['units'][s]}" for s in sensors]
+    screen.table(f"error of free runs on {files}, {closure['unit']}", ("plant", "all", *header), rows)
     if closure["closed"] is None:
         screen.say("The hold-out's gap is too small, against its standard error, to say how much of it closes.")
     elif closure["closed"] < 0.0:

@@ -47,6 +47,12 @@ class HeldOut:
     runs: Mapping[str, Tensor]
     noise: Noise
 
+    @property
+    def weight(self) -> Tensor:
+        """(C,): by which squares of all sensors add up. Sensors of several units count in levels of their noise."""
+        alike = len({s.unit for s in self.subject.plant.sensors}) == 1
+        return torch.ones_like(self.noise.std) if alike else 1.0 / self.noise.std.clamp(min=1e-300) ** 2
+
     def squares(self, model: str) -> Tensor:
         """Squared residuals (S, C), 0 where no reading counts."""
         residual = self.subject.readings - self.runs[model]
@@ -55,8 +61,8 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Closure:
-    """RMSE of free runs by model and 'noise_floor', in the reading's SI unit; closed is None where the gap is too small
-    to be shared out."""
+    """RMSE of free runs by model and 'noise_floor', in the reading's SI unit, pooled in levels of the noise where units
+    differ; closed is None where the gap is too small to be shared out."""
 
     pooled: dict[str, float]
     per_sensor: dict[str, dict[str, float]]
@@ -78,7 +84,9 @@ def closure(held: Sequence[HeldOut]) -> Closure:
     count = torch.stack([h.subject.mask.sum(dim=0) for h in held]).sum(dim=0)
     sums = {m: torch.stack([h.squares(m).sum(dim=0) for h in held]).sum(dim=0) for m in held[0].runs}
     sums["noise_floor"] = torch.stack([h.noise.std**2 * h.subject.mask.sum(dim=0) for h in held]).sum(dim=0)
-    pooled = {m: float(torch.sqrt(total.sum() / count.sum())) for m, total in sums.items()}
+    own = {m: torch.stack([(h.weight * h.squares(m)).sum() for h in held]).sum() for m in held[0].runs}
+    own["noise_floor"] = torch.stack([(h.weight * h.noise.std**2 * h.subject.mask).sum() for h in held]).sum()
+    pooled = {m: float(torch.sqrt(total / count.sum())) for m, total in own.items()}
     each = {m: torch.sqrt(total / count.clamp(min=1)) for m, total in sums.items()}
     names = [s.name for s in held[0].subject.plant.sensors]
     sensors = {s: {m: float(v[i]) for m, v in each.items()} for i, s in enumerate(names)}
@@ -140,8 +148,8 @@ def _closed(held: Sequence[HeldOut]) -> tuple[float | None, tuple[float, float] 
     The noise of a hold-out is the same in both runs, so that the gap is their difference, plus what the augmented
     run leaves; the latter counts as far as it stands out of the uncertainty of the floor.
     """
-    difference = torch.cat([_blocks(h.squares("recalibrated") - h.squares("augmented")) for h in held])
-    excess = sum(float((h.squares("augmented") - h.noise.std**2 * h.subject.mask).sum()) for h in held)
+    difference = torch.cat([_blocks(h.weight * (h.squares("recalibrated") - h.squares("augmented"))) for h in held])
+    excess = sum(float((h.weight * (h.squares("augmented") - h.noise.std**2 * h.subject.mask)).sum()) for h in held)
     uncertain = math.sqrt(sum(_floor_variance(h) for h in held))
     left = math.copysign(max(abs(excess) - uncertain, 0.0), excess)
     total, error = float(difference.sum()) + max(left, 0.0), float(difference.std()) * math.sqrt(len(difference))
@@ -157,7 +165,8 @@ def _closed(held: Sequence[HeldOut]) -> tuple[float | None, tuple[float, float] 
 
 def _floor_variance(held: HeldOut) -> float:
     """Of the sum of squares that the noise alone gives."""
-    std, ar, count = held.noise.std, held.noise.ar, held.subject.mask.sum(dim=0)
+    std, ar = held.noise.std * torch.sqrt(held.weight), held.noise.ar
+    count = held.subject.mask.sum(dim=0)
     return float((2.0 * std**4 * count * (1 + ar**2) / (1 - ar**2)).sum())
 
 

@@ -39,7 +39,7 @@ def closure_section(material: Material) -> Section | None:
     texts = [f"{number(v, 3)} {unit}".rstrip() for v in values]
     label = axis("free-run root mean square error", unit)
     figure = bar_panel("Hold-out", label, names, values, texts, [name == "augmented" for name in stages])
-    header = [f"plant{', error in ' + unit if unit else ''}", "all", *_sensors(closure)]
+    header = [f"plant{', error in ' + unit if unit else ''}", "all", *_headed(closure)]
     rows = [[words[m], number(float(closure[m]), 3), *_by_sensor(closure, m)] for m in stages]
     rows += [[name, number(value, 3), *[""] * (len(header) - 2)] for name, value in extra]
     blocks: list[Any] = [_closed(closure), [Picture("gap_closure", figure)], table(header, rows)]
@@ -86,6 +86,12 @@ def _closed(closure: Mapping[str, Any]) -> str:
 
 def _is_interval(interval: Any) -> bool:
     return len(interval) == 2 and all(isinstance(end, int | float) for end in interval)
+
+
+def _headed(closure: Mapping[str, Any]) -> list[str]:
+    """The sensors, each with its unit where these differ."""
+    units = closure.get("units") or {}
+    return [f"{s}, {units[s]}" if len(set(units.values())) > 1 and s in units else s for s in _sensors(closure)]
 
 
 def _sensors(closure: Mapping[str, Any]) -> list[str]:
