@@ -62,3 +62,13 @@ def test_what_has_a_memory_and_no_name_is_unknown_at_its_place(values: dict[str,
     answer = diagnose(believed(), recorded(values, 5), settings=Settings(leave_out=("pump_lag", "pump_delay")))
     assert answer.verdict == "unknown"
     assert answer.where[0][0] == next(iter(values)).partition(".")[0]
+
+
+def test_a_curvature_that_rounding_spoilt_harms_no_neighbour() -> None:
+    columns = torch.randn(3, 20, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    gram, score = columns.mT @ columns, torch.full((3, 6), 100.0, dtype=torch.float64)
+    spoilt = gram.clone()
+    spoilt[1, 0, 1] = spoilt[1, 1, 0] = 1.01 * torch.sqrt(gram[1, 0, 0] * gram[1, 1, 1])
+    found, expected = sparse(spoilt, score, 1e-3, 20), sparse(gram, score, 1e-3, 20)
+    assert bool(torch.isfinite(found.evidence).all())
+    assert torch.equal(found.evidence[[0, 2]], expected.evidence[[0, 2]])

@@ -16,6 +16,7 @@ from torch import Tensor
 
 SEEN = 1e-6  # chi-square units below which a column does nothing
 LOW, HIGH = 1e-8, 1e12
+RIDGES = tuple(10.0**k for k in range(-8, 2))  # shares of the diagonal
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,20 @@ def sparse(gram: Tensor, score: Tensor, heat: float, rounds: int) -> Sparse:
 
 def _posterior(told: Tensor, aim: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean (B, M), how far each coefficient is told (B, M), and half the log determinant of the curvature (B,)."""
-    root = torch.linalg.cholesky(told + torch.diag_embed(precision + 1e-9))
+    root = _root(told + torch.diag_embed(precision + 1e-9))
     covariance = torch.cholesky_inverse(root)
     mean = (covariance @ aim.unsqueeze(-1)).squeeze(-1)
     used = (1.0 - precision * torch.diagonal(covariance, dim1=-2, dim2=-1)).clamp(1e-12, 1.0)
     return mean, used, torch.log(torch.diagonal(root, dim1=-2, dim2=-1)).sum(-1)
+
+
+def _root(curvature: Tensor) -> Tensor:
+    """Cholesky's, (B, M, M). Products of columns that are nearly nothing are mostly rounding, and may leave a curvature
+    that no columns could have: such a one is widened until it has a root.
+    """
+    root, failed = torch.linalg.cholesky_ex(curvature)
+    for ridge in RIDGES if bool(failed.any()) else ():
+        wider = ridge * (failed > 0).to(curvature)[:, None] * torch.diagonal(curvature, dim1=-2, dim2=-1).abs()
+        curvature = curvature + torch.diag_embed(wider)
+        root, failed = torch.linalg.cholesky_ex(curvature)
+    return torch.linalg.cholesky(curvature) if bool(failed.any()) else root
