@@ -9,7 +9,7 @@ import torch
 from rigs import random_steps, three_tank
 
 from fdi_torch.effects import all_placements, build_network, placements_for
-from fdi_torch.effects.signature import likeness, signatures
+from fdi_torch.effects.signature import signatures
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.reach import reach_of
@@ -30,7 +30,8 @@ def likeness_of(placements: tuple[Placement, ...], kind: str) -> torch.Tensor:
     engine = make_engine(network, space, lay_out(recording, plant.channels(), 20.0), kind)
     reach = reach_of(replace(recording, outputs=engine.readings(space.nominal()), mask=None), plant)
     noise = torch.full((3,), 1e-3, dtype=torch.float64)
-    return likeness(signatures(engine, space, placements, plant, reach, noise, nuisance))
+    directions = signatures(engine, space, placements, plant, reach, noise, nuisance)
+    return torch.abs(directions @ directions.T)
 
 
 def test_what_is_one_thing_has_one_signature_and_what_calibration_absorbs_has_none() -> None:

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from fdi_torch.estimate.information import (
     certainty,
-    confidence_ellipse,
     cramer_rao,
     determined_combinations,
     fisher_information,
@@ -165,16 +164,6 @@ def test_bounds_are_told() -> None:
     assert parameters_at_bounds(space("a", "b", "c"), theta) == {"a": "low", "b": "high"}
     endless = ParameterSpace([Parameter("a", "m", 0.0)])
     assert parameters_at_bounds(endless, theta[:1]) == {}
-
-
-def test_ellipse_holds_the_truth_as_often_as_it_says() -> None:
-    covariance = certainty(fisher_information(line(), SIGMA)).covariance
-    centre = torch.tensor([1.0, 2.0], dtype=DOUBLE)
-    curve = confidence_ellipse(centre, covariance, 0.9) - centre
-    distance = (curve @ torch.linalg.inv(covariance) * curve).sum(-1)
-    torch.testing.assert_close(distance, torch.full((100,), stats.chi2(2).ppf(0.9), dtype=DOUBLE))
-    with pytest.raises(ValueError, match="expected a finite covariance"):
-        confidence_ellipse(centre, covariance * math.inf)
 
 
 def test_interval_and_p_value_are_those_of_the_distributions() -> None:

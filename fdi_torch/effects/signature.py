@@ -46,11 +46,6 @@ def signatures(
     return _directions(torch.stack(whitened[: len(rows)]), whitened[len(rows) :])
 
 
-def likeness(directions: Tensor) -> Tensor:
-    """|cosine| between all signatures, (N, N): 1 where two are the same up to their size's unit and sign."""
-    return torch.abs(directions @ directions.T)
-
-
 def _largest_change(
     engine: Engine,
     space: ParameterSpace,

@@ -145,18 +145,3 @@ def _reduced(rows: Tensor) -> Tensor:
             if other != i:
                 rows[other] = rows[other] - rows[other, column].clone() * rows[i]
     return rows
-
-
-def confidence_ellipse(centre: Tensor, covariance: Tensor, confidence: float = 0.95, points: int = 100) -> Tensor:
-    """Points (points, 2) of the curve around centre (2,) that holds the truth with this probability.
-
-    covariance (2, 2). The squared radius is the quantile of chi-square with two degrees of freedom, -2 ln(1 - p).
-    Raises ValueError where the covariance is not finite: the region then has no end.
-    """
-    if not bool(torch.isfinite(covariance).all()):
-        raise ValueError("expected a finite covariance, got one that is not; leave undetermined parameters out")
-    angle = torch.linspace(0.0, 2.0 * math.pi, points).to(covariance)
-    circle = torch.stack((angle.cos(), angle.sin()))
-    values, vectors = torch.linalg.eigh(covariance)
-    radius = math.sqrt(-2.0 * math.log1p(-confidence))
-    return centre + radius * (vectors * values.clamp(min=0.0).sqrt() @ circle).mT

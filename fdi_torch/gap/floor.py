@@ -36,11 +36,6 @@ class Noise:
     def std(self) -> Tensor:
         return self.innovation / torch.sqrt(1.0 - self.ar**2)
 
-    @property
-    def effective_share(self) -> Tensor:
-        """(C,): how many independent samples one sample is worth for a slow quantity."""
-        return (1.0 - self.ar) / (1.0 + self.ar)
-
     def whiten(self, x: Tensor, mask: Tensor) -> Tensor:
         """x (*lanes, S, C) or (*lanes, S, C, P), mask (S, C) -> independent samples of unit variance; masked are 0.
 
