@@ -23,7 +23,7 @@ from fdi_torch.logbook import RunLog, read_run
 
 Row = tuple[str, int, int, float, float]
 
-# A day of readings every ten seconds, of a leak in its middle.
+# A reading a second, of a rig with a small leak throughout.
 MONITOR = """
 plant: three_tank
 recording: {file: FILE}
@@ -41,7 +41,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "study: 500 trials": (*STUDY, "study.trials=500"),
     "monitor: 10,000 samples": ("monitor", "--config", "MONITOR"),
     "rehearse: 20 runs of an hour": (*REHEARSAL, "false_alarms={noises: {white: {}}, runs: 20, calibrations: 2}"),
-    "gap: 2,000 samples, all effects": ("gap", "--plant", "three_tank", "--recording", "RECORDING"),
+    "gap: 1,000 samples, all effects": ("gap", "--plant", "three_tank", "--recording", "RECORDING"),
     "challenge: 1 rig": ("challenge", "--cases", "1", "--kinds", "single", "--no-bic"),
 }
 """MONITOR and RECORDING stand for files that are made first."""
@@ -109,7 +109,7 @@ def runs() -> Iterator[tuple[int, tuple[str, tuple[str, ...]]]]:
 def prepared(folder: Path) -> dict[str, str]:
     """The files that jobs need."""
     files = {}
-    for what, duration, fault in (("MONITOR", 10_000, 0.05), ("RECORDING", 2000, 0.0)):
+    for what, duration, fault in (("MONITOR", 10_000, 0.05), ("RECORDING", 1000, 0.3)):
         sets = (f"simulate.duration={duration} s", f"simulate.faults={{T1.leak: {fault}}}")
         words = [word for change in sets for word in ("--set", change)]
         recording = run(("simulate", *words), folder / what, "*.csv")
