@@ -27,7 +27,7 @@ PARTS = {
 
 NOTES = """# Benchmarks
 
-One command compares fdi_torch with other tools on the same work, in one run on one machine:
+One command compares fdi_torch with other tools on the same work, on one machine; parts of it can be named:
 
     pip install -e '.[benchmarks]' && python -m benchmarks --write benchmarks/README.md
 
