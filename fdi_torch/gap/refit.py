@@ -6,6 +6,7 @@ a tolerance stays near what the plant file says (valves of one make are nearly a
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -18,7 +19,7 @@ from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter
 from fdi_torch.gap.floor import Noise, estimate_noise
 from fdi_torch.gap.limits import limits_of
-from fdi_torch.gap.spread import Own
+from fdi_torch.gap.spread import TOLD, Own
 from fdi_torch.gap.standard_errors import standard_errors
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -92,10 +93,9 @@ def refit(
         fit = base = fitter.fit(Candidate(tuple(free), (start,)), base, rounds=ROUNDS)
         found = {n: v for n, v in fit.effect_values.items() if n in start}
         start = {n: v for n, v in found.items() if n not in _undetermined(fitter, fit)}
-    better = replace(_with(bare, fit), tolerances=tolerances, varying=plant.varying)
-    return Refit(
-        better, _rmse(fitter, null), _rmse(fitter, fit), len(fit.space), _errors(fitter, fit), _own(fitter, fit)
-    )
+    own = _own(fitter, fit)
+    better = replace(_with(bare, fit, _typical(own, fit, bare)), tolerances=tolerances, varying=plant.varying)
+    return Refit(better, _rmse(fitter, null), _rmse(fitter, fit), len(fit.space), _errors(fitter, fit), own)
 
 
 def _matching(names: Collection[str], patterns: Collection[str]) -> list[str]:
@@ -109,7 +109,7 @@ def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
     low, high, _ = fitter.box(fit.space)
     errors = _errors(fitter, fit)
     widths = dict(zip(fit.space.names, (high - low).tolist(), strict=True))
-    return {n for n in fit.effect_values if errors[n][1] > WIDE * widths[n]}
+    return {n for n in fit.effect_values if n in errors and errors[n][1] > WIDE * widths[n]}
 
 
 def _errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
@@ -157,12 +157,24 @@ def _told(placed: PlacedEffect, plant: PlantDescription, recording: Recording) -
     return False
 
 
-def _with(plant: PlantDescription, fit: Fit) -> PlantDescription:
-    """Constants and effects as fitted; what each recording has for itself stays as it was."""
+def _typical(own: Sequence[Own], fit: Fit, plant: PlantDescription) -> dict[str, float]:
+    """What the next recording is best believed to have of what differs: the median of those that tell it and of what
+    the plant file says, which counts as one more: two recordings may both be odd.
+    """
+    found = {}
+    for name in plant.varying:
+        told = [o.value for o in own if o.name == name and o.std < TOLD * plant.tolerances[name]]
+        if told:
+            found[name] = statistics.median([*told, fit.space[name].nominal])
+    return found
+
+
+def _with(plant: PlantDescription, fit: Fit, typical: dict[str, float]) -> PlantDescription:
+    """Constants and effects as fitted; of what each recording has for itself what is typical."""
     own = {*plant.varying, *(f"{tank.name}.start_level" for tank in plant.tanks)}
-    common = {n: v for n, v in fit.values.items() if n.partition("@")[0] not in own}
+    common = {n: v for n, v in fit.values.items() if n.partition("@")[0] not in own} | typical
     constants = {n: v for n, v in common.items() if n.count(".") == 1}
-    found = fit.effect_values
+    found = {n: v for n, v in common.items() if n.count(".") == 2}
     effects = []
     for placed in plant.effects:
         prefix = f"{placed.location}.{placed.effect}"
