@@ -39,9 +39,9 @@ lane or once a length of step. What bounds the kernel is the processor's product
 would be wrong, it would be twice as fast. With steps of its own a trajectory takes few: short ones where a root has its
 kink, elsewhere as long as its stiffness allows. Errors are against SciPy's LSODA at a tolerance of 1e-12, on equations
 as sharp as for steps of 1 ms. The SciPy search is stopped after 120 generations, those of evosax and EvoX after 1500;
-all start from the tools' own defaults. Logging is timed within the log's own methods, on each
-thread, with the process that asks git; the job's seconds do not hold the imports. A sample's message costs half a
-microsecond; what is written once a generation finds the caches cold and costs sixty times as much.
+all start from the tools' own defaults. Logging is timed within the log's own methods, on each thread, with the
+process that asks git; the job's seconds do not hold the imports, those of the whole command do. A sample's message
+costs half a microsecond; what is written once a generation finds the caches cold and costs sixty times as much.
 
 """
 
