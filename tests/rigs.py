@@ -1,8 +1,12 @@
-"""Plants and recordings that tests share."""
+"""Plants and recordings that tests share, and what holds for every engine."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import pytest
 import torch
+from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.parameters import ParameterSpace
@@ -70,3 +74,16 @@ def random_steps(plant: PlantDescription, duration: float, seed: int = 0, sample
         values = 10e-6 + 80e-6 * torch.rand(len(time), generator=generator, dtype=torch.float64)
         columns.append(values[torch.cumsum(switch, 0)])
     return blank_recording(plant, torch.stack(columns, dim=1), time)
+
+
+def assert_lanes_stand_alone(run: Callable[[Tensor], Tensor], theta: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same bits alone, beside lanes of NaN, and with two threads; a lane of NaN does not come out finite."""
+    broken = theta.clone()
+    broken[1::2] = torch.nan
+    together = run(theta)
+    assert torch.equal(run(broken)[::2], together[::2])
+    assert torch.equal(run(theta[40:41])[0], together[40])
+    assert not torch.isfinite(run(broken)[1::2]).all(dim=-1).all()
+    with monkeypatch.context() as two_threads:
+        two_threads.setattr(torch, "get_num_threads", lambda: 2)
+        assert torch.equal(run(theta), together)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from rigs import assert_lanes_stand_alone
 from torch import Tensor
 
 from fdi_torch.config.plant import load_plant
@@ -248,8 +249,6 @@ def test_a_lane_depends_on_no_neighbour(make, monkeypatch: pytest.MonkeyPatch) -
     e = experiment("samples denser than steps")
     engine = CompiledEngine(network, space, e)
     theta = random_theta(space, 70)
-    broken = theta.clone()
-    broken[1::2] = torch.nan
     data = Readings(torch.rand(300, 3).double(), torch.ones(300, 3).double())
     for run in (
         engine.readings,
@@ -258,13 +257,7 @@ def test_a_lane_depends_on_no_neighbour(make, monkeypatch: pytest.MonkeyPatch) -
         lambda t: engine.moments(t, data),
         lambda t: engine.gram(t, data),
     ):
-        together = run(theta)
-        assert torch.equal(run(broken)[::2], together[::2])
-        assert torch.equal(run(theta[40:41])[0], together[40])
-        assert not torch.isfinite(run(broken)[1::2]).all(dim=-1).all()
-        monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-        assert torch.equal(run(theta), together)
-        monkeypatch.undo()
+        assert_lanes_stand_alone(run, theta, monkeypatch)
 
 
 def test_problems_with_one_lane_each_have_their_own_data() -> None:

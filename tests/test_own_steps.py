@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rigs import constant_inputs, three_tank
+from rigs import assert_lanes_stand_alone, constant_inputs, three_tank
 from rigs import paper_network as rig
 from torch import Tensor
 
@@ -92,17 +92,9 @@ def test_a_lane_depends_on_no_neighbour(monkeypatch: pytest.MonkeyPatch) -> None
     network, space = rig()
     e, theta = experiment(1e-6), faults(space, 70)
     engine = CompiledEngine(network, space, e)
-    broken = theta.clone()
-    broken[1::2] = torch.nan
     data = Readings(torch.rand(41, 3).double(), torch.ones(41, 3).double())
     for run in (engine.levels, lambda t: engine.linearise(t)[1], lambda t: engine.gram(t, data)):
-        together = run(theta)
-        assert torch.equal(run(broken)[::2], together[::2])
-        assert torch.equal(run(theta[40:41])[0], together[40])
-        assert not torch.isfinite(run(broken)[1::2]).all(dim=-1).all()
-        monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-        assert torch.equal(run(theta), together)
-        monkeypatch.undo()
+        assert_lanes_stand_alone(run, theta, monkeypatch)
 
 
 def test_sums_are_those_of_readings_and_jacobian() -> None:

@@ -22,10 +22,8 @@ from fdi_torch.simulate.joint import Joint, own_name
 ROUNDS = 14
 SETTLED = 0.05  # chi-square units; smaller gains decide nothing
 PATIENCE, ENOUGH = 1, 4.0  # a start is given up that gains less than a quarter of its arrears after two rounds
-CORRECTIONS, FAR = (
-    6,
-    1e-3,
-)  # of a trajectory that a step of the parameters moved; m, on a bench, from which it is worth one
+CORRECTIONS = 6  # of a trajectory that a step of the parameters moved
+FAR = 1e-3  # in units of the plant's length scale: a defect from which a correction is worth its cost
 Key = frozenset[tuple[str, str]]
 
 

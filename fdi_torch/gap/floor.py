@@ -80,9 +80,8 @@ def estimate_noise(
     spectra = [_spectrum_of_all([residual[r][mask[r][:, c], c] for r in rows]) for c in range(residual.shape[1])]
     say = [not r for r in rounded] if rounded and not all(rounded) else [True] * len(spectra)
     levels = [_levels(*s) for s in spectra]
-    likelihoods = torch.stack(
-        [_likelihood(*s, x) for s, x in zip(spectra, levels, strict=True)]
-    )  # (C, colours, errors)
+    # (C, colours, errors)
+    likelihoods = torch.stack([_likelihood(*s, x) for s, x in zip(spectra, levels, strict=True)])
     counts = [int(mask[:, c].sum()) for c in range(residual.shape[1])]
     likelihoods = likelihoods + torch.stack([_cost_of_error(n) for n in counts]).unsqueeze(1)
     best = likelihoods.min(dim=-1).values
