@@ -52,8 +52,11 @@ def test_a_valve_of_which_nothing_is_said_has_to_be_recorded(folder: Path, capsy
 
 def test_a_pump_that_was_not_recorded_has_to_be_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["predict", "--plant", "rig.yaml", "nopump.csv"]) == 2
-    assert "expected a column for Q" in capsys.readouterr().err
+    said_so = capsys.readouterr().err
+    assert "expected a column for Q, got t_s, h_mm, v_pct" in said_so and "--constant Q=0" in said_so
     assert said(capsys, "nopump.csv", "--constant", "Q=0")["rmse"] == {"h": pytest.approx(0.0, abs=1e-6)}
+    with_unit, bare = (said(capsys, "nopump.csv", "--constant", f"Q={q}")["rmse"] for q in ("50 cm^3/s", "5e-5"))
+    assert with_unit == bare and bare["h"] > 0.05  # 10 cm stood there, and 50 cm^3/s for 39 s are 19.5 cm
     assert main(["predict", "--plant", "rig.yaml", "nopump.csv", "--constant", "Q"]) == 2
     assert "INPUT=VALUE" in capsys.readouterr().err
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from fdi_torch.config.plant import build_plant
 from fdi_torch.config.run import Run, build_run
 from fdi_torch.estimate.stretches import stretches_of
-from fdi_torch.estimate.windows import Window, WindowFault, cut_up, state_of
+from fdi_torch.estimate.windows import Window, WindowFault, cut_up, noise_of, state_of
 from fdi_torch.jobs.windows import windows_of
 from fdi_torch.recording import Recording
 
@@ -91,3 +92,16 @@ def test_a_leak_that_opens_halfway_is_in_the_windows_after_it(tmp_path: Path) ->
     assert abs(leak.size - 0.3) < 4.0 * leak.std < 0.1
     assert leak.flow is not None and leak.flow > 0.0
     assert found.log.is_file()
+
+
+def test_a_sensor_without_noise_counts_as_off_by_a_share_of_its_span_in_whatever_unit() -> None:
+    """The same still levels read in metres and in volts (10 V over 0.5 m): the noise scales with the reading."""
+    tank = {"tanks": {"T": {"area": "100 cm^2", "height": "50 cm"}}, "sensors": {"h": {"tank": "T"}}}
+    volts = tank | {"sensors": {"h": {"tank": "T", "gain": "0.2 V/cm"}}}
+    time = torch.arange(20, dtype=torch.float64)
+    still = torch.full((20, 1), 0.3, dtype=torch.float64)
+    found = []
+    for plant, reading, unit in ((tank, still, "m"), (volts, 20.0 * still, "V")):
+        recording = Recording(time, torch.zeros(20, 0, dtype=torch.float64), reading, (), ("h",), (), (unit,))
+        found.append(float(noise_of(recording, build_plant(plant, "a tank"))))
+    assert found[1] == pytest.approx(20.0 * found[0]) and found[0] > 0.0

@@ -7,6 +7,7 @@ input becomes unknown, and begins anew where it is known again.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,14 @@ import torch
 from fdi_torch.cli import DONE
 from fdi_torch.cli.options import seconds
 from fdi_torch.cli.screen import Screen
+from fdi_torch.config.files import find_data
 from fdi_torch.config.plant import load_plant
-from fdi_torch.config.recordings import RecordingConfig, load_recordings, named_recordings
+from fdi_torch.config.recordings import RecordingConfig, load_recordings, missing_inputs, named_recordings
 from fdi_torch.gap.prediction import START_SAMPLES, Prediction, predict
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.csv_files import read_header
 from fdi_torch.report.free_run_figure import free_run_figure
 from fdi_torch.report.style import save
 
@@ -30,7 +33,7 @@ examples:
   fdi predict a.csv b.csv --plant rig.yaml --to 300          several, each for its first 300 s
   fdi predict runs.yaml --plant rig.yaml                     stretches listed under `recordings`, as in a run file
   fdi predict run.csv --plant better.yaml --beside rig.yaml --picture run.png
-  fdi predict run.csv --plant rig.yaml --constant q1_cmd=0   an input that was not recorded
+  fdi predict run.csv --plant rig.yaml --constant q1_cmd=0   an input that was not recorded, or '20 cm^3/s'
 """
 
 
@@ -50,7 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--picture", metavar="FILE", help="draw the run (PNG or SVG); of several, the last")
     parser.add_argument("--beside", metavar="PLANT", help="another plant, drawn beside it, such as the one before")
     parser.add_argument(
-        "--constant", metavar="INPUT=VALUE", action="append", default=[], help="an input that was not recorded, SI"
+        "--constant",
+        metavar="INPUT=VALUE",
+        action="append",
+        default=[],
+        help="an input that was not recorded, SI or with its unit",
     )
 
 
@@ -92,11 +99,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def _recordings(name: str, plant: PlantDescription, arguments: argparse.Namespace) -> list[Recording]:
     if Path(name).suffix in (".yaml", ".yml"):
         return named_recordings(name, plant, Path.cwd())
-    units = plant.channel_units()
-    columns: dict[str, dict[str, Any]] = {
-        key: {"constant": f"{value} {units[key]}" if units.get(key, "1") != "1" else value}
-        for key, value in _constants(arguments).items()
-    }
+    columns = _constants(arguments, plant)
+    _expect_inputs(name, plant, columns)
     config = RecordingConfig.model_validate(
         {
             "file": name,
@@ -113,12 +117,39 @@ def _other_name(other: PlantDescription, plant: PlantDescription, arguments: arg
     return other.name if other.name != plant.name else Path(arguments.beside).stem
 
 
-def _constants(arguments: argparse.Namespace) -> dict[str, float]:
-    pairs = [text.partition("=") for text in arguments.constant]
-    for name, sign, value in pairs:
-        if not (name and sign and value):
-            raise ValueError(f"--constant: expected INPUT=VALUE such as q1_cmd=0, got '{name}{sign}{value}'")
-    return {name: float(value) for name, _, value in pairs}
+def _constants(arguments: argparse.Namespace, plant: PlantDescription) -> dict[str, dict[str, Any]]:
+    """Inputs that were not recorded, as `columns` of a run file has them; a bare number is in SI."""
+    units, columns = plant.channel_units(), {}
+    for text in arguments.constant:
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not (name and value):
+            raise ValueError(f"--constant: expected INPUT=VALUE such as q1_cmd=0, got '{text}'")
+        bare = _is_number(value)
+        unit = units.get(name, "1")
+        columns[name] = {"constant": f"{value} {unit}" if bare and unit != "1" else float(value) if bare else value}
+    return columns
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _expect_inputs(name: str, plant: PlantDescription, columns: Collection[str]) -> None:
+    """Every input has to be known. Raises ValueError telling all those that a CSV file lacks, and what to do."""
+    path = find_data(name, Path.cwd())
+    lacking = [c for c in missing_inputs(path, plant) if c not in columns]
+    if lacking:
+        still = " ".join(f"--constant {channel}=0" for channel in lacking)
+        listed = f"recordings: [{{file: {name}, columns: {{{lacking[0]}: {{column: ..., unit: ...}}}}}}]"
+        raise ValueError(
+            f"{path}: expected a column for {' and '.join(lacking)}, got {', '.join(read_header(path))}; where they "
+            f"stood still, add {still} (--from and --to choose the stretch); a column by another name is mapped in a "
+            f"YAML file: {listed}"
+        )
 
 
 def _row(plant: PlantDescription, recording: Recording, found: Prediction) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -140,11 +140,22 @@ def _reader(path: Path) -> Reader:
 def unrecorded_valves(path: Path, plant: PlantDescription) -> dict[str, ChannelSource]:
     """The valves that a CSV file lacks and the plant file says how they then stand."""
     known = {p.valve: p.unrecorded for p in plant.pipes if p.valve and p.unrecorded is not None}
-    if not known or ".mcap" in path.suffixes:
-        return {}
+    return {name: ChannelSource(None, "1", known[name]) for name in _lacking(path, known)}
+
+
+def missing_inputs(path: Path, plant: PlantDescription) -> list[str]:
+    """The plant's inputs that a CSV file has no column for, but valves of which the plant file says how they stand."""
+    known = unrecorded_valves(path, plant)
+    return [name for name in _lacking(path, plant.channels()) if name not in known]
+
+
+def _lacking(path: Path, names: Collection[str]) -> list[str]:
+    """Those of the names that no header of a CSV file is about; of other files none."""
+    if not names or ".mcap" in path.suffixes:
+        return []
     header = read_header(path)
     there = {*header, *(split[0] for column in header if (split := header_unit(column)))}
-    return {valve: ChannelSource(None, "1", opening) for valve, opening in known.items() if valve not in there}
+    return [name for name in names if name not in there]
 
 
 def channel_mapping(config: RecordingConfig, plant: PlantDescription) -> dict[str, ChannelSource]:

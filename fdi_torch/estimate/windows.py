@@ -16,6 +16,7 @@ from fdi_torch.estimate.hybrid import search_box
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.objectives import Problem, Term
 from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
+from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import time_scale
 from fdi_torch.recording import Recording
@@ -25,7 +26,7 @@ from fdi_torch.simulate.steps import choose_step, probe_points
 REFINE = RefineSettings(iterations=40, decrease_tolerance=1e-6)
 START = 0.3  # of a fault, between nominal and the end of its range
 STEP_ERROR = 0.2  # of the simulation, as a share of the sensors' noise: a window is too short for it to add up
-LEAST_NOISE = 1e-6  # of a sensor that shows none, in its unit
+LEAST_NOISE = 1e-6  # of a sensor that shows none, as a share of what it reads from floor to rim
 NOTICED = 0.05  # a size within this of nominal is none, as a share of the range
 TOLD = 0.15  # a standard error beyond this share of the range tells nothing
 EMPTY = 0.02  # share of its height below which a tank counts as empty: what drains it then, nothing tells
@@ -59,7 +60,8 @@ class Window:
 def noise_of(recording: Recording, plant: PlantDescription) -> Tensor:
     """(C,) sample-to-sample noise of each sensor."""
     readings = readings_of(recording, plant)
-    return sample_noise(readings.values, readings.weight).clamp(min=LEAST_NOISE)
+    spans = readings.values.new_tensor([reading_span(plant, sensor) for sensor in plant.sensors])
+    return torch.maximum(sample_noise(readings.values, readings.weight), LEAST_NOISE * spans)
 
 
 def cut_up(recording: Recording, length: float) -> list[Recording]:
