@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +13,13 @@ import torch
 
 from fdi_torch.effects import build_network
 from fdi_torch.gap.challenge import cases
+from fdi_torch.gap.challenge.bench import Scales, on_bench
 from fdi_torch.gap.challenge.built import WIDEST, as_built
 from fdi_torch.gap.challenge.cases import make, plans
 from fdi_torch.gap.challenge.colours import Colour, autoregressive, rippling, smoothed
 from fdi_torch.gap.challenge.conditions import asked_of_pumps
 from fdi_torch.gap.challenge.exercise import exercised
+from fdi_torch.gap.challenge.files import as_csv
 from fdi_torch.gap.challenge.inputs import SIGNALS, commanded, with_standstills
 from fdi_torch.gap.challenge.kinds import KINDS, STANDARD, choose
 from fdi_torch.gap.challenge.known import KNOWN
@@ -31,8 +34,9 @@ from fdi_torch.gap.challenge.simulator import HiddenRigs, simulate
 from fdi_torch.gap.challenge.surroundings import Surroundings
 from fdi_torch.gap.challenge.unknown import UNKNOWN, unknown_to
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.integrate import ReferenceEngine
 
@@ -209,28 +213,58 @@ def test_mean_squares_of_coloured_noise_scatter_as_said(colour: Colour) -> None:
     assert squares.std() == pytest.approx(np.sqrt(2 * colour.repeats / samples), rel=0.06)
 
 
-@pytest.mark.parametrize("rig", [three_tank(), quadruple_tank(), cascaded_tanks()], ids=lambda r: r.plant.name)
+TOWER, PHIAL = Scales(time=100.0, length=10.0, area=1e4), Scales(time=0.1, length=0.1, area=0.01)
+
+
+def of_size(scales: Scales) -> Rig:
+    """The three tanks of another size, as their plant file alone has them exercised."""
+    back = Scales(1 / scales.time, 1 / scales.length, 1 / scales.area)
+    return exercised(on_bench(three_tank().plant, back), scales)
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [three_tank(), quadruple_tank(), cascaded_tanks(), of_size(TOWER), of_size(PHIAL)],
+    ids=["three", "quadruple", "cascaded", "tower", "phial"],
+)
 def test_two_independent_simulations_of_a_sound_rig_agree(rig: Rig) -> None:
     """The hidden rig without any effect and the library's plant: other code, other integrator, the same water."""
-    plant, seconds = rig.plant, 200
+    plant, scales, seconds = rig.plant, rig.scales, 200
     commands = commanded(rig, np.random.default_rng(2), seconds + 1)
     start = [0.2 * t.height * (1 + 0.3 * i) for i, t in enumerate(plant.tanks)]
     rigs = HiddenRigs([plant], [()])
     hidden = simulate(rigs, asked_of_pumps(plant, commands)[..., None], np.array(start)[:, None])[:, :, 0]
-    started = replace(plant, tanks=tuple(replace(t, start_level=h) for t, h in zip(plant.tanks, start, strict=True)))
-    si = commands * [1e-6 if p.gain_unit == "1" else 1.0 for p in (plant.pumps[0],) * commands.shape[1]]
+    full = zip(rig.believed.tanks, start, strict=True)
+    started = replace(rig.believed, tanks=tuple(replace(t, start_level=scales.length * h) for t, h in full))
+    pump = plant.pumps[0]
     recording = Recording(
-        time=torch.arange(seconds + 1, dtype=torch.float64),
-        inputs=torch.tensor(si),
+        time=scales.time * torch.arange(seconds + 1, dtype=torch.float64),
+        inputs=torch.tensor(scales.command(pump) * commands * (1e-6 if pump.gain_unit == "1" else 1.0)),
         outputs=torch.zeros(seconds + 1, len(plant.sensors), dtype=torch.float64),
         input_names=plant.channels(),
         output_names=tuple(s.name for s in plant.sensors),
         input_units=("m^3/s",) * commands.shape[1],
         output_units=("m",) * len(plant.sensors),
     )
-    engine = ReferenceEngine(build_network(started), ParameterSpace(), lay_out(recording, plant.channels(), 0.5))
+    layout = lay_out(recording, plant.channels(), 0.5 * scales.time)
+    engine = ReferenceEngine(build_network(started), ParameterSpace(), layout)
     library = engine.levels(torch.zeros(1, 0, dtype=torch.float64))[0].numpy()
-    np.testing.assert_allclose(hidden, library, atol=2e-5)
+    np.testing.assert_allclose(hidden, library / scales.length, atol=2e-5)
+
+
+@pytest.mark.parametrize("scales", [TOWER, PHIAL], ids=["tower", "phial"])
+def test_a_rig_of_another_size_is_recorded_in_its_own_size_and_pace(scales: Scales, tmp_path: Path) -> None:
+    rig, (same,) = of_size(scales), make(plans(1, 7, ("null",)), exercised(three_tank().plant), 7)
+    (case,) = make(plans(1, 7, ("null",)), rig, 7)
+    np.testing.assert_allclose(case.readings[0], same.readings[0], atol=1e-9)
+    for part, noise in same.truth["noise_rms_m"].items():
+        assert case.truth["noise_rms_m"][part] == pytest.approx([scales.length * n for n in noise])
+    path = tmp_path / "large.csv"
+    path.write_text(as_csv(rig, case.commands[0], case.readings[0], "seal"))
+    found = read_csv(path, rig.plant.channels(), [s.column for s in rig.plant.sensors])
+    assert found.time[-1].item() == pytest.approx(scales.time * 3600)
+    np.testing.assert_allclose(found.inputs.numpy() / scales.flow, 1e-6 * case.commands[0], atol=1e-12)
+    np.testing.assert_allclose(found.outputs.numpy() / scales.length, case.readings[0], atol=5.1e-6)
 
 
 def test_a_step_that_does_not_divide_a_second_is_refused() -> None:
@@ -259,6 +293,10 @@ def test_a_tank_has_no_past_commands() -> None:
         ({"input_low": 0.9}, "0 <= input_low < input_high <= 1"),
         ({"plant": rig_of(OUTLET)}, "expected pumps and sensors"),
         ({"plant": rig_of((Pipe("V", "A", "B", 6e-5, 0.6, valve="v"),), PUMP)}, "pipes without valves"),
+        (
+            {"plant": replace(rig_of(OUTLET, PUMP), effects=(PlacedEffect("leak", "A"),))},
+            "got leak at A; leave them out",
+        ),
     ],
 )
 def test_a_rig_that_cannot_be_exercised_is_refused(changes: dict[str, object], match: str) -> None:

@@ -21,9 +21,10 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant import load_plant
 from fdi_torch.gap.challenge import Row, Tables, challenge, joined
+from fdi_torch.gap.challenge.bench import Scales
 from fdi_torch.gap.challenge.exercise import exercised
 from fdi_torch.gap.challenge.kinds import STANDARD
-from fdi_torch.gap.challenge.plants import RIGS
+from fdi_torch.gap.challenge.plants import RIGS, Rig
 from fdi_torch.gap.challenge.run import Each
 from fdi_torch.gap.challenge.table import misses, sheets
 from fdi_torch.gap.diagnose import Settings, diagnose
@@ -32,6 +33,7 @@ from fdi_torch.gap.one_at_a_time import one_at_a_time
 from fdi_torch.jobs.challenge import LOG, conclude
 from fdi_torch.logbook.provenance import git_state
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.pace import area_scale, length_scale, time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.study.cluster import connected, each_on
 
@@ -103,7 +105,7 @@ def _challenged(arguments: argparse.Namespace, out: Path, screen: Screen) -> tup
         raise ValueError(f"--cases: expected at least one case, got {cases}")
     if arguments.plant and arguments.rig:
         raise ValueError("expected --rig or --plant, got both; leave one out")
-    rig = exercised(load_plant(arguments.plant)) if arguments.plant else RIGS[arguments.rig or "three_tank"]()
+    rig = _rig_like(load_plant(arguments.plant)) if arguments.plant else RIGS[arguments.rig or "three_tank"]()
     denied = LIBRARY if arguments.leave_out == "all" else tuple(n for n in arguments.leave_out.split(",") if n)
     code = git_state()
     with _each(arguments.cluster) as each, screen.progress("challenge") as advance:
@@ -111,12 +113,12 @@ def _challenged(arguments: argparse.Namespace, out: Path, screen: Screen) -> tup
             cases,
             seed,
             out,
-            partial(_diagnosed, rig.plant),
+            partial(_diagnosed, rig.believed),
             rig=rig,
             kinds=tuple(arguments.kinds.split(",")) if arguments.kinds else STANDARD,
             library=LIBRARY,
             leave_out=denied,
-            rivals={} if arguments.no_bic else {"one_at_a_time_bic": partial(_textbook, rig.plant)},
+            rivals={} if arguments.no_bic else {"one_at_a_time_bic": partial(_textbook, rig.believed)},
             each=each,
             minutes=arguments.minutes,
             code=code["commit"][:12] + ("+" if code["changed"] == "yes" else ""),
@@ -124,6 +126,10 @@ def _challenged(arguments: argparse.Namespace, out: Path, screen: Screen) -> tup
         )
     config = {"cases": cases, "seed": seed, "rig": rig.plant.name, "leave_out": list(denied)}
     return rows, conclude(out, rows, config, [out / "manifest.jsonl", out / "key.jsonl"])
+
+
+def _rig_like(plant: PlantDescription) -> Rig:
+    return exercised(plant, Scales(time_scale(plant), length_scale(plant), area_scale(plant)))
 
 
 @contextmanager

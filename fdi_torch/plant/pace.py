@@ -11,7 +11,7 @@ import math
 from fdi_torch.plant.constants import flow_scale
 from fdi_torch.plant.description import PlantDescription
 
-_USUAL_EMPTYING, _USUAL_HEIGHT = 100.0, 0.5  # s, m: of tanks on a bench, where both scales are 1
+_USUAL_EMPTYING, _USUAL_HEIGHT, _USUAL_AREA = 100.0, 0.5, 0.01  # s, m, m^2: of tanks on a bench, whose scales are 1
 
 
 def time_scale(plant: PlantDescription) -> float:
@@ -22,6 +22,11 @@ def time_scale(plant: PlantDescription) -> float:
 def length_scale(plant: PlantDescription) -> float:
     """1 m for tanks about half a metre high."""
     return _power_of_ten([tank.height for tank in plant.tanks], _USUAL_HEIGHT)
+
+
+def area_scale(plant: PlantDescription) -> float:
+    """1 m^2 for tanks of about 100 cm^2."""
+    return _power_of_ten([tank.area for tank in plant.tanks], _USUAL_AREA)
 
 
 def _power_of_ten(values: list[float], usual: float) -> float:

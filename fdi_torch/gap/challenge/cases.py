@@ -137,8 +137,8 @@ def _read(
         errors.append(conditions.colour.noise(rng, samples, conditions.noise))
         shown = _applied(READOUT_LAWS, rig, clean + errors[-1], deviations)
         readings.append(shown)
-        noise_rms[part] = np.sqrt(np.mean((shown - clean) ** 2, axis=0)).tolist()
-        gap_rms[part] = float(np.sqrt(np.mean((clean - sound) ** 2)))
+        noise_rms[part] = (rig.scales.length * np.sqrt(np.mean((shown - clean) ** 2, axis=0))).tolist()
+        gap_rms[part] = rig.scales.length * float(np.sqrt(np.mean((clean - sound) ** 2)))
     hidden = []
     for k, (_, without) in enumerate(_runs_of(KINDS[plan.kind], deviations)[4:]):
         other = _applied(READOUT_LAWS, rig, _sensed(rig, built, levels[:, :, 4 + k], without) + errors[0], without)
@@ -151,6 +151,7 @@ def _read(
         "signal": conditions.signal,
         "colour": conditions.colour.name,
         "repeats": conditions.colour.repeats,
+        "scales": rig.scales.as_dict(),
         "over_rim": bool((np.array(highest) >= [t.height for t in built.tanks]).any()),
     }
     return Case(plan, conditions.commands, (readings[0], readings[1]), truth)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from fdi_torch.gap.challenge.bench import SAME, Scales, on_bench
 from fdi_torch.gap.challenge.conditions import levels_at_rest
 from fdi_torch.gap.challenge.plants import Rig
 from fdi_torch.plant.description import PlantDescription
@@ -14,13 +15,16 @@ NOISE = 1 / 35
 """Of the mean level at rest, as in the three tanks: readings are then noisy by 0.14, 0.29 or 0.57 % of it."""
 
 
-def exercised(plant: PlantDescription) -> Rig:
+def exercised(plant: PlantDescription, scales: Scales = SAME) -> Rig:
     """The rig with the widest inputs, in steps of a tenth, at whose middle no tank rests above half its height.
+
+    scales: how much larger and slower it is than a rig on a bench. Cases are made there and recorded at the
+    plant's own size and pace: a water tower's recording lasts for days.
 
     Raises ValueError for valves, for a rig without pumps or sensors, and where every input overfills it.
     """
-    rig = Rig(plant, LOW, HIGH)
-    while ((rest := levels_at_rest(rig)) > [FULL * t.height for t in plant.tanks]).any():
+    rig = Rig(on_bench(plant, scales), LOW, HIGH, full_size=plant, scales=scales)
+    while ((rest := levels_at_rest(rig)) > [FULL * t.height for t in rig.plant.tanks]).any():
         rig = replace(rig, input_low=0.9 * rig.input_low, input_high=0.9 * rig.input_high)
         if rig.input_high < LEAST:
             raise ValueError(

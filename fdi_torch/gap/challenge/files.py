@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.gap.challenge.bench import decimals
 from fdi_torch.gap.challenge.cases import PARTS, Case
 from fdi_torch.gap.challenge.inputs import DECIMALS, command_unit
 from fdi_torch.gap.challenge.moment import Array
@@ -32,20 +33,24 @@ _DECIMALS_OF_LEVEL = 3
 
 
 def as_csv(rig: Rig, commands: Array, readings: Array, seal: str) -> str:
-    """commands (T, C) in the header's unit, readings (T, S) as levels in m; a second apart. seal: the key's."""
-    header, columns, decimals = ["t_s"], [np.arange(len(commands), dtype=np.float64)], [0]
+    """The recording in the rig's own size and pace. seal: the key's.
+
+    commands (T, C) in the header's unit, readings (T, S) as levels in m: on the bench, and a second apart there.
+    """
+    header, columns, places = ["t_s"], [np.arange(len(commands)) * rig.scales.time], [decimals(0, rig.scales.time)]
     for i, channel in enumerate(rig.plant.channels()):
-        unit = command_unit(next(p for p in rig.plant.pumps if p.channel == channel))
+        pump = next(p for p in rig.plant.pumps if p.channel == channel)
+        unit, scale = command_unit(pump), rig.scales.command(pump)
         header.append(f"{channel}_{unit}")
-        columns.append(commands[:, i])
-        decimals.append(DECIMALS[unit])
+        columns.append(commands[:, i] * scale)
+        places.append(decimals(DECIMALS[unit], scale))
     for i, sensor in enumerate(rig.plant.sensors):
         in_metres = sensor.unit == "m"
         header.append(f"{sensor.column}_{'cm' if in_metres else sensor.unit}")
         shown = np.clip(sensor.gain * readings[:, i] + sensor.offset, sensor.low, sensor.high)
-        columns.append(shown * (100 if in_metres else 1))
-        decimals.append(_DECIMALS_OF_LEVEL)
-    rows = zip(*([f"{v:.{d}f}" for v in column] for column, d in zip(columns, decimals, strict=True)), strict=True)
+        columns.append(shown * (100 * rig.scales.length if in_metres else 1))
+        places.append(decimals(_DECIMALS_OF_LEVEL, rig.scales.length if in_metres else 1.0))
+    rows = zip(*([f"{v:.{d}f}" for v in column] for column, d in zip(columns, places, strict=True)), strict=True)
     return (
         "\n".join([f"# SHA-256 of the sealed key: {seal}", ",".join(header), *(",".join(row) for row in rows)]) + "\n"
     )

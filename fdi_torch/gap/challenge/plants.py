@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fdi_torch.gap.challenge.bench import SAME, Scales
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 
 CM, CM2, CM3 = 1e-2, 1e-4, 1e-6
@@ -13,6 +14,7 @@ CM, CM2, CM3 = 1e-2, 1e-4, 1e-6
 class Rig:
     """A plant and how it is exercised.
 
+    plant: on the bench. full_size: the plant that is diagnosed, where that is of another size; scales: how much larger.
     input_low, input_high: range of the commanded flow as a share of a pump's max_flow, for ordinary inputs.
     noise_unit: m; noise levels are drawn as 0.05, 0.1 or 0.2 of it.
     """
@@ -21,6 +23,13 @@ class Rig:
     input_low: float = 0.13
     input_high: float = 0.8
     noise_unit: float = 1.0 * CM
+    full_size: PlantDescription | None = None
+    scales: Scales = SAME
+
+    @property
+    def believed(self) -> PlantDescription:
+        """The plant file that the diagnosis is given."""
+        return self.full_size or self.plant
 
     def __post_init__(self) -> None:
         if not 0 <= self.input_low < self.input_high <= 1:
@@ -30,6 +39,9 @@ class Rig:
             )
         if any(pipe.valve for pipe in self.plant.pipes):
             raise ValueError(f"rig {self.plant.name}: expected pipes without valves, got a valve; leave it out")
+        if self.plant.effects:
+            names = ", ".join(f"{e.effect} at {e.location}" for e in self.plant.effects)
+            raise ValueError(f"rig {self.plant.name}: expected a plant without effects, got {names}; leave them out")
         if not self.plant.pumps or not self.plant.sensors:
             raise ValueError(f"rig {self.plant.name}: expected pumps and sensors, got none; add at least one of each")
 

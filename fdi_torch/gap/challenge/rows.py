@@ -38,7 +38,7 @@ def judged(names: Sequence[str], cases: int, out: Path, rig: Rig) -> list[Row]:
 def _row(line: Mapping[str, Any], truth: Mapping[str, Any], rig: Rig) -> Row:
     about = {key: truth.get(key) for key in ("case", "index", "signal", "colour")}
     about |= {"sec": line["sec"], "code": line.get("code", ""), "gap_rms_m": truth["gap_rms_m"]["recording"]}
-    row = about | judge(truth, line["answer"], rig.plant)
+    row = about | judge(truth, line["answer"], rig.believed)
     return {key: float(f"{value:.6g}") if isinstance(value, float) else value for key, value in row.items()}
 
 
