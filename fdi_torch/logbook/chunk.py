@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
-from mcap.records import Chunk as ChunkRecord
 
 _MESSAGE = struct.Struct("<BQHIQQ")
 _ENTRY = struct.Struct("<QQ")
 _INDEX = struct.Struct("<BQHI")
+_CHUNK = struct.Struct("<BQQQQII")
 # Level 1 but for longer matches and a smaller table, that stays in the cache: samples and states in two thirds of the
 # time, not a byte larger.
 _ZSTD = zstandard.ZstdCompressionParameters.from_level(1, window_log=18, hash_log=13, min_match=7)
@@ -45,24 +46,34 @@ class Described:
 class Chunk:
     """Every channel is described in each chunk that uses it, so that no chunk needs another one to be read.
 
-    size: bytes of its records so far.
+    size: bytes of its records so far. cut: has a piece of it been asked for?
     """
 
     def __init__(self) -> None:
         self.size = 0
+        self.cut = False
         self._records: list[bytes] = []
+        self._told: dict[int, Described] = {}
         self._indexes: dict[int, bytearray] = {}  # of each channel: log time and place of every message
+        self._given = 0
+        self._given_indexes: dict[int, int] = {}  # of each channel: bytes of the index that are in earlier pieces
 
     @property
     def messages(self) -> dict[int, int]:
         """How many messages each channel has here."""
         return {number: len(index) // _ENTRY.size for number, index in self._indexes.items()}
 
+    @property
+    def waiting(self) -> bool:
+        """Are there messages that no piece holds yet?"""
+        return len(self._records) > self._given
+
     def message(self, told: Described, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
         number = told.channel.id
         index = self._indexes.get(number)
         if index is None:
             index = self._indexes[number] = bytearray()
+            self._told[number] = told
             self._records.append(told.records)
             self.size += len(told.records)
         index += _ENTRY.pack(log_time, self.size)
@@ -78,42 +89,57 @@ class Chunk:
     def block(self, numbers: Sequence[int], log_times: np.ndarray, records: bytes, starts: np.ndarray) -> None:
         """Records of messages of channels that are described here, in turn, which start at the places (B, S)."""
         for number, places in zip(numbers, starts.T, strict=True):
-            self._indexes[number] += np.column_stack([log_times, self.size + places]).astype("<u8").tobytes()
+            entries = np.empty((len(places), 2), "<u8")
+            entries[:, 0] = log_times
+            np.add(places, self.size, out=entries[:, 1], casting="unsafe")
+            self._indexes[number] += entries.data
         self._records.append(records)
         self.size += len(records)
 
+    def piece(self, compress: bool) -> bytes:
+        """What came since the last piece as a chunk of its own, without message indexes."""
+        fresh = {n: index for n, index in self._indexes.items() if len(index) > self._given_indexes.get(n, 0)}
+        described = [self._told[number].records for number in fresh if number in self._given_indexes]
+        data, _ = _chunk([*described, *self._records[self._given :]], fresh, self._given_indexes, compress)
+        self._given, self._given_indexes = len(self._records), {n: len(index) for n, index in self._indexes.items()}
+        self.cut = True
+        return b"".join(data)
+
     def record(self, compress: bool, start: int) -> tuple[bytes, ChunkIndex]:
         """The chunk and its message indexes as they stand in the file from byte `start`, and the entry about them."""
-        body = b"".join(self._records)
-        packed = zstandard.ZstdCompressor(compression_params=_ZSTD).compress(body) if compress else body
-        compression = "zstd" if compress else ""
-        times = np.concatenate([np.frombuffer(index, "<u8")[::2] for index in self._indexes.values()])
-        earliest, latest = int(times.min()), int(times.max())
-        record = RecordBuilder()
-        ChunkRecord(
-            compression=compression,
-            data=packed,
-            message_start_time=earliest,
-            message_end_time=latest,
-            uncompressed_crc=zlib.crc32(body),
-            uncompressed_size=len(body),
-        ).write(record)
-        chunk = record.end()
-        offsets, indexes, place = {}, [], start + len(chunk)
+        parts, told = _chunk(self._records, self._indexes, {}, compress)
+        length = sum(map(len, parts))
+        offsets, place = {}, start + length
         for number, index in self._indexes.items():
             offsets[number] = place
-            indexes.append(_INDEX.pack(Opcode.MESSAGE_INDEX, _INDEX_HEAD + len(index), number, len(index)))
-            indexes.append(bytes(index))
+            parts += (_INDEX.pack(Opcode.MESSAGE_INDEX, _INDEX_HEAD + len(index), number, len(index)), index)
             place += _INDEX.size + len(index)
         about = ChunkIndex(
             chunk_start_offset=start,
-            chunk_length=len(chunk),
-            compression=compression,
-            compressed_size=len(packed),
-            uncompressed_size=len(body),
-            message_start_time=earliest,
-            message_end_time=latest,
+            chunk_length=length,
             message_index_offsets=offsets,
-            message_index_length=place - start - len(chunk),
+            message_index_length=place - start - length,
+            **told,
         )
-        return b"".join((chunk, *indexes)), about
+        return b"".join(parts), about
+
+
+def _chunk(
+    records: Sequence[bytes], indexes: Mapping[int, bytearray], given: Mapping[int, int], compress: bool
+) -> tuple[list[bytes | bytearray], dict[str, Any]]:
+    """A chunk record in parts, and what its entry says of it; given: bytes of the indexes that are about others."""
+    body = b"".join(records)
+    packed = zstandard.ZstdCompressor(compression_params=_ZSTD).compress(body) if compress else body
+    compression = b"zstd" if compress else b""
+    times = [np.frombuffer(index, "<u8", offset=given.get(number, 0))[::2] for number, index in indexes.items()]
+    earliest, latest = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
+    length = _CHUNK.size - 9 + len(compression) + 8 + len(packed)
+    head = _CHUNK.pack(Opcode.CHUNK, length, earliest, latest, len(body), zlib.crc32(body), len(compression))
+    told = {
+        "compression": compression.decode(),
+        "compressed_size": len(packed),
+        "uncompressed_size": len(body),
+        "message_start_time": earliest,
+        "message_end_time": latest,
+    }
+    return [head, compression, struct.pack("<Q", len(packed)), packed], told

@@ -22,7 +22,7 @@ def copy_log(source: Path, target: Path, salvage: bool = False, extra: Extra | N
     run = read_run(source, salvage=salvage)
     sink = Sink(target, run.library, run.profile)
     try:
-        messages = copy_records(run, sink)
+        messages = _copy_records(run, sink)
         for name, values in (extra(run, messages) if extra else {}).items():
             sink.metadata(name, values)
     except BaseException:
@@ -32,25 +32,10 @@ def copy_log(source: Path, target: Path, salvage: bool = False, extra: Extra | N
     return run
 
 
-def joined(sink: Sink, target: Path) -> None:
-    """The file of a finished sink as it would be had nothing been cut: as it is up to the mark, then in full chunks."""
-    assert sink.mark is not None
-    other = sink.again(target)
-    try:
-        if sink.tail is None:
-            copy_records(read_run(sink.path), other, sink.mark.size)
-        for what, given in sink.tail or ():
-            getattr(other, what)(*given)
-    except BaseException:
-        other.abandon()
-        raise
-    other.finish()
-
-
-def copy_records(run: Run, sink: Sink, start: int = 0) -> int:
-    """Metadata, attachments and messages in the order of the file, from byte `start`. Returns how many messages."""
+def _copy_records(run: Run, sink: Sink) -> int:
+    """Metadata, attachments and messages in the order of the file. Returns how many messages."""
     count = 0
-    for part in run.walk(start):
+    for part in run.walk():
         if not isinstance(part, Frame):
             count += 1
             sink.message(part.channel, part.log_time, part.publish_time, part.sequence, part.data)

@@ -116,13 +116,11 @@ class Run:
             if isinstance(item, Message) and (topics is None or item.topic in topics):
                 yield item
 
-    def walk(self, start: int = 0) -> Iterator[Message | scan.Frame]:
-        """Messages, and the frames of metadata and attachments, in the order of the file, from byte `start`."""
+    def walk(self) -> Iterator[Message | scan.Frame]:
+        """Messages, and the frames of metadata and attachments, in the order of the file."""
         self.damages = [part for part in self.parts if isinstance(part, scan.Damage)]
         directory = Directory(self._summary_records())
         for place, part in enumerate(self.parts):
-            if part.start < start:
-                continue
             if isinstance(part, scan.Damage):
                 if place < len(self.parts) - 1 and not self.salvage:
                     raise self._damaged(part)

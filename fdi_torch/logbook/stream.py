@@ -53,8 +53,18 @@ class Stream:
         if self.dead is not None:
             raise LogError(f"{self.dead}; nothing more is logged")
 
-    def sync(self) -> None:
+    def go_back(self, place: int) -> None:
+        """What is written next stands at that place; all from there on is given up."""
         try:
+            os.lseek(self._file, place, os.SEEK_SET)
+        except OSError as error:
+            raise log_error(self.path, error) from error
+        self.size = place
+
+    def sync(self) -> None:
+        """All of it on disk, and nothing behind it."""
+        try:
+            os.ftruncate(self._file, self.size)
             os.fsync(self._file)
         except OSError as error:
             raise log_error(self.path, error) from error

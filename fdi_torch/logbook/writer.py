@@ -1,8 +1,8 @@
 """RunLog: the log of one run or study, written so that a crash loses at most its last second.
 
 The run is written to `NAME.mcap.partial` and becomes `NAME.mcap` at its end. What waits in memory goes to disk after
-0.7 s at the latest, by a small thread, also while the run computes and says nothing. Chunks that it cut are
-joined again at the end, so that equal configuration, data and seed give byte-identical files but for the wall-clock
+0.75 s at the latest, by a small thread, also while the run computes and says nothing. Chunks that came there in pieces
+are whole in the end, so that equal configuration, data and seed give byte-identical files but for the wall-clock
 fields: `started` and `run_id` of `fdi_torch.run`, `ended` and `wall_seconds` of `fdi_torch.status`.
 """
 
@@ -24,7 +24,6 @@ import numpy as np
 
 from fdi_torch.logbook.block import Block, Timed
 from fdi_torch.logbook.channel import Channel
-from fdi_torch.logbook.copying import joined
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.flat import flatten
 from fdi_torch.logbook.payload import as_array
@@ -118,12 +117,12 @@ class RunLog(Topics):
             self.status, self.reason = _ending(error)
         try:
             self.settle()
-            self._write_end(self._open_sink())
+            whole = self._write_end(self._open_sink())
         except LogError:
             if error is None:
                 raise
             return
-        self._publish()
+        self._publish(whole)
 
     def set_status(self, status: str, reason: str = "") -> None:
         """How the run ended, such as "not_converged"; "completed" where nothing is said."""
@@ -198,9 +197,9 @@ class RunLog(Topics):
         sink = self._open_sink()
         if not sink.waiting:
             self._waiting_since = None
-        elif self._waiting_since is None or sink.size != self._size:
+        elif self._waiting_since is None or sink.written != self._size:
             self._waiting_since = time.monotonic()
-        self._size = sink.size
+        self._size = sink.written
 
     def _flush_by_clock(self) -> None:
         """A run that logs something in the next moment writes by itself: two threads at a time hinder each other."""
@@ -228,7 +227,8 @@ class RunLog(Topics):
         if self._config_text:
             sink.attachment("config.yaml", "application/yaml", self._config_text.encode())
 
-    def _write_end(self, sink: Sink) -> None:
+    def _write_end(self, sink: Sink) -> Path:
+        """Results and status; the file that is whole then."""
         if self._arrays:
             sink.attachment("results.npz", "application/x-npz", _npz(self._arrays))
         if self._results:
@@ -241,18 +241,17 @@ class RunLog(Topics):
         except LogError:
             sink.abandon()
             raise
-        sink.finish()
+        return sink.finish()
 
-    def _publish(self) -> None:
-        """Give the finished file its name, with its chunks joined if the clock cut them."""
-        source, sink = self.partial_path, self._open_sink()
+    def _publish(self, whole: Path) -> None:
+        """Give the finished file its name."""
         try:
-            if sink.mark is not None:
-                source = _joined(sink)
-            os.replace(source, self.path)
-            if source != self.partial_path:
+            os.replace(whole, self.path)
+            if whole != self.partial_path:
                 self.partial_path.unlink()
         except OSError as error:
+            if whole.exists():
+                os.replace(whole, self.partial_path)
             raise log_error(self.path, error) from error
 
 
@@ -266,17 +265,6 @@ def _make_room(path: Path) -> None:
         raise log_error(path, error) from error
     if taken:
         raise LogError(f"{path}: exists already; choose another name, or delete it")
-
-
-def _joined(sink: Sink) -> Path:
-    """A copy with full chunks; the partial file itself where there is no room for a copy."""
-    target = sink.path.with_name(sink.path.name + ".joined")
-    try:
-        joined(sink, target)
-    except LogError:
-        target.unlink(missing_ok=True)
-        return sink.path
-    return target
 
 
 def _ending(error: BaseException) -> tuple[str, str]:

@@ -1,0 +1,103 @@
+"""What an MCAP file holds, gathered while it is written: the summary at its end."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mcap import records
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+
+from fdi_torch.logbook.channel import Channel
+from fdi_torch.logbook.chunk import Described
+from fdi_torch.logbook.scan import MAGIC
+
+_FOOTER = struct.Struct("<BQQQ")
+
+
+class Contents:
+    """Channels in the order of their first messages; chunks, attachments and metadata in that of the file."""
+
+    def __init__(self) -> None:
+        self.chunks: list[records.ChunkIndex] = []
+        self.metadata: list[records.MetadataIndex] = []
+        self.attachments: list[records.AttachmentIndex] = []
+        self._schemas: dict[tuple[str, str, bytes], records.Schema] = {}
+        self._channels: dict[Channel, Described] = {}
+        self._counts: dict[int, int] = {}
+
+    def described(self, channel: Channel) -> Described:
+        """The channel as it stands in this file, with its number."""
+        return self._channels.get(channel) or self._register(channel)
+
+    def chunk(self, index: records.ChunkIndex, messages: Mapping[int, int]) -> None:
+        """A chunk, and how many messages each channel has in it."""
+        self.chunks.append(index)
+        for number, count in messages.items():
+            self._counts[number] = self._counts.get(number, 0) + count
+
+    def ending(self, size: int, crc: int) -> bytes:
+        """All that follows data of that size and CRC: their end, the summary, places of its parts, the footer."""
+        end_of_data = record_bytes(records.DataEnd(crc))
+        start = size + len(end_of_data)
+        summary, offsets = b"", b""
+        for opcode, group in self._summary():
+            data = b"".join(map(record_bytes, group))
+            if data:
+                offsets += record_bytes(records.SummaryOffset(opcode, start + len(summary), len(data)))
+            summary += data
+        places = (start, start + len(summary))
+        footer = _FOOTER.pack(Opcode.FOOTER, 20, *places)
+        footer_crc = zlib.crc32(summary + offsets + footer)
+        return end_of_data + summary + offsets + record_bytes(records.Footer(*places, footer_crc)) + MAGIC
+
+    def _register(self, channel: Channel) -> Described:
+        schema = None
+        if channel.schema_name:
+            key = (channel.schema_name, channel.schema_encoding, channel.schema_data)
+            number = len(self._schemas) + 1
+            schema = self._schemas.setdefault(
+                key, records.Schema(number, channel.schema_data, channel.schema_encoding, channel.schema_name)
+            )
+        told = records.Channel(
+            id=len(self._channels) + 1,
+            topic=channel.topic,
+            message_encoding=channel.encoding,
+            metadata=dict(channel.metadata),
+            schema_id=schema.id if schema else 0,
+        )
+        is_signal = channel.topic.startswith("/plant/") and channel.topic.endswith(("/input", "/output"))
+        self._channels[channel] = Described(schema, told, is_signal)
+        return self._channels[channel]
+
+    def _summary(self) -> list[tuple[Opcode, Sequence[Any]]]:
+        chunks = self.chunks
+        statistics = records.Statistics(
+            attachment_count=len(self.attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(chunks),
+            message_count=sum(self._counts.values()),
+            message_start_time=min((chunk.message_start_time for chunk in chunks), default=0),
+            message_end_time=max((chunk.message_end_time for chunk in chunks), default=0),
+            metadata_count=len(self.metadata),
+            schema_count=len(self._schemas),
+        )
+        return [
+            (Opcode.SCHEMA, list(self._schemas.values())),
+            (Opcode.CHANNEL, [told.channel for told in self._channels.values()]),
+            (Opcode.STATISTICS, [statistics]),
+            (Opcode.CHUNK_INDEX, chunks),
+            (Opcode.ATTACHMENT_INDEX, self.attachments),
+            (Opcode.METADATA_INDEX, self.metadata),
+        ]
+
+
+def record_bytes(record: Any) -> bytes:
+    """A record of the format as it stands in the file."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
