@@ -71,12 +71,14 @@ def test_a_hose_takes_its_own_volume_once_whatever_the_step(step: float) -> None
     """2 for 6 s, rest for 6 s, 2 for 6 s through a hose of 5: the second stroke loses nothing."""
     stroke, rest = [2.0] * round(6.0 / step), [0.0] * round(6.0 / step)
     sent = [0.0, *stroke, *rest, *stroke]
-    out = through(effect("pump_priming"), sent, step, values(volume=5.0, passed=0.0))
+    out = through(effect("pump_priming"), sent, step, values(volume=5.0, passed=0.0, ran_for=10.0))
     assert sum(out) * step == pytest.approx(sum(sent) * step - 5.0)
     assert out[-len(stroke) :] == stroke and out[0] == 0.0
-    running = through(effect("pump_priming"), stroke, step, values(volume=5.0, passed=0.0))
+    running = through(effect("pump_priming"), stroke, step, values(volume=5.0, passed=0.0, ran_for=10.0))
     assert running == stroke  # a pump that runs at the first sample has a full hose
-    beside = through(effect("pump_priming"), sent, step, values(volume=5.0, passed=0.5))
+    trickle = through(effect("pump_priming"), [0.1, *stroke], step, values(volume=5.0, passed=0.0, ran_for=10.0))
+    assert sum(trickle) * step == pytest.approx(12.0 + 0.1 * step - 4.0)  # 0.1 for 10 s before has filled 1 of 5
+    beside = through(effect("pump_priming"), sent, step, values(volume=5.0, passed=0.5, ran_for=10.0))
     # A half fills the hose: full after 5 s, so that of the 12 of the first stroke 5 + 2 have arrived.
     assert sum(beside[1 : 1 + len(stroke)]) * step == pytest.approx(7.0)
     assert beside[1] == pytest.approx(1.0) and beside[-len(stroke) :] == stroke

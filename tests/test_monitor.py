@@ -17,6 +17,7 @@ from fdi_torch.config.monitor import load_monitor
 from fdi_torch.config.plant import load_plant
 from fdi_torch.config.recordings import read_recording
 from fdi_torch.effects import build_network, place
+from fdi_torch.jobs.monitor import Listening, watch
 from fdi_torch.monitor.change import ChangedObserver, Window
 from fdi_torch.monitor.continuity import continuous
 from fdi_torch.monitor.detection import make_detector
@@ -348,3 +349,24 @@ def test_figures_6_and_7() -> None:
     for event, expected in zip(ends, (first, second), strict=True):
         for name, size, std_error in zip(event.faults, event.sizes, event.stds, strict=True):
             assert abs(size - float(expected[space.index(name)])) < 3 * std_error, (name, size, std_error)
+
+
+def test_a_level_that_is_known_at_the_start_is_not_taken_for_that_of_a_later_fault_free_part(tmp_path: Path) -> None:
+    """A tank filled from empty by 50 cm^3/s, a flow read 10 % too low; the noise is learnt from 20 s on, at 10 cm."""
+    noise = torch.randn(100, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).tolist()
+    rows = [f"{t},{10 * (0.5 * t + 0.05 * e):.4f},45" for t, e in enumerate(noise)]
+    (tmp_path / "run.csv").write_text("t_s,h_mm,Q_cm3_s\n" + "\n".join(rows) + "\n")
+    (tmp_path / "watch.yaml").write_text(
+        "plant:\n"
+        "  tanks: {T: {area: 100 cm^2, height: 80 cm}}\n"
+        "  pumps: {Q: {target: T, max_flow: 100 cm^3/s}}\n"
+        "  sensors: {h: {tank: T}}\n"
+        "  tolerances: {Q.gain: 20 %}\n"
+        "recording: {file: run.csv, start_levels: {T: 0 cm}}\n"
+        "fault_free: [20 s, 95 s]\ncalibrate: [Q.gain]\nfaults: [T.leak]\n"
+        f"output: {{folder: {tmp_path}}}\n"
+    )
+    told: list[float] = []
+    silent = Listening(lambda *_: None, lambda _: None, lambda ready: told.append(ready.calibrated["Q.gain"]))
+    watch(load_monitor(tmp_path / "watch.yaml"), silent)
+    assert told == [pytest.approx(50.0 / 45.0, rel=0.01)]

@@ -244,9 +244,12 @@ class _Watcher:
 
 def _prepared(run: MonitorRun, whole: Recording) -> Prepared:
     c = run.config
+    part = fault_free_part(whole, *c.fault_free)
+    # Levels that are known at the recording's start are those of no later moment.
+    at_start = float(part.time[0]) == float(whole.time[0])
     return prepare(
         run.plant,
-        fault_free_part(whole, *c.fault_free),
+        part,
         c.faults,
         c.calibrate,
         c.detector,
@@ -254,7 +257,7 @@ def _prepared(run: MonitorRun, whole: Recording) -> Prepared:
         c.window.settings(),
         c.step,
         c.seed,
-        c.recording.start_levels,
+        c.recording.start_levels if at_start else "free",
         c.ranges,
         c.observer.wish(),
     )
