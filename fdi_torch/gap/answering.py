@@ -23,6 +23,7 @@ from fdi_torch.gap.library import twins
 from fdi_torch.gap.next_input import next_input
 from fdi_torch.gap.remarks import remarks_on
 from fdi_torch.gap.standard_errors import standard_errors
+from fdi_torch.gap.strays import most_astray
 from fdi_torch.gap.subject import Subject
 from fdi_torch.gap.traces import traces
 
@@ -152,7 +153,7 @@ def _causes(found: Finding) -> tuple[Cause, ...]:
 
 def _p_value(found: Finding) -> float:
     """Chance that noise alone lets some option of the library gain as much (Bonferroni over the options)."""
-    if found.rounded:
+    if found.rounded or (found.verdict == "unknown" and most_astray(found.strays[0])):
         return 0.0
     screen, null = found.search.screens[found.null.key], found.null
     singles = [f.cost for f in found.search.fits if len(f.key) == 1]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.limits import told_limits
+from fdi_torch.gap.strays import Strays, strays_of, without
 from fdi_torch.gap.subject import Subject, subject_of
 from fdi_torch.gap.which import DEEPEST
 from fdi_torch.plant.description import PlantDescription
@@ -42,7 +43,8 @@ PLAIN = Settings()
 @dataclass(frozen=True)
 class Case:
     """library: the effects at places to search. subject: the recordings, for the plant with the limits of its sensors
-    that their values tell (`told`); held: the hold-outs. most, named_only: as in `Settings`.
+    that their values tell (`told`); held: the hold-outs. strays: what was masked in the recordings, and in the
+    hold-outs. most, named_only: as in `Settings`.
     """
 
     library: tuple[Placement, ...]
@@ -52,6 +54,7 @@ class Case:
     held: tuple[Subject, ...]
     most: int
     named_only: bool = False
+    strays: tuple[Sequence[Strays], Sequence[Strays]] = ((), ())
 
 
 def case_of(
@@ -64,10 +67,30 @@ def case_of(
         expect_another(one, recordings)
     library = library_of(plant, settings.library, settings.leave_out)
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    recordings, strays = _without_strays(plant, believed, recordings, settings.step)
+    holdouts, strays_held = _without_strays(plant, believed, holdouts, settings.step)
     told = told_limits(plant, recordings[0], believed, library) if len(recordings) == 1 else []
     believed += told
     subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recordings, *((h,) for h in holdouts)))
-    return Case(library, tuple(recordings), told, subject, tuple(held), settings.most, settings.named_only)
+    apart = (strays, strays_held)
+    return Case(library, tuple(recordings), told, subject, tuple(held), settings.most, settings.named_only, apart)
+
+
+def _without_strays(
+    plant: PlantDescription, believed: Sequence[Placement], recordings: Sequence[Recording], step: float | None
+) -> tuple[list[Recording], list[Strays]]:
+    """The recordings, what strays in them masked, and that."""
+    kept: list[Recording] = []
+    found: list[Strays] = []
+    columns = {s.name: s.column for s in plant.sensors}
+    for recording in recordings:
+        interval = float(torch.median(torch.diff(recording.time)))
+        mask, own = recording.mask, strays_of(subject_of(plant, believed, recording, step or interval))
+        for strays in own:
+            mask = without(mask, strays.each, recording.output_names.index(columns[strays.sensor]))
+        kept.append(replace(recording, mask=mask) if own else recording)
+        found += own
+    return kept, found
 
 
 def expect_another(holdout: Recording, recordings: Sequence[Recording]) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 
@@ -16,6 +18,7 @@ from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_roundi
 from fdi_torch.gap.freeform import fitted_free_form
 from fdi_torch.gap.library import canonical, possible_places
 from fdi_torch.gap.screening import options_of
+from fdi_torch.gap.strays import most_astray
 from fdi_torch.gap.subject import Subject
 from fdi_torch.gap.where.suspects import Suspect, suspects
 from fdi_torch.gap.which import Search, search
@@ -69,8 +72,13 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
         unknown = fitted_free_form(fitter, found.null, places[0].location, places[0].periods, reach)
     standing = _content(weighed.explanations)
     verdict: Verdict = "unknown" if unknown else _verdict(standing, rounded)
+    nowhere = places[0].leaves > 0.5 * whole_gap(fitter, found)
+    if (verdict == "no_gap" or (unknown and nowhere)) and (straying := most_astray(case.strays[0])):
+        # Nothing else is wrong, or nothing that any place could do: no effect of the library makes a reading jump.
+        places = [Suspect(straying, 0.0, 0.0), *(replace(s, leaves=math.inf) for s in places if s.location != straying)]
+        unknown, verdict = fitted_free_form(fitter, found.null, straying, (), reach), "unknown"
     finding = Finding(
-        fitter, library, reach, found, places, weighed, standing, unknown, verdict, rounded, lattice, told
+        fitter, library, reach, found, places, weighed, standing, unknown, verdict, rounded, lattice, told, case.strays
     )
     tell(0.8, "hold-out")
     return answered(finding, case.held)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from fdi_torch.gap.answer import CauseName, Explanation, Verdict
 from fdi_torch.gap.fitting import Fit, Fitter, left_open
+from fdi_torch.gap.strays import Strays
 from fdi_torch.gap.where.suspects import Suspect
 from fdi_torch.gap.which import Search
 from fdi_torch.plant.effect import Placement
@@ -27,7 +28,8 @@ class Weighed:
 class Finding:
     """library: what was searched. standing: the explanations that hold 95 % together. unnamed: the free discrepancy
     that closes what no effect does, if there is one. rounded: what the values themselves tell; lattice (C,): the step
-    of each rounded sensor, or 0; told: the limits of sensors, with their values.
+    of each rounded sensor, or 0; told: the limits of sensors, with their values; strays: what was masked in the
+    recordings, and in the hold-outs.
     """
 
     fitter: Fitter
@@ -42,6 +44,7 @@ class Finding:
     rounded: Sequence[CauseName]
     lattice: Sequence[float]
     told: Sequence[Placement] = ()
+    strays: tuple[Sequence[Strays], Sequence[Strays]] = ((), ())
 
     @property
     def null(self) -> Fit:

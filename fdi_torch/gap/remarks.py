@@ -14,10 +14,12 @@ from fdi_torch.gap.closure import HeldOut
 from fdi_torch.gap.finding import Finding
 from fdi_torch.gap.freeform import shape_of
 from fdi_torch.gap.same_rig import other_rig
+from fdi_torch.gap.strays import Strays
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 
 AT_END = 1e-3  # of a parameter's range
+SHOWN_TIMES = 5  # of strays
 SWINGS = 0.03  # amplitude of an oscillation worth a word, as a share of the free form's scale
 
 
@@ -36,8 +38,20 @@ def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
             "the plant file lists no tolerances, so that every constant is taken to be exact and what is a little off "
             "looks like an effect; list them under tolerances, as in P13.discharge_coefficient: 3 %"
         )
+    remarks += [_astray(s) for group in found.strays for s in group]
     remarks += [*_believed_outside(subject.plant), *_at_their_ends(found), *_period(found)]
     return remarks + [sentence for h in held if (sentence := other_rig(found, h))]
+
+
+def _astray(strays: Strays) -> str:
+    """How many readings of a sensor were left out, and when."""
+    at = [f"{a:.6g}" if a == b else f"{a:.6g} to {b:.6g}" for a, b in (s.times for s in strays.each)]
+    when = ", ".join(at[:SHOWN_TIMES]) + (f" s and {len(at) - SHOWN_TIMES} more" if len(at) > SHOWN_TIMES else " s")
+    count = f"{strays.samples} reading" + ("s" if strays.samples > 1 else "")
+    return (
+        f"{count} of {strays.sensor} in {strays.source or 'the recording'} jump away and back, or stand still, as no "
+        f"tank can; left out of all fits ({when})"
+    )
 
 
 def _period(found: Finding) -> list[str]:

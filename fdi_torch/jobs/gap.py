@@ -31,7 +31,9 @@ def run_gap(
 ) -> Answer:
     """Diagnoses, and writes the log `path`: recordings first, then what is said on the way, then the answer."""
     recordings = (recording,) if isinstance(recording, Recording) else tuple(recording)
-    every, case = (*recordings, *holdouts), case_of(plant, recordings, holdouts, settings)
+    every = (*recordings, *holdouts)
+    with one_thread():
+        case = case_of(plant, recordings, holdouts, settings)
     sources = [{"path": r.source, "sha256": r.sha256} for r in every]
     config = {"settings": asdict(settings), "recordings": len(recordings)}
     text = dump_plant(plant)
