@@ -28,7 +28,7 @@ from fdi_torch.monitor.windows import WindowMonitor, WindowState
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 
-CHUNK = 256  # samples of a recording that are taken at a time
+CHUNK = 1024  # samples of a recording that are taken at a time
 
 
 @dataclass(frozen=True)

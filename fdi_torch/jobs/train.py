@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from fdi_torch.config.recordings import LoadedRecording
 from fdi_torch.config.run import Run
-from fdi_torch.estimate.evolution import Search, State
+from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
 from fdi_torch.estimate.refine import Progress
@@ -26,7 +27,7 @@ from fdi_torch.jobs.run_setup import (
     usable_device,
     wanted_space,
 )
-from fdi_torch.logbook import Listener, RunLog, as_array
+from fdi_torch.logbook import Listener, RunLog, Trickle, as_array
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.report.fit_figure import fit_figure, save
 
@@ -97,8 +98,12 @@ class Watch:
     def __init__(self, log: RunLog, space: ParameterSpace, settings: HybridSettings, tell: Tell) -> None:
         self.log, self.settings, self.tell = log, settings, tell
         self.names = space.names
-        self.units = {p.name: p.unit for p in space}
+        self._fields = ("problem", "generation", "best_cost", "mean_cost", "evaluations", *space.names)
         self.iterations = 0
+        units = {p.name: p.unit for p in space}
+        self._generation = Trickle(GENERATION, self._generations, units)
+        self._iteration = Trickle(ITERATION, self._iterations, units)
+        self._keep, self._next_state = log.keep, 0
 
     def generation(self, search: Search) -> None:
         state = search.state
@@ -109,32 +114,54 @@ class Watch:
     def write(self, search: Search) -> None:
         """Into the log."""
         state = search.state
-        self.log.later(GENERATION, partial(self._generation, state), state.generation, self.units)
-        if state_is_due(state.generation):
-            self.log.population(state.generation, search.to_dict())
+        generation = state.generation
+        kept = generation, state.evaluations, state.cost, state.population  # the rest of a state need not be kept alive
+        if generation < self._next_state and not self.log.due:
+            self._keep((self._generation, kept))
+            return
+        self.log.later(self._generation, kept)
+        if state_is_due(generation):
+            self.log.population(generation, search.to_dict())
+        self._next_state = next_state(generation)
 
-    def _generation(self, state: State) -> dict[str, Any]:
-        """What is logged of a generation, worked out when its message is written."""
-        costs, population = as_array(state.cost)[0], as_array(state.population)[0]
-        told = {"problem": 0, "generation": state.generation, "best_cost": float(costs[0])}
-        told |= {"mean_cost": float(np.add.reduce(costs)) / len(costs), "evaluations": state.evaluations}
-        return told | dict(zip(self.names, population[0].tolist(), strict=True))
+    def _generations(self, kept: Sequence[tuple[int, int, Tensor, Tensor]]) -> Iterator[tuple[float, dict[str, Any]]]:
+        """What is logged of each generation, worked out when their messages are written: best first, one problem."""
+        costs = as_array(torch.cat([cost for *_, cost, _ in kept], 1))[0]
+        start = 0
+        for generation, evaluations, cost, population in kept:
+            end = start + cost.shape[1]
+            mean = float(np.add.reduce(costs[start:end])) / (end - start)
+            best = as_array(population)[0, 0].tolist()
+            row = 0, generation, float(costs[start]), mean, evaluations, *best
+            yield generation, dict(zip(self._fields, row, strict=True))
+            start = end
 
     def iteration(self, progress: Progress) -> None:
         self.iterations += 1
         for k in range(len(progress.lanes)):
-            self.log.later(ITERATION, partial(self._iteration, progress, k), self.iterations, self.units)
+            self.log.later(self._iteration, (self.iterations, progress, k))
         self.tell(0.9, f"refinement: iteration {progress.iteration}, cost {float(progress.cost.min()):.6g}")
 
-    def _iteration(self, progress: Progress, k: int) -> dict[str, Any]:
-        told = {"problem": int(progress.lanes[k]), "iteration": progress.iteration, "cost": float(progress.cost[k])}
-        told |= {"damping": float(progress.damping[k]), "accepted": bool(progress.accepted[k])}
-        return told | dict(zip(self.names, progress.theta[k].tolist(), strict=True))
+    def _iterations(self, steps: Sequence[tuple[int, Progress, int]]) -> Iterator[tuple[float, dict[str, Any]]]:
+        for number, progress, k in steps:
+            told = {"problem": int(progress.lanes[k]), "iteration": progress.iteration, "cost": float(progress.cost[k])}
+            told |= {"damping": float(progress.damping[k]), "accepted": bool(progress.accepted[k])}
+            yield number, told | dict(zip(self.names, progress.theta[k].tolist(), strict=True))
 
 
 def state_is_due(generation: int) -> bool:
     """Is the whole state of the search logged? So often that a resumed run repeats 32 generations or an eighth."""
-    return generation % (1 << max(5, generation.bit_length() - 4)) == 0
+    return generation % _spacing(generation) == 0
+
+
+def next_state(generation: int) -> int:
+    """The first generation after this one whose state is logged."""
+    spacing = _spacing(generation + 1)
+    return -(-(generation + 1) // spacing) * spacing
+
+
+def _spacing(generation: int) -> int:
+    return 1 << max(5, generation.bit_length() - 4)
 
 
 def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[str, float]) -> None:

@@ -7,6 +7,7 @@ from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.follow import follow
 from fdi_torch.logbook.inspect import Inspection, inspect_log
 from fdi_torch.logbook.live import Live, serve
+from fdi_torch.logbook.messages import Trickle
 from fdi_torch.logbook.payload import as_array, unpack
 from fdi_torch.logbook.reader import Message, Run, read_run
 from fdi_torch.logbook.recover import Recovery, recover
@@ -29,6 +30,7 @@ __all__ = [
     "RunLog",
     "Signals",
     "Terminated",
+    "Trickle",
     "align",
     "arrays",
     "as_array",

@@ -23,6 +23,8 @@ _HEAD = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("published", "<u8")]
 )
 _COMMA, _CLOSING = b",}"
+_WIDEST = 32
+"""Bytes that are moved for a number: no less than its text, and no more than reach from it into the next sample's."""
 _UNCOUNTED = 9
 """Bytes of a record that its length does not count: opcode and length."""
 
@@ -78,23 +80,40 @@ def block_of(
     log_times: np.ndarray,
 ) -> Block:
     """Samples values[k] (B, N_k), finite float64, of channel k over time (B,) in s."""
-    columns = np.column_stack([part for block in values for part in (time, block)])
-    text = np.frombuffer(orjson.dumps(columns.ravel(), option=orjson.OPT_SERIALIZE_NUMPY), np.uint8)[1:]
-    commas = np.flatnonzero(text == _COMMA)  # after each number but the last, which a bracket stops
-    before = [piece for named in names for piece in (bytes(_HEAD.itemsize) + b'{"t":', *map(_key, named))]
-    put_in = np.cumsum([len(piece) for piece in before])
-    stops = np.append(commas, len(text) - 1).reshape(columns.shape)
-    stops += put_in + put_in[-1] * np.arange(len(columns))[:, None]
-    starts = np.concatenate([[0], stops.ravel()[:-1] + 1]).reshape(columns.shape)
-    data = np.empty(stops[-1, -1] + 1, np.uint8)
-    is_text = np.ones(len(data), bool)
-    for j, piece in enumerate(before):
-        _windows(data, len(piece))[starts[:, j]] = np.frombuffer(piece, f"V{len(piece)}")
-        _windows(is_text, len(piece))[starts[:, j]] = np.zeros(1, f"V{len(piece)}")
-    data[is_text] = text
-    last = stops[:, np.cumsum([1 + len(named) for named in names]) - 1]
-    data[last] = _CLOSING
-    return Block(channels, sequences, log_times, data, last + 1)
+    columns = np.column_stack([time, *values])
+    bare = orjson.dumps(columns.ravel(), option=orjson.OPT_SERIALIZE_NUMPY)
+    text = np.frombuffer(bare + bytes(_WIDEST), np.uint8)
+    stops = np.append(np.flatnonzero(text == _COMMA), len(bare) - 1)
+    begins = np.ascontiguousarray(np.append(0, stops[:-1]).reshape(columns.shape).T) + 1
+    lengths = np.ascontiguousarray(stops.reshape(columns.shape).T - begins)
+    pieces = _pieces(names)
+    sizes = sum(lengths[column] for _, column, _ in pieces) + sum(len(piece) + last for piece, _, last in pieces)
+    stop = np.cumsum(sizes) - sizes  # of what has its place already, in each sample
+    data = np.empty(int(sizes.sum()) + _WIDEST, np.uint8)
+    numbers, target = _windows(text, _WIDEST), _windows(data, _WIDEST)
+    places, ends = [], []
+    for piece, column, last in pieces:
+        places.append(stop)
+        begin = stop + len(piece)
+        target[begin] = numbers[begins[column]]  # with what follows it there, which what is written next covers
+        stop = begin + lengths[column] + last
+        ends += [stop] if last else []
+    for (piece, *_), place in zip(pieces, places, strict=True):
+        _windows(data, len(piece))[place] = np.frombuffer(piece, f"V{len(piece)}")
+    found = np.column_stack(ends)
+    data[found - 1] = _CLOSING
+    return Block(channels, sequences, log_times, data, found)
+
+
+def _pieces(names: Sequence[Sequence[str]]) -> list[tuple[bytes, int, bool]]:
+    """Of each number of a sample: what stands before it, its column (time is the first), is it its record's last?"""
+    pieces, column = [], 0
+    for named in names:
+        pieces.append((bytes(_HEAD.itemsize) + b'{"t":', 0, not named))
+        for k, name in enumerate(named):
+            column += 1
+            pieces.append((b"," + _key(name), column, k == len(named) - 1))
+    return pieces
 
 
 def _key(name: str) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,7 +22,16 @@ _CHUNK = struct.Struct("<BQQQQII")
 # Level 1 but for longer matches and a smaller table, that stays in the cache: samples and states in two thirds of the
 # time, not a byte larger.
 _ZSTD = zstandard.ZstdCompressionParameters.from_level(1, window_log=18, hash_log=13, min_match=7)
+Packer = zstandard.ZstdCompressor
+Span = tuple[int, int]
+"""Log times from and to, in ns."""
+_NEVER = (2**64, -1)
 _INDEX_HEAD = 6  # channel number and length of the list, in a message index's body
+
+
+def packer() -> Packer:
+    """What compresses chunks, one after the other."""
+    return Packer(compression_params=_ZSTD)
 
 
 @dataclass(frozen=True)
@@ -52,10 +61,11 @@ class Chunk:
     def __init__(self) -> None:
         self.size = 0
         self.cut = False
-        self._records: list[bytes] = []
+        self._records: list[bytes | memoryview] = []
         self._told: dict[int, Described] = {}
         self._indexes: dict[int, bytearray] = {}  # of each channel: log time and place of every message
-        self._given = 0
+        self._span = _NEVER
+        self._given_span, self._given = _NEVER, 0
         self._given_indexes: dict[int, int] = {}  # of each channel: bytes of the index that are in earlier pieces
 
     @property
@@ -77,6 +87,9 @@ class Chunk:
             self._records.append(told.records)
             self.size += len(told.records)
         index += _ENTRY.pack(log_time, self.size)
+        earliest, latest = self._span
+        if not earliest <= log_time <= latest:
+            self._span = min(earliest, log_time), max(latest, log_time)
         length = len(data)
         head = _MESSAGE.pack(Opcode.MESSAGE, 22 + length, number, sequence, log_time, publish_time)
         self._records += (head, data)
@@ -86,28 +99,30 @@ class Chunk:
         """Has this channel a message here already?"""
         return told.channel.id in self._indexes
 
-    def block(self, numbers: Sequence[int], log_times: np.ndarray, records: bytes, starts: np.ndarray) -> None:
+    def block(self, numbers: Sequence[int], log_times: np.ndarray, records: memoryview, starts: np.ndarray) -> None:
         """Records of messages of channels that are described here, in turn, which start at the places (B, S)."""
         for number, places in zip(numbers, starts.T, strict=True):
             entries = np.empty((len(places), 2), "<u8")
             entries[:, 0] = log_times
             np.add(places, self.size, out=entries[:, 1], casting="unsafe")
             self._indexes[number] += entries.data
+        self._span = _both(self._span, (int(log_times.min()), int(log_times.max())))
         self._records.append(records)
         self.size += len(records)
 
-    def piece(self, compress: bool) -> bytes:
+    def piece(self, packer: Packer | None) -> bytes:
         """What came since the last piece as a chunk of its own, without message indexes."""
         fresh = {n: index for n, index in self._indexes.items() if len(index) > self._given_indexes.get(n, 0)}
         described = [self._told[number].records for number in fresh if number in self._given_indexes]
-        data, _ = _chunk([*described, *self._records[self._given :]], fresh, self._given_indexes, compress)
+        data, _ = _chunk([*described, *self._records[self._given :]], self._span, packer)
         self._given, self._given_indexes = len(self._records), {n: len(index) for n, index in self._indexes.items()}
+        self._given_span, self._span = _both(self._given_span, self._span), _NEVER
         self.cut = True
         return b"".join(data)
 
-    def record(self, compress: bool, start: int) -> tuple[bytes, ChunkIndex]:
+    def record(self, packer: Packer | None, start: int) -> tuple[bytes, ChunkIndex]:
         """The chunk and its message indexes as they stand in the file from byte `start`, and the entry about them."""
-        parts, told = _chunk(self._records, self._indexes, {}, compress)
+        parts, told = _chunk(self._records, _both(self._given_span, self._span), packer)
         length = sum(map(len, parts))
         offsets, place = {}, start + length
         for number, index in self._indexes.items():
@@ -124,22 +139,23 @@ class Chunk:
         return b"".join(parts), about
 
 
+def _both(a: Span, b: Span) -> Span:
+    return min(a[0], b[0]), max(a[1], b[1])
+
+
 def _chunk(
-    records: Sequence[bytes], indexes: Mapping[int, bytearray], given: Mapping[int, int], compress: bool
+    records: Sequence[bytes | memoryview], span: Span, packer: Packer | None
 ) -> tuple[list[bytes | bytearray], dict[str, Any]]:
-    """A chunk record in parts, and what its entry says of it; given: bytes of the indexes that are about others."""
+    """A chunk record in parts, and what its entry says of it; span: of its messages."""
     body = b"".join(records)
-    packed = zstandard.ZstdCompressor(compression_params=_ZSTD).compress(body) if compress else body
-    compression = b"zstd" if compress else b""
-    times = [np.frombuffer(index, "<u8", offset=given.get(number, 0))[::2] for number, index in indexes.items()]
-    earliest, latest = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
+    packed, compression = (body, b"") if packer is None else (packer.compress(body), b"zstd")
     length = _CHUNK.size - 9 + len(compression) + 8 + len(packed)
-    head = _CHUNK.pack(Opcode.CHUNK, length, earliest, latest, len(body), zlib.crc32(body), len(compression))
+    head = _CHUNK.pack(Opcode.CHUNK, length, *span, len(body), zlib.crc32(body), len(compression))
     told = {
         "compression": compression.decode(),
         "compressed_size": len(packed),
         "uncompressed_size": len(body),
-        "message_start_time": earliest,
-        "message_end_time": latest,
+        "message_start_time": span[0],
+        "message_end_time": span[1],
     }
     return [head, compression, struct.pack("<Q", len(packed)), packed], told

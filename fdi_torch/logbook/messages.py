@@ -10,6 +10,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain, count, repeat
 from typing import Any
 
@@ -23,7 +24,6 @@ from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, Topic, json_schema, 
 from fdi_torch.logbook.sink import EPOCH_NS, log_time_of
 
 Named = Mapping[str, Any]
-Fields = Callable[[], Named]
 _RESERVED = ("t", NON_FINITE, WALL, "masked")
 _BLOCK = 4096
 _FEW = 32
@@ -31,18 +31,32 @@ _FEW = 32
 _TOGETHER, _TOGETHER_BYTES = 512, 1 << 22
 
 
+@dataclass(frozen=True, eq=False)
+class Trickle:
+    """Messages of one topic that come one at a time and may be written a little later, many at a time.
+
+    told: time and fields of each, worked out of what was kept for it, which must not have changed.
+    """
+
+    topic: str
+    told: Callable[[Sequence[Any]], Iterable[tuple[float, Named]]]
+    units: Mapping[str, str] | None = None
+
+
 class Messages:
     """Encodes messages and hands them to `put`, with their log time in ns.
 
     What comes in a slow trickle can be put off (`later`), and is then encoded many at a time: a processor that has been
-    busy with other things takes several times as long over each alone.
+    busy with other things takes several times as long over each alone. keep((trickle, item)): the same with nothing
+    else done, for what comes so often that even `later` counts; for when not `due`, after a first `later`.
     """
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
-        self._put_off: deque[tuple[str, Fields, float, Mapping[str, str] | None]] = deque()
+        self._put_off: deque[tuple[Trickle, Any]] = deque()
         self._put_off_bytes = 0
-        self._due = False
+        self.keep = self._put_off.append
+        self.due = False
         self._latest = 0.0
         self._described: dict[str, tuple[frozenset[str], Channel]] = {}
         self._sequence: dict[str, int] = {}
@@ -101,19 +115,18 @@ class Messages:
         log_time = log_time_of(t)
         return channel, log_time, log_time, self._next(topic), data
 
-    def later(
-        self, topic: str, fields: Fields, t: float, units: Mapping[str, str] | None = None, size: int = 0
-    ) -> None:
-        """One message, soon: before the next one that is written at once. size: about how many bytes it keeps alive.
+    def later(self, trickle: Trickle, item: Any, size: int = 0) -> None:
+        """One message, soon: before the next one that is written at once. size: about how many bytes the item keeps.
 
-        What it holds must not change any more. The first of a topic is written at once, so that errors show.
+        The first of a topic is written at once, so that errors show.
         """
-        if topic not in self._described:
-            self.write(topic, fields(), t, units=units)
+        if trickle.topic not in self._described:
+            ((t, fields),) = trickle.told((item,))
+            self.write(trickle.topic, fields, t, units=trickle.units)
             return
-        self._put_off.append((topic, fields, t, units))  # needs no lock, so that a search goes on at once
+        self.keep((trickle, item))  # needs no lock, so that a search goes on at once
         self._put_off_bytes += size
-        if self._due:
+        if self.due:
             self.flush()
         elif len(self._put_off) >= _TOGETHER or self._put_off_bytes > _TOGETHER_BYTES:
             self.settle()
@@ -127,8 +140,14 @@ class Messages:
 
     def _settled(self) -> Iterator[Timed]:
         while self._put_off:
-            topic, fields, t, units = self._put_off.popleft()
-            yield self._timed(topic, fields(), t, units)
+            taken = [self._put_off.popleft() for _ in range(len(self._put_off))]
+            items: dict[Trickle, list[Any]] = {}
+            for trickle, item in taken:
+                items.setdefault(trickle, []).append(item)
+            told = {trickle: iter(trickle.told(own)) for trickle, own in items.items()}
+            for trickle, _ in taken:
+                t, fields = next(told[trickle])
+                yield self._timed(trickle.topic, fields, t, trickle.units)
 
     def samples(
         self,

@@ -19,7 +19,7 @@ from mcap import records
 
 from fdi_torch.logbook.block import Block, Timed
 from fdi_torch.logbook.channel import Channel
-from fdi_torch.logbook.chunk import Chunk, Described
+from fdi_torch.logbook.chunk import Chunk, Described, packer
 from fdi_torch.logbook.contents import Contents, record_bytes
 from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.rest import Rest
@@ -39,7 +39,7 @@ class Sink:
     def __init__(self, path: Path, library: str, profile: str = PROFILE, compress: bool = True) -> None:
         self.path = path
         self._stream = Stream(path)
-        self._compress = compress
+        self._packer = packer() if compress else None
         self._contents = Contents()
         self._chunk = Chunk()
         self._size = self._crc = 0  # of the file as it shall be
@@ -118,7 +118,7 @@ class Sink:
         if told[0].is_signal:
             self._signals += (last - first) * len(told)
         starts = np.append(start, ends[first:last].ravel()[:-1]).reshape(last - first, -1) - start
-        records = block.data[start : ends[last - 1, -1]].tobytes()
+        records = block.data[start : ends[last - 1, -1]].data
         self._chunk.block([channel.channel.id for channel in told], block.log_times[first:last], records, starts)
         return last
 
@@ -130,7 +130,7 @@ class Sink:
     def cut(self) -> None:
         """What waits goes to disk now, though its chunk is not full."""
         if self._chunk.waiting:
-            self._stream.write(self._chunk.piece(self._compress))
+            self._stream.write(self._chunk.piece(self._packer))
 
     def flush(self) -> None:
         """The chunk ends here."""
@@ -140,7 +140,7 @@ class Sink:
         if chunk.cut:
             self.cut()
             self._rest = self._rest or Rest(self.path, self._size)
-        data, index = chunk.record(self._compress, self._size)
+        data, index = chunk.record(self._packer, self._size)
         self._chunk = Chunk()
         self._contents.chunk(index, chunk.messages)
         self._write(data, in_pieces=chunk.cut)

@@ -6,20 +6,42 @@ second a step, so that viewers draw it over its number; other events default to 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import orjson
 
-from fdi_torch.logbook.messages import Messages, Named
+from fdi_torch.logbook.messages import Messages, Named, Trickle
 from fdi_torch.logbook.payload import as_array, pack
 from fdi_torch.logbook.sink import log_time_of
 
 _LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
 
 
+def _packed(kept: Sequence[tuple[float, Named, Named]]) -> Iterator[tuple[float, Named]]:
+    for t, fields, arrays in kept:
+        told = dict(fields)
+        for name, array in arrays.items():
+            told |= pack(name, array)
+        yield t, told
+
+
+_POPULATION = Trickle("/estimator/de/population", _packed)
+
+
 class Topics(Messages):
     """The topics by name."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._trickles: dict[str, Trickle] = {}
+
+    def _trickle(self, topic: str, units: Mapping[str, str] | None) -> Trickle:
+        """Of messages whose fields are kept as they are."""
+        found = self._trickles.get(topic)
+        if found is None or found.units != units:
+            found = self._trickles[topic] = Trickle(topic, lambda kept: kept, units)
+        return found
 
     def residual(
         self,
@@ -55,7 +77,7 @@ class Topics(Messages):
         numbers: mean_cost, spread, evaluations and others by name.
         """
         fields = {"problem": problem, "generation": generation, "best_cost": best_cost, **numbers, **best}
-        self.later("/estimator/de/generation", lambda: fields, generation if t is None else t, units)
+        self.later(self._trickle("/estimator/de/generation", units), (generation if t is None else t, fields))
 
     def population(
         self, generation: int, arrays: Mapping[str, Any], *, problem: int = 0, t: float | None = None
@@ -64,16 +86,9 @@ class Topics(Messages):
 
         They are written a little later, and must not be changed in place.
         """
-        kept = dict(arrays)
-
-        def fields() -> Named:
-            told: dict[str, Any] = {"problem": problem, "generation": generation}
-            for name, array in kept.items():
-                told |= pack(name, array)
-            return told
-
-        size = sum(getattr(array, "nbytes", 0) for array in kept.values())
-        self.later("/estimator/de/population", fields, generation if t is None else t, size=size)
+        fields = {"problem": problem, "generation": generation}
+        size = sum(getattr(array, "nbytes", 0) for array in arrays.values())
+        self.later(_POPULATION, (generation if t is None else t, fields, dict(arrays)), size)
 
     def iteration(
         self,
@@ -91,7 +106,7 @@ class Topics(Messages):
         numbers: step, gradient, damping, accepted and others by name.
         """
         fields = {"problem": problem, "iteration": iteration, "cost": cost, **numbers, **parameters}
-        self.later("/estimator/refine/iteration", lambda: fields, iteration if t is None else t, units)
+        self.later(self._trickle("/estimator/refine/iteration", units), (iteration if t is None else t, fields))
 
     def estimate(
         self,

@@ -146,7 +146,7 @@ class RunLog(Topics):
     def flush(self) -> None:
         """Everything logged so far goes to disk."""
         with self._lock:
-            self._due = False
+            self.due = False
             self.settle()
             self._open_sink().cut()
             self._note_progress()
@@ -204,11 +204,11 @@ class RunLog(Topics):
     def _flush_by_clock(self) -> None:
         """A run that logs something in the next moment writes by itself: two threads at a time hinder each other."""
         while not self._stop.wait(self._flush_seconds / 2):
-            self._due = self._has_waited()
-            if self._due and not self._stop.wait(_MOMENT):
+            self.due = self._has_waited()
+            if self.due and not self._stop.wait(_MOMENT):
                 with self._lock:
                     try:
-                        if self._due:
+                        if self.due:
                             self.flush()
                     except LogError:
                         return  # the sink is dead; the next write says so

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +19,7 @@ import pytest
 from example_logs import FIXED, FROZEN, VERDICT, write_everything, write_finished
 from mcap.reader import make_reader
 
-from fdi_torch.logbook import LogError, RunLog, content_hash, read_run, rest
+from fdi_torch.logbook import LogError, RunLog, Trickle, content_hash, read_run, rest
 from fdi_torch.logbook.provenance import environment, git_state
 from fdi_torch.logbook.schemas import TOPICS
 from fdi_torch.logbook.terminate import Terminated
@@ -433,13 +434,19 @@ def test_what_is_put_off_comes_before_what_follows(tmp_path: Path) -> None:
 
 
 def test_what_is_put_off_while_the_clock_writes_keeps_its_order(tmp_path: Path) -> None:
-    def slow(number: int) -> dict[str, int]:
-        time.sleep(0.002)  # the clock is still at it when the next comes
-        return {"problem": 0, "generation": number}
+    def slow(numbers: Sequence[int]) -> Iterator[tuple[float, dict[str, int]]]:
+        for number in numbers:
+            time.sleep(0.002)  # the clock is still at it when the next comes
+            yield number, {"problem": 0, "generation": number}
+
+    trickle = Trickle("/estimator/de/population", slow)
 
     with RunLog(tmp_path / "a.mcap", "train", **FIXED, flush_seconds=0.01) as log:
         for number in range(200):
-            log.later("/estimator/de/population", lambda number=number: slow(number), number)
+            if number == 0 or log.due or number % 50 == 0:
+                log.later(trickle, number)
+            else:
+                log.keep((trickle, number))
             time.sleep(0.0005)
     told = [orjson.loads(m.data)["generation"] for m in read_run(tmp_path / "a.mcap").messages()]
     assert told == list(range(200))
