@@ -1,15 +1,22 @@
-"""Which effects: screening, refits of singles, and of combinations one effect at a time."""
+"""Which effects: screening, refits of singles, and of combinations one effect at a time.
+
+One effect after the other is taken for what it closes then, and an early one may stand in for what later ones explain
+better. So, where no single effect explains much and recalibration went far from what is believed, singles are fitted
+once more from the plant as believed, and each effect of the best fit gives way to others in turn (as in floating selection:
+Pudil, Novovicova and Kittler, 1994, "Floating search methods in feature selection").
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from fdi_torch.gap.evidence import temperature
 from fdi_torch.gap.fitting import SETTLED, Candidate, Fit, Fitter, Key, left_open
 from fdi_torch.gap.screening import Option, Screen, screen
+from fdi_torch.plant.effect import Placement
 
 SINGLES, STARTS = 14, 2
 PARENTS, PARTNERS = 3, 5
@@ -19,7 +26,10 @@ PROMISE = 10.0  # chi-square units, of the evidence, that an effect has to promi
 # Of the gap, and chi-square units: what noise alone may leave open. Then only what is beside the best is looked for.
 EXPLAINED_SHARE, EXPLAINED_LEAST = 1e-3, 60.0
 WORTH_TRYING = 1e-4  # of the gap, that a fit with one effect less leaves more, from which it is tried again
+AFRESH = 0.1  # of the gap left open by the best single, from which singles begin once more at the plant as believed
 HOPELESS = 0.5  # of the gap left open by the best pair, at which a third effect will not explain it either
+SWAPS, SUBSTITUTES = 3, 3  # rounds in which effects give way to others, and how many others are tried for each
+FAR_OFF = 2.0  # tolerances off its nominal, from which a recalibrated constant may have taken up what an effect does
 SETTLED_SHARE = 0.02  # of the gap left open by the best single, below which lesser promises are not followed
 
 
@@ -41,9 +51,16 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEE
     fits: dict[Key, Fit] = {null.key: null}
     screens = {null.key: screen(fitter, null, options)}
     settled = SETTLED * temperature(left_open(fitter, null))
-    for candidate in _further(null, screens[null.key], SINGLES, PROMISE):
+    singles = _further(null, screens[null.key], SINGLES, PROMISE)
+    for candidate in singles:
         if not _outdone(fitter, null, _best(fits), candidate.promise):
             _keep(fits, fitter.fit(candidate, null, target=_best(fits), settled=settled))
+    left, gap = _open(fitter, null, fits)
+    hidden = left > AFRESH * gap and _far_off(null)
+    if hidden:
+        believed = fitter.fit(Candidate(), rounds=0)
+        for candidate in singles:
+            _keep(fits, fitter.fit(_from_all(candidate, options), believed, settled=settled))
     _polish(fitter, fits, 1)
     for depth in range(2, most + 1):
         before = len(fits)
@@ -55,7 +72,7 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEE
         for parent in _parents(fits.values(), depth - 1, 1 if explained else PARENTS if depth == 2 else 2):
             screens[parent.key] = screen(fitter, parent, _beside(parent, options), heat)
             for candidate in _further(parent, screens[parent.key], PARTNERS if depth == 2 else 3, PROMISE):
-                if candidate.key not in fits:
+                if _untried(fits, candidate, parent):
                     _keep(fits, fitter.fit(candidate, parent, target=_best(fits), settled=settled))
         if depth == 2 and len(fits) > before and not explained:
             for candidate in _pairs(screens[null.key], 3):
@@ -64,8 +81,54 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEE
         if len(fits) == before:
             break
         _polish(fitter, fits, depth)
+        if hidden and left > SETTLED_SHARE * gap:
+            _swap(fitter, fits, screens, options, depth, settled)
     _without_one(fitter, fits, settled)
     return Search(null, tuple(sorted(fits.values(), key=lambda f: f.cost)), screens)
+
+
+def _far_off(null: Fit) -> bool:
+    """Whether recalibration went far from what is believed: constants that took up an effect's work may keep its fit
+    from finding it.
+    """
+    off = (null.theta - null.space.nominal(null.theta)) / null.space.std(null.theta)
+    return float(off.abs().max()) > FAR_OFF
+
+
+def _from_all(candidate: Candidate, options: Sequence[Option]) -> Candidate:
+    """A single from every start of its cause: a screen tells the good ones only near where it was made."""
+    return replace(candidate, starts=tuple(o.start for o in options if {o.cause} == candidate.key))
+
+
+def _untried(fits: dict[Key, Fit], candidate: Candidate, parent: Fit) -> bool:
+    """Whether there is no such fit yet, or one that went astray: with an effect more it leaves more."""
+    return candidate.key not in fits or fits[candidate.key].cost > parent.cost
+
+
+def _swap(
+    fitter: Fitter,
+    fits: dict[Key, Fit],
+    screens: dict[Key, Screen],
+    options: Sequence[Option],
+    depth: int,
+    settled: float,
+) -> None:
+    """Each effect of the best fit of so many gives way in turn to those that promise most in its stead, until none is
+    better.
+    """
+    null = fits[frozenset()]
+    for _ in range(SWAPS):
+        (best,) = _parents(fits.values(), depth, 1)
+        heat = temperature(null.cost - best.cost, left_open(fitter, best))
+        for left in best.candidate.placements:
+            rest = _less(fitter, fits, best, left, settled)
+            screens[rest.key] = screen(fitter, rest, _beside(best, options), heat)
+            for candidate in _further(rest, screens[rest.key], SUBSTITUTES, PROMISE):
+                if _untried(fits, candidate, rest):
+                    _keep(fits, fitter.fit(candidate, rest, target=_best(fits), settled=settled))
+        if best.cost - _best(fits) < WORTH_TRYING * (null.cost - best.cost):
+            break
+        _polish(fitter, fits, depth)
 
 
 def _without_one(fitter: Fitter, fits: dict[Key, Fit], settled: float) -> None:
@@ -75,13 +138,18 @@ def _without_one(fitter: Fitter, fits: dict[Key, Fit], settled: float) -> None:
     for depth in range(max(len(key) for key in fits), 1, -1):
         for fit in _parents(fits.values(), depth, 1):
             for left in fit.candidate.placements:
-                rest = tuple(p for p in fit.candidate.placements if p is not left)
-                start = {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] != left.prefix}
-                key = fit.key - {(left.effect.name, left.location)}
-                known = fits.get(key)
-                if known is None or known.cost > fit.cost + WORTH_TRYING * (fits[frozenset()].cost - fit.cost):
-                    again = fitter.fit(Candidate(rest, (start,)), fit, target=_best(fits), settled=settled)
-                    _keep(fits, again)
+                _less(fitter, fits, fit, left, settled)
+
+
+def _less(fitter: Fitter, fits: dict[Key, Fit], fit: Fit, left: Placement, settled: float) -> Fit:
+    """The fit without one of its effects, the others from where they are; a known one where that is as good."""
+    rest = tuple(p for p in fit.candidate.placements if p is not left)
+    start = {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] != left.prefix}
+    key = fit.key - {(left.effect.name, left.location)}
+    known = fits.get(key)
+    if known is None or known.cost > fit.cost + WORTH_TRYING * (fits[frozenset()].cost - fit.cost):
+        _keep(fits, fitter.fit(Candidate(rest, (start,)), fit, target=_best(fits), settled=settled))
+    return fits[key]
 
 
 def _polish(fitter: Fitter, fits: dict[Key, Fit], effects: int) -> None:
