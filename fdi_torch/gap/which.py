@@ -2,8 +2,8 @@
 
 One effect after the other is taken for what it closes then, and an early one may stand in for what later ones explain
 better. So, where no single effect explains much and recalibration went far from what is believed, singles are fitted
-once more from the plant as believed, and each effect of the best fit gives way to others in turn (as in floating selection:
-Pudil, Novovicova and Kittler, 1994, "Floating search methods in feature selection").
+once more from the plant as believed, and each effect of the best fit gives way to others in turn (as in floating
+selection: Pudil, Novovicova and Kittler, 1994, "Floating search methods in feature selection").
 """
 
 from __future__ import annotations
