@@ -20,6 +20,7 @@ class Recording:
     time (T,) in s, strictly increasing. inputs (T, M) and outputs (T, N) in the SI units named beside them.
     mask (T, N): True where a reading counts; a missing reading is NaN in outputs and False here.
     An unknown input is NaN; `known_stretches` cuts the recording there. hold: how inputs run between samples.
+    ran: inputs that were on, or may have been, before the first sample, as far as what it was cut from tells.
     """
 
     time: Tensor
@@ -33,6 +34,7 @@ class Recording:
     hold: Hold = "zero_order"
     source: str = "memory"
     sha256: str = ""
+    ran: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         if self.mask is None:
@@ -66,8 +68,10 @@ class Recording:
     def stretch(self, first: int, last: int) -> Recording:
         """Samples first..last-1, with the same clock."""
         part = slice(first, last)
+        on = (~(self.inputs[:first] <= 0.0)).any(dim=0).tolist()
         return replace(
             self,
+            ran=self.ran | {name for name, ever in zip(self.input_names, on, strict=True) if ever},
             time=self.time[part],
             inputs=self.inputs[part],
             outputs=self.outputs[part],

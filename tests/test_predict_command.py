@@ -79,3 +79,19 @@ def test_the_picture_has_both_plants(folder: Path, capsys: pytest.CaptureFixture
 def test_no_recording_is_misuse(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["predict", "--plant", "rig.yaml"]) == 2
     assert "expected a recording" in capsys.readouterr().err
+
+
+HOSE = "effects: [{effect: pump_priming, location: Q, parameters: {volume: 200 cm^3}}]\n"
+
+
+def test_a_hose_fills_once_and_is_full_where_a_run_was_cut_out_of_a_longer_one(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """50 cm^3/s for 10 s, rest for 10 s, 50 cm^3/s again: 200 cm^3, 2 cm of level, are missing once."""
+    (folder / "rig.yaml").write_text(PLANT + HOSE)
+    flows = [50.0 if t < 10 or t >= 20 else 0.0 for t in range(40)]
+    pumped = [sum(flows[:t]) for t in range(40)]
+    rows = [f"{t},{10 + max(v - 200.0, 0.0) / 100.0},{q}" for t, v, q in zip(range(40), pumped, flows, strict=True)]
+    (folder / "rests.csv").write_text("t_s,h_cm,Q_cm3_s\n" + "".join(f"{t},10,0\n" for t in (-2, -1)) + "\n".join(rows))
+    whole, later = (said(capsys, "rests.csv", *words)["rmse"] for words in ((), ("--from", "15")))
+    assert whole == {"h": pytest.approx(0.0, abs=2e-4)} and later == {"h": pytest.approx(0.0, abs=2e-4)}

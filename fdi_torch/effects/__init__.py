@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
+from dataclasses import replace
 from difflib import get_close_matches
 
 from fdi_torch.effects.actuator_slew import ActuatorSlew
@@ -126,6 +127,21 @@ def build_network(plant: PlantDescription, placements: Iterable[Placement] = ())
     own = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     known = {p.prefix for p in own}
     return TankNetwork(plant, [*own, *(p for p in placements if p.prefix not in known)])
+
+
+def once_run(plant: PlantDescription, channels: Collection[str]) -> PlantDescription:
+    """The plant in the midst of a run in which these inputs were on before: what acts at first only no longer does,
+    nor does it vary.
+    """
+    ran = {p.name for p in plant.pumps if p.channel in channels}
+    ran |= {p.name for p in plant.pipes if p.valve in channels}
+    over = {f"{e.location}.{e.effect}" for e in plant.effects if e.location in ran and effect(e.effect).at_first}
+    return replace(
+        plant,
+        effects=tuple(e for e in plant.effects if f"{e.location}.{e.effect}" not in over),
+        tolerances={n: v for n, v in plant.tolerances.items() if n.rpartition(".")[0] not in over},
+        varying=tuple(n for n in plant.varying if n.rpartition(".")[0] not in over),
+    )
 
 
 def placements_for(names: Iterable[str]) -> tuple[Placement, ...]:

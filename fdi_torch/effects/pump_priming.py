@@ -34,6 +34,7 @@ class PumpPriming(Effect):
     stage = Stage.COMMAND
     places = ("pump",)
     memory = 1
+    at_first = True
     mistaken_for = ("pump_delay", "unmetered_flow", "pump_dead_zone")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -2,6 +2,7 @@
 
 What the plant file says varies from recording to recording (the zero of a sensor that is zeroed before each run) is
 taken from the same samples, within its tolerance: a tank that reads less than nothing is empty, and its sensor off.
+Where the recording was cut from a longer one in which a pump had run, its hose is full.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import effect, once_run
 from fdi_torch.gap.fitting import Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.subject import Subject, subject_of
@@ -56,6 +57,7 @@ def predict(
     """
     if start_samples < 1:
         raise ValueError(f"expected at least 1 sample for the start levels, got {start_samples}")
+    plant = once_run(plant, recording.ran)
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     span = float(recording.time[-1] - recording.time[0])
     step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), span / MOST_STEPS)

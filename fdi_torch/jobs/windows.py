@@ -5,12 +5,13 @@ goes shows when it was there. `estimate.windows` of a run file asks for it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recordings import LoadedRecording, StartLevel
 from fdi_torch.config.run import Run
+from fdi_torch.effects import once_run
 from fdi_torch.estimate.stretches import Stretch, stretches_of
 from fdi_torch.estimate.windows import Window, cut_up, noise_of, window_of, window_step
 from fdi_torch.jobs.log_paths import free_path
@@ -33,7 +34,10 @@ def windows_of(run: Run, tell: Callable[[float, str], None] = lambda share, text
     """Cuts the recordings of a run file into windows of `estimate.windows` s, and fits the suspects in each.
 
     A window's own start levels are always free; constants to calibrate have their tolerance as prior in each window.
+    What the plant believes to act at first only does not: windows begin in the midst of a run, and what shows of it in
+    the first is for a suspect to say.
     """
+    run = replace(run, plant=once_run(run.plant, run.plant.channels()))
     length = run.config.estimate.windows
     assert length is not None
     loaded = recordings_of(run)
