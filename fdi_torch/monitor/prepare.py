@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import build_network, placements_for
+from fdi_torch.effects import build_network, once_run, placements_for
 from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
 from fdi_torch.monitor.detection import Chart, make_detector
@@ -76,7 +76,9 @@ def prepare(
     step = usual_step(plant) if step is None else step
     watched = with_shapes(list(faults) or usual_faults(plant), plant)
     network = build_network(plant, placements_for(watched))
-    values = calibration(plant, fault_free, calibrate, step, start) if calibrate else {}
+    running = once_run(plant, fault_free.ran)  # the fault-free part may be from the midst of the run
+    learning = build_network(running, placements_for([*watched, *calibrate]))
+    values = calibration(running, fault_free, calibrate, step, start) if calibrate else {}
     space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate)])
     for name in watched:
         if name.endswith(".phase"):  # once round in either direction, so that no fit ends at a seam
@@ -86,13 +88,13 @@ def prepare(
     believed = space.vector(values)
     samples = take(fault_free, plant)
     if gain is None:
-        noise, seen = learn_noise(network, samples, space, believed, longest_step=step)
-        radius = Observer(network, noise.gain, space, believed, step).check_stable(samples, seen)
+        noise, seen = learn_noise(learning, samples, space, believed, longest_step=step)
+        radius = Observer(learning, noise.gain, space, believed, step).check_stable(samples, seen)
     else:
-        wished = _wished(network, samples, space, believed, step, gain)
-        observer = Observer(network, wished, space, believed, step)
+        wished = _wished(learning, samples, space, believed, step, gain)
+        observer = Observer(learning, wished, space, believed, step)
         radius = observer.check_stable(samples, observer.run(samples))
-        noise, seen = noise_of_gain(network, wished, samples, space, believed, step)
+        noise, seen = noise_of_gain(learning, wished, samples, space, believed, step)
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)
     every = time_between_false_alarms
@@ -100,7 +102,7 @@ def prepare(
     monitor = Monitor(network, space, noise, detector, settings, step, watched=len(watched))
     doubts = (
         *residual_doubts(plant, noise, detector, seen),
-        *fault_doubts(network, space, samples, believed, step, faults_of(watched)),
+        *fault_doubts(learning, space, samples, believed, step, faults_of(watched)),
     )
     return Prepared(monitor, believed, noise, values, radius, doubts)
 
