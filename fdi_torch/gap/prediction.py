@@ -7,6 +7,7 @@ Where the recording was cut from a longer one in which a pump had run, its hose 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
@@ -28,6 +29,7 @@ from fdi_torch.simulate.collocation import Collocation
 START_SAMPLES = 50
 ROUNDS, CORRECTIONS, HALVINGS = 30, 80, 4
 SETTLED = 1e-5  # m, on a bench
+NEARLY = 10.0  # so many times as far, and shorter steps do not help
 MOST_STEPS = 4000  # of the first try; samples may be closer, levels do not change as fast
 UNSEEN_STARTS = (0.1, 0.25, 0.5, 0.8)  # shares of the height, for a tank that no sensor sees
 
@@ -36,7 +38,8 @@ UNSEEN_STARTS = (0.1, 0.25, 0.5, 0.8)  # shares of the height, for a tank that n
 class Prediction:
     """readings (S, C) in SI as the plant's sensors have them; start_levels in m; rmse by sensor, over all samples.
 
-    settled: whether the trajectory is the model's to SETTLED, or as much more as tanks are larger.
+    settled: whether the trajectory is the model's to SETTLED, or as much more as tanks are larger; defect, m: by how
+    much it is not.
     """
 
     readings: Tensor
@@ -44,6 +47,7 @@ class Prediction:
     start_levels: Mapping[str, float]
     rmse: Mapping[str, float]
     settled: bool
+    defect: float
 
 
 def predict(
@@ -61,10 +65,13 @@ def predict(
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     span = float(recording.time[-1] - recording.time[0])
     step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), span / MOST_STEPS)
+    left = math.inf
     for _ in range(HALVINGS):
         subject = subject_of(plant, believed, recording, step)
-        found = _run(subject, start_samples)
-        if found.settled:
+        found, before = _run(subject, start_samples), left
+        left = found.defect
+        stuck = left < NEARLY * SETTLED * length_scale(plant) and left > 0.5 * before
+        if found.settled or stuck:  # an empty tank flickers at its floor, whatever the step
             break
         step *= 0.5
     return found
@@ -95,6 +102,7 @@ def _run(subject: Subject, start_samples: int) -> Prediction:
         dict(zip((t.name for t in plant.tanks), theta[best].tolist(), strict=False)),
         dict(zip((s.name for s in plant.sensors), rmse.tolist(), strict=True)),
         float(run.defect.max()) < SETTLED * length_scale(plant),
+        float(run.defect.max()),
     )
 
 
