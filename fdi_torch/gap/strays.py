@@ -129,13 +129,14 @@ def _resolution(values: Tensor) -> float:
 
 def stood_still(values: Tensor) -> list[tuple[int, int]]:
     """Where values (S,) of one sensor repeat the last one longer than by chance, elsewhere than at an end of its range,
-    which may be where it is clipped: the first repeated sample, and the first beyond.
+    which may be where it is clipped, and not to the end, which is a sensor stuck for good: the first repeated sample,
+    and the first beyond.
     """
     count = len(values)
     starts = torch.cat([torch.zeros(1, dtype=torch.int64), (torch.diff(values) != 0.0).nonzero().flatten() + 1])
     ends = torch.cat([starts[1:], torch.tensor([count])])
     length = ends - starts
-    inside = (values[starts] != values.max()) & (values[starts] != values.min())
+    inside = (values[starts] != values.max()) & (values[starts] != values.min()) & (ends < count)
     long = length > LONGEST_BY_CHANCE
     if int((length[~long] - 1).sum()) > STILL * count or int((length[inside] - 1).sum()) > MOST * count:
         return []  # a rounded channel, or one at rest
