@@ -32,6 +32,7 @@ LEFT_SHARE, LEFT_LEAST = 2e-3, 150.0  # share of the gap, and chi-square units, 
 AMONG_OTHERS_SHARE = 1e-2  # the same where one of the effects found is at the likeliest place
 SAME_PLACE_SHARE = 3e-2  # the same where one effect at the likeliest place leaves it: its equation is a little off
 FAR_BETTER = 0.35
+DOUBT = 0.1  # that of two effects at one place one is there only because the other's equation is a little off
 Tell = Callable[[float, str], None]
 
 
@@ -144,9 +145,24 @@ def _weighed(fitter: Fitter, found: Search, choices: int, plant: PlantDescriptio
         key = frozenset(canonical(c, plant) for c in fit.key)
         if key not in best or fit.cost < best[key].cost:
             best[key] = fit
-    weights = opinions(fitter, list(best.values()), heat, choices)
+    weights = _doubted(opinions(fitter, list(best.values()), heat, choices), list(best.values()), gap)
     ranked = sorted(zip(weights, best.values(), strict=True), key=lambda item: -item[0])
     return Weighed(tuple(Explanation(in_order(f), w) for w, f in ranked), tuple(f for _, f in ranked))
+
+
+def _doubted(weights: list[float], fits: Sequence[Fit], gap: float) -> list[float]:
+    """The likeliest explanation gives some of its weight to one with an effect less, where that stands beside another
+    at the same place and closes no more than a law that is a little off leaves: it may only take up its misfit.
+    """
+    top = max(range(len(fits)), key=lambda i: weights[i])
+    crowded = [c for c in fits[top].key if sum(place == c[1] for _, place in fits[top].key) > 1]
+    plainer = {fits[top].key - {c} for c in crowded}
+    rivals = [i for i, f in enumerate(fits) if f.key in plainer and f.cost - fits[top].cost < SAME_PLACE_SHARE * gap]
+    if not rivals:
+        return weights
+    rival = min(rivals, key=lambda i: fits[i].cost)
+    given = max(DOUBT - weights[rival], 0.0) * weights[top]
+    return [w + given * ((i == rival) - (i == top)) for i, w in enumerate(weights)]
 
 
 def _content(explanations: Sequence[Explanation]) -> list[Explanation]:
