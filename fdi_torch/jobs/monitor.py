@@ -28,7 +28,7 @@ from fdi_torch.monitor.windows import WindowMonitor, WindowState
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 
-CHUNK = 1024  # samples of a recording that are taken at a time
+CHUNK = 2048  # samples of a recording that are taken at a time
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,11 @@ class _Watcher:
             samples = samples.stretch(1, len(samples))
         events: list[Event] = []
         if len(samples):
-            self.state, events = self.monitor.advance(self.state, samples, self._log_seen)
+            seen: list[Seen] = []
+            try:
+                self.state, events = self.monitor.advance(self.state, samples, seen.append)
+            finally:  # all at once, in a third of the time
+                self._log_seen(seen)
             self._now = float(samples.time[-1])
         for event in events:
             self._tell(event)
@@ -232,14 +236,20 @@ class _Watcher:
             hold=samples.hold,
         )
 
-    def _log_seen(self, seen: Seen) -> None:
+    def _log_seen(self, seen: Sequence[Seen]) -> None:
         """Residuals, and the one statistic of all channels beside its threshold."""
+        if not seen:
+            return
         names, units = [s.column for s in self.plant.sensors], [s.unit for s in self.plant.sensors]
         chart = self.monitor.detector.chart
-        limit = torch.full_like(seen.statistic, self.monitor.detector.threshold)
-        table = torch.cat([seen.residual, seen.statistic.unsqueeze(1), limit.unsqueeze(1)], dim=1)
+        time, residual, statistic = (
+            torch.cat(parts) for parts in zip(*((s.time, s.residual, s.statistic) for s in seen), strict=True)
+        )
+        limit = torch.full_like(statistic, self.monitor.detector.threshold)
+        residual = torch.cat([part.residual for part in seen])
+        table = torch.cat([residual, torch.stack([statistic, limit], dim=1)], dim=1)
         names += [f"{chart}_statistic", f"{chart}_threshold"]
-        self.log.samples("/observer/residual", seen.time, table, names, [*units, "", ""])
+        self.log.samples("/observer/residual", time, table, names, [*units, "", ""])
 
 
 def _prepared(run: MonitorRun, whole: Recording) -> Prepared:

@@ -6,6 +6,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Iterable
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -22,6 +23,7 @@ def environment(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
     return versions
 
 
+@cache
 def version_of(package: str) -> str:
     """What is imported says it at once; of the others the installation knows it."""
     told = getattr(sys.modules.get(package), "__version__", None)
@@ -45,7 +47,9 @@ def git_state(folder: Path | None = None) -> dict[str, str]:
 def _git(folder: Path, *arguments: str) -> str:
     try:
         command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
+        done = subprocess.run(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, timeout=5, check=False
+        )
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""

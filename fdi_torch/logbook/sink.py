@@ -20,7 +20,7 @@ from mcap import records
 from fdi_torch.logbook.block import Block, Timed
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.chunk import Chunk, Described, packer
-from fdi_torch.logbook.contents import Contents, record_bytes
+from fdi_torch.logbook.contents import Contents, metadata_bytes, record_bytes
 from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.rest import Rest
 from fdi_torch.logbook.scan import MAGIC
@@ -65,7 +65,7 @@ class Sink:
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         self.flush()
-        data = record_bytes(records.Metadata(name=name, metadata=dict(values)))
+        data = metadata_bytes(name, values)
         self._contents.metadata.append(records.MetadataIndex(offset=self._size, length=len(data), name=name))
         self._write(data)
 

@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -27,7 +26,7 @@ from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.flat import flatten
 from fdi_torch.logbook.payload import as_array
-from fdi_torch.logbook.provenance import environment, git_state
+from fdi_torch.logbook.provenance import environment, git_state, version_of
 from fdi_torch.logbook.reader import Message
 from fdi_torch.logbook.schemas import FORMAT_VERSION
 from fdi_torch.logbook.sink import Sink
@@ -98,7 +97,7 @@ class RunLog(Topics):
         self._started = self._clock()
         self._run["started"] = _wall_text(self._started)
         self._run["run_id"] = _sha256(repr((self._run, self._start_records)))[:16]
-        self._sink = Sink(self.partial_path, f"fdi_torch {_version()}")
+        self._sink = Sink(self.partial_path, f"fdi_torch {version_of('fdi_torch')}")
         try:
             self._write_start(self._sink)
         except LogError:
@@ -288,10 +287,3 @@ def _sha256(text: str) -> str:
 def _wall_text(nanoseconds: int) -> str:
     moment = datetime.fromtimestamp(nanoseconds // 10**9, UTC)
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{nanoseconds % 10**9:09d}Z"
-
-
-def _version() -> str:
-    try:
-        return metadata.version("fdi_torch")
-    except metadata.PackageNotFoundError:
-        return "0"
