@@ -14,13 +14,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 DECAY_SHARE = 0.3  # of a rounding step, over which its error is forgotten
 MOST_BINS = 512  # of a spectrum
-KEPT = 2  # sets of frequencies whose spectra are kept, 40 MB each: a recording's, and its hold-out's
+KEPT = 2  # layouts whose spectra are kept, 40 MB each: a recording's, and its hold-out's
 LEAST_SAMPLES = 20  # in a stretch that has a say in level and colour
 FAST_PERIOD = 30.0  # samples; slower parts of a residual may be the model's
 
@@ -99,30 +100,41 @@ _WHITE = int(_COLOURS.abs().argmin())
 _ERRORS = torch.cat([torch.zeros(1), torch.logspace(-4, 2, 25)])  # of the model, as shares of the innovation
 
 
-def _spectrum_of_all(stretches: Sequence[Tensor]) -> tuple[Tensor, Tensor, int]:
-    """Frequencies of several stretches side by side; too short ones have no say."""
-    if len(stretches) == 1:
-        return _fast_spectrum(stretches[0], MOST_BINS)
-    told = [x for x in stretches if len(x) >= LEAST_SAMPLES] or [max(stretches, key=len)]
-    found = [_fast_spectrum(x, len(x)) for x in told]
-    return torch.cat([power for power, _, _ in found]), torch.cat([cosine for _, cosine, _ in found]), 1
+Layout = tuple[tuple[int, int], ...]
+"""Of which stretches a spectrum is put together: samples of each, and at most how many bins."""
 
 
-def _fast_spectrum(x: Tensor, bins: int) -> tuple[Tensor, Tensor, int]:
-    """Tapered periodogram of x (S,) above the corner frequency, and the cosine of each frequency.
-
-    Of a long recording in that many bins, each the mean of so many neighbours (the third item): spectra here are
-    smooth.
+def _spectrum_of_all(stretches: Sequence[Tensor]) -> tuple[Tensor, Layout, int]:
+    """Spectra of several stretches side by side; too short ones have no say. Each bin is the mean of so many
+    neighbours (the third item).
     """
-    count = len(x)
-    taper = torch.hann_window(count, periodic=False, dtype=x.dtype)
+    if len(stretches) == 1:
+        power, width = _fast_spectrum(stretches[0], MOST_BINS)
+        return power, ((len(stretches[0]), MOST_BINS),), width
+    told = [x for x in stretches if len(x) >= LEAST_SAMPLES] or [max(stretches, key=len)]
+    return torch.cat([_fast_spectrum(x, len(x))[0] for x in told]), tuple((len(x), len(x)) for x in told), 1
+
+
+def _fast_spectrum(x: Tensor, bins: int) -> tuple[Tensor, int]:
+    """Tapered periodogram of x (S,) above the corner frequency, in bins: spectra here are smooth."""
+    taper = torch.hann_window(len(x), periodic=False, dtype=x.dtype)
     power = torch.fft.rfft((x - x.mean()) * taper).abs() ** 2 / (taper**2).sum()
-    frequency = torch.arange(len(power), dtype=x.dtype) / count
-    fast = frequency > 1.0 / FAST_PERIOD
+    return _binned(power, len(x), bins)
+
+
+def _binned(each: Tensor, count: int, bins: int) -> tuple[Tensor, int]:
+    """What belongs to the frequencies of so many samples, above the corner frequency: the means of neighbours, and of
+    how many.
+    """
+    fast = torch.arange(len(each), dtype=each.dtype) / count > 1.0 / FAST_PERIOD
     width = -(-int(fast.sum()) // bins)
-    power, frequency = (b[fast][: int(fast.sum()) // width * width] for b in (power, frequency))
-    power, frequency = (b.reshape(-1, width).mean(dim=1) for b in (power, frequency))
-    return power, torch.cos(2 * math.pi * frequency), width
+    return each[fast][: int(fast.sum()) // width * width].reshape(-1, width).mean(dim=1), width
+
+
+def _cosine(count: int, bins: int) -> Tensor:
+    """Of the frequency of each bin."""
+    frequency = torch.arange(count // 2 + 1, dtype=torch.float64) / count
+    return torch.cos(2 * math.pi * _binned(frequency, count, bins)[0])
 
 
 @dataclass(frozen=True)
@@ -131,37 +143,30 @@ class _Shapes:
     and the mean of their logarithms (colours, errors).
     """
 
-    cosine: Tensor
     inverse: Tensor
     mean_log: Tensor
 
 
-_known: list[_Shapes] = []
-
-
-def _shapes(cosine: Tensor) -> _Shapes:
-    """Kept for the last few sets of frequencies: all channels of a recording, and its next estimate, have the same."""
-    for known in _known:
-        if torch.equal(known.cosine, cosine):
-            return known
+@lru_cache(maxsize=KEPT)
+def _shapes(layout: Layout) -> _Shapes:
+    """Kept for the last few layouts: all channels of a recording, and its next estimate, have the same."""
+    cosine = torch.cat([_cosine(count, bins) for count, bins in layout])
     a, error = _COLOURS.to(cosine).reshape(-1, 1, 1), _ERRORS.to(cosine).reshape(-1, 1)
     shape = 1.0 / (1.0 - 2.0 * a * cosine + a * a) + error / (2.0 - 2.0 * cosine) ** 2
-    found = _Shapes(cosine, 1.0 / shape, torch.log(shape).mean(dim=-1))
-    _known[:] = [found, *_known[: KEPT - 1]]
-    return found
+    return _Shapes(1.0 / shape, torch.log(shape).mean(dim=-1))
 
 
-def _levels(power: Tensor, cosine: Tensor, width: int) -> Tensor:
+def _levels(power: Tensor, layout: Layout, width: int) -> Tensor:
     """Innovation variance for each colour and error, (colours, errors)."""
-    return (_shapes(cosine).inverse @ power) / len(power)
+    return (_shapes(layout).inverse @ power) / len(power)
 
 
-def _likelihood(power: Tensor, cosine: Tensor, width: int, levels: Tensor) -> Tensor:
+def _likelihood(power: Tensor, layout: Layout, width: int, levels: Tensor) -> Tensor:
     """Twice the negative log-likelihood for each colour and error; the taper leaves one frequency in 1.94
     independent.
     """
     level = torch.log(torch.clamp(levels, min=torch.finfo(power.dtype).tiny))
-    return 2.0 * (level + _shapes(cosine).mean_log) * len(power) * width / 1.94
+    return 2.0 * (level + _shapes(layout).mean_log) * len(power) * width / 1.94
 
 
 def _cost_of_error(count: int) -> Tensor:

@@ -26,6 +26,7 @@ LATE = 3.0  # samples by which a reading may come early or late: what its slope 
 WING = 5  # samples to either side, whose median is where the reading was
 BACK = 0.3  # of the height of a stray, to within which the reading has to come back
 ENOUGH = 100  # readings of a sensor, among which it can be told what strays
+RETURNS = 8  # jumps after one, with which it may come back: that of a spike is the next
 MOST = 0.1  # share of a sensor's readings, beyond which they do not stray but are how it reads
 PASSES = 3  # each about a fit that knows nothing of the strays found before
 CLEAR = 1.4  # times FAR: of noise with heavy tails (Laplace's 1.1, Student's with three degrees of freedom 1.26) the
@@ -164,7 +165,7 @@ def jumps_and_returns(x: Tensor, slope: Tensor, least: float, far: float = FAR) 
             continue
         steady = [k for k in range(max(last - longest, 0), last + 1) if k not in strayed]
         was = median(values[k] for k in steady[-WING:])
-        for back in jumps[n + 1 :]:
+        for back in jumps[n + 1 : n + 1 + RETURNS]:
             if back - last > longest:
                 break
             block, beyond = values[last + 1 : back + 1], values[back + 1 : back + 1 + WING]
