@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -49,7 +50,7 @@ def _astray(strays: Strays) -> str:
     when = ", ".join(at[:SHOWN_TIMES]) + (f" s and {len(at) - SHOWN_TIMES} more" if len(at) > SHOWN_TIMES else " s")
     count = f"{strays.samples} reading" + ("s" if strays.samples > 1 else "")
     return (
-        f"{count} of {strays.sensor} in {strays.source or 'the recording'} jump away and back, or stand still, as no "
+        f"{count} of {strays.sensor} in {Path(strays.source).name or 'the recording'} jump away and back, or stand still, as no "
         f"tank can; left out of all fits ({when})"
     )
 
