@@ -49,9 +49,10 @@ def _astray(strays: Strays) -> str:
     at = [f"{a:.6g}" if a == b else f"{a:.6g} to {b:.6g}" for a, b in (s.times for s in strays.each)]
     when = ", ".join(at[:SHOWN_TIMES]) + (f" s and {len(at) - SHOWN_TIMES} more" if len(at) > SHOWN_TIMES else " s")
     count = f"{strays.samples} reading" + ("s" if strays.samples > 1 else "")
+    source = Path(strays.source).name or "the recording"
     return (
-        f"{count} of {strays.sensor} in {Path(strays.source).name or 'the recording'} jump away and back, or stand still, as no "
-        f"tank can; left out of all fits ({when})"
+        f"{count} of {strays.sensor} in {source} jump away and back, or stand still, as no tank can; left out of all "
+        f"fits ({when})"
     )
 
 
