@@ -13,11 +13,12 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, place
 from fdi_torch.monitor.gain import hand_gain, kalman_gain, linearised, riccati, spectral_radius, timed_gain
 from fdi_torch.monitor.noise import learn_noise, operating_point
-from fdi_torch.monitor.observer import Observer, bound
+from fdi_torch.monitor.observer import Observer, bound, first_levels
 from fdi_torch.monitor.running import run_lanes
 from fdi_torch.monitor.samples import Samples, stack, take
 from fdi_torch.monitor.stepper import PlantState, Stepper
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlacedEffect
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.compiled import CompiledEngine
 from fdi_torch.simulate.engine import Readings
@@ -251,3 +252,16 @@ def test_a_fault_shows_in_the_residual_with_its_sign() -> None:
     believing = Observer(leaking, gain, space, torch.tensor([0.1], dtype=torch.float64)).run(samples, REST)
     assert sound.residual.abs().max() < 1e-6  # m; rest was found with sharper roots than a step of 1 s has
     assert float(believing.residual[-1, 0]) > 1e-3  # the observer that believes in a leak expects less water
+
+
+def test_first_levels_are_those_behind_what_the_plant_is_believed_to_do_to_readings() -> None:
+    """A sensor that reads 10 % and 3 cm too much shows 25 cm where 20 cm stand."""
+    plant = load_plant("three_tank")
+    believed = {"sensor_gain": {"factor": 1.1}, "sensor_bias": {"bias": 0.03}}
+    plant = replace(plant, effects=tuple(PlacedEffect(e, "h1", p) for e, p in believed.items()))
+    network = build_network(plant)
+    readings = torch.tensor([[0.25, 0.15, 0.10]], dtype=torch.float64)
+    first = Samples(torch.zeros(1, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64), readings)
+    assert first_levels(network, first, bound(network, None, None)).tolist() == pytest.approx(
+        [0.2, 0.15, 0.10], abs=1e-4
+    )

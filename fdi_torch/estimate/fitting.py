@@ -12,6 +12,7 @@ from torch import Tensor
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.objectives import Objective, Problem, Term
 from fdi_torch.parameters import Parameter, ParameterSpace, display_unit
+from fdi_torch.plant.behind import levels_behind
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
@@ -145,7 +146,7 @@ def start_levels(
     for i, tank in enumerate(plant.tanks):
         choice = by_tank.get(tank.name, "free")
         if choice == "free":
-            parameter = _free_start(plant, tank, recording)
+            parameter = _free_start(plant, network, tank, recording)
             levels.append(parameter.nominal)
             free.append(parameter)
         elif choice == "equilibrium" and tank.start_level is None:
@@ -162,23 +163,29 @@ def _first_inputs(plant: PlantDescription, recording: Recording) -> Tensor:
     return recording.inputs[0, columns]
 
 
-def _free_start(plant: PlantDescription, tank: Tank, recording: Recording) -> Parameter:
-    seen = first_level(plant, tank.name, recording)
+def _free_start(plant: PlantDescription, network: TankNetwork, tank: Tank, recording: Recording) -> Parameter:
+    seen = first_level(plant, network, tank.name, recording)
     level = min(max(0.5 * tank.height if seen is None else seen, 0.0), tank.height)
     reach = tank.height if seen is None else START_SEARCH_SHARE * tank.height
     low, high = max(0.0, level - reach), min(tank.height, level + reach)
     return Parameter(f"{tank.name}.start_level", "m", level, low, high, meaning=f"level of {tank.name} at t = 0")
 
 
-def first_level(plant: PlantDescription, tank: str, recording: Recording) -> float | None:
+def first_level(plant: PlantDescription, network: TankNetwork, tank: str, recording: Recording) -> float | None:
     """The level that the first few readings of a tank's sensor show, m; None where no sensor sees it."""
+    readings, seen = [], set()
     for sensor in plant.sensors:
-        if sensor.tank == tank and sensor.column in recording.output_names:
+        valid = recording.outputs[:0, 0]
+        if sensor.column in recording.output_names:
             column = recording.output_names.index(sensor.column)
             valid = recording.outputs[:, column][recording.mask[:, column]][:FIRST_READINGS]
-            if len(valid):
-                return (float(valid.median()) - sensor.offset) / sensor.gain
-    return None
+        seen |= {sensor.tank} if len(valid) else set()
+        readings.append(valid.median() if len(valid) else network.nominal.new_tensor(torch.nan))
+    if tank not in seen:
+        return None
+    values = network.bind(ParameterSpace(), network.nominal.new_zeros(0))
+    levels = levels_behind(network, readings, network.start_levels(values), network.nominal.new_zeros(()), values)
+    return float(levels[[t.name for t in plant.tanks].index(tank)])
 
 
 def _expect_variation(recording: Recording, plant: PlantDescription) -> None:

@@ -12,6 +12,7 @@ from fdi_torch.monitor.running import run_lanes
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.behind import levels_behind
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 
 CHECKED_POINTS = 200
@@ -164,10 +165,7 @@ def bound(network: TankNetwork, space: ParameterSpace | None, theta: Tensor | No
 
 def first_levels(network: TankNetwork, samples: Samples, values: PlaceValues) -> Tensor:
     """Levels (*batch, tanks) that the first reading of each sensor shows; the nominal start level where none does."""
-    batch = samples.batch
-    levels = [level.expand(batch) for level in network.start_levels(values)]
-    for c, (sensor, tank) in enumerate(zip(network.description.sensors, network.sensor_tanks(), strict=True)):
-        own = values[sensor.name]
-        shown = (samples.readings[..., 0, c] - own["offset"]) / own["gain"]
-        levels[tank] = torch.where(torch.isfinite(shown), shown.clamp(min=0.0), levels[tank])
-    return torch.stack(levels, dim=-1)
+    start = [level.expand(samples.batch) for level in network.start_levels(values)]
+    readings = samples.readings[..., 0, :].unbind(-1)
+    found = levels_behind(network, readings, start, samples.time[0], values)
+    return torch.stack(torch.broadcast_tensors(*found), dim=-1)
