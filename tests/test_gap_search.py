@@ -9,8 +9,10 @@ from pathlib import Path
 
 import torch
 
+from fdi_torch.cli.gap_text import next_steps
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
+from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
@@ -63,3 +65,10 @@ def test_what_stands_is_found_where_constants_hide_it_and_nothing_that_begins_in
     found = diagnose(PLANT, recording, settings=Settings(library=LIBRARY, most=2, named_only=True))
     assert ("overflow", "upper") in {(c.effect, c.location) for c in found.causes}
     assert not any("onset" in c.parameters for c in found.causes)
+
+
+def test_unknown_leads_on_to_what_has_a_name() -> None:
+    unknown = Answer("unknown", 0.0, [("bottom", 0.99)], [], [], [], {}, {})
+    assert any("--named-only" in step for step in next_steps(unknown, True, ("all",), None, "better.yaml"))
+    sound = replace(unknown, verdict="no_gap")
+    assert not any("--named-only" in step for step in next_steps(sound, True, ("all",), None, "better.yaml"))

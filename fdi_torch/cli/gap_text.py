@@ -67,6 +67,11 @@ def next_steps(
         steps.append("next: no input within the limits of pumps and levels parts the two likeliest explanations soon")
     if answer.verdict == "unknown" and library is None:
         steps.append("next: --library all searches further effects; the report draws the discrepancy's shape")
+    if answer.verdict == "unknown":
+        steps.append(
+            "next: --named-only leads past it, to the best that has a name, where several things may be wrong at once; "
+            "--adopt then has something to write, and the next diagnosis tells what is left"
+        )
     if answer.verdict in ("named", "ambiguous"):
         no_longer = "train and monitor no longer take the gap for a fault"
         written = f"with {adopted} as their plant, {no_longer}" if adopted else ""
