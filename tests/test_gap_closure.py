@@ -52,7 +52,8 @@ def test_what_recalibration_took_for_the_cause_shows_as_counted_twice(answer: An
     assert constant["recalibrated"] < 0.58 < 0.59 < constant["augmented"] < 0.61
     frozen = answer.closure["frozen"]
     assert frozen["recalibrated"] > 2.0 * answer.closure["augmented"]
-    assert frozen["nominal"] == pytest.approx(answer.closure["augmented"], rel=0.1)  # the rig has nominal constants
+    # The rig has nominal constants. The cause was fitted beside the coefficient, whose error (2 %) it has taken up.
+    assert answer.closure["augmented"] <= frozen["nominal"] < 0.2 * frozen["recalibrated"]
 
 
 def test_the_free_curve_finds_the_effect_that_is_there(answer: Answer) -> None:
