@@ -4,9 +4,11 @@ import pytest
 import torch
 
 from fdi_torch.config.plant import load_plant
+from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.floor import estimate_noise
 from fdi_torch.plant.reach import reach_of, with_levels
 from fdi_torch.recording import Recording
+from tests.test_gap import believed, recorded
 
 
 @pytest.mark.parametrize(("ar", "count"), [(0.0, 1024), (0.0, 6000), (0.7, 6000)])
@@ -34,3 +36,9 @@ def test_a_tank_without_a_sensor_reaches_as_far_as_the_model_has_it() -> None:
     found = with_levels(plain, plant, levels)
     assert found.levels["upper"] == (0.05, 0.08)
     assert found.levels["lower"] == plain.levels["lower"]
+
+
+def test_samples_far_apart_are_simulated_in_shorter_steps() -> None:
+    recording = recorded({"P13.discharge_coefficient": 0.615}, 11)
+    steps = [float(laid_out(believed(), (), [recording.every(n)], None).experiment.steps.max()) for n in (1, 5, 10, 12)]
+    assert steps == [1.0, 5.0, 5.0, 4.0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,16 +16,19 @@ from fdi_torch.gap.subject import Subject, subject_of
 from fdi_torch.gap.which import DEEPEST
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.pace import time_scale
 from fdi_torch.recording import Recording
 
 LEAST = 60
 """Readings of a sensor below which its noise cannot be told from what a model gets wrong: two of the slowest periods
 that still count as noise."""
 
+LONGEST_STEP = 5.0  # s, for tanks on a bench; ten are in error by more than the noise of a good sensor
+
 
 @dataclass(frozen=True)
 class Settings:
-    """library, leave_out: as in `library_of`. step: of the simulation, s; None for the sampling interval.
+    """library, leave_out: as in `library_of`. step: of the simulation, s; None: as in `laid_out`.
 
     most: effects that one explanation may have. named_only: the best of what has a name, however much it leaves open:
     a step on the way where many causes come together.
@@ -84,8 +88,7 @@ def _without_strays(
     found: list[Strays] = []
     columns = {s.name: s.column for s in plant.sensors}
     for recording in recordings:
-        interval = float(torch.median(torch.diff(recording.time)))
-        mask, own = recording.mask, strays_of(subject_of(plant, believed, recording, step or interval))
+        mask, own = recording.mask, strays_of(subject_of(plant, believed, recording, step or _step(plant, recording)))
         for strays in own:
             mask = without(mask, strays.each, recording.output_names.index(columns[strays.sensor]))
         kept.append(replace(recording, mask=mask) if own else recording)
@@ -111,11 +114,18 @@ def _overlap(a: Recording, b: Recording) -> bool:
 def laid_out(
     plant: PlantDescription, believed: Sequence[Placement], recordings: Sequence[Recording], step: float | None
 ) -> Subject:
-    """The recordings on the grid of their simulation. step: s; None for the sampling interval of the first."""
-    interval = float(torch.median(torch.diff(recordings[0].time)))
-    subject = subject_of(plant, believed, recordings, step or interval)
+    """The recordings on the grid of their simulation. step: s; None for the sampling interval of the first, or a whole
+    part of it that is no longer than LONGEST_STEP.
+    """
+    subject = subject_of(plant, believed, recordings, step or _step(plant, recordings[0]))
     expect_usable(subject)
     return subject
+
+
+def _step(plant: PlantDescription, recording: Recording) -> float:
+    """A whole part of the sampling interval, s."""
+    interval = float(torch.median(torch.diff(recording.time)))
+    return interval / math.ceil(interval / (LONGEST_STEP * time_scale(plant)) - 1e-9)
 
 
 def expect_usable(subject: Subject) -> None:
