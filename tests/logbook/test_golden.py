@@ -29,6 +29,11 @@ COMMANDS = [
     ("rehearsal", "787b29854bf52007", "64a16c5607bde079"),
     ("challenge", "2b4036dd6b4553c9", "d5f2cce268fb4001"),
 ]
+# What one command wrote in other ways: name, kind, hashes. A fit window by window; a replay with another seed.
+OTHER_WAYS = [
+    ("windows", "train", "ec97452a9f695053", "86e9be987de96a9b"),
+    ("what_if", "train", "eb514534738c4dc9", "dfa3e0fa705884bc"),
+]
 LAYOUT = TESTS.parent / "docs/fdi_torch.foxglove-layout.json"
 
 
@@ -56,9 +61,11 @@ def test_format_1_means_what_it_meant() -> None:
     np.testing.assert_array_equal(arrays(run)["covariance"], np.eye(2))
 
 
-@pytest.mark.parametrize(("kind", "file_hash", "content"), COMMANDS)
-def test_each_commands_log_stays_readable(kind: str, file_hash: str, content: str, tmp_path: Path) -> None:
-    path = TESTS / f"data/log_format_1_{kind}.mcap"
+@pytest.mark.parametrize(
+    ("name", "kind", "file_hash", "content"), [*((kind, kind, *hashes) for kind, *hashes in COMMANDS), *OTHER_WAYS]
+)
+def test_each_commands_log_stays_readable(name: str, kind: str, file_hash: str, content: str, tmp_path: Path) -> None:
+    path = TESTS / f"data/log_format_1_{name}.mcap"
     assert hashlib.sha256(path.read_bytes()).hexdigest().startswith(file_hash)
     run = read_run(path)
     assert content_hash(run.messages()).startswith(content)
@@ -85,6 +92,16 @@ def test_each_commands_log_means_what_it_meant() -> None:
     assert [(a["case"], a["status"], a["causes"]) for a in answers] == [
         ("case0001", "named", answers[0]["truth"]), ("case0002", "no_gap", [])
     ]  # fmt: skip
+
+
+def test_what_a_command_wrote_in_other_ways_means_what_it_meant() -> None:
+    windows, what_if = (read_run(TESTS / f"data/log_format_1_{name}.mcap") for name, *_ in OTHER_WAYS)
+    (stretch,) = orjson.loads(windows.metadata["fdi_torch.result"]["stretches"])
+    assert (stretch["name"], stretch["start"], stretch["stop"]) == ("T1.leak.size", 200.0, 400.0)
+    assert stretch["size"] == 0.29947730352483615 and own_signals(windows).outputs.shape == (401, 3)
+    parent = read_run(TESTS / "data/log_format_1_train.mcap").metadata["fdi_torch.run"]
+    assert what_if.metadata["fdi_torch.run"]["parent_run_id"] == parent["run_id"]
+    assert what_if.metadata["fdi_torch.seeds"] == {"seed": "5"}
 
 
 def test_every_kind_of_log_that_is_written_has_a_golden_one() -> None:
