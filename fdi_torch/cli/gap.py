@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--library", metavar="EFFECT,...", help="effects to search (EFFECT@PLACE for one), or all")
     parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="effects to deny the diagnosis")
-    parser.add_argument("--step", metavar="S", type=float, help="of the simulation, s (the sampling interval or a part of it)")
+    parser.add_argument("--step", metavar="S", type=float, help="of the simulation, s (as sampled, on a bench <= 5)")
     parser.add_argument("--most", metavar="N", type=int, default=DEEPEST, help=f"effects at once, at most ({DEEPEST})")
     parser.add_argument("--named-only", action="store_true", help="never unknown: the best that has a name, on the way")
     parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the causes found among its effects")
