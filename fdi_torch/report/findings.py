@@ -40,21 +40,27 @@ def findings(material: Material) -> list[Finding]:
 
 
 def _fault(message: Mapping[str, Any]) -> Finding:
-    size, std, flow, hole = (_number(message.get(name)) for name in ("size", "size_std", "flow", "hole_diameter"))
+    size, std, flow, hole = (as_number(message.get(name)) for name in ("size", "size_std", "flow", "hole_diameter"))
     name, location, unit = (str(message.get(key, "")) for key in ("fault", "location", "unit"))
     return Finding(_effect_name(name), location, message.get("present") is True, size, std, unit, flow, hole)
 
 
+def fault_at(name: str) -> tuple[str, str]:
+    """A parameter's full name, 'L.leak.size', as an effect in words and its place: 'leak', 'L'."""
+    place, _, fault = name.partition(".")
+    return (_effect_name(fault).replace("_", " "), place) if fault else (name, "")
+
+
 def _effect_name(name: str) -> str:
-    """'leak.size' -> 'leak'."""
-    return name.removesuffix(".size")
+    """'leak.size' -> 'leak', 'sensor_bias.bias' -> 'sensor_bias'."""
+    return name.partition(".")[0]
 
 
 def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> Finding:
     """A log may hold the parameters in any order: which is the size, the effect itself says."""
     name, location, parameters = str(cause["effect"]), str(cause["location"]), cause.get("parameters", {})
     size: Mapping[str, Any] = parameters.get(_size_of(name, location, plant)) or next(iter(parameters.values()), {})
-    value, std = _number(size.get("value")), _number(size.get("std"))
+    value, std = as_number(size.get("value")), as_number(size.get("std"))
     return Finding(name, location, True, value, std, str(size.get("unit", "")))
 
 
@@ -67,5 +73,6 @@ def _size_of(name: str, location: str, plant: PlantDescription | None) -> str:
     return effect(name).parameters(location, plant)[0].name if placed and plant is not None else ""
 
 
-def _number(value: Any) -> float:
+def as_number(value: Any) -> float:
+    """A number of a log, or NaN."""
     return float(value) if isinstance(value, int | float) else NAN

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from fdi_torch.report.findings import Finding, findings
+from fdi_torch.report.findings import Finding, fault_at, findings
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
+from fdi_torch.report.windows import told_windows
 
 KINDS = {
     "train": "Fault diagnosis",
@@ -24,7 +25,7 @@ def kind_words(material: Material) -> str:
 def headline(material: Material) -> str:
     """The verdict; how the run ended where it has none."""
     said = (gap_words, lambda m: fault_words(findings(m)), alarm_words, challenge_words, rehearsal_words, study_words)
-    for words in (of(material) for of in said):
+    for words in (of(material) for of in (*said, windows_words)):
         if words:
             return words
     return material.about("status").get("status", "did not end").replace("_", " ").capitalize()
@@ -83,6 +84,20 @@ def study_words(material: Material) -> str:
     if not trials and not groups:
         return ""
     return f"{trials} trials" + (f" in {groups} settings" if groups else "")
+
+
+def windows_words(material: Material) -> str:
+    """Which faults were there for a time, and when."""
+    windows, stretches = told_windows(material)
+    if not windows:
+        return ""
+    when: dict[str, list[str]] = {}
+    for stretch in stretches:
+        effect, place = fault_at(str(stretch["name"]))
+        spans = when.setdefault(f"{effect} at {place}" if place else effect, [])
+        spans.append(f"{number(float(stretch['start']), 6)} to {number(float(stretch['stop']), 6)} s")
+    said = "; ".join(f"{fault} from {_listed(spans)}" for fault, spans in when.items()) or "no fault in any window"
+    return said[:1].upper() + said[1:]
 
 
 def how_it_ended(material: Material) -> list[str]:

@@ -27,6 +27,8 @@ from fdi_torch.report.page import RunReport, page, report_of
 from fdi_torch.report.sections.before_after import sample_noise
 from fdi_torch.report.verdict import headline
 
+DATA = Path(__file__).parents[1] / "data"
+
 
 def report(write: Callable[[Path], Path], folder: Path) -> RunReport:
     return report_of(material_of(write(folder / "run.mcap"), load_plant("three_tank")))
@@ -126,6 +128,24 @@ def test_a_rehearsal_page_shows_the_tables_of_the_command(tmp_path: Path) -> Non
     assert titles(made)[:3] == ["The rig", "What the monitor did", "Configuration"]
     assert "1 of 1 (21 .. 100 %)" in text and "too short" not in text.partition("Provenance")[0]
     assert NASTY not in text
+
+
+def test_a_page_of_windows_shows_when_each_fault_was_there() -> None:
+    made = report_of(material_of(DATA / "log_format_1_windows.mcap", load_plant("three_tank")))
+    assert headline(made.material) == "Leak at T1 from 200 to 400 s"
+    assert titles(made)[:2] == ["The rig", "Window by window"] and "windows" in names(made)
+    assert all(words in page([made]) for words in ("0.29948 ± 0.00064", "26.5 cm³/s", "T3.leak.size"))
+
+
+def test_windows_that_make_no_sense_are_not_shown(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    good = {"start": 0.0, "stop": 9.0, "misfit": 1.0, "T1.leak.size": {"size": 2.0, "std": None, "state": "present"}}
+    beyond = {"name": "T1.leak.size", "start": 0.0, "stop": 9.0, "size": 2.0, "std": None, "flow": None, "unit": "1"}
+    with RunLog(path, "train") as log:
+        log.result({"windows": [good, {"start": NASTY}, 7], "stretches": [beyond, {"name": NASTY}]})
+    made = report_of(material_of(path, load_plant("three_tank")))
+    text = page([made]).partition("Provenance")[0]
+    assert "1 windows, each" not in text and "One window" in text and "&gt; 2" in text and NASTY not in text
 
 
 def test_several_runs_share_a_page(tmp_path: Path) -> None:

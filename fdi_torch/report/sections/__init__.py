@@ -16,6 +16,7 @@ from fdi_torch.report.sections.rig import rig_section
 from fdi_torch.report.sections.search import refinement_section, search_section
 from fdi_torch.report.sections.signals import fit_section, inputs_section
 from fdi_torch.report.sections.study import error_section, summary_section, trials_section
+from fdi_torch.report.sections.windows import windows_section
 
 SECTIONS: tuple[Maker, ...] = (
     rig_section,
@@ -30,6 +31,7 @@ SECTIONS: tuple[Maker, ...] = (
     next_input_section,
     limits_section,
     estimate_section,
+    windows_section,
     event_section,
     residual_section,
     scores_section,

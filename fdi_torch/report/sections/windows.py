@@ -1,0 +1,66 @@
+"""Faults window by window: when each suspect was there, how large, and where the recording cannot tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from fdi_torch.report.findings import as_number
+from fdi_torch.report.html import short, table
+from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import number, shown_unit, with_error
+from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.style import FAINT, MARK, panel
+from fdi_torch.report.windows import told_windows
+
+MOST_SUSPECTS = 40
+
+
+def windows_section(material: Material) -> Section | None:
+    """A bar for each stretch in which a suspect was there, then its size."""
+    windows, stretches = told_windows(material)
+    if not windows:
+        return None
+    count = f"{len(windows)} windows, each" if len(windows) > 1 else "One window,"
+    words = f"{count} fitted on its own; neighbours with the same fault are one stretch."
+    header = ["fault", "from, s", "to, s", "size", "flow"]
+    listed = table(header, [_row(s) for s in stretches]) if stretches else "No suspect was there in any window."
+    caption = "When each suspect was there (dark), and where its window cannot tell (pale)."
+    return Section("Window by window", [words, [Picture("windows", _bars(windows), caption, wide=True)], listed])
+
+
+def _row(stretch: dict[str, Any]) -> list[str]:
+    """Sizes in the unit in which people read them; one that is beyond its range has no error."""
+    unit, scale = shown_unit(str(stretch.get("unit", "1")))
+    size, std = (as_number(stretch.get(name)) * scale for name in ("size", "std"))
+    shown = with_error(size, std) if math.isfinite(std) else f"> {number(size)}"
+    flow, flow_scale = shown_unit("m^3/s")
+    moved = as_number(stretch.get("flow")) * flow_scale
+    return [
+        str(stretch["name"]),
+        *(number(stretch[name], 6) for name in ("start", "stop")),
+        f"{shown} {unit}".rstrip(),
+        f"{number(moved, 3)} {flow}" if math.isfinite(moved) else "",
+    ]
+
+
+def _bars(windows: Sequence[dict[str, Any]]) -> Figure:
+    suspects = [name for name, told in windows[0].items() if isinstance(told, dict)][:MOST_SUSPECTS]
+    figure, axes = panel("", "time, s", "", width=9.0, height=1.0 + 0.25 * len(suspects))
+    for row, name in enumerate(suspects):
+        for state, strength in (("present", 1.0), ("cannot tell", 0.25)):
+            spans = [
+                (float(w["start"]), float(w["stop"]) - float(w["start"]))
+                for w in windows
+                if isinstance(w.get(name), dict) and w[name].get("state") == state
+            ]
+            axes.broken_barh(spans, (row - 0.35, 0.7), facecolors=MARK, alpha=strength, edgecolor="none")
+        axes.axhline(row, color=FAINT, linewidth=0.5, zorder=0)
+    axes.set_yticks(range(len(suspects)), [short(name) for name in suspects])
+    axes.set_ylim(len(suspects) - 0.5, -0.5)
+    axes.set_xlim(float(windows[0]["start"]), max(float(w["stop"]) for w in windows))
+    axes.grid(False)
+    return figure

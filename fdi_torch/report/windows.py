@@ -1,0 +1,29 @@
+"""What a fit window by window found, as the result of a log holds it. The file is untrusted input."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import orjson
+
+from fdi_torch.report.material import Material
+
+Records = list[dict[str, Any]]
+
+
+def told_windows(material: Material) -> tuple[Records, Records]:
+    """Windows, and the stretches in which a fault was there; none where there are none, or none that can be read."""
+    windows, stretches = (_records(material, name) for name in ("windows", "stretches"))
+    return [w for w in windows if _spans(w)], [s for s in stretches if _spans(s) and isinstance(s.get("name"), str)]
+
+
+def _records(material: Material, name: str) -> Records:
+    try:
+        found = orjson.loads(material.about("result").get(name, "[]"))
+    except ValueError:
+        return []
+    return [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
+
+
+def _spans(record: dict[str, Any]) -> bool:
+    return all(isinstance(record.get(name), int | float) for name in ("start", "stop"))
