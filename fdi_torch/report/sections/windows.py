@@ -49,7 +49,7 @@ def _row(stretch: dict[str, Any]) -> list[str]:
 
 def _bars(windows: Sequence[dict[str, Any]]) -> Figure:
     suspects = [name for name, told in windows[0].items() if isinstance(told, dict)][:MOST_SUSPECTS]
-    figure, axes = panel("", "time, s", "", width=9.0, height=1.0 + 0.25 * len(suspects))
+    figure, axes = panel("", "time, s", "", width=5.6, height=1.0 + 0.28 * len(suspects))
     for row, name in enumerate(suspects):
         for state, strength in (("present", 1.0), ("cannot tell", 0.25)):
             spans = [
