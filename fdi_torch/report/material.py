@@ -49,6 +49,14 @@ class Material:
         """A metadata record of ours, such as "status"."""
         return self.run.metadata.get(f"fdi_torch.{record}", {})
 
+    def listed(self, name: str) -> list[Any]:
+        """A list of the run's result; empty where there is none, or none that can be read."""
+        try:
+            found = orjson.loads(self.about("result").get(name, "[]"))
+        except ValueError:
+            return []
+        return found if isinstance(found, list) else []
+
     @property
     def kind(self) -> str:
         return self.about("run").get("kind", "")

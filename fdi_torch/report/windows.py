@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import orjson
-
 from fdi_torch.report.material import Material
 
 Records = list[dict[str, Any]]
@@ -18,11 +16,7 @@ def told_windows(material: Material) -> tuple[Records, Records]:
 
 
 def _records(material: Material, name: str) -> Records:
-    try:
-        found = orjson.loads(material.about("result").get(name, "[]"))
-    except ValueError:
-        return []
-    return [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
+    return [each for each in material.listed(name) if isinstance(each, dict)]
 
 
 def _spans(record: dict[str, Any]) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import orjson
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
@@ -58,8 +57,4 @@ def _row(k: int, labels: list[str], counts: np.ndarray) -> list[str]:
 
 def _labels(material: Material) -> list[str]:
     """The names of the modes, as the result record holds them."""
-    try:
-        found = orjson.loads(material.about("result").get("isolation.labels", "[]"))
-    except ValueError:
-        return []
-    return [str(label) for label in found] if isinstance(found, list) else []
+    return [str(label) for label in material.listed("isolation.labels")]

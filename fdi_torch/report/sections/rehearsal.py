@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import orjson
-
 from fdi_torch.report.html import Markup, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.section import Section
@@ -26,8 +24,4 @@ def rehearsal_tables(material: Material) -> list[dict[str, Any]]:
     """The tables of the log's result; none where it has none, or none that can be read."""
     if material.kind != "rehearsal":
         return []
-    try:
-        found = orjson.loads(material.about("result").get("tables", "[]"))
-    except ValueError:
-        return []
-    return [told for told in found if isinstance(told, dict)] if isinstance(found, list) else []
+    return [told for told in material.listed("tables") if isinstance(told, dict)]
