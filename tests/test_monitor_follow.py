@@ -17,7 +17,7 @@ import yaml
 from fdi_torch.cli import INTERRUPTED, main
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
-from fdi_torch.jobs.monitor import reaching
+from fdi_torch.jobs.arrived import reaching
 from fdi_torch.logbook import RunLog, follow, read_run
 from fdi_torch.monitor.arrivals import Arrivals, Punctuality
 from fdi_torch.monitor.observer import bound

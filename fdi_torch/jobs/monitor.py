@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain, pairwise
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,10 @@ from torch import Tensor
 from fdi_torch.config.growing import Row, growing_rows
 from fdi_torch.config.monitor import MonitorRun
 from fdi_torch.config.recordings import read_recording
+from fdi_torch.jobs.arrived import reaching, recording_of, samples_of
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.monitor.arrivals import Arrivals, Punctuality
-from fdi_torch.monitor.continuity import GAP
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.following import MonitorState
 from fdi_torch.monitor.online import Monitor, Seen
@@ -108,7 +108,7 @@ def _follow(run: MonitorRun, watcher: _Watcher, listening: Listening, idle: floa
         learnt = reaching(early, run.config.fault_free[1])
         if learnt:
             break
-    watcher.begin(_prepared(run, _recording_of(learnt or early, run)))
+    watcher.begin(_prepared(run, recording_of(learnt or early, run)))
     punctual = Punctuality(time.monotonic)
     first: list[Row | str] = [*said, *early]
     for batch in chain([first], arrivals):
@@ -118,7 +118,7 @@ def _follow(run: MonitorRun, watcher: _Watcher, listening: Listening, idle: floa
         for notice in notices:
             watcher.say(notice)
         if rows:
-            if watcher.take(_samples_of(rows, run)):
+            if watcher.take(samples_of(rows, run)):
                 punctual.restarted()
             for notice in punctual.handled(rows[-1][0]):
                 watcher.say(notice)
@@ -271,55 +271,3 @@ def _prepared(run: MonitorRun, whole: Recording) -> Prepared:
         c.ranges,
         c.observer.wish(),
     )
-
-
-def _samples_of(rows: Sequence[Row], run: MonitorRun) -> Samples:
-    time, inputs, readings = (torch.tensor(column, dtype=torch.float64) for column in zip(*rows, strict=True))
-    sensors = len(run.plant.sensors)
-    return Samples(time, inputs.reshape(len(time), -1), readings.reshape(-1, sensors), run.config.recording.hold)
-
-
-def reaching(rows: Sequence[Row], until: float) -> list[Row]:
-    """The first of them without a jump back of their clock that reach a moment (s); none while they do not.
-
-    A single stamp far ahead does not reach it, a gap does once GAP samples have come after it.
-    """
-    stretch: list[Row] = []
-    steps: list[float] = []
-    beyond = 0
-    for row in rows:
-        step = row[0] - stretch[-1][0] if stretch else 0.0
-        if step == 0.0 and stretch:
-            continue
-        if step < 0.0:
-            stretch, steps, beyond = [], [], 0
-        elif stretch:
-            steps.append(step)
-        stretch.append(row)
-        if row[0] < until:
-            continue
-        beyond += 1
-        if beyond >= GAP or (beyond == 1 and steps and step <= GAP * sorted(steps)[len(steps) // 2]):
-            return stretch
-    return []
-
-
-def _recording_of(rows: Sequence[Row], run: MonitorRun) -> Recording:
-    """Rows as a recording, from the last jump of their clock on."""
-    if len(rows) < 2:
-        raise ValueError(f"{run.config.recording.file}: expected samples to follow, got {len(rows)}")
-    once = [rows[0], *(after for before, after in pairwise(rows) if after[0] != before[0])]
-    jumps = [k for k in range(1, len(once)) if once[k][0] < once[k - 1][0]]
-    samples = _samples_of(once[jumps[-1] if jumps else 0 :], run)
-    plant = run.plant
-    blank = Recording(
-        samples.time,
-        samples.inputs,
-        samples.readings,
-        tuple(plant.channels()),
-        tuple(sensor.column for sensor in plant.sensors),
-        tuple(plant.channel_units().values()),
-        tuple(sensor.unit for sensor in plant.sensors),
-        hold=samples.hold,
-    )
-    return replace(blank, source=run.config.recording.file)
