@@ -18,7 +18,7 @@ from fdi_torch.config.study import load_study
 from fdi_torch.jobs.replay import run_again
 from fdi_torch.jobs.study import run_study
 from fdi_torch.jobs.train import train
-from fdi_torch.logbook import Message, RunLog, read_run, replay
+from fdi_torch.logbook import LogError, Message, RunLog, read_run, replay
 
 QUICK = [
     "simulate.duration=200 s",
@@ -243,3 +243,10 @@ def test_a_log_of_another_command_cannot_be_replayed(tmp_path: Path, capsys: pyt
         pass
     assert cli.main(["replay", str(tmp_path / "m.mcap"), "--quiet"]) == cli.MISUSE
     assert "expected a log of fdi train, fdi study or fdi gap, got one of monitor" in capsys.readouterr().err
+
+
+def test_a_fit_window_by_window_is_not_replayed_as_another(tmp_path: Path) -> None:
+    source = Path(__file__).parent / "data" / "log_format_1_windows.mcap"
+    with pytest.raises(LogError, match="got one window by window"):
+        run_again(read_run(source), tmp_path / "again.mcap")
+    assert not list(tmp_path.iterdir())

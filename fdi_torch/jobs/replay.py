@@ -57,6 +57,11 @@ def run_again(
 def estimate_again(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
     """The estimation, from the recordings in the log."""
     run = asked_again(log, overrides)
+    if run.config.estimate.windows is not None:
+        raise LogError(
+            f"{log.path}: expected a fit of whole recordings, got one window by window, which leaves no events to "
+            "compare; do it again by fdi train"
+        )
     space, loaded = wanted_space(run), recorded(log, run)
     fitting = fitting_of(run, space, loaded)
     with RunLog(path, "train", **origin_of(run, loaded), parent_run_id=parent) as again:
