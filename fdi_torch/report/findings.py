@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,13 +11,17 @@ from fdi_torch.effects import effect
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import fits
 from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import number, shown_unit, with_error
 
 NAN = float("nan")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """effect at location. size and std in `unit` (SI); flow m^3/s, hole m where it moves water; NaN: unknown."""
+    """effect at location. quantity: which parameter `size` is, with its std in `unit` (SI).
+
+    flow m^3/s, hole m where it moves water; NaN: unknown.
+    """
 
     effect: str
     location: str
@@ -26,11 +31,24 @@ class Finding:
     unit: str = ""
     flow: float = NAN
     hole: float = NAN
+    quantity: str = "size"
 
     @property
     def words(self) -> str:
         """'leak at T1'."""
         return f"{self.effect.replace('_', ' ')} at {self.location}"
+
+    @property
+    def sized(self) -> str:
+        """'leak at T1 (33.1 cm³/s)': as a flow where it moves water, else its size."""
+        if math.isfinite(self.flow):
+            return f"{self.words} ({number(1e6 * self.flow, 3)} cm³/s)"
+        if not math.isfinite(self.size):
+            return self.words
+        unit, scale = shown_unit(self.unit)
+        value = with_error(scale * self.size, scale * self.std)
+        told = f"{self.quantity.replace('_', ' ')} {value}" if unit in ("", "1") else f"{value} {unit}"
+        return f"{self.words} ({told})"
 
 
 def findings(material: Material) -> list[Finding]:
@@ -42,7 +60,8 @@ def findings(material: Material) -> list[Finding]:
 def _fault(message: Mapping[str, Any]) -> Finding:
     size, std, flow, hole = (as_number(message.get(name)) for name in ("size", "size_std", "flow", "hole_diameter"))
     name, location, unit = (str(message.get(key, "")) for key in ("fault", "location", "unit"))
-    return Finding(_effect_name(name), location, message.get("present") is True, size, std, unit, flow, hole)
+    quantity = name.partition(".")[2] or "size"
+    return Finding(_effect_name(name), location, message.get("present") is True, size, std, unit, flow, hole, quantity)
 
 
 def fault_at(name: str) -> tuple[str, str]:
@@ -59,9 +78,11 @@ def _effect_name(name: str) -> str:
 def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> Finding:
     """A log may hold the parameters in any order: which is the size, the effect itself says."""
     name, location, parameters = str(cause["effect"]), str(cause["location"]), cause.get("parameters", {})
-    size: Mapping[str, Any] = parameters.get(_size_of(name, location, plant)) or next(iter(parameters.values()), {})
+    quantity = _size_of(name, location, plant)
+    quantity = quantity if quantity in parameters else next(iter(parameters), "size")
+    size: Mapping[str, Any] = parameters.get(quantity, {})
     value, std = as_number(size.get("value")), as_number(size.get("std"))
-    return Finding(name, location, True, value, std, str(size.get("unit", "")))
+    return Finding(name, location, True, value, std, str(size.get("unit", "")), quantity=quantity)
 
 
 def _size_of(name: str, location: str, plant: PlantDescription | None) -> str:

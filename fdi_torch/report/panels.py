@@ -6,11 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
 from fdi_torch.report.curves import thinned
 from fdi_torch.report.html import short
-from fdi_torch.report.style import INK, MARK, MODEL, OTHER, SOFT, label_lines, panel
+from fdi_torch.report.style import INK, MARK, MODEL, OTHER, SOFT, label_lines, logarithmic, panel
 
 Line = tuple[str, np.ndarray, np.ndarray, str]  # name, x, y, colour
 
@@ -24,9 +23,7 @@ def line_panel(title: str, x_label: str, y_label: str, lines: Sequence[Line], lo
         axes.plot(shown_x, shown_y, color=colour, lw=0.8 if thin else 1.4, label=short(name, 18))
     values = np.concatenate([np.asarray(y, dtype=float) for _, _, y, _ in lines] or [np.zeros(0)])
     if log and len(values) and np.nanmin(values) > 0 and np.nanmax(values) > 20 * np.nanmin(values):
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(lambda value, place: f"{value:g}")
-        axes.yaxis.set_minor_formatter(NullFormatter())
+        logarithmic(axes)
     if len(lines) > 1:
         label_lines(axes)
     return figure

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.report.style import INK, MARK, MODEL
+from fdi_torch.report.style import INK, MARK, MODEL, logarithmic
 
 _REACH = 1.96
 
@@ -21,8 +21,7 @@ def correlation_figure(snr_db: Sequence[float], rho: Sequence[Any]) -> Figure:
     figure, axes = _figure(1)
     sums = [1.0 - np.asarray(values).mean(axis=1) for values in rho]
     _boxes(axes[0], snr_db, sums)
-    axes[0].set_yscale("log")
-    axes[0].yaxis.set_major_formatter(lambda value, place: f"{value:g}")
+    logarithmic(axes[0])
     axes[0].set_xlabel("SNR [dB]")
     axes[0].set_ylabel("1 - mean correlation of the outputs [1]")
     axes[0].set_title("correlation at the estimate")

@@ -16,6 +16,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 # What was read is grey, what a model says is blue, what deviates is orange, a second model or the truth is green
 # (after Okabe & Ito 2008, darkened until text in them has a contrast of 4.5 on white).
@@ -74,6 +75,15 @@ def panel(title: str, x_label: str, y_label: str, width: float = WIDTH, height: 
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
     return figure, axes
+
+
+def logarithmic(axes: Axes) -> None:
+    """A vertical axis by decades, in plain numbers."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(lambda value, place: f"{value:g}")
+    low, high = axes.get_ylim()
+    few = high < 30.0 * low  # so few decades that the steps between have to be named too
+    axes.yaxis.set_minor_formatter((lambda value, place: f"{value:g}") if few else NullFormatter())
 
 
 def label_lines(axes: Axes, columns: int = 4) -> None:

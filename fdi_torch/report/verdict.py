@@ -5,6 +5,7 @@ from __future__ import annotations
 from fdi_torch.report.findings import Finding, fault_at, findings
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
+from fdi_torch.report.sections.study import ESTIMATORS
 from fdi_torch.report.windows import told_windows
 
 KINDS = {
@@ -34,7 +35,7 @@ def headline(material: Material) -> str:
 def fault_words(found: list[Finding]) -> str:
     if not found:
         return ""
-    present = [f.words for f in found if f.present]
+    present = [f.sized for f in found if f.present]
     if not present:
         return "No fault found"
     return f"{'Fault' if len(present) == 1 else f'{len(present)} faults'}: {_listed(present)}"
@@ -42,7 +43,7 @@ def fault_words(found: list[Finding]) -> str:
 
 def gap_words(material: Material) -> str:
     answer = material.answer
-    causes = _listed([f"{c['effect']} at {c['location']}".replace("_", " ") for c in answer.get("causes", [])])
+    causes = _listed([finding.sized for finding in findings(material)])
     places = _listed([str(place["location"]) for place in answer.get("where", [])[:1]])
     standing = len(answer.get("ambiguity_set", []))
     return {
@@ -80,10 +81,23 @@ def rehearsal_words(material: Material) -> str:
 
 
 def study_words(material: Material) -> str:
-    trials, groups = material.counts.get("/study/trial", 0), len(material.of("/study/summary"))
-    if not trials and not groups:
+    """How many trials, and how the errors of the study's own estimator compare with what no estimator can beat."""
+    trials, settings = material.counts.get("/study/trial", 0), material.of("/study/summary")
+    if not trials and not settings:
         return ""
-    return f"{trials} trials" + (f" in {groups} settings" if groups else "")
+    said = f"{trials} trial{'s' if trials != 1 else ''}"
+    said += f" in {len(settings)} setting{'s' if len(settings) != 1 else ''}" if settings else ""
+    own = next((name for name in ESTIMATORS if any(f"{name}.failures" in m for m in settings)), "")
+    ratios = [
+        float(v)
+        for m in settings
+        for k, v in m.items()
+        if own and k.startswith(f"{own}.") and k.endswith(".over_bound") and isinstance(v, int | float)
+    ]
+    if not ratios:
+        return said
+    low, high = number(min(ratios), 3), number(max(ratios), 3)
+    return f"{said}: errors {low if low == high else f'{low} to {high}'} times the Cramér-Rao bound"
 
 
 def windows_words(material: Material) -> str:

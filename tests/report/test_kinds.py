@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from fdi_torch.logbook import RunLog, read_run
 from fdi_torch.report.findings import findings
 from fdi_torch.report.material import gather
 from fdi_torch.report.page import RunReport, page, report_of
-from fdi_torch.report.sections.before_after import sample_noise
+from fdi_torch.report.sections.before_after import profile_section, sample_noise
 from fdi_torch.report.verdict import headline
 
 DATA = Path(__file__).parents[1] / "data"
@@ -45,7 +46,7 @@ def names(made: RunReport) -> set[str]:
 def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> None:
     made = report(write_gap, tmp_path)
     text = page([made])
-    assert headline(made.material) == "The gap comes from pump lag at Q1"
+    assert headline(made.material) == "The gap comes from pump lag at Q1 (8.10 ± 0.20 s)"
     assert titles(made)[:10] == [
         "The rig",
         "What causes it",
@@ -76,7 +77,7 @@ def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> No
     ("changes", "words"),
     [
         ({"verdict": "no_gap", "causes": []}, "No gap beyond noise and tolerances"),
-        ({"verdict": "ambiguous"}, "A gap that 2 explanations share; the best is pump lag at Q1"),
+        ({"verdict": "ambiguous"}, "A gap that 2 explanations share; the best is pump lag at Q1 (8.10 ± 0.20 s)"),
         ({"verdict": "unknown", "causes": []}, "A gap at Q1 that no known effect explains"),
     ],
 )
@@ -96,7 +97,7 @@ def test_noise_is_seen_through_a_moving_signal() -> None:
 
 def test_a_monitor_page_shows_residuals_thresholds_and_events(tmp_path: Path) -> None:
     made = report(write_monitor, tmp_path)
-    assert headline(made.material) == "Fault: leak at T1"
+    assert headline(made.material) == "Fault: leak at T1 (size 0.200 ± 0.010)"
     assert titles(made)[1:3] == ["Events", "Residuals"]
     assert {"observer_residual_3", "observer_statistic_1"} <= names(made)
     assert "the residual leaves its fault-free range" in page([made])
@@ -159,3 +160,24 @@ def test_a_cause_shows_its_size_in_whatever_order_its_parameters_were_logged() -
     log = read_run(Path(__file__).parents[1] / "data/log_format_1_gap.mcap")
     (found,) = findings(gather(log, load_plant("three_tank")))
     assert (found.words, round(found.size, 3), found.unit) == ("leak at T1", 0.295, "1")
+
+
+def test_a_study_says_how_its_errors_compare_with_the_bound() -> None:
+    made = report_of(material_of(DATA / "log_format_1_study.mcap", load_plant("three_tank")))
+    assert headline(made.material) == "5 trials in 1 setting: errors 1.02 times the Cramér-Rao bound"
+
+
+def test_an_axis_by_decades_has_plain_numbers() -> None:
+    made = report_of(material_of(DATA / "log_format_1_study.mcap", load_plant("three_tank")))
+    assert any(axes.get_yscale() == "log" for picture in made.pictures for axes in picture.figure.axes)
+    assert "mathdefault" not in page([made])
+
+
+def test_a_variable_that_stands_still_has_no_panel() -> None:
+    material = material_of(DATA / "log_format_1_gap.mcap", load_plant("three_tank"))
+    recording = material.recordings[0]
+    before = profile_section(material)
+    material.recordings[0] = replace(recording, inputs=recording.inputs * np.array([0.0, 1.0]))
+    after = profile_section(material)
+    assert before is not None and after is not None
+    assert [len(section.pictures) for section in (before, after)] == [8, 7]

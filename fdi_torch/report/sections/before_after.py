@@ -60,7 +60,8 @@ def profile_section(material: Material) -> Section | None:
     if not left:
         return None
     pictures = []
-    for k, (title, label, variable) in enumerate(_variables(material, recording)):
+    varied = (told for told in _variables(material, recording) if np.nanmin(told[2]) < np.nanmax(told[2]))
+    for k, (title, label, variable) in enumerate(varied):
         lines: list[Line] = [(MODELS[m][0], *_binned(variable, size), MODELS[m][1]) for m, size in left.items()]
         figure = line_panel(title, label, "residual, × noise", lines)
         figure.axes[0].axhline(1.0, color=SOFT, lw=0.8, ls=":")

@@ -12,7 +12,7 @@ from fdi_torch.report.html import folded, short, table
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import axis, number, percent, shown_unit
 from fdi_torch.report.section import Picture, Section
-from fdi_torch.report.style import MARK, MODEL, SOFT, panel
+from fdi_torch.report.style import MARK, MODEL, SOFT, logarithmic, panel
 
 TRIAL, SUMMARY = "/study/trial", "/study/summary"
 MOST_PANELS, MOST_GROUPS, MOST_ROWS = 9, 40, 30
@@ -51,8 +51,7 @@ def error_section(material: Material) -> Section | None:
             bounds.append(np.median([float(m["bound"][i]) if "bound" in m else np.nan for m in own]))
         figure = group_panel(name, "size of the error, SI", groups, errors)
         if all(np.nanmax(e, initial=0.0) > 0 for e in errors):
-            figure.axes[0].set_yscale("log")
-            figure.axes[0].yaxis.set_major_formatter(lambda value, place: f"{value:g}")
+            logarithmic(figure.axes[0])
         figure.axes[0].plot(range(len(groups)), bounds, "_", color=MARK, ms=22, mew=2.0)
         pictures.append(Picture(f"errors_{i + 1}", figure))
     words = f"Estimator: {estimator}. Each point is a trial, blue is the median, orange the Cramér-Rao bound."
