@@ -16,7 +16,7 @@ from fdi_torch.gap.finding import UNEXPLAINED, Finding, Weighed, in_order, whole
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter, left_open
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_rounding
 from fdi_torch.gap.freeform import fitted_free_form
-from fdi_torch.gap.library import canonical, possible_places
+from fdi_torch.gap.library import canonical, possible_places, stacked
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.strays import most_astray
 from fdi_torch.gap.subject import Subject
@@ -89,7 +89,7 @@ def _places(fitter: Fitter, found: Search, named: Fit, plant: PlantDescription) 
     """Every place with what it leaves open, the likeliest first; looked at closely where the library leaves much."""
     gap, left = whole_gap(fitter, found), left_open(fitter, named)
     much = left > UNEXPLAINED * gap > 0.0
-    closely = left > max(LEFT_SHARE * gap, LEFT_LEAST) or _scattered(named)
+    closely = left > max(LEFT_SHARE * gap, LEFT_LEAST) or _scattered(named) or bool(stacked(named.key))
     return suspects(fitter, found.null, possible_places(plant), waves=much, closely=closely)
 
 
@@ -97,9 +97,12 @@ def _unnamed(fitter: Fitter, named: Fit, found: Search, place: Suspect) -> bool:
     """Whether one place alone does what no effect of the library does.
 
     Equations that differ a little leave a little open; where one place alone does far better than all that has a name,
-    or nothing named does, it has no name. So too where it does what otherwise takes effects at several other places.
+    or nothing named does, it has no name. So too where it does what otherwise takes effects at several other places,
+    and where two forms of one law are needed at one place: the law there is a third one.
     """
     gap, left, free = whole_gap(fitter, found), left_open(fitter, named), place.leaves
+    if stacked(named.key):
+        return True
     if left < LEFT_LEAST and not _scattered(named):
         return False
     nothing_named = left > UNEXPLAINED * gap
@@ -152,16 +155,20 @@ def _weighed(fitter: Fitter, found: Search, choices: int, plant: PlantDescriptio
 
 def _doubted(weights: list[float], fits: Sequence[Fit], gap: float) -> list[float]:
     """The likeliest explanation gives some of its weight to one with an effect less, where that stands beside another
-    at the same place and closes no more than a law that is a little off leaves: it may only take up its misfit.
+    at the same place and closes no more than a law that is a little off leaves: it may only take up its misfit. Nearly
+    all of it where both are forms of one law.
     """
     top = max(range(len(fits)), key=lambda i: weights[i])
-    crowded = [c for c in fits[top].key if sum(place == c[1] for _, place in fits[top].key) > 1]
-    plainer = {fits[top].key - {c} for c in crowded}
-    rivals = [i for i, f in enumerate(fits) if f.key in plainer and f.cost - fits[top].cost < SAME_PLACE_SHARE * gap]
+    alike = stacked(fits[top].key)
+    crowded = alike or {c for c in fits[top].key if sum(place == c[1] for _, place in fits[top].key) > 1}
+    plainer, little = {fits[top].key - {c} for c in crowded}, SAME_PLACE_SHARE * gap
+    little = max(little, LEFT_LEAST) if alike else little
+    rivals = [i for i, f in enumerate(fits) if f.key in plainer and f.cost - fits[top].cost < little]
     if not rivals:
         return weights
     rival = min(rivals, key=lambda i: fits[i].cost)
-    given = max(DOUBT - weights[rival], 0.0) * weights[top]
+    doubt = 1.0 - DOUBT if alike else DOUBT
+    given = max(doubt - weights[rival], 0.0) * weights[top]
     return [w + given * ((i == rival) - (i == top)) for i, w in enumerate(weights)]
 
 
