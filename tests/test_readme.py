@@ -45,7 +45,7 @@ def test_own_recording_gives_what_is_shown(
     assert main(["report", "logs/own.mcap", "--quiet"]) == DONE
     assert main(["gap", "--plant", "three_tank", "--recording", "rig.csv", "--quiet"]) == DONE
     shown = capsys.readouterr().out
-    assert "logs/own.mcap: 2 faults: leak at T1 and plugging at P32" in shown and "page: logs/own.html" in shown
+    assert "logs/own.mcap: 2 faults: leak at T1 (size 0.0997" in shown and "page: logs/own.html" in shown
     assert "The gap comes from leak at T1 and plugging at P32 (over 99.9 % of all" in shown
     for line in ("1201 samples, 1200 s: rig.csv", "nothing odd was found", "12.2 cm^3/s", "29.4 cm^3/s"):
         assert line in shown and line in README

@@ -40,15 +40,13 @@ class Finding:
 
     @property
     def sized(self) -> str:
-        """'leak at T1 (33.1 cm³/s)': as a flow where it moves water, else its size."""
-        if math.isfinite(self.flow):
-            return f"{self.words} ({number(1e6 * self.flow, 3)} cm³/s)"
-        if not math.isfinite(self.size):
-            return self.words
+        """'leak at T1 (size 0.3000 ± 0.0020, 33.1 cm³/s)': its size, and the flow of it where it moves water."""
         unit, scale = shown_unit(self.unit)
         value = with_error(scale * self.size, scale * self.std)
         told = f"{self.quantity.replace('_', ' ')} {value}" if unit in ("", "1") else f"{value} {unit}"
-        return f"{self.words} ({told})"
+        sizes = [told] if math.isfinite(self.size) else []
+        sizes += [f"{number(1e6 * self.flow, 3)} cm³/s"] if math.isfinite(self.flow) else []
+        return f"{self.words} ({', '.join(sizes)})" if sizes else self.words
 
 
 def findings(material: Material) -> list[Finding]:

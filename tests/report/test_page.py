@@ -40,7 +40,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_verdict_comes_first_in_words(log: Path) -> None:
     text = page([report_of(material_of(log, load_plant("three_tank")))])
-    assert headline(material_of(log)) == "Fault: leak at T1 (30 cm³/s)"
+    assert headline(material_of(log)) == "Fault: leak at T1 (size 0.3004 ± 0.0020, 30 cm³/s)"
     assert text.index("Fault: leak at T1") < text.index("<svg")
     assert "0.3004 ± 0.0020" in text and "leak at T1 moves 30 cm³/s, as a sharp-edged hole of 4.8 mm would" in text
 
