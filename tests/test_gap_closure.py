@@ -158,7 +158,7 @@ def test_a_parameter_at_the_end_of_its_range_is_said(monkeypatch: pytest.MonkeyP
     from fdi_torch.effects.laminar_flow import LaminarFlow
 
     def narrow(self: LaminarFlow, place: str, plant: object) -> tuple[Parameter, ...]:
-        return (Parameter("transition_head", "m", 0.0, 0.0, 0.02), Parameter("sharpness", "1", 2.0, 2.0, 6.0))
+        return (Parameter("transition_head", "m", 0.0, 0.0, 0.02), Parameter("softness", "1", 0.5, 0.17, 0.5))
 
     monkeypatch.setattr(LaminarFlow, "parameters", narrow)
     answer = diagnose(

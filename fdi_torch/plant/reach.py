@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.constants import reading_at
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import Pipe, PlantDescription
 from fdi_torch.recording import Recording
 
 Range = tuple[float, float]
@@ -79,6 +79,17 @@ def bounded(space: ParameterSpace, last: float) -> ParameterSpace:
     for name in endless:
         space = space.with_changes(name, high=max(last, space[name].nominal))
     return space
+
+
+def heads(plant: PlantDescription, pipe: str, reach: Reach) -> Range:
+    """The least and the greatest head that may have driven a pipe or an outlet, without sign, m."""
+    found = plant.component(pipe)
+    assert isinstance(found, Pipe)
+    low, high = (max(level - found.elevation, 0.0) for level in reach.levels[found.source])
+    if found.is_outlet:
+        return low, high
+    far_low, far_high = (max(level - found.elevation, 0.0) for level in reach.levels[found.target])
+    return max(low - far_high, far_low - high, 0.0), max(high - far_low, far_high - low)
 
 
 def inside(reached: Range, count: int) -> list[float]:
