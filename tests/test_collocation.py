@@ -13,6 +13,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.integrate import ReferenceEngine
+from fdi_torch.simulate.midpoint import newton_step
 from fdi_torch.simulate.scan import linear_scan
 from tests.rigs import constant_inputs, three_tank
 
@@ -25,6 +26,29 @@ def stepped(duration: float = 200.0) -> Recording:
         inputs[40 * k : 40 * (k + 1), 0] = level
         inputs[40 * k + 20 : 40 * (k + 1) + 20, 1] = 90e-6 - level
     return replace(blank, inputs=inputs)
+
+
+@pytest.fixture(autouse=True, params=["compiled", "torch"])
+def loops(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both ways through a recurrence: compiled where there is a compiler, and torch's."""
+    if request.param == "torch":
+        monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda: None)
+
+
+@pytest.mark.parametrize("tanks", [1, 3, 7])
+def test_both_ways_through_a_newton_step_are_one(tanks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(1)
+    draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+    lanes, steps, columns = 3, 21, 4
+    by_level = -draw(lanes, tanks, tanks, steps).abs() / tanks
+    by_theta, slopes = draw(lanes, tanks, columns, steps), draw(lanes, tanks, columns)
+    path, rates, start = draw(lanes, tanks, steps + 1), draw(lanes, tanks, steps), draw(lanes, tanks)
+    path[1, 0, 5] = torch.nan
+    given = (draw(steps).abs(), path, rates, by_level, by_theta, start, slopes)
+    found = newton_step(*given)
+    monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda: None)
+    for ours, torchs in zip(found, newton_step(*given), strict=True):
+        torch.testing.assert_close(ours, torchs, rtol=1e-10, atol=1e-10, equal_nan=True)
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 50])

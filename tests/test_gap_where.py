@@ -32,7 +32,10 @@ def test_forms_with_memory_are_what_their_equations_say() -> None:
     assert faded(torch.diff(x, prepend=x[:1]), step, 4.0) == pytest.approx(
         torch.stack([0 * decay, decay**0, decay, decay**2])
     )
-    assert stuck(torch.tensor([0.0, 0.5, 2.0, 1.5, 0.0]), 1.0).tolist() == [0.0, 0.0, 1.0, 1.0, 1.0]
+    assert stuck(torch.tensor([0.0, 0.5, 2.0, 1.5, 0.0]), torch.tensor([[1.0], [0.25]])).tolist() == [
+        [0.0, 0.0, 1.0, 1.0, 1.0],
+        [0.0, 0.25, 1.75, 1.75, 0.25],
+    ]
     assert slewed(torch.tensor([0.0, 5.0, 5.0, 1.0]), step, 1.0).tolist() == [0.0, 2.0, 4.0, 2.0]
 
 

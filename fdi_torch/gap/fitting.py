@@ -24,6 +24,8 @@ SETTLED = 0.05  # chi-square units; smaller gains decide nothing
 PATIENCE, ENOUGH = 1, 4.0  # a start is given up that gains less than a quarter of its arrears after two rounds
 CORRECTIONS = 6  # of a trajectory that a step of the parameters moved
 FAR = 1e-3  # in units of the plant's length scale: a defect from which a correction is worth its cost
+LONG, NEARLY = 4.0, 10.0  # in the same: a shift that needs a correction, and a defect that one more makes good
+LOST, STALLED = 100.0, 0.9  # a trajectory so many times too far off that a correction brings no nearer has no end
 Key = frozenset[tuple[str, str]]
 
 
@@ -168,8 +170,8 @@ class Fitter:
             step = _bounded_step(gradient[lanes], curvature[lanes], damping[lanes], theta[lanes], low, high, scale)
             moved = torch.minimum(torch.maximum(theta[lanes] + step, low), high)
             moves = (moved - theta[lanes]).unsqueeze(1).unsqueeze(1)
-            guess = near.levels[lanes] + (near.slopes[lanes] * moves).sum(-1)
-            tried = _settled(engine, moved, engine.linearise(moved, guess), self.far)
+            shift = (near.slopes[lanes] * moves).sum(-1)
+            tried = _followed(engine, moved, near.levels[lanes] + shift, shift, self.far)
             new_cost, new_gradient, new_curvature = self.normal(engine.space, moved, tried, scale)
             better = new_cost < cost[lanes]
             gain = torch.where(better, cost[lanes] - new_cost, torch.zeros_like(new_cost))
@@ -228,14 +230,42 @@ def left_open(fitter: Fitter, fit: Fit) -> float:
     return max(slow_excess(fitter.white(fit.near)[0][0]), 0.0)
 
 
-def _settled(engine: Collocation | Joint, theta: Tensor, near: Linearised, far: float) -> Linearised:
-    """The lanes whose trajectories were still far from the model's corrected until they are not, or no more."""
-    for _ in range(CORRECTIONS):
-        lanes = (near.defect > far).nonzero().flatten()
+def _followed(engine: Collocation | Joint, theta: Tensor, guess: Tensor, shift: Tensor, far: float) -> Linearised:
+    """The neighbourhood of trajectories that are guessed to be `shift` from known ones; slopes are worked out once a
+    guess is good.
+    """
+    levels, lost = guess, torch.zeros(len(theta), dtype=torch.bool)
+    lanes = (shift.abs().amax(dim=(-1, -2)) > LONG * far).nonzero().flatten()
+    defect = torch.full((len(theta),), torch.inf, dtype=guess.dtype)
+    for _ in range(CORRECTIONS - 1):
         if not len(lanes):
             break
+        before = defect[lanes]
+        path, moved = engine.corrected(theta[lanes], levels[lanes])
+        levels, defect = levels.index_copy(0, lanes, path), defect.index_copy(0, lanes, moved)
+        lost[lanes] = _no_nearer(moved, before, far)
+        lanes = lanes[(moved > NEARLY * far) & ~lost[lanes]]
+    return _settled(engine, theta, engine.linearise(theta, levels), far, lost)
+
+
+def _settled(
+    engine: Collocation | Joint, theta: Tensor, near: Linearised, far: float, lost: Tensor | None = None
+) -> Linearised:
+    """The lanes whose trajectories were still far from the model's corrected until they are not, or no more."""
+    lost = torch.zeros_like(near.defect, dtype=torch.bool) if lost is None else lost
+    for _ in range(CORRECTIONS):
+        lanes = (~lost & (near.defect > far)).nonzero().flatten()
+        if not len(lanes):
+            break
+        before = near.defect
         near = _replaced(near, lanes, engine.linearise(theta[lanes], near.levels[lanes]))
+        lost = lost | _no_nearer(near.defect, before, far)
     return near
+
+
+def _no_nearer(defect: Tensor, before: Tensor, far: float) -> Tensor:
+    """Which lanes (L,) a correction has not brought nearer to a trajectory that they are lost from."""
+    return ~((defect < LOST * far) | (defect < STALLED * before))
 
 
 def _bounded_step(
@@ -256,6 +286,8 @@ def _bounded_step(
 
 
 def _replaced(near: Linearised, lanes: Tensor, new: Linearised) -> Linearised:
+    if len(lanes) == len(near.defect):
+        return new
     fields = {name: getattr(near, name).index_copy(0, lanes, getattr(new, name)) for name in near.__dataclass_fields__}
     return replace(near, **fields)
 

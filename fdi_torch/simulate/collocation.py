@@ -4,25 +4,27 @@
 
 Every step's right-hand side is evaluated in one call, its slopes in one backward pass a tank; Newton's correction of
 the trajectory and its sensitivities to theta then obey one linear recurrence. A Gauss-Newton fit can therefore
-correct parameters and trajectory together (Bock, 1987), at the price of one evaluation an iteration and without
-compiled code. Error of the rule: dt^2 h'''/24 a second; with 1 s steps on the three tanks below 1e-3 cm.
+correct parameters and trajectory together (Bock, 1987), at the price of one evaluation an iteration, and nothing is
+compiled for a plant. Error of the rule: dt^2 h'''/24 a second; with 1 s steps on the three tanks below 1e-3 cm.
 
 Inside, time is the last dimension in memory; what is handed out has the shapes that are written beside it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.simulate.actuation import Actuation, moved
 from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.midpoint import newton_step
 from fdi_torch.simulate.pointwise import partials
-from fdi_torch.simulate.scan import product, scan_in_time
+from fdi_torch.simulate.scan import scan_in_time
 from fdi_torch.simulate.seen import Look, Sight
 
 
@@ -62,24 +64,20 @@ class Collocation:
         self._names = [space.names[j] for j in self._moving]
         self._actuation = Actuation(network, experiment, self._names)
         self._sight = Sight(network, experiment, self._names)
+        self._still_commands: list[Tensor] | None = None
 
     def linearise(self, theta: Tensor, levels: Tensor) -> Linearised:
         """theta (L, P), levels (L, K+1, tanks) a guess of the trajectory -> one Newton step further, with slopes."""
         path = levels.movedim(1, 2).contiguous()
         middle = 0.5 * (path[..., :-1] + path[..., 1:])
-        rates, by_level, by_theta = self._rate_slopes(middle, theta)
-        step = self.experiment.steps
-        one = torch.eye(middle.shape[1], dtype=theta.dtype, device=theta.device).unsqueeze(-1)
-        inverse = _inverse(one - 0.5 * step * by_level)
-        transition, gain = 2.0 * inverse - one, inverse * step
-        misfit = (step * rates - (path[..., 1:] - path[..., :-1])).unsqueeze(2)
-        forcing = torch.cat([product(inverse, misfit), product(gain, by_theta)], dim=2)
-        start, start_slopes = self._start(theta)
-        first = torch.cat([(start - path[..., 0]).unsqueeze(-1), start_slopes], dim=-1)
-        found = scan_in_time(transition, forcing, first)
-        corrected, slopes = path + found[:, :, 0], found[:, :, 1:]
         values = self.network.bind(self.space, theta.unsqueeze(-2))
-        look = self._sight.look(corrected, values, [theta[:, j, None] for j in self._moving])
+        rates, by_level, by_theta = self._rate_slopes(middle, values, self._columns(theta), len(self.space))
+        step = self.experiment.steps
+        start, start_slopes = self._start(theta, values)
+        corrected, slopes, transition, gain, defect = newton_step(
+            step, path, rates, by_level, by_theta, start, start_slopes
+        )
+        look = self._sight.look(corrected, values, self._columns(theta))
         return Linearised(
             corrected.movedim(2, 1),
             slopes.permute(0, 3, 1, 2),
@@ -87,8 +85,18 @@ class Collocation:
             self._jacobian(look, slopes).permute(0, 3, 1, 2),
             transition.permute(0, 3, 1, 2),
             gain.permute(0, 3, 1, 2),
-            found[:, :, 0].abs().amax(dim=(-1, -2)),
+            defect,
         )
+
+    def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
+        """The levels of `linearise` and their defect, without slopes: for much less."""
+        path = levels.movedim(1, 2).contiguous()
+        values = self.network.bind(self.space, theta.unsqueeze(-2))
+        rates, by_level, by_theta = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), values, [], 0)
+        start = self._start(theta, values)[0]
+        none = start.new_empty(*start.shape, 0)
+        found, _, _, _, defect = newton_step(self.experiment.steps, path, rates, by_level, by_theta, start, none)
+        return found.movedim(2, 1), defect
 
     def settle(self, theta: Tensor, levels: Tensor, rounds: int = 12, tolerance: float = 1e-7) -> Linearised:
         """Newton steps at fixed theta until no level moves by more than `tolerance` (m)."""
@@ -104,7 +112,8 @@ class Collocation:
         levels = levels.clone()
         for _ in range(rounds):
             path = levels.movedim(1, 2)
-            rates, by_level, _ = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), theta)
+            values = self.network.bind(self.space, theta.unsqueeze(-2))
+            rates, by_level, _ = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), values, [], 0)
             own, step = path[:, tank], self.experiment.steps
             inverse = 1.0 / (1.0 - 0.5 * step * by_level[:, tank, tank])
             misfit = step * rates[:, tank] - torch.diff(own)
@@ -133,16 +142,19 @@ class Collocation:
     def look(self, levels: Tensor, theta: Tensor) -> Look:
         """The sensors about given levels (L, K+1, tanks), from which follows how readings change with the levels."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
-        return self._sight.look(levels.movedim(1, 2), values, [theta[:, j, None] for j in self._moving])
+        return self._sight.look(levels.movedim(1, 2), values, self._columns(theta))
 
     def constant_guess(self, theta: Tensor) -> Tensor:
         """Levels that stay where they start (L, K+1, tanks)."""
-        start, _ = self._start(theta)
+        start, _ = self._start(theta, self.network.bind(self.space, theta.unsqueeze(-2)))
         return start.unsqueeze(1).expand(-1, len(self.experiment.nodes), -1).clone()
 
-    def _start(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        values = self.network.bind(self.space, theta)
-        start = torch.stack([h.expand(theta.shape[:-1]) for h in self.network.start_levels(values)], dim=-1)
+    def _columns(self, theta: Tensor) -> list[Tensor]:
+        """What of theta may move rates and readings, each (L, 1)."""
+        return [theta[:, j, None] for j in self._moving]
+
+    def _start(self, theta: Tensor, values: PlaceValues) -> tuple[Tensor, Tensor]:
+        start = torch.cat([h.expand(len(theta), 1) for h in self.network.start_levels(values)], dim=1)
         slopes = theta.new_zeros(*start.shape, theta.shape[-1])
         for column, tank in self._start_columns.items():
             slopes[:, tank, column] = 1.0
@@ -155,14 +167,18 @@ class Collocation:
             moves[column] = q
         return look.along(slopes, moves)
 
-    def _rate_slopes(self, middle: Tensor, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """middle (L, n, K) -> rates (L, n, K), their slopes by level (L, n, n, K) and by theta (L, n, P, K)."""
+    def _rate_slopes(
+        self, middle: Tensor, values: PlaceValues, moving: Sequence[Tensor], width: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """middle (L, n, K) -> rates (L, n, K), their slopes by level (L, n, n, K) and by theta (L, n, P, K).
+
+        moving: what of theta may move the rates, each (L, 1), or nothing; width: P.
+        """
         lanes, n, steps = middle.shape
-        shape, values = (lanes, steps), self.network.bind(self.space, theta.unsqueeze(-2))
-        moving = [theta[:, j, None] for j in self._moving]
+        shape = (lanes, steps)
         full = bool((middle >= middle.new_tensor(self._rims).unsqueeze(-1)).any())
         network = self.network if full else self._below_rims
-        commands, command_slopes, columns = self._actuation.slopes(values, moving, lanes)
+        commands, command_slopes, columns = self._commands(values, moving, lanes)
         driven = [i for i, slopes in enumerate(command_slopes) if slopes is not None]
 
         def rates(x: list[Tensor]) -> list[Tensor]:
@@ -174,7 +190,7 @@ class Collocation:
 
         inputs = [*middle.unbind(1), *(commands[i] for i in driven), *moving]
         found, rows = partials(rates, inputs, shape)
-        by_level, by_theta = middle.new_zeros(lanes, n, n, steps), middle.new_zeros(lanes, n, theta.shape[-1], steps)
+        by_level, by_theta = (middle.new_zeros(lanes, n, m, steps) for m in (n, width))
         for i, row in enumerate(rows):
             for j in range(n):
                 if (slope := row[j]) is not None:
@@ -189,15 +205,16 @@ class Collocation:
                         by_theta[:, i, self._moving[column]] += slope * course[:, q]
         return torch.stack(found, dim=1), by_level, by_theta
 
-
-def _inverse(a: Tensor) -> Tensor:
-    """Of (L, n, n, K) at every step, by elimination. No pivots: 1 - dt/2 df/dh has its weight on the diagonal."""
-    n = a.shape[1]
-    one = torch.eye(n, dtype=a.dtype, device=a.device).unsqueeze(-1).expand(a.shape)
-    rows = list(torch.cat([a, one], dim=2).unbind(1))
-    for i in range(n):
-        rows[i] = rows[i] / rows[i][:, i, None]
-        for k in range(n):
-            if k != i:
-                rows[k] = rows[k] - rows[k][:, i, None] * rows[i]
-    return torch.stack([row[:, n:] for row in rows], dim=1)
+    def _commands(
+        self, values: PlaceValues, moving: Sequence[Tensor], lanes: int
+    ) -> tuple[list[Tensor], list[Tensor | None], list[int]]:
+        """As `Actuation.slopes`; where no parameter moves any command, they are worked out once."""
+        if self._still_commands is None:
+            if not moving and self._names:
+                commands = self._actuation.commands(values, lanes)
+                return commands, [None] * len(commands), []
+            found = self._actuation.slopes(values, moving, lanes)
+            if found[2]:
+                return found
+            self._still_commands = [command[:1] for command in found[0]]
+        return [c.expand(lanes, -1) for c in self._still_commands], [None] * len(self._still_commands), []

@@ -44,6 +44,12 @@ class Joint:
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
         return self._joined([part.linearise(own, piece) for part, own, piece in pieces])
 
+    def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
+        """The levels of `linearise` and their defect, without slopes."""
+        pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
+        found = [part.corrected(own, piece) for part, own, piece in pieces]
+        return torch.cat([f[0] for f in found], dim=1), torch.stack([f[1] for f in found]).amax(dim=0)
+
     def settle(self, theta: Tensor, levels: Tensor, rounds: int = 12, tolerance: float = 1e-7) -> Linearised:
         """Newton steps at fixed theta until no level moves by more than `tolerance` (m)."""
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)

@@ -1,9 +1,11 @@
-"""A linear recurrence in time, solved in blocks of blocks: a few dozen vector operations instead of K."""
+"""A linear recurrence in time: a compiled loop, or else blocks of blocks, a few dozen vector operations for all K."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+from fdi_torch.simulate.recurrence import scanned
 
 LENGTH = 8  # steps taken one after the other in each block, and in blocks of blocks
 
@@ -25,6 +27,8 @@ def scan_in_time(a: Tensor, b: Tensor, first: Tensor) -> Tensor:
     """
     m, count = b.shape[2], b.shape[-1]
     a = a.expand(b.shape[0], *a.shape[1:])
+    if (compiled := scanned(a, b, first)) is not None:
+        return compiled
     if count <= LENGTH:
         return torch.stack(_one_by_one(a, b, first), dim=-1)
     blocks = -(-count // LENGTH)

@@ -46,7 +46,8 @@ def memories(x: Tensor, step: Tensor, pace: float) -> list[Tensor]:
 
 def sticks(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
     """How x differs from what follows it only within a band."""
-    return [stuck(x, share * (ends[1] - ends[0])) - x for share in BANDS]
+    band = x.new_tensor(BANDS).unsqueeze(1) * (ends[1] - ends[0])
+    return list((stuck(x, band) - x).unbind())
 
 
 def slews(x: Tensor, step: Tensor, ends: tuple[float, float], pace: float) -> list[Tensor]:
@@ -79,13 +80,22 @@ def faded(x: Tensor, step: Tensor, tau: float) -> Tensor:
     return _scanned(torch.exp(-step / tau), x, torch.zeros_like(x[0]))
 
 
-def stuck(x: Tensor, band: float) -> Tensor:
-    """The play operator: it stays until x is further than the band, and then follows the band behind."""
-    held, found = float(x[0]), []
-    for value in x.tolist():
-        held = min(max(held, value - band), value + band)
-        found.append(held)
-    return x.new_tensor(found)
+def stuck(x: Tensor, band: Tensor) -> Tensor:
+    """The play operator: it stays until x (K,) is further than the band (B, 1), and then follows the band behind.
+
+    Each step limits what is held to x's surroundings, and limits one after the other make a limit: of so many steps
+    before each, twice as many in every round. Returns (B, K).
+    """
+    low, high = x - band, x + band
+    reach = 1
+    while reach < x.shape[-1]:
+        now_low, now_high = low[:, reach:], high[:, reach:]
+        low, high = (
+            torch.cat([y[:, :reach], torch.minimum(torch.maximum(y[:, :-reach], now_low), now_high)], dim=1)
+            for y in (low, high)
+        )
+        reach *= 2
+    return torch.minimum(torch.maximum(x[0], low), high)
 
 
 def slewed(x: Tensor, step: Tensor, rate: float) -> Tensor:

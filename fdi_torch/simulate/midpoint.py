@@ -1,0 +1,49 @@
+"""Newton's correction of a whole trajectory under the implicit midpoint rule, and its slopes by parameters.
+
+With M = 1 - dt/2 df/dh at each step, a correction x of the levels and the slopes s by theta both obey
+
+    M x_{k+1} = (2 - M) x_k + forcing_k,   forcing: dt f - (h_{k+1} - h_k) for x, dt df/dtheta for s.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fdi_torch.simulate.recurrence import midpoint_step
+from fdi_torch.simulate.scan import product, scan_in_time
+
+
+def newton_step(
+    span: Tensor, path: Tensor, rates: Tensor, by_level: Tensor, by_theta: Tensor, start: Tensor, start_slopes: Tensor
+) -> tuple[Tensor, ...]:
+    """span (K,) s; path (L, n, K+1); rates (L, n, K) at its mid-steps with their slopes (L, n, n, K) and (L, n, P, K);
+    start (L, n) and start_slopes (L, n, P): where the trajectory begins.
+
+    Returns the corrected levels (L, n, K+1), slopes (L, n, P, K+1), the transition and the gain (L, n, n, K) of a
+    disturbance, and the largest correction (L,).
+    """
+    compiled = midpoint_step(span, path, rates, by_level, by_theta, start, start_slopes)
+    if compiled is not None:
+        return compiled
+    one = torch.eye(path.shape[1], dtype=path.dtype, device=path.device).unsqueeze(-1)
+    inverse = _inverse(one - 0.5 * span * by_level)
+    transition, gain = 2.0 * inverse - one, inverse * span
+    misfit = (span * rates - (path[..., 1:] - path[..., :-1])).unsqueeze(2)
+    forcing = torch.cat([product(inverse, misfit), product(gain, by_theta)], dim=2)
+    first = torch.cat([(start - path[..., 0]).unsqueeze(-1), start_slopes], dim=-1)
+    found = scan_in_time(transition, forcing, first)
+    return path + found[:, :, 0], found[:, :, 1:], transition, gain, found[:, :, 0].abs().amax(dim=(-1, -2))
+
+
+def _inverse(a: Tensor) -> Tensor:
+    """Of (L, n, n, K) at every step, by elimination. No pivots: 1 - dt/2 df/dh has its weight on the diagonal."""
+    n = a.shape[1]
+    one = torch.eye(n, dtype=a.dtype, device=a.device).unsqueeze(-1).expand(a.shape)
+    rows = list(torch.cat([a, one], dim=2).unbind(1))
+    for i in range(n):
+        rows[i] = rows[i] / rows[i][:, i, None]
+        for k in range(n):
+            if k != i:
+                rows[k] = rows[k] - rows[k][:, i, None] * rows[i]
+    return torch.stack([row[:, n:] for row in rows], dim=1)
