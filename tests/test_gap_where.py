@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.case import case_of
+from fdi_torch.gap.diagnose import Settings, _recalibrated, diagnose
 from fdi_torch.gap.where.followed import between, smoothed
-from fdi_torch.gap.where.forms import bends, faded, lagged, slewed, stuck
+from fdi_torch.gap.where.forms import bends, faded, jerked, lagged, relays, slewed, stuck, switched
 from fdi_torch.gap.where.sparse import sparse
+from fdi_torch.gap.where.suspects import parted, suspects
 from tests.test_gap import believed, recorded
 
 
@@ -39,6 +41,13 @@ def test_forms_with_memory_are_what_their_equations_say() -> None:
     assert slewed(torch.tensor([0.0, 5.0, 5.0, 1.0]), step, 1.0).tolist() == [0.0, 2.0, 4.0, 2.0]
 
 
+def test_what_switches_stays_between_its_thresholds_as_it_was() -> None:
+    x = torch.tensor([0.0, 0.5, 0.9, 0.5, 0.1, 0.5])
+    assert switched(x, 0.2, 0.8).tolist() == [0.0, 0.0, 1.0, 1.0, 0.0, 0.0]
+    assert jerked(x, 0.45).tolist() == pytest.approx([0.0, 0.5, 0.5, 0.5, 0.5, 0.5])
+    assert [low for low, _ in relays(x, (0.0, 1.0), 3)] == pytest.approx([1 / 6, 1 / 6, 0.5])
+
+
 def test_bends_span_every_piecewise_linear_function_of_their_values() -> None:
     x = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
     basis = torch.stack(bends(x, (0.0, 1.0), 5), dim=1)
@@ -58,6 +67,18 @@ def test_the_forms_that_made_a_signal_have_more_evidence_than_as_many_others() -
     least_squares = torch.linalg.lstsq(true[:, [4, 11]], signal.unsqueeze(1)).solution
     closed = float(signal @ signal - ((signal - (true[:, [4, 11]] @ least_squares).squeeze(1)) ** 2).sum())
     assert float(found.closes[0]) == pytest.approx(closed, rel=5e-3)
+    assert 1.9 < float(found.needs[0]) < 10.0 < float(found.needs[1]), "two did it, and others need many to come near"
+
+
+def test_a_sluggish_pump_is_told_from_its_tank_by_a_closer_look() -> None:
+    """Both make one balance; coarse steps in time, at the tank, do nearly as well as the pump's own forms."""
+    case = case_of(believed(), (recorded({"Q2.actuator_slew.slowness": 3e6}, 4),), (), Settings())
+    fitter, null, _ = _recalibrated(case.subject)
+    first = suspects(fitter, null, ("Q2", "T2", "OUT2"), waves=True, closely=True)
+    found = parted(fitter, null, first)
+    assert first[0].location == "T2"
+    assert found[0].location == "Q2"
+    assert sorted(s.location for s in found) == ["OUT2", "Q2", "T2"]
 
 
 @pytest.mark.parametrize("values", [{"Q1.pump_lag.time_constant": 15.0}, {"h2.sensor_hysteresis.play": 0.02}])

@@ -20,7 +20,7 @@ from fdi_torch.gap.library import canonical, possible_places, stacked
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.strays import most_astray
 from fdi_torch.gap.subject import Subject
-from fdi_torch.gap.where.suspects import Suspect, suspects
+from fdi_torch.gap.where.suspects import Suspect, parted, suspects
 from fdi_torch.gap.which import Search, search
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.reach import reach_of_all, with_levels
@@ -70,6 +70,7 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
     rounded += [(p.effect.name, p.location) for p in told]
     unknown = None
     if not case.named_only and _unnamed(fitter, weighed.fits[0], found, places[0]):
+        places = parted(fitter, found.null, places)
         unknown = fitted_free_form(fitter, found.null, places[0].location, places[0].periods, reach)
     standing = _content(weighed.explanations)
     verdict: Verdict = "unknown" if unknown else _verdict(standing, rounded)

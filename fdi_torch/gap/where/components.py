@@ -13,23 +13,49 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.forcing import Forcing
-from fdi_torch.gap.where.forms import bends, jumps, memories, slews, sticks, tirings
+from fdi_torch.gap.where.forms import (
+    MORE_STROKES,
+    STROKES,
+    bends,
+    jerks,
+    jumps,
+    lagged,
+    memories,
+    relays,
+    slews,
+    sticks,
+    tirings,
+)
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump
 from fdi_torch.plant.effect import place_kind
 from fdi_torch.plant.pace import time_scale
 
 Signals = dict[str, Tensor]
+RELAYS = 6  # values between which a place may switch
+SLOW = (100.0, 300.0)  # s, of a chamber beside a tank
 
 
 class Ends:
-    """The least and the greatest value of each signal in all recordings."""
+    """The least and the greatest value of each signal in all recordings.
 
-    def __init__(self, seen: Sequence[Signals]) -> None:
-        self.seen = seen
+    closely: whether forms are to lie close together, and what switches or is slow is asked about as well.
+    """
+
+    def __init__(self, seen: Sequence[Signals], closely: bool = False) -> None:
+        self.seen, self.closely = seen, closely
 
     def __call__(self, name: str) -> tuple[float, float]:
         low = min(float(s[name].min()) for s in self.seen)
         return low, max(*(float(s[name].max()) for s in self.seen), low + 1e-9)
+
+    def bends(self, s: Signals, name: str, count: int) -> list[Tensor]:
+        return bends(s[name], self(name), 2 * count if self.closely else count)
+
+    def jumps(self, s: Signals, name: str, count: int) -> list[Tensor]:
+        return jumps(s[name], self(name), 3 * count if self.closely else count)
+
+    def relays(self, s: Signals, name: str) -> list[tuple[float, Tensor]]:
+        return relays(s[name], self(name), RELAYS) if self.closely else []
 
 
 Forms = Callable[[Signals, Tensor, Ends], list[Tensor]]  # signals (K,), steps (K,) s -> (K,) each
@@ -65,7 +91,7 @@ def component_at(place: str, plant: PlantDescription) -> Component:
 
 def of_reading(s: Signals, step: Tensor, ends: Ends, pace: float) -> list[Tensor]:
     """Forms of a sensor's discrepancy; step: between samples, s; pace: of the plant."""
-    own = [*bends(s["reading"], ends("reading"), 12), s["reading"] * s["time"] / ends("time")[1]]
+    own = [*ends.bends(s, "reading", 12), s["reading"] * s["time"] / ends("time")[1]]
     return [*own, *memories(s["reading"], step, pace), *sticks(s["reading"], ends("reading"))]
 
 
@@ -76,9 +102,11 @@ def _pump(pump: Pump, plant: PlantDescription) -> Component:
         return {"command": along.commands[which], "flow": along.pumps[which], "level": along.levels[tank]}
 
     def flows(s: Signals, step: Tensor, ends: Ends) -> list[Tensor]:
-        own = [*bends(s["command"], ends("command"), 9), *memories(s["flow"], step, pace)]
-        own += [s["flow"] * b for b in bends(s["level"], ends("level"), 6)]
-        own += slews(s["flow"], step, ends("flow"), pace)
+        own = [*ends.bends(s, "command", 9), *memories(s["flow"], step, pace)]
+        own += [s["flow"] * b for b in ends.bends(s, "level", 6)]
+        own += slews(s["flow"], step, ends("flow"), pace, MORE_STROKES if ends.closely else STROKES)
+        if ends.closely:
+            own += jerks(s["flow"], ends("flow"))
         return [*own, *sticks(s["flow"], ends("flow")), *tirings(s["flow"], step, ends("flow"), pace)]
 
     return Component(signals, flows, "flow", OUTSIDE, pump.target)
@@ -97,10 +125,11 @@ def _pipe(pipe: Pipe, plant: PlantDescription) -> Component:
         return known | ({"opening": along.commands[valve]} if pipe.valve else {})
 
     def flows(s: Signals, step: Tensor, ends: Ends) -> list[Tensor]:
-        own = [*bends(s["root"], ends("root"), 16), *memories(s["flow"], step, pace)]
-        own += [s["flow"] * j for j in jumps(s["root"], ends("root"), 24)]
+        own = [*ends.bends(s, "root", 16), *memories(s["flow"], step, pace)]
+        own += [s["flow"] * j for j in ends.jumps(s, "root", 24)]
+        own += [s["flow"] * on for _, on in ends.relays(s, "root")]
         if pipe.valve:
-            own += [s["root"] * b for b in bends(s["opening"], ends("opening"), 9)]
+            own += [s["root"] * b for b in ends.bends(s, "opening", 9)]
             own += memories(s["root"] * s["opening"], step, pace)
         return [*own, *sticks(s["flow"], ends("flow")), *tirings(s["flow"], step, ends("flow"), pace)]
 
@@ -115,25 +144,29 @@ def _pair(place: str, plant: PlantDescription) -> Component:
         return {"head": head, "root": _root(head)}
 
     def flows(s: Signals, step: Tensor, ends: Ends) -> list[Tensor]:
-        return [*bends(s["head"], ends("head"), 10), *bends(s["root"], ends("root"), 10)]
+        return [*ends.bends(s, "head", 10), *ends.bends(s, "root", 10)]
 
     return Component(signals, flows, "root", first, second)
 
 
 def _tank(place: str, plant: PlantDescription) -> Component:
-    tank = _index(plant, place)
+    tank, pace = _index(plant, place), time_scale(plant)
 
     def signals(along: Forcing) -> Signals:
         level = along.levels[tank]
         return {"level": level, "rate": along.still[tank], "one": torch.ones_like(level)}
 
     def flows(s: Signals, step: Tensor, ends: Ends) -> list[Tensor]:
-        own = [*bends(s["level"], ends("level"), 12), *jumps(s["level"], ends("level"), 24)]
-        # No lags: how the level lags behind itself is its own rate, which is all that there is to explain.
+        own = [*ends.bends(s, "level", 12), *ends.jumps(s, "level", 24)]
+        for low, on in ends.relays(s, "level"):  # a draw, an orifice at the floor, and one that low
+            own += [on, on * _root(s["level"]), on * _root((s["level"] - low).clamp(min=0.0))]
+        # No short lags: how the level lags behind itself is its own rate, which is all that there is to explain.
+        if ends.closely:
+            own += [lagged(s["level"], step, pace * tau) - s["level"] for tau in SLOW]
         return [*own, *sticks(s["level"], ends("level"))]
 
     def areas(s: Signals, step: Tensor, ends: Ends) -> list[Tensor]:
-        return [s["rate"] * b for b in bends(s["level"], ends("level"), 12)]
+        return [s["rate"] * b for b in ends.bends(s, "level", 12)]
 
     return Component(signals, flows, "one", OUTSIDE, place, areas)
 

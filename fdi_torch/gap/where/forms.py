@@ -19,7 +19,9 @@ from fdi_torch.simulate.scan import scan_in_time
 LAGS = (3.0, 10.0, 30.0, 100.0, 300.0)  # s
 FADES = (10.0, 40.0, 160.0)  # s, of what a step up, or a step down, leaves behind
 BANDS = (0.03, 0.08, 0.16, 0.3)  # of the signal's range, within which it sticks
+JERKS = (0.1, 0.2, 0.3, 0.4)  # of the signal's range
 STROKES = (8.0, 25.0, 80.0)  # s, through the signal's range
+MORE_STROKES = (8.0, 20.0, 40.0, 80.0, 160.0, 320.0)
 HEATS = (150.0, 500.0)  # s, over which its own recent past weakens (or strengthens) a flow
 RAMPS = 12  # in time, evenly
 
@@ -50,9 +52,23 @@ def sticks(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
     return list((stuck(x, band) - x).unbind())
 
 
-def slews(x: Tensor, step: Tensor, ends: tuple[float, float], pace: float) -> list[Tensor]:
+def slews(
+    x: Tensor, step: Tensor, ends: tuple[float, float], pace: float, strokes: Sequence[float] = STROKES
+) -> list[Tensor]:
     """How x differs from what follows it no faster than through its range in some time."""
-    return [slewed(x, step, (ends[1] - ends[0]) / (pace * time)) - x for time in STROKES]
+    return [slewed(x, step, (ends[1] - ends[0]) / (pace * time)) - x for time in strokes]
+
+
+def jerks(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
+    """How x differs from what stays until it is a band away, and then jumps to it."""
+    return [jerked(x, share * (ends[1] - ends[0])) - x for share in JERKS]
+
+
+def relays(x: Tensor, ends: tuple[float, float], count: int) -> list[tuple[float, Tensor]]:
+    """Of two of `count` values the lower one, and whether x has been beyond the upper since it was last below it."""
+    width = (ends[1] - ends[0]) / count
+    at = [ends[0] + width * (j + 0.5) for j in range(count)]
+    return [(low, switched(x, low, high)) for i, low in enumerate(at) for high in at[i + 1 :]]
 
 
 def tirings(x: Tensor, step: Tensor, ends: tuple[float, float], pace: float) -> list[Tensor]:
@@ -96,6 +112,24 @@ def stuck(x: Tensor, band: Tensor) -> Tensor:
         )
         reach *= 2
     return torch.minimum(torch.maximum(x[0], low), high)
+
+
+def jerked(x: Tensor, band: float) -> Tensor:
+    """Stiction: it stays until x is further than the band, and is then where x is."""
+    held, found = float(x[0]), []
+    for value in x.tolist():
+        held = value if abs(value - held) > band else held
+        found.append(held)
+    return x.new_tensor(found)
+
+
+def switched(x: Tensor, low: float, high: float) -> Tensor:
+    """1 from where x exceeds `high` to where it falls below `low`, else 0; between them as it was."""
+    on, found = float(x[0]) > 0.5 * (low + high), []
+    for value in x.tolist():
+        on = value >= low if on else value > high
+        found.append(float(on))
+    return x.new_tensor(found)
 
 
 def slewed(x: Tensor, step: Tensor, rate: float) -> Tensor:

@@ -16,15 +16,19 @@ from torch import Tensor
 
 SEEN = 1e-6  # chi-square units below which a column does nothing
 LOW, HIGH = 1e-8, 1e12
+FIRST_ROUNDS = 12  # after which columns that are needed for less than so much are left out
+VANISHED = 1e-3
 RIDGES = tuple(10.0**k for k in range(-8, 2))  # shares of the diagonal
 
 
 @dataclass(frozen=True)
 class Sparse:
-    """Of B problems: log evidence (B,) against no coefficients at all, and closes (B,), chi-square units."""
+    """Of B problems: log evidence (B,) against no coefficients at all, closes (B,), chi-square units, and how many
+    coefficients they need (B,)."""
 
     evidence: Tensor
     closes: Tensor
+    needs: Tensor
 
 
 def sparse(gram: Tensor, score: Tensor, heat: float, rounds: int) -> Sparse:
@@ -35,14 +39,27 @@ def sparse(gram: Tensor, score: Tensor, heat: float, rounds: int) -> Sparse:
     told, aim = unit / heat, score / size / heat
     first = score.shape[-1] / (aim * heat).abs().amax(dim=-1, keepdim=True).clamp(min=1e-9) ** 2
     precision = torch.where(live, first.expand_as(aim), HIGH)
-    for _ in range(rounds):
+    for turn in range(rounds):
+        if turn == FIRST_ROUNDS:
+            told, aim, unit, live, precision = _needed(told, aim, unit, live, precision)
         mean, used, _ = _posterior(told, aim, precision)
         found = used / (mean * mean).clamp(min=1e-30)
         precision = torch.where(live, found.clamp(LOW, HIGH), HIGH)
     mean, used, half_log_det = _posterior(told, aim, precision)
     evidence = 0.5 * (aim * mean).sum(-1) - half_log_det + 0.5 * torch.log(precision).sum(-1) - used.sum(-1)
     fitted = (mean.unsqueeze(-2) @ unit @ mean.unsqueeze(-1)).flatten()
-    return Sparse(evidence, 2.0 * heat * (aim * mean).sum(-1) - fitted)
+    return Sparse(evidence, 2.0 * heat * (aim * mean).sum(-1) - fitted, used.sum(-1))
+
+
+def _needed(told: Tensor, aim: Tensor, unit: Tensor, live: Tensor, precision: Tensor) -> tuple[Tensor, ...]:
+    """The same problems without the columns that all but vanished, as many in each as the largest needs."""
+    _, used, _ = _posterior(told, aim, precision)
+    count = max(int((used > VANISHED).sum(-1).max()), 1)
+    kept = used.topk(count, dim=-1).indices
+    rows, columns = kept.unsqueeze(-1), kept.unsqueeze(-2)
+    each = torch.arange(len(kept))[:, None, None]
+    told, unit = told[each, rows, columns], unit[each, rows, columns]
+    return told, aim.gather(-1, kept), unit, live.gather(-1, kept), precision.gather(-1, kept)
 
 
 def _posterior(told: Tensor, aim: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, Tensor]:

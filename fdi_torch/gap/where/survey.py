@@ -24,7 +24,7 @@ from fdi_torch.simulate.joint import Joint, with_blanks
 from fdi_torch.simulate.scan import product, scan_in_time
 
 MOST_ROWS = 1000  # of a channel; more samples are taken together, for no form is as fast
-SAMPLES_A_STEP = 25  # of a course in time, at least
+SAMPLES_A_STEP, FEWER = 25, 9  # of a course in time, at least; where one looks closely
 
 
 @dataclass(frozen=True)
@@ -63,17 +63,18 @@ class _Piece:
 class Survey:
     """The regressions of all components of a subject, beside the constants of a fit.
 
-    periods: of waves, s. steps: in time, over all recordings.
+    periods: of waves, s. steps: in time, over all recordings. closely: with forms that lie close together.
     """
 
-    def __init__(self, fitter: Fitter, fit: Fit, periods: Sequence[float], steps: int) -> None:
+    def __init__(self, fitter: Fitter, fit: Fit, periods: Sequence[float], steps: int, closely: bool = False) -> None:
+        self.closely = closely
         self.fitter, self.fit, self.periods = fitter, fit, tuple(periods)
         self.engine = fitter.engine(fit.candidate, list(fit.effect_values))
         self.theta, self.levels = fit.theta.unsqueeze(0), followed(fitter.subject, fit)
         self.near = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.near, levels=self.levels))
         parts, samples = len(self.pieces), len(fitter.subject.readings)
-        self.steps = max(min(steps, samples // SAMPLES_A_STEP) // parts, 2)
+        self.steps = max(min(steps, samples // (FEWER if closely else SAMPLES_A_STEP)) // parts, 2)
 
     def of(self, place: str) -> Regression:
         plant = self.fitter.subject.plant
@@ -98,7 +99,7 @@ class Survey:
         seen = [
             {n: x.reshape(-1).expand(len(p.middle)) for n, x in component.signals(p.along).items()} for p in self.pieces
         ]
-        ends = Ends(seen)
+        ends = Ends(seen, self.closely)
         shared: list[Tensor] = []
         own: list[Tensor] = []
         for piece, s in zip(self.pieces, seen, strict=True):
@@ -139,7 +140,7 @@ class Survey:
             own = levels[0, first : first + len(nodes), int(self._tank(sensor.tank))]
             seen.append({"reading": sensor.gain * between(times, nodes, own) + sensor.offset, "time": times})
             first += len(nodes)
-        ends = Ends(seen)
+        ends = Ends(seen, self.closely)
         shared: list[Tensor] = []
         own_columns: list[Tensor] = []
         pace = time_scale(self.fitter.subject.plant)

@@ -20,6 +20,9 @@ from fdi_torch.gap.where.survey import Regression, Survey
 
 HARMONICS = 3
 STEPS, FEW_STEPS = 120, 40  # in time
+NEAR = 120.0  # nats behind the likeliest within which places are rivals
+MORE_STEPS = 400  # in time, to part rivals
+CHOICE = 2.0  # nats, of choosing a form among some hundred, beside the one that its size costs
 ROUNDS = (10, 40)  # at a first temperature, which tells what is left open, and at the one that follows from it
 FIRST_HEAT, FREEDOM = 1e4, 300.0  # chi-square units left open that a unit of temperature stands for, at first and then
 
@@ -48,8 +51,24 @@ def suspects(fitter: Fitter, fit: Fit, places: Sequence[str], waves: bool, close
     return sorted(found, key=lambda s: -s.evidence)
 
 
-def _weighed(each: Sequence[Regression]) -> tuple[list[float], list[float]]:
-    """Log evidence and what is left open, for every regression."""
+def parted(fitter: Fitter, fit: Fit, found: Sequence[Suspect]) -> list[Suspect]:
+    """The rivals of the likeliest in the order that a closer look gives them, with what they left open at the first.
+
+    What flows into a tank or out of it makes one balance: its pump, its outlet and itself can take up each other's
+    discrepancies, but only the one that has it needs few forms. With thresholds and steps that lie far apart, even
+    that one needs many.
+    """
+    near = [s for s in found if s.evidence > -NEAR]
+    if len(near) < 2:
+        return list(found)
+    survey = Survey(fitter, fit, near[0].periods, MORE_STEPS, closely=True)
+    evidence, _ = _weighed([survey.of(s.location) for s in near], CHOICE)
+    order = sorted(range(len(near)), key=lambda k: -evidence[k])
+    return [*(near[k] for k in order), *(s for s in found if s.evidence <= -NEAR)]
+
+
+def _weighed(each: Sequence[Regression], choice: float = 0.0) -> tuple[list[float], list[float]]:
+    """Log evidence, a form costing `choice` nats, and what is left open, for every regression."""
     width = max(len(r.score) for r in each)
     gram, score = (torch.zeros(len(each), *(width,) * d, dtype=torch.float64) for d in (2, 1))
     for k, r in enumerate(each):
@@ -61,7 +80,7 @@ def _weighed(each: Sequence[Regression]) -> tuple[list[float], list[float]]:
     for rounds in ROUNDS:
         found = sparse(gram, score, heat, rounds)  # anew: what a high temperature sends to nothing is slow to return
         leaves = unexplained - found.closes - noise
-        evidence = found.evidence - 0.5 * unexplained / heat
+        evidence = found.evidence - choice * found.needs - 0.5 * unexplained / heat
         heat = 1.0 + max(float(leaves.min()), 0.0) / FREEDOM
     return evidence.tolist(), leaves.clamp(min=0.0).tolist()
 
