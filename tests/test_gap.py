@@ -65,6 +65,7 @@ def test_level_and_colour_of_noise_are_found_beside_a_slow_misfit(ar: float) -> 
     found = estimate_noise(x + slow, torch.ones_like(x, dtype=torch.bool))
     assert found.std.tolist() == pytest.approx([0.002] * 3, rel=0.15 if ar else 0.04)
     assert found.ar.tolist() == pytest.approx([ar] * 3, abs=0.04)
+    assert found.mean_of == 0
 
 
 def test_whitened_noise_is_white_and_of_unit_variance_also_across_masked_samples() -> None:
@@ -75,6 +76,28 @@ def test_whitened_noise_is_white_and_of_unit_variance_also_across_masked_samples
     assert float((white[~mask]).abs().max()) == 0.0
     assert float(white[mask].var()) == pytest.approx(1.0, abs=0.02)
     assert float((white[1:] * white[:-1])[mask[1:] & mask[:-1]].mean()) == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("samples", "slow"), [(3, 0.0), (8, 0.0), (8, 0.05)])
+def test_a_transmitter_that_averages_is_told_and_undone(samples: int, slow: float) -> None:
+    """Taken for AR(1), a mean has several times the slow power that it should."""
+    fresh = noise(6000 + samples - 1, 0.0, 0.002, 9)
+    mean = torch.stack([fresh[j : j + 6000] for j in range(samples)]).mean(dim=0)
+    misfit = slow * torch.sin(torch.arange(6000, dtype=torch.float64) / 200.0).unsqueeze(1)
+    mask = torch.ones_like(mean, dtype=torch.bool)
+    found = estimate_noise(mean + misfit, mask)
+    assert found.mean_of == samples
+    assert found.std.tolist() == pytest.approx([0.002 / math.sqrt(samples)] * 3, rel=0.06)
+    assert found.alike.tolist() == pytest.approx([1.0 - 1.0 / samples] * 3, abs=0.01)
+    repeats = 1.0 + 2.0 * sum((1.0 - k / samples) ** 2 for k in range(1, samples))
+    assert found.repeats.tolist() == pytest.approx([repeats] * 3, rel=0.02)
+    white = found.whiten(mean, mask)
+    power = torch.fft.rfft(white, dim=0).abs() ** 2 / len(white)
+    assert float(power[1:200].mean()) == pytest.approx(1.0, abs=0.13)  # 600 values of variance 1, and what was undone
+    mask[2000:2100, 1] = False
+    hidden = found.whiten(mean, mask)
+    assert float(hidden[~mask].abs().max()) == 0.0
+    assert float(hidden[mask].var()) == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_rounded_channel_shows_its_step_and_a_printed_one_does_not() -> None:

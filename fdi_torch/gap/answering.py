@@ -165,6 +165,6 @@ def _noise(fitter: Fitter, lattice: Sequence[float]) -> Mapping[str, Any]:
     sensors = fitter.subject.plant.sensors
     std: Tensor = fitter.noise.std
     return {
-        s.name: {"std": float(std[i]), "ar1": float(fitter.noise.ar[i]), "rounded_to": lattice[i], "unit": s.unit}
+        s.name: {"std": float(std[i]), "ar1": float(fitter.noise.alike[i]), "rounded_to": lattice[i], "unit": s.unit}
         for i, s in enumerate(sensors)
     }

@@ -165,9 +165,8 @@ def _closed(held: Sequence[HeldOut]) -> tuple[float | None, tuple[float, float] 
 
 def _floor_variance(held: HeldOut) -> float:
     """Of the sum of squares that the noise alone gives."""
-    std, ar = held.noise.std * torch.sqrt(held.weight), held.noise.ar
-    count = held.subject.mask.sum(dim=0)
-    return float((2.0 * std**4 * count * (1 + ar**2) / (1 - ar**2)).sum())
+    std, count = held.noise.std * torch.sqrt(held.weight), held.subject.mask.sum(dim=0)
+    return float((2.0 * std**4 * count * held.noise.repeats).sum())
 
 
 def _blocks(x: Tensor) -> Tensor:

@@ -6,7 +6,12 @@ error whose slope jumps (levels are integrals of flows),
     S(w) = s^2 (1 / |1 - a exp(-i w)|^2 + m / |1 - exp(-i w)|^4),
 
 is fitted to the periodogram above a corner frequency only (Whittle, 1953), so that a gap does not pass for colour,
-not even where the samples are so far apart that the error reaches beyond the corner.
+not even where the samples are so far apart that the error reaches beyond the corner. A transmitter that shows the mean
+of its last n samples is told by the zeros of its spectrum: its kernel ends after n samples, where AR(1)'s goes on,
+
+    1, a, a^2, ..., a^(n-1):   |1 - a^n exp(-i n w)|^2 / |1 - a exp(-i w)|^2,   a^n = 0.9,
+
+which is as good as even, and can be undone.
 """
 
 from __future__ import annotations
@@ -26,21 +31,54 @@ LEAST_SAMPLES = 20  # in a stretch that has a say in level and colour
 FAST_PERIOD = 30.0  # samples; slower parts of a residual may be the model's
 
 
+KEPT_OF_MEAN = 0.9  # a^n
+LONGEST_MEAN = 16  # samples
+MEAN_EARNS = 50.0  # twice the log-likelihood by which a mean has to be likelier than AR(1)
+DOUBLINGS = 6  # of the undoing of a mean: 0.9^64 is nothing
+
+
 @dataclass(frozen=True)
 class Noise:
-    """innovation (C,): standard deviation of what is new in each sample, in the reading's unit; ar (C,)."""
+    """innovation (C,): standard deviation of what is new in each sample, in the reading's unit; ar (C,).
+
+    mean_of: over how many samples what is new lasts; 0: for ever, AR(1).
+    """
 
     innovation: Tensor
     ar: Tensor
+    mean_of: int = 0
+
+    @property
+    def energy(self) -> Tensor:
+        """Sum of the kernel's squares, (C,)."""
+        last = self.ar ** (2 * self.mean_of) if self.mean_of else 0.0
+        return (1.0 - last) / (1.0 - self.ar**2)
 
     @property
     def std(self) -> Tensor:
-        return self.innovation / torch.sqrt(1.0 - self.ar**2)
+        return self.innovation * torch.sqrt(self.energy)
+
+    @property
+    def alike(self) -> Tensor:
+        """Correlation of neighbouring samples, (C,)."""
+        if not self.mean_of:
+            return self.ar
+        return self.ar * (1.0 - self.ar ** (2 * self.mean_of - 2)) / (1.0 - self.ar ** (2 * self.mean_of))
+
+    @property
+    def repeats(self) -> Tensor:
+        """Samples that count as one where squares are summed: the sum of all squared correlations, (C,)."""
+        if not self.mean_of:
+            return (1.0 + self.ar**2) / (1.0 - self.ar**2)
+        kernel = self.ar ** torch.arange(self.mean_of, dtype=self.ar.dtype).unsqueeze(1)
+        power = torch.fft.rfft(kernel, n=2 * self.mean_of, dim=0).abs() ** 2
+        return (torch.fft.irfft(power, n=2 * self.mean_of, dim=0) ** 2).sum(dim=0) / self.energy**2
 
     def whiten(self, x: Tensor, mask: Tensor) -> Tensor:
         """x (*lanes, S, C) or (*lanes, S, C, P), mask (S, C) -> independent samples of unit variance; masked are 0.
 
         x_k - a x_{k-1}; the first sample, and one after a masked one, is scaled by sqrt(1 - a^2) instead.
+        Of a mean of n, what left it is added again: y_k = ... + a^n y_{k-n}.
         """
         columns = x.shape[-2:] != mask.shape
         wide = (lambda t: t.unsqueeze(-1)) if columns else (lambda t: t)
@@ -49,13 +87,20 @@ class Noise:
         scaled = (x if whole else torch.where(keep, x, 0.0)) / wide(self.innovation)
         if not bool((ar != 0.0).any()):
             return scaled
-        count, fresh = x.shape[time], torch.sqrt(1.0 - ar**2)
+        count, fresh = x.shape[time], 1.0 / torch.sqrt(wide(self.energy))
         first, before = scaled.narrow(time, 0, 1), scaled.narrow(time, 0, count - 1)
         after = scaled.narrow(time, 1, count - 1)
         rest = after - ar * before
         if not whole:
             rest = torch.where(keep[1:], torch.where(keep[:-1], rest, fresh * after), 0.0)
-        return torch.cat([fresh * first, rest], dim=time)
+        white = torch.cat([fresh * first, rest], dim=time)
+        for turn in range(DOUBLINGS if self.mean_of else 0):
+            lag = self.mean_of * 2**turn
+            if lag < count:
+                again = ar**lag * white.narrow(time, 0, count - lag)
+                still, later = white.narrow(time, 0, lag), white.narrow(time, lag, count - lag)
+                white = torch.cat([still, later + again], dim=time)
+        return white if whole or not self.mean_of else torch.where(keep, white, 0.0)
 
 
 def slow_excess(white: Tensor) -> float:
@@ -85,17 +130,25 @@ def estimate_noise(
     likelihoods = torch.stack([_likelihood(*s, x) for s, x in zip(spectra, levels, strict=True)])
     counts = [int(mask[:, c].sum()) for c in range(residual.shape[1])]
     likelihoods = likelihoods + torch.stack([_cost_of_error(n) for n in counts]).unsqueeze(1)
+    likelihoods[:, len(_COLOURS) - MEANS :] += math.inf if any(rounded) else MEAN_EARNS
     best = likelihoods.min(dim=-1).values
     common = _chosen(best[torch.tensor(say)].sum(dim=0), int(mask.sum()))
     chosen = [common if ours else _chosen(best[c], counts[c]) for c, ours in enumerate(say)]
     errors = [int(x[i].argmin()) for x, i in zip(likelihoods, chosen, strict=True)]
     level = torch.stack([x[i, j] for x, i, j in zip(levels, chosen, errors, strict=True)])
-    return Noise(
-        torch.sqrt(torch.clamp(level, min=torch.finfo(level.dtype).tiny)), _COLOURS.to(level)[torch.tensor(chosen)]
-    )
+    innovation = torch.sqrt(torch.clamp(level, min=torch.finfo(level.dtype).tiny))
+    return Noise(innovation, _COLOURS.to(level)[torch.tensor(chosen)], int(_LASTING[common]))
 
 
-_COLOURS = torch.cat([torch.linspace(-0.5, 0.9, 281), torch.linspace(0.901, 0.98, 80)])
+MEANS = LONGEST_MEAN - 1
+_LASTING = torch.cat([torch.zeros(361, dtype=torch.long), torch.arange(2, LONGEST_MEAN + 1)])  # samples; 0: for ever
+_COLOURS = torch.cat(
+    [
+        torch.linspace(-0.5, 0.9, 281),
+        torch.linspace(0.901, 0.98, 80),
+        KEPT_OF_MEAN ** (1.0 / torch.arange(2, LONGEST_MEAN + 1)),
+    ]
+)
 _WHITE = int(_COLOURS.abs().argmin())
 _ERRORS = torch.cat([torch.zeros(1), torch.logspace(-4, 2, 25)])  # of the model, as shares of the innovation
 
@@ -152,7 +205,10 @@ def _shapes(layout: Layout) -> _Shapes:
     """Kept for the last few layouts: all channels of a recording, and its next estimate, have the same."""
     cosine = torch.cat([_cosine(count, bins) for count, bins in layout])
     a, error = _COLOURS.to(cosine).reshape(-1, 1, 1), _ERRORS.to(cosine).reshape(-1, 1)
-    shape = 1.0 / (1.0 - 2.0 * a * cosine + a * a) + error / (2.0 - 2.0 * cosine) ** 2
+    lasting = _LASTING.to(cosine).reshape(-1, 1, 1)
+    gone = torch.where(lasting > 0, a**lasting, 0.0)
+    ended = 1.0 - 2.0 * gone * torch.cos(lasting * torch.arccos(cosine.clamp(-1.0, 1.0))) + gone * gone
+    shape = ended / (1.0 - 2.0 * a * cosine + a * a) + error / (2.0 - 2.0 * cosine) ** 2
     return _Shapes(1.0 / shape, torch.log(shape).mean(dim=-1))
 
 
