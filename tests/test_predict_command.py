@@ -81,6 +81,22 @@ def test_no_recording_is_misuse(folder: Path, capsys: pytest.CaptureFixture[str]
     assert "expected a recording" in capsys.readouterr().err
 
 
+def test_what_a_run_has_of_its_own_is_taken_from_the_stretch_that_it_settles_in(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """50 cm^3/s are asked for; the plant file believes in 60, within a tenth, and in the tank's level."""
+    (folder / "rig.yaml").write_text(
+        PLANT.replace("100 cm^3/s", "100 cm^3/s, gain: 1.2") + "tolerances: {Q.gain: 0.2}\n"
+    )
+    before = said(capsys, "novalve.csv", "--settle", "10 s")
+    after = said(capsys, "novalve.csv", "--settle", "10 s", "--vary", "Q.*")
+    assert before["settle"] == 10.0 and before["own"] == {}
+    assert after["own"] == {"Q.gain": pytest.approx(1.0, abs=5e-3)} and after["rmse"]["h"] < 1e-3  # type: ignore[index]
+    assert before["rmse"]["h"] > 0.005  # type: ignore[index]
+    assert main(["predict", "--plant", "rig.yaml", "novalve.csv", "--settle", "39"]) == 2
+    assert "left" not in (told := capsys.readouterr().err) and "less than the 39 s" in told
+
+
 HOSE = "effects: [{effect: pump_priming, location: Q, parameters: {volume: 200 cm^3}}]\n"
 
 

@@ -99,6 +99,30 @@ def filling(gain: float, offset: float, seed: int, name: str = "a") -> Recording
     return replace(empty, outputs=levels + offset + noise)
 
 
+def test_what_varies_is_told_by_the_stretch_that_a_run_settles_in_and_errors_are_counted_after_it() -> None:
+    """A pump that delivers a tenth more in this run. (Of the sensor's zero a closed tank tells nothing.)"""
+    run = filling(1.1, 0.0, 1)
+    plain, told = (predict(tank(), run, settle=40.0, vary=vary) for vary in ((), ("Q.*",)))
+    assert set(plain.own) == {"h.offset"} and set(told.own) == {"h.offset", "Q.gain"}
+    assert told.own["Q.gain"] == pytest.approx(1.1, abs=2e-3)
+    assert told.rmse["h"] < 1e-3 < 0.1 * plain.rmse["h"]
+    later = told.residuals[run.time > 40.0, 0]
+    assert told.rmse["h"] == pytest.approx(float((later**2).mean()) ** 0.5, rel=1e-12)
+    spoilt = run.outputs.clone()
+    spoilt[run.time > 40.0] += 0.1
+    again = predict(tank(), replace(run, outputs=spoilt), settle=40.0, vary=("Q.*",))
+    assert again.own["Q.gain"] == pytest.approx(told.own["Q.gain"], rel=1e-4)
+
+
+def test_a_run_needs_something_to_settle_in_and_something_left() -> None:
+    run = filling(1.1, 0.0, 1)
+    for seconds in (0.0, 200.0, 1e4):
+        with pytest.raises(ValueError, match="a stretch to settle in of more than 0 s and less than the 200 s"):
+            predict(tank(), run, settle=seconds)
+    with pytest.raises(ValueError, match=r"constants with a tolerance.*got 'Z.gain'.*Q.gain"):
+        predict(tank(), run, vary=("Z.gain",))
+
+
 def test_a_sensor_that_reads_less_than_nothing_is_off_and_its_tank_empty() -> None:
     run = filling(1.0, 0.0, 1)
     early = replace(run, outputs=run.outputs - float(run.outputs[0]) - 0.01)

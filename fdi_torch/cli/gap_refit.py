@@ -9,6 +9,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from fdi_torch.cli import DONE
+from fdi_torch.cli.options import seconds
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.effects import build_network
@@ -49,6 +50,9 @@ def add_refit_arguments(parser: argparse.ArgumentParser) -> None:
         default=START_SAMPLES,
         help=f"with --in-turn: for the start levels ({START_SAMPLES})",
     )
+    parser.add_argument(
+        "--settle", metavar="TIME", type=seconds, help="with --in-turn: as `fdi predict` has it, in place of those"
+    )
 
 
 def run_refit(
@@ -77,6 +81,7 @@ def run_refit(
                 lambda rest: refit(plant, rest, leave_out, arguments.step, hold, arguments.white, vary).plant,
                 arguments.start_samples,
                 advance,
+                arguments.settle,
             )
         _show_trials(trials, plant, screen)
     screen.result(

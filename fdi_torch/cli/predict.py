@@ -1,7 +1,7 @@
 """Run a plant file freely along recordings: of each only the first samples are used, for the start levels.
 
-What is printed is the error of the whole run, the first samples included, in each sensor's unit. A run ends where an
-input becomes unknown, and begins anew where it is known again.
+What is printed is the error of the whole run, the first samples included, in each sensor's unit; with --settle, of what
+comes after that stretch. A run ends where an input becomes unknown, and begins anew where it is known again.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ examples:
   fdi predict a.csv b.csv --plant rig.yaml --to 300          several, each for its first 300 s
   fdi predict runs.yaml --plant rig.yaml                     stretches listed under `recordings`, as in a run file
   fdi predict run.csv --plant better.yaml --beside rig.yaml --picture run.png
+  fdi predict run.csv --plant rig.yaml --settle 30           what varies from run to run is told by the first 30 s
+  fdi predict run.csv --plant rig.yaml --settle 60 --vary 'q?.gain'   the pumps' gains of this run too
   fdi predict run.csv --plant rig.yaml --constant q1_cmd=0   an input that was not recorded, or '20 cm^3/s'
 """
 
@@ -47,6 +49,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
     parser.add_argument(
         "--start-samples", metavar="N", type=int, default=START_SAMPLES, help=f"for the start levels ({START_SAMPLES})"
+    )
+    parser.add_argument(
+        "--settle",
+        metavar="TIME",
+        type=seconds,
+        help="take start levels, and what the plant file says varies from run to run, from all of so much of each run "
+        "('30 s'), and count errors after it",
+    )
+    parser.add_argument(
+        "--vary",
+        metavar="NAME,...",
+        default="",
+        help="constants with a tolerance that are taken from there too (* is any name)",
     )
     parser.add_argument("--from", metavar="TIME", dest="start", type=seconds, help="first time used of each file")
     parser.add_argument("--to", metavar="TIME", dest="stop", type=seconds, help="last time used: 300, or '2 h'")
@@ -68,10 +83,11 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     if not names:
         raise ValueError("expected a recording, got none; name a CSV, MCAP or YAML file")
     recordings = [r for name in names for r in _recordings(name, plant, arguments)]
-    found = [(recording, predict(plant, recording, arguments.start_samples)) for recording in recordings]
-    screen.say(f"free run of {plant.name}, start levels from the first {arguments.start_samples} samples")
+    found = [(recording, _predict(plant, recording, arguments)) for recording in recordings]
+    first = f"{arguments.start_samples} samples" if arguments.settle is None else f"{arguments.settle:g} s"
+    screen.say(f"free run of {plant.name}, start levels from the first {first}")
     screen.table(
-        "root mean square error",
+        "root mean square error" + ("" if arguments.settle is None else f" after the first {arguments.settle:g} s"),
         (
             "recording",
             "from, s",
@@ -86,14 +102,21 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         runs = {plant.name: prediction.readings}
         if arguments.beside:
             other = load_plant(arguments.beside)
-            before = predict(other, recording, arguments.start_samples)
+            before = _predict(other, recording, arguments, vary="")
             runs = {_other_name(other, plant, arguments): before.readings} | runs
         columns = [sensor.column for sensor in plant.sensors]
         title = f"free run along {Path(recording.source).name}"
         screen.note(f"picture: {save(free_run_figure(recording, columns, runs, title), Path(arguments.picture))}")
-    results = [_result(plant, recording, prediction, arguments.start_samples) for recording, prediction in found]
+    results = [_result(plant, recording, prediction, arguments) for recording, prediction in found]
     screen.result(results[0] if len(results) == 1 else {"format": "fdi_torch.predictions/1", "runs": results})
     return DONE
+
+
+def _predict(
+    plant: PlantDescription, recording: Recording, arguments: argparse.Namespace, vary: str | None = None
+) -> Prediction:
+    patterns = [name for name in (arguments.vary if vary is None else vary).split(",") if name]
+    return predict(plant, recording, arguments.start_samples, settle=arguments.settle, vary=patterns)
 
 
 def _recordings(name: str, plant: PlantDescription, arguments: argparse.Namespace) -> list[Recording]:
@@ -159,14 +182,18 @@ def _row(plant: PlantDescription, recording: Recording, found: Prediction) -> li
     return [Path(recording.source).name, *times, *errors, levels]
 
 
-def _result(plant: PlantDescription, recording: Recording, found: Prediction, start_samples: int) -> dict[str, Any]:
+def _result(
+    plant: PlantDescription, recording: Recording, found: Prediction, arguments: argparse.Namespace
+) -> dict[str, Any]:
     return {
         "format": "fdi_torch.prediction/1",
         "plant": plant.name,
         "recording": recording.source,
         "rmse": dict(found.rmse),
         "start_levels": dict(found.start_levels),
-        "start_samples": start_samples,
+        "own": dict(found.own),
+        "start_samples": arguments.start_samples,
+        "settle": arguments.settle,
         "time": recording.time.tolist(),
         "readings": {s.name: found.readings[:, i].tolist() for i, s in enumerate(plant.sensors)},
     }

@@ -30,9 +30,11 @@ def in_turn(
     fit: Callable[[Sequence[Recording]], PlantDescription],
     start_samples: int,
     tell: Callable[[float, str], None] = lambda share, text: None,
+    settle: float | None = None,
 ) -> list[Trial]:
     """trials: what is run freely; for each, `fit` sees the recordings of all other files. Recordings of one file are
-    told by the hash of its contents. Raises ValueError where that would leave none to fit.
+    told by the hash of its contents. settle: as `predict` has it, s. Raises ValueError where that would leave none to
+    fit.
     """
     refitted: dict[str, PlantDescription] = {}
     found = []
@@ -43,6 +45,7 @@ def in_turn(
             if not rest:
                 raise ValueError(f"{run.source}: expected recordings of another file to fit to, got none; give more")
             refitted[run.sha256] = fit(rest)
-        as_is, without = (predict(p, run, start_samples).rmse for p in (plant, refitted[run.sha256]))
+        plants = plant, refitted[run.sha256]
+        as_is, without = (predict(p, run, start_samples, settle=settle).rmse for p in plants)
         found.append(Trial(run.source, float(run.time[0]), float(run.time[-1]), as_is, without))
     return found

@@ -2,14 +2,16 @@
 
 What the plant file says varies from recording to recording (the zero of a sensor that is zeroed before each run) is
 taken from the same samples, within its tolerance: a tank that reads less than nothing is empty, and its sensor off.
-Where the recording was cut from a longer one in which a pump had run, its hose is full.
+Where the recording was cut from a longer one in which a pump had run, its hose is full. A longer stretch at the start
+tells more of what varies, and is then no part of what is predicted.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from itertools import product
 
 import torch
@@ -36,7 +38,8 @@ UNSEEN_STARTS = (0.1, 0.25, 0.5, 0.8)  # shares of the height, for a tank that n
 
 @dataclass(frozen=True)
 class Prediction:
-    """readings (S, C) in SI as the plant's sensors have them; start_levels in m; rmse by sensor, over all samples.
+    """readings (S, C) in SI as the plant's sensors have them; start_levels in m; own: what else was taken from the
+    first samples, SI; rmse by sensor, over all samples, or those after the stretch that the plant settled in.
 
     settled: whether the trajectory is the model's to SETTLED, or as much more as tanks are larger; defect, m: by how
     much it is not.
@@ -45,30 +48,42 @@ class Prediction:
     readings: Tensor
     residuals: Tensor
     start_levels: Mapping[str, float]
+    own: Mapping[str, float]
     rmse: Mapping[str, float]
     settled: bool
     defect: float
 
 
 def predict(
-    plant: PlantDescription, recording: Recording, start_samples: int = START_SAMPLES, step: float | None = None
+    plant: PlantDescription,
+    recording: Recording,
+    start_samples: int = START_SAMPLES,
+    step: float | None = None,
+    settle: float | None = None,
+    vary: Collection[str] = (),
 ) -> Prediction:
     """The free run of the plant as its file has it. step: of the simulation, s; None for half the sampling interval (in
     a long run of close samples the MOST_STEPS-th part of it), and less where a rim that runs over, or another sharp
     bend, keeps the trajectory from settling.
 
-    Raises ValueError where there is no first sample to start from.
+    settle: s; all of so much is used for the start, in place of start_samples, and errors are counted after it. vary:
+    patterns of constants with a tolerance that are taken from there too, beside those that the plant file says.
+
+    Raises ValueError where there is no first sample to start from, or none left to predict.
     """
+    counted = 0
+    if settle is not None:
+        start_samples = counted = _samples_within(recording, settle)
     if start_samples < 1:
         raise ValueError(f"expected at least 1 sample for the start levels, got {start_samples}")
-    plant = once_run(plant, recording.ran)
+    plant = once_run(_varying(plant, vary), recording.ran)
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     span = float(recording.time[-1] - recording.time[0])
     step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), span / MOST_STEPS)
     left = math.inf
     for _ in range(HALVINGS):
         subject = subject_of(plant, believed, recording, step)
-        found, before = _run(subject, start_samples), left
+        found, before = _run(subject, start_samples, counted), left
         left = found.defect
         stuck = left < NEARLY * SETTLED * length_scale(plant) and left > 0.5 * before
         if found.settled or stuck:  # an empty tank flickers at its floor, whatever the step
@@ -77,7 +92,35 @@ def predict(
     return found
 
 
-def _run(subject: Subject, start_samples: int) -> Prediction:
+def _samples_within(recording: Recording, seconds: float) -> int:
+    """How many samples lie in the first so many seconds; some reading must be left to predict."""
+    first = float(recording.time[0])
+    samples = int((recording.time <= first + seconds).sum())
+    if seconds <= 0 or not bool(recording.mask[samples:].any()):
+        length = float(recording.time[-1]) - first
+        raise ValueError(
+            f"{recording.source}: expected a stretch to settle in of more than 0 s and less than the {length:g} s of "
+            f"the recording, got {seconds:g} s"
+        )
+    return samples
+
+
+def _varying(plant: PlantDescription, patterns: Collection[str]) -> PlantDescription:
+    """The plant of which more varies. Raises ValueError for a pattern that no constant with a tolerance has."""
+    names = list(plant.varying)
+    for pattern in patterns:
+        found = [n for n in plant.tolerances if fnmatchcase(n, pattern)]
+        if not found:
+            known = ", ".join(plant.tolerances) or "none"
+            raise ValueError(
+                f"plant {plant.name}: expected constants with a tolerance in the plant file to vary, got '{pattern}'; "
+                f"those are {known}"
+            )
+        names += found
+    return replace(plant, varying=tuple(dict.fromkeys(names)))
+
+
+def _run(subject: Subject, start_samples: int, counted: int) -> Prediction:
     plant, recording = subject.plant, subject.recording
     early = subject.mask.clone()
     early[start_samples:] = False
@@ -95,11 +138,13 @@ def _run(subject: Subject, start_samples: int) -> Prediction:
     run = engine.settle(theta[best : best + 1], near.levels[best : best + 1], CORRECTIONS)
     readings = run.readings[0]
     residuals = torch.where(subject.mask, subject.readings - readings, torch.zeros_like(readings))
-    rmse = torch.sqrt((residuals**2).sum(dim=0) / subject.mask.sum(dim=0))
+    rmse = torch.sqrt((residuals[counted:] ** 2).sum(dim=0) / subject.mask[counted:].sum(dim=0))
+    values = dict(zip(names, theta[best].tolist(), strict=True))
     return Prediction(
         readings,
         residuals,
-        dict(zip((t.name for t in plant.tanks), theta[best].tolist(), strict=False)),
+        {t.name: values[f"{t.name}.start_level"] for t in plant.tanks},
+        {name: values[name] for name in plant.varying},
         dict(zip((s.name for s in plant.sensors), rmse.tolist(), strict=True)),
         float(run.defect.max()) < SETTLED * length_scale(plant),
         float(run.defect.max()),
