@@ -159,6 +159,18 @@ def test_the_softness_of_a_laminar_transition_holds_other_known_laws(
         assert factor == pytest.approx(law(head / 0.1), rel=off)
 
 
+@pytest.mark.parametrize("level", [0.97, 0.99, 1.0, 1.01, 1.03])
+@pytest.mark.parametrize("behind", [0.0, 1.0])
+def test_a_clipped_noisy_reading_reads_what_it_does_in_the_mean(level: float, behind: float) -> None:
+    noise = 0.01 * torch.randn(200000, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    before = min(level, 1.0) if behind else level
+    p, clock = values(limit=1.0, noise=0.01, behind=behind), Clock(number(0.0), number(1.0), number(1.0))
+    seen = float(effect("sensor_saturation").reading(number(level), (), clock, p)[0])
+    assert seen == pytest.approx(float((before + noise).clamp(max=1.0).mean()), abs=2.5e-4)
+    below = float(effect("sensor_floor").reading(number(-level), (), clock, p | values(limit=-1.0))[0])
+    assert below == pytest.approx(-seen, rel=1e-12)
+
+
 def test_a_limited_pump_has_a_kink_or_a_knee() -> None:
     full, limit = 1e-4, 5e-5
     for flow in (0.0, 1e-5, 4e-5, 5e-5, 8e-5):

@@ -1,12 +1,17 @@
 """Limits of a sensor that the values themselves tell."""
 
+import math
+from dataclasses import replace
+
 import pytest
 import torch
 
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import place
+from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.limits import limits_of, told_limits
 from fdi_torch.recording import Recording
+from tests.test_gap import believed, noise, recorded
 
 
 def noisy(count: int = 400) -> torch.Tensor:
@@ -38,3 +43,25 @@ def test_a_limit_that_the_plant_has_already_or_that_is_not_searched_is_not_told(
     assert told.values == {"limit": pytest.approx(8.0)}
     assert told_limits(plant, recording, [saturation], [saturation]) == []
     assert told_limits(plant, recording, [], []) == []
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_noise_that_is_clipped_with_the_level_is_no_further_gap(behind: bool) -> None:
+    std, seed, samples = 4e-3, 11, 2000
+    recording = recorded({}, seed, samples, std)
+    e = noise(samples, 0.0, std, seed + 1)
+    level = recording.outputs - e
+    limit = float(level[:, 0].quantile(0.7))
+    limits = torch.tensor([limit, math.inf, math.inf], dtype=torch.float64)
+    reading = torch.minimum((torch.minimum(level, limits) if behind else level) + e, limits)
+    library = ("sensor_saturation", "sensor_bias", "sensor_curvature", "pump_gain@Q1")
+    answer = diagnose(believed(), replace(recording, outputs=reading), settings=Settings(library))
+    assert answer.verdict == "named"
+    assert [(c.effect, c.location, c.parameters["limit"].value) for c in answer.causes] == [
+        ("sensor_saturation", "h1", limit)
+    ]
+    assert answer.noise["h1"]["std"] == pytest.approx(std, rel=0.08)
+    known = replace(
+        believed(), sensors=tuple(replace(s, high=limit) if s.name == "h1" else s for s in believed().sensors)
+    )
+    assert diagnose(known, replace(recording, outputs=reading), settings=Settings(library)).verdict == "no_gap"

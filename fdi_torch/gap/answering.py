@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
@@ -66,8 +67,8 @@ def _held_out(found: Finding, holdouts: Sequence[Subject]) -> list[HeldOut]:
     """Free runs of all models on all hold-outs."""
     if not holdouts:
         return []
-    models = models_of(found)
-    return [run_all(each, found.fitter.noise, models, found.lattice) for each in holdouts]
+    models, believed = models_of(found), found.fitter.subject.believed
+    return [run_all(replace(each, believed=believed), found.fitter.noise, models, found.lattice) for each in holdouts]
 
 
 def _curves(found: Finding) -> list[dict[str, Any]]:

@@ -17,6 +17,7 @@ from fdi_torch.gap.fitting import Candidate, Fit, Fitter, left_open
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_rounding
 from fdi_torch.gap.freeform import fitted_free_form
 from fdi_torch.gap.library import canonical, possible_places, stacked
+from fdi_torch.gap.limits import unclipped, with_clipped_noise
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.strays import most_astray
 from fdi_torch.gap.subject import Subject
@@ -136,7 +137,8 @@ def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
     values = [subject.readings[subject.mask[:, c], c] for c in range(channels)]
     lattice = [lattice_step(v, float(noise.std[c])) for c, v in enumerate(values)]
     noise = estimate_noise(residual, subject.mask, [step > 0.0 for step in lattice], subject.rows)
-    fitter = Fitter(subject, with_rounding(noise, lattice, null.near.readings[0]))
+    noise = unclipped(noise, subject, null.near.readings[0])
+    fitter = Fitter(with_clipped_noise(subject, null, noise), with_rounding(noise, lattice, null.near.readings[0]))
     return fitter, fitter.fit(Candidate(), null, rounds=PATIENT), lattice
 
 

@@ -1,22 +1,30 @@
 """What the values themselves tell of a sensor's range: readings that stand still at one end of it and nowhere else.
 
 A rig clips its noisy reading, so that a clipped stretch shows no noise at all. This is told without a model, as
-rounding is; a limit that the level meets before the noise is added is left to the search.
+rounding is; a limit that the level meets before the noise is added is left to the search. Near such an end the mean of
+a reading is not what the level says, by up to 0.4 of the noise's deviation: with 3600 samples a gap by itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from fdi_torch.effects import effect
+from fdi_torch.gap.fitting import Fit, Fitter
+from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.subject import Subject
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
 
+LIMITS = ("sensor_saturation", "sensor_floor")
 LONGEST_BY_CHANCE = 5  # samples in a row of one value
+CLEAR = 4.0  # standard deviations from an end of the range, from which noise is not clipped
+FEWEST = 0.1  # share of a sensor's samples that tell of its noise
 STILL = 0.05  # share of steps without change, the ends left out, above which a channel may just be at rest
 
 
@@ -24,7 +32,7 @@ def limits_of(values: Tensor) -> dict[str, float]:
     """values (S,) of one sensor -> where it ends: 'sensor_saturation' and 'sensor_floor', as far as it was seen to."""
     same = torch.diff(values) == 0.0
     found = {}
-    ends = {"sensor_saturation": float(values.max()), "sensor_floor": float(values.min())}
+    ends = dict(zip(LIMITS, (float(values.max()), float(values.min())), strict=True))
     at_end = (values[1:] == values.max()) | (values[1:] == values.min())
     elsewhere = same[~at_end]
     if len(elsewhere) == 0 or float(elsewhere.double().mean()) > STILL:
@@ -45,12 +53,88 @@ def told_limits(
         if sensor.column not in recording.output_names:
             continue
         i = recording.output_names.index(sensor.column)
-        given = {"sensor_saturation": sensor.high, "sensor_floor": sensor.low}
+        given = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
         for name, limit in limits_of(recording.outputs[recording.mask[:, i], i]).items():
             placement = Placement(effect(name), sensor.name, {"limit": limit})
             if given[name] is None and placement.prefix in offered - known:
                 told.append(placement)
     return told
+
+
+def unclipped(noise: Noise, subject: Subject, believed: Tensor) -> Noise:
+    """The noise before the range clips it: each sensor's level as the samples far from its ends tell it, by how much
+    neighbours differ, of which little is the model's. The colour is that of all samples: pieces tell it badly.
+
+    believed (S, C): about what would be read.
+    """
+    innovation, residual = noise.innovation.clone(), subject.readings - believed
+    for c, ends in enumerate(_ends(subject)):
+        seen = free = subject.mask[:, c]
+        for name, end in ends.items():
+            free = free & (_beyond(name, believed[:, c], end) < -CLEAR * float(noise.std[c]))
+        if ends and int(free.sum()) > FEWEST * int(seen.sum()):
+            innovation[c] *= _roughness(residual[:, c], free) / _roughness(residual[:, c], seen, subject.rows)
+    return replace(noise, innovation=innovation)
+
+
+def _roughness(x: Tensor, which: Tensor, tapered: Sequence[slice] = ()) -> float:
+    """How much neighbours among some samples (S,) differ: the root of their mean square. tapered: stretches whose middle
+    counts most, as in the noise's spectrum.
+    """
+    weight = torch.ones_like(x) if not tapered else torch.zeros_like(x)
+    for rows in tapered:
+        weight[rows] = torch.hann_window(len(x[rows]), periodic=False, dtype=x.dtype) ** 2
+    weight = weight[1:] * (which[1:] & which[:-1])
+    return float((weight * torch.diff(x) ** 2).sum() / weight.sum()) ** 0.5
+
+
+def with_clipped_noise(subject: Subject, null: Fit, noise: Noise) -> Subject:
+    """The same, in which limits that the readings show, and the plant file or `told_limits` name, clip the noise too.
+
+    null: a fit of the subject without further effects.
+    """
+    if not any(_ends(subject)):
+        return subject
+    levels = _unlimited(subject, null, noise)
+    left = torch.where(subject.mask, subject.readings - null.near.readings[0], 0.0)
+    most = torch.sqrt(left.square().sum(dim=0) / subject.mask.sum(dim=0))  # a slow colour's level is told badly
+    believed = {p.prefix: p for p in subject.believed}
+    for c, (sensor, ends) in enumerate(zip(subject.plant.sensors, _ends(subject), strict=True)):
+        std = min(float(noise.std[c]), float(most[c]))
+        given = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
+        for name, end in ends.items():
+            placement = believed.get(f"{sensor.name}.{name}", Placement(effect(name), sensor.name))
+            values = dict(placement.values or {})
+            known = [limit for limit in (values.get("limit"), given[name]) if limit is not None]
+            if known and all(abs(limit - end) < std for limit in known):
+                beyond = subject.mask[:, c] & (_beyond(name, levels[:, c], end) > CLEAR * std)
+                behind = _met_again(subject.readings[beyond, c] == end)
+                values = {"limit": end, **values, "noise": std, "behind": behind}
+                believed[placement.prefix] = replace(placement, values=values)
+    return replace(subject, believed=tuple(believed.values()))
+
+
+def _unlimited(subject: Subject, null: Fit, noise: Noise) -> Tensor:
+    """What a fit would read if no sensor had a limit, (S, C), in the readings' unit."""
+    sensors = tuple(replace(s, low=None, high=None) for s in subject.plant.sensors)
+    believed = tuple(p for p in subject.believed if p.effect.name not in LIMITS)
+    free = replace(subject, plant=replace(subject.plant, sensors=sensors), believed=believed)
+    return Fitter(free, noise).engine(null.candidate, ()).read(null.near.levels, null.theta.unsqueeze(0))[0]
+
+
+def _beyond(name: str, values: Tensor, end: float) -> Tensor:
+    """How far outside of an end of the range, in the readings' unit."""
+    return values - end if name == LIMITS[0] else end - values
+
+
+def _met_again(at_end: Tensor) -> float:
+    """Which share of the noise comes behind the limit: of samples far beyond, half of those with it are off the end."""
+    return min(2.0 * float((~at_end).double().mean()), 1.0) if len(at_end) else 0.0
+
+
+def _ends(subject: Subject) -> list[dict[str, float]]:
+    """Of each sensor, as in `limits_of`."""
+    return [limits_of(subject.readings[seen, c]) for c, seen in enumerate(subject.mask.T)]
 
 
 def _longest_run(yes: Tensor) -> int:
