@@ -141,6 +141,14 @@ def test_a_cause_that_the_library_lacks_is_unknown_at_its_place() -> None:
     assert answer.where[0][0] == "P13"
 
 
+def test_slow_noise_that_no_effect_explains_is_no_unknown_cause() -> None:
+    recording = recorded({"P13.discharge_coefficient": 0.61}, 1, samples=1500)
+    slow = replace(recording, outputs=recording.outputs + noise(1500, 0.95, 7e-4, 51))
+    answer = diagnose(believed(), slow, settings=Settings(("pump_delay", "pump_saturation", "sensor_lag")))
+    assert answer.p_value > 1e-3
+    assert answer.verdict == "no_gap"
+
+
 def test_the_answer_is_the_protocols() -> None:
     answer = diagnose(believed(), recorded({"Q2.pump_gain.factor": 1.12}, 51), settings=Settings(("pump_gain",)))
     found = answer.to_dict()

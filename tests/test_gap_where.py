@@ -7,6 +7,7 @@ import torch
 
 from fdi_torch.gap.case import case_of
 from fdi_torch.gap.diagnose import Settings, _recalibrated, diagnose
+from fdi_torch.gap.where.components import balance_of
 from fdi_torch.gap.where.followed import between, smoothed
 from fdi_torch.gap.where.forms import bends, faded, jerked, lagged, relays, slewed, stuck, switched
 from fdi_torch.gap.where.sparse import sparse
@@ -86,6 +87,11 @@ def test_what_has_a_memory_and_no_name_is_unknown_at_its_place(values: dict[str,
     answer = diagnose(believed(), recorded(values, 5), settings=Settings(leave_out=("pump_lag", "pump_delay")))
     assert answer.verdict == "unknown"
     assert answer.where[0][0] == next(iter(values)).partition(".")[0]
+
+
+def test_a_pump_and_an_outlet_have_a_part_in_one_balance_and_a_pipe_in_two() -> None:
+    places = ("Q2", "T2", "OUT2", "P32", "T1-T2", "h2", "Q1")
+    assert [balance_of(p, believed()) for p in places] == ["T2", "T2", "T2", None, None, None, "T1"]
 
 
 def test_a_curvature_that_rounding_spoilt_harms_no_neighbour() -> None:

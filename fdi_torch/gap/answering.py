@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,7 +15,7 @@ from fdi_torch.gap.closure_answer import closure_in_full
 from fdi_torch.gap.curves import curves_at
 from fdi_torch.gap.evidence import temperature
 from fdi_torch.gap.excitation import excitation
-from fdi_torch.gap.finding import Finding, in_order
+from fdi_torch.gap.finding import Finding, chance, in_order
 from fdi_torch.gap.fitting import Fitter, left_open
 from fdi_torch.gap.freeform import shape_of
 from fdi_torch.gap.impostors import PASSES, simulated_impostors
@@ -153,13 +152,10 @@ def _causes(found: Finding) -> tuple[Cause, ...]:
 
 
 def _p_value(found: Finding) -> float:
-    """Chance that noise alone lets some option of the library gain as much (Bonferroni over the options)."""
+    """Chance that it is noise; what the values themselves tell is none."""
     if found.rounded or (found.verdict == "unknown" and most_astray(found.strays[0])):
         return 0.0
-    screen, null = found.search.screens[found.null.key], found.null
-    singles = [f.cost for f in found.search.fits if len(f.key) == 1]
-    gain = max(float(screen.gain.max()), null.cost - min(singles, default=null.cost))
-    return min(1.0, len(screen.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))
+    return chance(found.search)
 
 
 def _noise(fitter: Fitter, lattice: Sequence[float]) -> Mapping[str, Any]:

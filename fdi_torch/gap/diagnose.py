@@ -12,7 +12,7 @@ from fdi_torch.gap.answer import Answer, CauseName, Explanation, Verdict
 from fdi_torch.gap.answering import answered
 from fdi_torch.gap.case import PLAIN, Case, Settings, case_of
 from fdi_torch.gap.evidence import opinions, plainest, temperature
-from fdi_torch.gap.finding import UNEXPLAINED, Finding, Weighed, in_order, whole_gap
+from fdi_torch.gap.finding import ALARM, UNEXPLAINED, Finding, Weighed, chance, in_order, whole_gap
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter, left_open
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, with_rounding
 from fdi_torch.gap.freeform import fitted_free_form
@@ -70,7 +70,9 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
     rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]
     rounded += [(p.effect.name, p.location) for p in told]
     unknown = None
-    if not case.named_only and _unnamed(fitter, weighed.fits[0], found, places[0]):
+    # A gap without a name is a gap: hardly any is such that nothing in the library helps. Slow noise is.
+    alarmed = chance(found) < ALARM
+    if not case.named_only and alarmed and _unnamed(fitter, weighed.fits[0], found, places[0]):
         places = parted(fitter, found.null, places)
         unknown = fitted_free_form(fitter, found.null, places[0].location, places[0].periods, reach)
     standing = _content(weighed.explanations)

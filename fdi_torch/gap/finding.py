@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from fdi_torch.gap.which import Search
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.reach import Reach
 
+ALARM = 1e-3  # chance that it is noise, above which nothing is told as unknown
 UNEXPLAINED = 0.1  # share of the gap left open at which nothing has been explained
 
 
@@ -74,6 +76,13 @@ class Finding:
 def whole_gap(fitter: Fitter, found: Search) -> float:
     """What the recalibrated plant leaves open: what the best explanation closes, and what that leaves."""
     return found.null.cost - found.best.cost + left_open(fitter, found.best)
+
+
+def chance(found: Search) -> float:
+    """That noise alone lets some option of the library gain as much as the best one does (Bonferroni)."""
+    screen, singles = found.screens[found.null.key], [f.cost for f in found.fits if len(f.key) == 1]
+    gain = max(float(screen.gain.max()), found.null.cost - min(singles, default=found.null.cost))
+    return min(1.0, len(screen.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))
 
 
 def in_order(fit: Fit) -> tuple[CauseName, ...]:

@@ -89,6 +89,15 @@ def component_at(place: str, plant: PlantDescription) -> Component:
     return _pipe(found, plant)
 
 
+def balance_of(place: str, plant: PlantDescription) -> str | None:
+    """The tank whose balance alone a place has a part in: itself, its pump's, its outlet's; None of what joins two."""
+    if place_kind(plant, place) in ("tank_pair", "sensor"):
+        return None
+    component = component_at(place, plant)
+    ends = {component.source, component.target} - {OUTSIDE}
+    return ends.pop() if len(ends) == 1 else None
+
+
 def of_reading(s: Signals, step: Tensor, ends: Ends, pace: float) -> list[Tensor]:
     """Forms of a sensor's discrepancy; step: between samples, s; pace: of the plant."""
     own = [*ends.bends(s, "reading", 12), s["reading"] * s["time"] / ends("time")[1]]

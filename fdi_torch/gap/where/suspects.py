@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 
 from fdi_torch.gap.fitting import Fit, Fitter
+from fdi_torch.gap.where.components import balance_of
 from fdi_torch.gap.where.line import STANDS_OUT, spectral_line
 from fdi_torch.gap.where.sparse import sparse
 from fdi_torch.gap.where.survey import Regression, Survey
@@ -52,19 +53,21 @@ def suspects(fitter: Fitter, fit: Fit, places: Sequence[str], waves: bool, close
 
 
 def parted(fitter: Fitter, fit: Fit, found: Sequence[Suspect]) -> list[Suspect]:
-    """The rivals of the likeliest in the order that a closer look gives them, with what they left open at the first.
+    """The likeliest and its rivals in the order that a closer look gives them, with what they left open at the first.
 
     What flows into a tank or out of it makes one balance: its pump, its outlet and itself can take up each other's
     discrepancies, but only the one that has it needs few forms. With thresholds and steps that lie far apart, even
     that one needs many.
     """
-    near = [s for s in found if s.evidence > -NEAR]
-    if len(near) < 2:
+    plant = fitter.subject.plant
+    shared = balance_of(found[0].location, plant)
+    near = [s for s in found if s.evidence > -NEAR and balance_of(s.location, plant) == shared]
+    if shared is None or len(near) < 2:
         return list(found)
     survey = Survey(fitter, fit, near[0].periods, MORE_STEPS, closely=True)
     evidence, _ = _weighed([survey.of(s.location) for s in near], CHOICE)
     order = sorted(range(len(near)), key=lambda k: -evidence[k])
-    return [*(near[k] for k in order), *(s for s in found if s.evidence <= -NEAR)]
+    return [*(near[k] for k in order), *(s for s in found if s not in near)]
 
 
 def _weighed(each: Sequence[Regression], choice: float = 0.0) -> tuple[list[float], list[float]]:
