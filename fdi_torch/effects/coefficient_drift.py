@@ -24,6 +24,7 @@ class CoefficientDrift(Effect):
     name = "coefficient_drift"
     stage = Stage.FLOW
     places = ("pipe", "outlet")
+    on_clock = ("rate",)
     mistaken_for = ("unmetered_flow", "plugging", "sensor_drift", "flow_exponent")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -21,6 +21,7 @@ class SensorDrift(Effect):
     name = "sensor_drift"
     stage = Stage.READING
     places = ("sensor",)
+    on_clock = ("rate",)
     mistaken_for = ("sensor_bias", "coefficient_drift", "sensor_curvature")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -26,6 +26,7 @@ class SensorOscillation(Effect):
     name = "sensor_oscillation"
     stage = Stage.READING
     places = ("sensor",)
+    on_clock = ("phase",)
     mistaken_for = ("pump_oscillation", "sensor_bias")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

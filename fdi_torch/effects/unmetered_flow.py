@@ -22,6 +22,7 @@ class UnmeteredFlow(Effect):
     name = "unmetered_flow"
     stage = Stage.BALANCE
     places = ("tank",)
+    on_clock = ("begin",)
     mistaken_for = ("leak", "evaporation", "pump_offset", "pump_dead_zone", "coefficient_drift")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

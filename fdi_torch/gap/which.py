@@ -16,6 +16,7 @@ import torch
 from fdi_torch.gap.evidence import temperature
 from fdi_torch.gap.fitting import SETTLED, Candidate, Fit, Fitter, Key, left_open
 from fdi_torch.gap.screening import Option, Screen, screen
+from fdi_torch.gap.tied import paying
 from fdi_torch.plant.effect import Placement
 
 SINGLES, STARTS = 14, 2
@@ -69,7 +70,8 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEE
         if depth > 2 and left > HOPELESS * gap:
             break
         explained = left < max(EXPLAINED_SHARE * gap, min(EXPLAINED_LEAST, 0.1 * gap))
-        for parent in _parents(fits.values(), depth - 1, 1 if explained else PARENTS if depth == 2 else 2):
+        followed, count = _followed(fitter, fits, depth - 1), 1 if explained else PARENTS if depth == 2 else 2
+        for parent in _parents(followed, depth - 1, count):
             screens[parent.key] = screen(fitter, parent, _beside(parent, options), heat)
             for candidate in _further(parent, screens[parent.key], PARTNERS if depth == 2 else 3, PROMISE):
                 if _untried(fits, candidate, parent):
@@ -84,7 +86,15 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEE
         if hidden and left > SETTLED_SHARE * gap:
             _swap(fitter, fits, screens, options, depth, settled)
     _without_one(fitter, fits, settled)
-    return Search(null, tuple(sorted(fits.values(), key=lambda f: f.cost)), screens)
+    return Search(null, tuple(sorted(paying(fitter, fits.values(), fits), key=lambda f: f.cost)), screens)
+
+
+def _followed(fitter: Fitter, fits: dict[Key, Fit], effects: int) -> list[Fit]:
+    """The fits of so many effects from which others follow. From three on, what is tied to the clock has to pay: with
+    fewer, what it has to close beside may only not have been found yet.
+    """
+    some = [f for f in fits.values() if len(f.key) == effects]
+    return (paying(fitter, some, fits) if effects > 2 else []) or some
 
 
 def _far_off(null: Fit) -> bool:
@@ -118,7 +128,7 @@ def _swap(
     """
     null = fits[frozenset()]
     for _ in range(SWAPS):
-        (best,) = _parents(fits.values(), depth, 1)
+        (best,) = _parents(_followed(fitter, fits, depth), depth, 1)
         heat = temperature(null.cost - best.cost, left_open(fitter, best))
         for left in best.candidate.placements:
             rest = _less(fitter, fits, best, left, settled)
