@@ -171,6 +171,19 @@ def test_a_clipped_noisy_reading_reads_what_it_does_in_the_mean(level: float, be
     assert below == pytest.approx(-seen, rel=1e-12)
 
 
+def test_a_narrow_gap_between_tanks_is_linear_near_equal_levels_and_torricellian_far_from_them() -> None:
+    law, p = effect("cross_flow"), values(size=0.5, height=0.0, transition_head=0.002)
+    for head in (1e-6, -1e-6):
+        here = replace(local(head), level=number(0.3 + head), far_level=number(0.3))
+        assert float(law.inflow(here, p)) == pytest.approx(0.5 * head / math.sqrt(0.002), rel=2e-2)
+    far = replace(local(0.5), level=number(0.8), far_level=number(0.3))
+    assert float(law.inflow(far, p)) == pytest.approx(0.5 * math.sqrt(0.5), rel=0.02)
+    for head in (5e-4, 2e-3, 8e-3, 0.03, 0.12):  # head = a q + b q^2
+        here = replace(local(head), level=number(0.3 + head), far_level=number(0.3))
+        exact = 0.5 * head / (0.5 * math.sqrt(0.002) + math.sqrt(head + 0.25 * 0.002))
+        assert float(law.inflow(here, p)) == pytest.approx(exact, rel=0.09)
+
+
 def test_a_limited_pump_has_a_kink_or_a_knee() -> None:
     full, limit = 1e-4, 5e-5
     for flow in (0.0, 1e-5, 4e-5, 5e-5, 8e-5):

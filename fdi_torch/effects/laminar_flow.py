@@ -46,11 +46,14 @@ class LaminarFlow(Effect):
         return [*({"transition_head": low, "softness": s} for s in (0.67, 0.33, 0.125)), kink]
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
-        ratio = p["transition_head"] / local.magnitude(local.head)
-        power = 0.5 / p["softness"]
-        below, above = torch.clamp(ratio, LEAST_RATIO, 1.0), torch.clamp(ratio, min=1.0)
-        # (1 + ratio^power)^(-s), of which no part overflows. Not a power of the ratio itself: at a transition head of 0
-        # its slope would be lost.
-        inner = torch.clamp(ratio, max=1.0) * torch.exp((power - 1.0) * torch.log(below))
-        outer = power * torch.log(above)
-        return flow * torch.exp(-p["softness"] * (outer + torch.log(1.0 + inner * torch.exp(-outer))))
+        return flow * kept(p["transition_head"] / local.magnitude(local.head), p["softness"])
+
+
+def kept(ratio: Tensor, softness: Tensor | float) -> Tensor:
+    """The share of Torricelli's flow, of a ratio of transition head and head: (1 + ratio^(1/2s))^(-s)."""
+    power = 0.5 / softness
+    below, above = torch.clamp(ratio, LEAST_RATIO, 1.0), torch.clamp(ratio, min=1.0)
+    # No part overflows. Not a power of the ratio itself: at a transition head of 0 its slope would be lost.
+    inner = torch.clamp(ratio, max=1.0) * torch.exp((power - 1.0) * torch.log(below))
+    outer = power * torch.log(above)
+    return torch.exp(-softness * (outer + torch.log(1.0 + inner * torch.exp(-outer))))

@@ -78,8 +78,9 @@ def unclipped(noise: Noise, subject: Subject, believed: Tensor) -> Noise:
 
 
 def _roughness(x: Tensor, which: Tensor, tapered: Sequence[slice] = ()) -> float:
-    """How much neighbours among some samples (S,) differ: the root of their mean square. tapered: stretches whose middle
-    counts most, as in the noise's spectrum.
+    """How much neighbours among some samples (S,) differ: the root of their mean square.
+
+    tapered: stretches whose middle counts most, as in the noise's spectrum.
     """
     weight = torch.ones_like(x) if not tapered else torch.zeros_like(x)
     for rows in tapered:
