@@ -86,7 +86,11 @@ def test_a_sluggish_pump_is_told_from_its_tank_by_a_closer_look() -> None:
 def test_what_has_a_memory_and_no_name_is_unknown_at_its_place(values: dict[str, float]) -> None:
     answer = diagnose(believed(), recorded(values, 5), settings=Settings(leave_out=("pump_lag", "pump_delay")))
     assert answer.verdict == "unknown"
-    assert answer.where[0][0] == next(iter(values)).partition(".")[0]
+    place = next(iter(values)).partition(".")[0]
+    assert answer.where[0][0] == place
+    assert answer.posterior[0].unknown_at == place
+    assert 0.5 < answer.posterior[0].probability < 0.95, "what has a name is never quite out of the question"
+    assert sum(e.probability for e in answer.posterior) == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_pump_and_an_outlet_have_a_part_in_one_balance_and_a_pipe_in_two() -> None:

@@ -9,7 +9,7 @@ none of them can do parts nobody.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -53,7 +53,8 @@ def suspects(fitter: Fitter, fit: Fit, places: Sequence[str], waves: bool, close
 
 
 def parted(fitter: Fitter, fit: Fit, found: Sequence[Suspect]) -> list[Suspect]:
-    """The likeliest and its rivals in the order that a closer look gives them, with what they left open at the first.
+    """The likeliest and its rivals in the order of what evidence a closer look gives them, with what they left open at
+    the first.
 
     What flows into a tank or out of it makes one balance: its pump, its outlet and itself can take up each other's
     discrepancies, but only the one that has it needs few forms. With thresholds and steps that lie far apart, even
@@ -67,7 +68,9 @@ def parted(fitter: Fitter, fit: Fit, found: Sequence[Suspect]) -> list[Suspect]:
     survey = Survey(fitter, fit, near[0].periods, MORE_STEPS, closely=True)
     evidence, _ = _weighed([survey.of(s.location) for s in near], CHOICE)
     order = sorted(range(len(near)), key=lambda k: -evidence[k])
-    return [*(near[k] for k in order), *(s for s in found if s not in near)]
+    near = [replace(s, evidence=e - max(evidence)) for s, e in zip(near, evidence, strict=True)]
+    rest = [s for s in found if s.location not in {n.location for n in near}]
+    return [*(near[k] for k in order), *rest]
 
 
 def _weighed(each: Sequence[Regression], choice: float = 0.0) -> tuple[list[float], list[float]]:
