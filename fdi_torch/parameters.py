@@ -168,6 +168,7 @@ def display_unit(si_unit: str) -> tuple[str, float]:
     return ("" if unit == "1" else unit), 1.0 if unit == si_unit else 1.0 / unit_factor(unit, si_unit)
 
 
+@lru_cache(maxsize=1024)
 def header_unit(header: str) -> tuple[str, str] | None:
     """Splits a CSV header of the form name_unit, name [unit] or name (unit): 'Q1_cm3_s' -> ('Q1', 'cm3_s').
 

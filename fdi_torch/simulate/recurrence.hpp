@@ -6,7 +6,7 @@
 #include <vector>
 
 namespace {
-constexpr int64_t BLOCK = 8;
+constexpr int64_t BLOCK = 64;
 
 // rows (count, stride) from `first` on -> block[t][row]; and back.
 inline void gather(const double* rows, int64_t count, int64_t stride, int64_t first, int64_t length, double* block) {
@@ -23,32 +23,41 @@ inline void scatter(const double* block, int64_t count, int64_t stride, int64_t 
     }
 }
 
-// to = A from + b, or without a b, columns side by side.
+// to = A from + b, columns side by side.
 template <int N>
-inline void step(const double* a, const double* from, const double* b, int64_t columns, double* __restrict to) {
+inline void step(const double* __restrict a, const double* __restrict from, const double* __restrict b,
+                 int64_t columns, double* __restrict to) {
     for (int i = 0; i < N; ++i)
         for (int64_t c = 0; c < columns; ++c) {
-            double total = b ? b[i * columns + c] : 0.0;
+            double total = b[i * columns + c];
             for (int j = 0; j < N; ++j) total += a[i * N + j] * from[j * columns + c];
             to[i * columns + c] = total;
         }
 }
 
-// Inverse of an N x N matrix by elimination without pivots.
+// A block of steps of several rows, time last: row r lies at r * BLOCK.
+typedef double Steps[BLOCK];
+
+// Inverses of N x N matrices by elimination without pivots, at all steps of a block side by side.
 template <int N>
-inline void invert(double* m, double* inverse) {
+inline void invert(Steps* m, Steps* inverse) {
     for (int i = 0; i < N; ++i)
-        for (int j = 0; j < N; ++j) inverse[i * N + j] = i == j;
+        for (int j = 0; j < N; ++j)
+            for (int64_t t = 0; t < BLOCK; ++t) inverse[i * N + j][t] = i == j;
     for (int i = 0; i < N; ++i) {
-        const double scale = 1.0 / m[i * N + i];
-        for (int j = 0; j < N; ++j) m[i * N + j] *= scale, inverse[i * N + j] *= scale;
+        Steps scale;
+        for (int64_t t = 0; t < BLOCK; ++t) scale[t] = 1.0 / m[i * N + i][t];
+        for (int j = 0; j < N; ++j)
+            for (int64_t t = 0; t < BLOCK; ++t) m[i * N + j][t] *= scale[t], inverse[i * N + j][t] *= scale[t];
         for (int k = 0; k < N; ++k) {
             if (k == i) continue;
-            const double factor = m[k * N + i];
-            for (int j = 0; j < N; ++j) {
-                m[k * N + j] -= factor * m[i * N + j];
-                inverse[k * N + j] -= factor * inverse[i * N + j];
-            }
+            Steps factor;
+            for (int64_t t = 0; t < BLOCK; ++t) factor[t] = m[k * N + i][t];
+            for (int j = 0; j < N; ++j)
+                for (int64_t t = 0; t < BLOCK; ++t) {
+                    m[k * N + j][t] -= factor[t] * m[i * N + j][t];
+                    inverse[k * N + j][t] -= factor[t] * inverse[i * N + j][t];
+                }
         }
     }
 }
@@ -87,56 +96,76 @@ void midpoint(int64_t lanes, int64_t steps, int64_t columns, const double* span,
               const double* start_slopes, double* levels, double* slopes, double* transition, double* gain,
               double* defect) {
     const int64_t wide = N * columns;
-    std::vector<double> pushed(BLOCK * wide), forced(wide), moved((BLOCK + 1) * wide);
-    double by[BLOCK * N * N], rate[BLOCK * N], at[(BLOCK + 1) * N], on[BLOCK * N * N], reach[BLOCK * N * N];
-    double shift[(BLOCK + 1) * N];
+    std::vector<double> pushed(BLOCK * wide), moved((BLOCK + 1) * wide);
+    double on[BLOCK * N * N], forcing[BLOCK * N], shift[(BLOCK + 1) * N];
+    Steps matrix[N * N], inverse[N * N], half, misfit[N];
+    for (int i = 0; i < N * N; ++i)
+        for (int64_t t = 0; t < BLOCK; ++t) matrix[i][t] = i % (N + 1) == 0;
     for (int64_t lane = 0; lane < lanes; ++lane) {
         const double* own_path = path + lane * N * (steps + 1);
+        const double *own_rates = rates + lane * N * steps, *own_by_level = by_level + lane * N * N * steps;
+        const double* own_by_theta = by_theta + lane * wide * steps;
         double *own_levels = levels + lane * N * (steps + 1), *own_slopes = slopes + lane * wide * (steps + 1);
+        double *own_on = transition + lane * N * N * steps, *own_gain = gain + lane * N * N * steps;
         std::copy(start_slopes + lane * wide, start_slopes + (lane + 1) * wide, moved.begin());
-        for (int i = 0; i < N; ++i) shift[i] = start[lane * N + i] - own_path[i * (steps + 1)];
-        for (int i = 0; i < N; ++i) own_levels[i * (steps + 1)] = own_path[i * (steps + 1)] + shift[i];
         scatter(moved.data(), wide, steps + 1, 0, 1, own_slopes);
         double largest = 0.0;
         bool broken = false;
         for (int i = 0; i < N; ++i) {
+            shift[i] = start[lane * N + i] - own_path[i * (steps + 1)];
+            own_levels[i * (steps + 1)] = own_path[i * (steps + 1)] + shift[i];
             largest = std::max(largest, std::fabs(shift[i]));
             broken |= std::isnan(shift[i]);
         }
         for (int64_t k = 0; k < steps; k += BLOCK) {
             const int64_t length = std::min(BLOCK, steps - k);
-            gather(by_level + lane * N * N * steps, N * N, steps, k, length, by);
-            gather(rates + lane * N * steps, N, steps, k, length, rate);
-            gather(own_path, N, steps + 1, k, length + 1, at);
-            gather(by_theta + lane * wide * steps, wide, steps, k, length, pushed.data());
+            for (int64_t t = 0; t < length; ++t) half[t] = 0.5 * span[k + t];
+            for (int i = 0; i < N * N; ++i) {
+                const double* by = own_by_level + i * steps + k;
+                for (int64_t t = 0; t < length; ++t) matrix[i][t] = (i % (N + 1) == 0) - half[t] * by[t];
+            }
+            invert<N>(matrix, inverse);
+            for (int i = 0; i < N; ++i) {
+                const double *at = own_path + i * (steps + 1) + k, *rate = own_rates + i * steps + k;
+                for (int64_t t = 0; t < length; ++t) misfit[i][t] = 2.0 * half[t] * rate[t] - (at[t + 1] - at[t]);
+            }
+            for (int i = 0; i < N * N; ++i) {
+                double *to = own_on + i * steps + k, *reach = own_gain + i * steps + k;
+                for (int64_t t = 0; t < length; ++t) {
+                    to[t] = 2.0 * inverse[i][t] - (i % (N + 1) == 0);
+                    reach[t] = 2.0 * half[t] * inverse[i][t];
+                }
+                for (int64_t t = 0; t < length; ++t) on[t * N * N + i] = to[t];
+            }
+            for (int i = 0; i < N; ++i) {
+                for (int64_t t = 0; t < length; ++t) {
+                    double total = 0.0;
+                    for (int j = 0; j < N; ++j) total += inverse[i * N + j][t] * misfit[j][t];
+                    forcing[t * N + i] = total;
+                }
+                for (int64_t c = 0; c < columns; ++c) {
+                    Steps total = {};
+                    for (int j = 0; j < N; ++j) {
+                        const double* reach = own_gain + (i * N + j) * steps + k;
+                        const double* by = own_by_theta + (j * columns + c) * steps + k;
+                        for (int64_t t = 0; t < length; ++t) total[t] += reach[t] * by[t];
+                    }
+                    for (int64_t t = 0; t < length; ++t) pushed[t * wide + i * columns + c] = total[t];
+                }
+            }
             for (int64_t t = 0; t < length; ++t) {
-                const double half = 0.5 * span[k + t];
-                double matrix[N * N], inverse[N * N], misfit[N], forcing[N];
-                for (int i = 0; i < N * N; ++i) matrix[i] = (i % (N + 1) == 0) - half * by[t * N * N + i];
-                invert<N>(matrix, inverse);
-                for (int i = 0; i < N * N; ++i) {
-                    on[t * N * N + i] = 2.0 * inverse[i] - (i % (N + 1) == 0);
-                    reach[t * N * N + i] = inverse[i] * span[k + t];
-                }
-                for (int i = 0; i < N; ++i)
-                    misfit[i] = span[k + t] * rate[t * N + i] - (at[(t + 1) * N + i] - at[t * N + i]);
-                for (int i = 0; i < N; ++i) {
-                    forcing[i] = 0.0;
-                    for (int j = 0; j < N; ++j) forcing[i] += inverse[i * N + j] * misfit[j];
-                }
-                step<N>(&on[t * N * N], &shift[t * N], forcing, 1, &shift[(t + 1) * N]);
-                step<N>(&reach[t * N * N], pushed.data() + t * wide, nullptr, columns, forced.data());
-                step<N>(&on[t * N * N], moved.data() + t * wide, forced.data(), columns, moved.data() + (t + 1) * wide);
+                step<N>(&on[t * N * N], &shift[t * N], &forcing[t * N], 1, &shift[(t + 1) * N]);
+                step<N>(&on[t * N * N], moved.data() + t * wide, pushed.data() + t * wide, columns,
+                        moved.data() + (t + 1) * wide);
             }
-            for (int64_t r = N; r < (length + 1) * N; ++r) {
-                largest = std::max(largest, std::fabs(shift[r]));
-                broken |= std::isnan(shift[r]);
-                at[r] += shift[r];
-            }
-            scatter(&at[N], N, steps + 1, k + 1, length, own_levels);
+            for (int i = 0; i < N; ++i)
+                for (int64_t t = 0; t < length; ++t) {
+                    const double own = shift[(t + 1) * N + i];
+                    largest = std::max(largest, std::fabs(own));
+                    broken |= std::isnan(own);
+                    own_levels[i * (steps + 1) + k + 1 + t] = own_path[i * (steps + 1) + k + 1 + t] + own;
+                }
             scatter(moved.data() + wide, wide, steps + 1, k + 1, length, own_slopes);
-            scatter(on, N * N, steps, k, length, transition + lane * N * N * steps);
-            scatter(reach, N * N, steps, k, length, gain + lane * N * N * steps);
             std::copy(&shift[length * N], &shift[length * N] + N, shift);
             std::copy(moved.data() + length * wide, moved.data() + (length + 1) * wide, moved.begin());
         }
