@@ -195,13 +195,10 @@ class Fitter:
         residual, jacobian = self.white(near)
         pull = 1.0 / space.std(theta)
         off = (theta - space.nominal(theta)) * pull
-        j = (jacobian * scale).flatten(1, 2)
-        r = residual.flatten(1)
+        j, r = (jacobian * scale).permute(0, 3, 2, 1).flatten(2), residual.transpose(1, 2).flatten(1)  # time last
         cost = (r * r).sum(-1) + (off * off).sum(-1)
-        gradient = torch.einsum("lsp,ls->lp", j, r) - off * pull * scale
-        curvature = torch.einsum("lsp,lsq->lpq", j, j) + torch.diag_embed((pull * scale) ** 2).expand(
-            len(theta), -1, -1
-        )
+        gradient = (j @ r.unsqueeze(-1)).squeeze(-1) - off * pull * scale
+        curvature = j @ j.mT + torch.diag_embed((pull * scale) ** 2)
         return cost, gradient, curvature
 
     def white(self, near: Linearised) -> tuple[Tensor, Tensor]:

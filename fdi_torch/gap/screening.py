@@ -43,7 +43,7 @@ class Option:
 @dataclass(frozen=True)
 class Screen:
     """What options would close beside a fit: with their columns C, less the nuisances' part, and what the fit leaves
-    r, score (M,) = C'r and gram (M, M) = C'C."""
+    r, score (M,) = C'r and gram (M, M) = C'C; beside its diagonal not a number where pairs were not asked for."""
 
     options: tuple[Option, ...]
     score: Tensor
@@ -81,31 +81,40 @@ def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Reach) ->
     ]
 
 
-def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], heat: float = 1.0) -> Screen:
-    """Columns of all options about a fit, beside its own parameters. heat: as in `against`."""
+def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], heat: float = 1.0, pairs: bool = True) -> Screen:
+    """Columns of all options about a fit, beside its own parameters. heat, pairs: as in `against`."""
     columns = effect_columns(fitter, fit, options)
-    return against(fitter, fit, options, columns, heat)
+    return against(fitter, fit, options, columns, heat, pairs)
 
 
-def against(fitter: Fitter, fit: Fit, options: Sequence[Option], columns: Tensor, heat: float = 1.0) -> Screen:
+def against(
+    fitter: Fitter, fit: Fit, options: Sequence[Option], columns: Tensor, heat: float = 1.0, pairs: bool = True
+) -> Screen:
     """Regresses whitened columns (S, C, M) beside the fit's own parameters with their priors.
 
-    heat: by which the data's chi-square is divided, as in the evidence; what a tolerance says is no data and stays, so
-    that an effect which relieves a constant far out of its tolerance shows, however large the gap.
+    pairs: whether to say what pairs do together. heat: by which the data's chi-square is divided, as in the evidence;
+    what a tolerance says is no data and stays, so that an effect which relieves a constant far out of its tolerance
+    shows, however large the gap.
     """
-    residual, jacobian = (x / math.sqrt(heat) for x in fitter.white(fit.near))
+    root = math.sqrt(heat)
+    residual, jacobian = (x / root for x in fitter.white(fit.near))
     space, theta = fit.space, fit.theta
     scale = fitter.box(space)[2]
     pull = (scale / space.std(theta)).nan_to_num(0.0)
     j = torch.cat([_by_column(jacobian[0] * scale), torch.diag(pull)], dim=1)
     r = torch.cat([_by_column(residual[0].unsqueeze(-1))[0], -(theta - space.nominal(theta)) / space.std(theta)])
     # The priors' rows of the columns are zero: no constant's tolerance speaks of an effect.
-    c = _by_column(columns / math.sqrt(heat))
+    c = _by_column(columns)
     seen = c.shape[1]
     q, _ = torch.linalg.qr(torch.cat([j, 1e-6 * torch.eye(len(pull), dtype=j.dtype)], dim=1).T)
     q = q[: len(r)]
     shared, r = c @ q[:seen], r - q @ (q.T @ r)
-    return Screen(tuple(options), c @ r[:seen], c @ c.T - shared @ shared.T)
+    if pairs:
+        gram = c @ c.T - shared @ shared.T
+    else:
+        alone = torch.linalg.vecdot(c, c) - torch.linalg.vecdot(shared, shared)
+        gram = torch.full((len(c), len(c)), torch.nan, dtype=c.dtype).diagonal_scatter(alone)
+    return Screen(tuple(options), c @ r[:seen] / root, gram / heat)
 
 
 def _by_column(x: Tensor) -> Tensor:

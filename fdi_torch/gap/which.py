@@ -72,7 +72,7 @@ def search(fitter: Fitter, null: Fit, options: Sequence[Option], most: int = DEE
         explained = left < max(EXPLAINED_SHARE * gap, min(EXPLAINED_LEAST, 0.1 * gap))
         followed, count = _followed(fitter, fits, depth - 1), 1 if explained else PARENTS if depth == 2 else 2
         for parent in _parents(followed, depth - 1, count):
-            screens[parent.key] = screen(fitter, parent, _beside(parent, options), heat)
+            screens[parent.key] = screen(fitter, parent, _beside(parent, options), heat, pairs=False)
             for candidate in _further(parent, screens[parent.key], PARTNERS if depth == 2 else 3, PROMISE):
                 if _untried(fits, candidate, parent):
                     _keep(fits, fitter.fit(candidate, parent, target=_best(fits), settled=settled))
@@ -132,7 +132,7 @@ def _swap(
         heat = temperature(null.cost - best.cost, left_open(fitter, best))
         for left in best.candidate.placements:
             rest = _less(fitter, fits, best, left, settled)
-            screens[rest.key] = screen(fitter, rest, _beside(best, options), heat)
+            screens[rest.key] = screen(fitter, rest, _beside(best, options), heat, pairs=False)
             for candidate in _further(rest, screens[rest.key], SUBSTITUTES, PROMISE):
                 if _untried(fits, candidate, rest):
                     _keep(fits, fitter.fit(candidate, rest, target=_best(fits), settled=settled))

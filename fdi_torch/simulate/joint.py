@@ -113,6 +113,8 @@ class Joint:
 
 def with_blanks(pieces: Sequence[Tensor], dim: int = 1) -> Tensor:
     """(..., n_k, ...) one after the other along a dimension, one row of zeros between."""
+    if len(pieces) == 1:
+        return pieces[0]
     rows = [pieces[0]]
     for piece in pieces[1:]:
         rows += [torch.zeros_like(piece.narrow(dim, 0, 1)), piece]
