@@ -184,6 +184,13 @@ def test_a_narrow_gap_between_tanks_is_linear_near_equal_levels_and_torricellian
         assert float(law.inflow(here, p)) == pytest.approx(exact, rel=0.09)
 
 
+@pytest.mark.parametrize(("level", "left"), [(0.1, 0.02), (0.22, 0.0122), (0.3, 0.013), (0.38, 0.0138), (0.5, 0.02)])
+def test_a_heap_takes_up_less_towards_its_top(level: float, left: float) -> None:
+    heap = values(area=0.008, bottom=0.2, height=0.2, narrowing=0.25)
+    area = effect("internal_body").area(number(0.02), replace(local(0.5), level=number(level)), heap)
+    assert float(area) == pytest.approx(left, rel=1e-9)
+
+
 def test_a_limited_pump_has_a_kink_or_a_knee() -> None:
     full, limit = 1e-4, 5e-5
     for flow in (0.0, 1e-5, 4e-5, 5e-5, 8e-5):

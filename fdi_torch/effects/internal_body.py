@@ -15,8 +15,9 @@ LEAST_SHARE = 0.05
 
 
 class InternalBody(Effect):
-    """The cross-section is A - a between the body's bottom and top: a displacer, a float, a pump housing. Its edges
-    are rounded over a hundredth of the tank's height, so that a step across them stays accurate and has a slope.
+    """The cross-section is A - a between the body's bottom and top: a displacer, a float, a pump housing; or, of a heap
+    that narrows (widens) upwards, A - a (1 - s x) at the share x of its height. Its edges are rounded over a hundredth
+    of the tank's height, so that a step across them stays accurate and has a slope.
 
     Typical: a of 10 to 50 % of A over 5 to 30 cm. Outside its levels nothing shows.
     """
@@ -33,6 +34,7 @@ class InternalBody(Effect):
             Parameter("area", "m^2", 0.0, 0.0, 0.9 * tank.area, meaning="cross-section of the body"),
             Parameter("bottom", "m", 0.2 * tank.height, 0.0, tank.height, meaning="level at which it begins"),
             Parameter("height", "m", 0.2 * tank.height, 0.0, tank.height, meaning="how far it rises above that"),
+            Parameter("narrowing", "1", 0.0, -1.0, 1.0, meaning="share by which its top is narrower"),
         )
 
     def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
@@ -41,10 +43,15 @@ class InternalBody(Effect):
         low, high = reach.levels[place]
         span = high - low
         sections = [(k / 4, 1 / 4) for k in range(4)] + [(k / 4, 1 / 2) for k in range(3)]
-        return [{"area": 0.3 * tank.area, "bottom": low + at * span, "height": tall * span} for at, tall in sections]
+        return [
+            {"area": 0.3 * tank.area, "bottom": low + at * span, "height": tall * span, "narrowing": 0.0}
+            for at, tall in sections
+        ]
 
     def area(self, area: Tensor, local: Local, p: Values) -> Tensor:
         edge = EDGE_SHARE * local.height
         above_bottom = torch.clamp((local.level - p["bottom"]) / edge + 0.5, 0.0, 1.0)
         above_top = torch.clamp((local.level - p["bottom"] - p["height"]) / edge + 0.5, 0.0, 1.0)
-        return torch.maximum(area - p["area"] * (above_bottom - above_top), LEAST_SHARE * area)
+        risen = torch.clamp((local.level - p["bottom"]) / torch.clamp(p["height"], min=edge), 0.0, 1.0)
+        body = p["area"] * (1.0 - p["narrowing"] * risen)
+        return torch.maximum(area - body * (above_bottom - above_top), LEAST_SHARE * area)
