@@ -32,13 +32,21 @@ def runs(name: str) -> list[Recording]:
     return named_recordings(str(REAL / f"{name}.yaml"), load_plant("dts200"), ROOT)
 
 
-def test_the_adopted_plant_runs_freely_within_5_mm_where_valves_and_not_hoses_decide(data: Path) -> None:
+def test_the_adopted_plant_runs_freely_within_5_mm_where_hoses_are_full_or_told_by_the_first_half_minute(
+    data: Path,
+) -> None:
     plant = load_plant(REAL / "dts200_adopted.yaml")
+    tried = 0
     for run in runs("dts200_trials"):
-        if "exp8" in run.source or "lqr" in run.source:
-            found = predict(plant, run, 3)
-            assert found.settled
-            assert max(found.rmse.values()) < 0.005, run.source  # m
+        start = float(run.time[0])
+        if "smc" in run.source and start == 0.0:
+            continue  # the pumps draw air there, and R's reading slips: docs/real-rigs.md
+        filling = "exp4" in run.source and start == 90.0  # R's hose takes 140 cm^3, twice what is typical
+        found = predict(plant, run, 3, settle=30.0 if filling else None)
+        assert found.settled
+        assert max(found.rmse.values()) < 0.005, run.source  # m
+        tried += 1
+    assert tried == 11
 
 
 @pytest.mark.slow
