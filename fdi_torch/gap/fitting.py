@@ -173,7 +173,8 @@ class Fitter:
             shift = (near.slopes[lanes] * moves).sum(-1)
             tried = _followed(engine, moved, near.levels[lanes] + shift, shift, self.far)
             new_cost, new_gradient, new_curvature = self.normal(engine.space, moved, tried, scale)
-            better = new_cost < cost[lanes]
+            # What a trajectory leaves that is not the model's, for it was not followed to its end, says nothing.
+            better = (new_cost < cost[lanes]) & (tried.defect <= near.defect[lanes].clamp(min=self.far))
             gain = torch.where(better, cost[lanes] - new_cost, torch.zeros_like(new_cost))
             take = lanes[better]
             theta, cost = theta.index_copy(0, take, moved[better]), cost.index_copy(0, take, new_cost[better])
