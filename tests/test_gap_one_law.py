@@ -22,6 +22,7 @@ EXPONENT, LAMINAR = ("flow_exponent", "P13"), ("laminar_flow", "P13")
         {("sensor_gain", "h1"), ("sensor_bias", "h1")},
         {("plugging", "P13"), ("flow_exponent", "P13")},
         {("laminar_flow", "P13"), ("flow_exponent", "P32")},
+        {("valve_characteristic", "LM"), ("valve_authority", "LM")},  # its bore by its stem, and what resists beside it
     ],
 )
 def test_two_causes_of_several_kinds_or_places_are_two(real: set[tuple[str, str]]) -> None:

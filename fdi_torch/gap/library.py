@@ -46,7 +46,6 @@ STANDARD = (
 FORMS_OF_ONE_LAW = (
     frozenset({"laminar_flow", "flow_exponent", "outlet_drop"}),
     frozenset({"area_taper", "internal_body"}),
-    frozenset({"valve_characteristic", "valve_authority"}),
 )
 
 
