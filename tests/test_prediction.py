@@ -1,11 +1,13 @@
 """Free runs of a plant file, and the joint refit of what it holds."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
 from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.gap.fitting import Fit, Fitter
 from fdi_torch.gap.in_turn import in_turn
 from fdi_torch.gap.prediction import predict
 from fdi_torch.gap.refit import refit
@@ -71,6 +73,20 @@ def test_a_refit_finds_what_the_effects_are_and_loses_those_left_out() -> None:
     assert predict(found.plant, run).rmse["level"] == pytest.approx(NOISE, rel=0.2)
     assert found.plant.effects[0].parameters["time_constant"] == pytest.approx(60.0, rel=0.1)
     assert refit(wrong, run, leave_out=["pump_lag"]).plant.effects == ()
+
+
+def test_a_refit_that_finds_no_course_of_the_levels_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = Fitter.fit
+
+    def lost(fitter: Fitter, *asked: Any, **options: Any) -> Fit:
+        fit = found(fitter, *asked, **options)
+        return replace(fit, near=replace(fit.near, jacobian=torch.full_like(fit.near.jacobian, torch.nan)))
+
+    plant = rig()
+    run = replace(recording(plant), source="a.csv")
+    monkeypatch.setattr(Fitter, "fit", lost)
+    with pytest.raises(ValueError, match=r"no course of the levels through a\.csv was found; begin with other values"):
+        refit(plant, run)
 
 
 def tank(**changes: object) -> PlantDescription:

@@ -6,6 +6,7 @@ a tolerance stays near what the plant file says (valves of one make are nearly a
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -85,17 +86,28 @@ def refit(
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     size = 1e-2 * spread if white is None else torch.full_like(spread, white)
     fitter = Fitter(subject, Noise(size, torch.zeros_like(spread)))
-    null = fitter.fit(Candidate(), rounds=ROUNDS)
+    null = _with_a_trajectory(fitter.fit(Candidate(), rounds=ROUNDS), recordings)
     fit, base = null, null if white is None else None
     for _ in range(TURNS if white is None else 1):
         if white is None:
             fitter = Fitter(subject, estimate_noise(subject.readings - fit.near.readings[0], subject.mask))
-        fit = base = fitter.fit(Candidate(tuple(free), (start,)), base, rounds=ROUNDS)
+        fit = base = _with_a_trajectory(fitter.fit(Candidate(tuple(free), (start,)), base, rounds=ROUNDS), recordings)
         found = {n: v for n, v in fit.effect_values.items() if n in start}
         start = {n: v for n, v in found.items() if n not in _undetermined(fitter, fit)}
     own = _own(fitter, fit)
     better = replace(_with(bare, fit, _typical(own, fit, bare)), tolerances=tolerances, varying=plant.varying)
     return Refit(better, _rmse(fitter, null), _rmse(fitter, fit), len(fit.space), _errors(fitter, fit), own)
+
+
+def _with_a_trajectory(fit: Fit, recordings: Sequence[Recording]) -> Fit:
+    """The fit. Raises ValueError where its levels over time were never found, so that nothing can be said of it."""
+    if math.isfinite(fit.cost) and bool(torch.isfinite(fit.near.jacobian).all()):
+        return fit
+    named = ", ".join(dict.fromkeys(r.source for r in recordings if r.source)) or "the recordings"
+    raise ValueError(
+        f"refit: from the plant file's values no course of the levels through {named} was found; begin with other"
+        " values of its effects, leave one of them out (--leave-out), or simulate in finer steps (--step)"
+    )
 
 
 def _matching(names: Collection[str], patterns: Collection[str]) -> list[str]:
