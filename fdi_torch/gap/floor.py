@@ -130,7 +130,7 @@ def estimate_noise(
     likelihoods = torch.stack([_likelihood(*s, x) for s, x in zip(spectra, levels, strict=True)])
     counts = [int(mask[:, c].sum()) for c in range(residual.shape[1])]
     likelihoods = likelihoods + torch.stack([_cost_of_error(n) for n in counts]).unsqueeze(1)
-    likelihoods[:, len(_COLOURS) - MEANS :] += math.inf if any(rounded) else MEAN_EARNS
+    likelihoods[:, len(_AR) :] += math.inf if any(rounded) else MEAN_EARNS
     best = likelihoods.min(dim=-1).values
     common = _chosen(best[torch.tensor(say)].sum(dim=0), int(mask.sum()))
     chosen = [common if ours else _chosen(best[c], counts[c]) for c, ours in enumerate(say)]
@@ -140,15 +140,10 @@ def estimate_noise(
     return Noise(innovation, _COLOURS.to(level)[torch.tensor(chosen)], int(_LASTING[common]))
 
 
-MEANS = LONGEST_MEAN - 1
-_LASTING = torch.cat([torch.zeros(361, dtype=torch.long), torch.arange(2, LONGEST_MEAN + 1)])  # samples; 0: for ever
-_COLOURS = torch.cat(
-    [
-        torch.linspace(-0.5, 0.9, 281),
-        torch.linspace(0.901, 0.98, 80),
-        KEPT_OF_MEAN ** (1.0 / torch.arange(2, LONGEST_MEAN + 1)),
-    ]
-)
+_AR = torch.cat([torch.linspace(-0.5, 0.9, 281), torch.linspace(0.901, 0.98, 80)])
+_LENGTHS = torch.arange(2, LONGEST_MEAN + 1)  # of means, samples
+_LASTING = torch.cat([torch.zeros(len(_AR), dtype=torch.long), _LENGTHS])  # samples; 0: for ever
+_COLOURS = torch.cat([_AR, KEPT_OF_MEAN ** (1.0 / _LENGTHS)])
 _WHITE = int(_COLOURS.abs().argmin())
 _ERRORS = torch.cat([torch.zeros(1), torch.logspace(-4, 2, 25)])  # of the model, as shares of the innovation
 
