@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
+from fnmatch import fnmatchcase
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -16,3 +17,16 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> str:
     """The sentence for a name that is not among the known ones."""
     known = list(known)
     return f"expected {kind} ({', '.join(known) or 'there are none'}), got '{name}'{nearest(name, known)}"
+
+
+def matching(kind: str, patterns: Iterable[str], known: Collection[str]) -> list[str]:
+    """The known names that the patterns ask for (* is any name), each once. Raises ValueError for a pattern that asks
+    for none.
+    """
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        fitting = [name for name in known if fnmatchcase(name, pattern)]
+        if not fitting:
+            raise ValueError(unknown(kind, pattern, known))
+        found |= dict.fromkeys(fitting)
+    return list(found)

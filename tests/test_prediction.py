@@ -135,7 +135,7 @@ def test_a_run_needs_something_to_settle_in_and_something_left() -> None:
     for seconds in (0.0, 200.0, 1e4):
         with pytest.raises(ValueError, match="a stretch to settle in of more than 0 s and less than the 200 s"):
             predict(tank(), run, settle=seconds)
-    with pytest.raises(ValueError, match=r"constants with a tolerance.*got 'Z.gain'.*Q.gain"):
+    with pytest.raises(ValueError, match=r"with a tolerance to vary .*got 'Z.gain'; the nearest is 'Q.gain'"):
         predict(tank(), run, vary=("Z.gain",))
 
 
@@ -157,6 +157,14 @@ def test_several_recordings_share_what_does_not_vary_and_held_constants_stay() -
     held = refit(tank(), runs, white=1e-4, hold=["Q.*"])
     assert held.plant.pumps[0].gain == 1.0 and held.plant.tolerances["Q.gain"] == 0.2
     assert held.rmse["h"] > found.rmse["h"]
+
+
+def test_what_a_refit_is_to_hold_or_to_vary_must_be_there() -> None:
+    runs = [filling(1.0, 0.0, 1)]
+    with pytest.raises(ValueError, match=r"a constant of the plant to hold .*got 'Q.gian'; the nearest is 'Q.gain'"):
+        refit(tank(), runs, hold=["Q.gian"])
+    with pytest.raises(ValueError, match=r"with a tolerance to vary \(.*\), got 'Q.max_flow'"):
+        refit(tank(), runs, vary=["Q.max_flow"])
 
 
 def test_what_each_recording_has_for_itself_is_told_with_how_much_it_differs() -> None:

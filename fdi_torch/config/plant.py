@@ -14,7 +14,7 @@ from fdi_torch.config.files import find_plant, read_yaml
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Share, Strict, quantity
 from fdi_torch.effects import effect
-from fdi_torch.names import unknown
+from fdi_torch.names import matching, unknown
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import COMMAND_UNITS, OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Effect, fits, place_kind
@@ -194,14 +194,10 @@ def _tolerances(config: PlantConfig, plant: PlantDescription) -> dict[str, float
 
 def _varying(patterns: Sequence[str], tolerances: dict[str, float]) -> tuple[str, ...]:
     """Raises ValueError for what matches no constant with a tolerance: how much would it vary?"""
-    found: dict[str, None] = {}
-    for pattern in patterns:
-        matched = [name for name in tolerances if fnmatchcase(name, pattern)]
-        if not matched:
-            known = list(tolerances) or ["none there are"]
-            raise ValueError(f"varying: {unknown('a constant with a tolerance', pattern, known)}")
-        found |= dict.fromkeys(matched)
-    return tuple(found)
+    try:
+        return tuple(matching("a constant with a tolerance", patterns, tolerances))
+    except ValueError as error:
+        raise ValueError(f"varying: {error}") from error
 
 
 def absolute_units(plant: PlantDescription) -> dict[str, str]:

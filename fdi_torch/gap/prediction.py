@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from itertools import product
 
 import torch
@@ -21,6 +20,7 @@ from fdi_torch.effects import effect, once_run
 from fdi_torch.gap.fitting import Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.subject import Subject, subject_of
+from fdi_torch.names import matching
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -107,17 +107,8 @@ def _samples_within(recording: Recording, seconds: float) -> int:
 
 def _varying(plant: PlantDescription, patterns: Collection[str]) -> PlantDescription:
     """The plant of which more varies. Raises ValueError for a pattern that no constant with a tolerance has."""
-    names = list(plant.varying)
-    for pattern in patterns:
-        found = [n for n in plant.tolerances if fnmatchcase(n, pattern)]
-        if not found:
-            known = ", ".join(plant.tolerances) or "none"
-            raise ValueError(
-                f"plant {plant.name}: expected constants with a tolerance in the plant file to vary, got '{pattern}'; "
-                f"those are {known}"
-            )
-        names += found
-    return replace(plant, varying=tuple(dict.fromkeys(names)))
+    more = matching("a constant with a tolerance to vary", patterns, plant.tolerances)
+    return replace(plant, varying=tuple(dict.fromkeys([*plant.varying, *more])))
 
 
 def _run(subject: Subject, start_samples: int, counted: int) -> Prediction:

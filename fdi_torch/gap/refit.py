@@ -10,11 +10,10 @@ import math
 import statistics
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 
 import torch
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import build_network, effect
 from fdi_torch.gap.answer import with_constants
 from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter
@@ -22,6 +21,7 @@ from fdi_torch.gap.floor import Noise, estimate_noise
 from fdi_torch.gap.limits import limits_of
 from fdi_torch.gap.spread import TOLD, Own
 from fdi_torch.gap.standard_errors import standard_errors
+from fdi_torch.names import matching
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.reach import reach_of_all
@@ -64,13 +64,15 @@ def refit(
     (SI) in every reading, whatever is left of the fast ones; that is what a free run asks for where equations are not
     quite the rig's, while the noise itself lets fast errors count for more than slow ones. vary: patterns of constants
     with a tolerance that each recording is to have for itself, beside those that the plant file says.
+
+    Raises ValueError for a pattern of either that no name fits.
     """
     kept = tuple(e for e in plant.effects if e.effect not in leave_out)
     placed = [Placement(effect(e.effect), e.location, e.parameters) for e in kept]
     prefixes = {p.prefix for p in placed}
     tolerances = {n: v for n, v in plant.tolerances.items() if n.count(".") == 1 or n.rpartition(".")[0] in prefixes}
-    held = _matching(tolerances, hold)
-    varying = dict.fromkeys([*plant.varying, *_matching(tolerances, vary)])
+    held = set(matching("a constant of the plant to hold", hold, build_network(plant).constants.names))
+    varying = dict.fromkeys([*plant.varying, *matching("a constant with a tolerance to vary", vary, tolerances)])
     bare = replace(
         plant,
         effects=kept,
@@ -81,7 +83,7 @@ def refit(
     step = step or 0.5 * float(torch.median(torch.diff(recordings[0].time)))
     subject = laid_out(bare, placed, recordings, step)
     start = {n: v for n, v in _start(kept, plant, recordings).items() if n not in tolerances}
-    start = {n: v for n, v in start.items() if not any(fnmatchcase(n, pattern) for pattern in hold)}
+    start = {n: v for n, v in start.items() if n not in held}
     free = [p for p in placed if any(n.startswith(f"{p.prefix}.") for n in start)]
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     size = 1e-2 * spread if white is None else torch.full_like(spread, white)
@@ -108,10 +110,6 @@ def _with_a_trajectory(fit: Fit, recordings: Sequence[Recording]) -> Fit:
         f"refit: from the plant file's values no course of the levels through {named} was found; begin with other"
         " values of its effects, leave one of them out (--leave-out), or simulate in finer steps (--step)"
     )
-
-
-def _matching(names: Collection[str], patterns: Collection[str]) -> list[str]:
-    return [n for n in names if any(fnmatchcase(n, pattern) for pattern in patterns)]
 
 
 def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
