@@ -23,6 +23,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.compiled import CompiledEngine
 from fdi_torch.simulate.experiment import Experiment, lay_out
 from fdi_torch.simulate.integrate import ReferenceEngine
+from fdi_torch.simulate.own_steps import OwnSteps
 
 NAMES = ("T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size")
 SAMPLES, INTERVAL = 11, 100.0
@@ -43,7 +44,8 @@ def experiment(step: float, tolerance: float | None = None) -> Experiment:
     nothing = torch.zeros(SAMPLES, 3, dtype=torch.float64)
     units = ("m^3/s", "m^3/s"), ("m", "m", "m")
     recording = Recording(time, flows, nothing, ("Q1", "Q2"), ("h1", "h2", "h3"), *units)
-    return lay_out(recording, ("Q1", "Q2"), step, tolerance)
+    own = None if tolerance is None else OwnSteps.within(tolerance, plant()[0].description)
+    return lay_out(recording, ("Q1", "Q2"), step, own)
 
 
 def random_faults(count: int, seed: int = 0) -> np.ndarray:

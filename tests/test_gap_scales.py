@@ -13,6 +13,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import time_scale
 from fdi_torch.recording import Recording
 from tests.test_gap import SMALL, believed, recorded
+from tests.test_pace import scaled as similar
 
 SLOWER, WIDER = 20.0, 1000.0
 FLOWS = WIDER / SLOWER  # A dh/dt = q
@@ -55,3 +56,23 @@ def test_a_rig_scaled_in_time_and_size_has_the_same_verdict(left_out: tuple[str,
     assert large.where[0][1] == pytest.approx(small.where[0][1], abs=0.02)
     for cause in large.causes:
         assert cause.parameters["time_constant"].value == pytest.approx(SLOWER * 15.0, rel=0.02)
+
+
+@pytest.mark.parametrize(("metres", "seconds"), [(0.01, 1.0), (10.0, 100.0), (1.0, 0.01)])
+@pytest.mark.parametrize("cause", [{"Q1.pump_lag.time_constant": 15.0}, {"T3.leak.size": 0.1}])
+def test_a_rig_of_powers_of_ten_has_the_same_numbers(cause: dict[str, float], metres: float, seconds: float) -> None:
+    """A constant in metres, seconds or m^3/s that is not the plant's own would show here."""
+    bench, library = recorded(cause, 5), (*SMALL, "leak")
+    usual = diagnose(believed(), bench, settings=Settings(library))
+    inputs, outputs = bench.inputs * metres**3 / seconds, bench.outputs * metres
+    other = replace(bench, time=bench.time * seconds, inputs=inputs, outputs=outputs)
+    found = diagnose(similar(believed(), metres, seconds), other, settings=Settings(library))
+    assert found.verdict == usual.verdict == "named"
+    assert [(c.effect, c.location) for c in found.causes] == [(c.effect, c.location) for c in usual.causes]
+    assert dict(found.where) == pytest.approx(dict(usual.where), abs=3e-7)
+    per_unit = {"s": seconds, "m": metres, "1": 1.0}
+    for here, there in zip(usual.causes, found.causes, strict=True):
+        for name, amount in here.parameters.items():
+            scale = per_unit[amount.unit]
+            assert there.parameters[name].value == pytest.approx(scale * amount.value, rel=1e-6)
+            assert there.parameters[name].std == pytest.approx(scale * amount.std, rel=1e-6)

@@ -19,9 +19,9 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.compiled import CompiledEngine
 from fdi_torch.simulate.engine import Readings, gram_of
-from fdi_torch.simulate.experiment import Experiment, lay_out, shortest_step
+from fdi_torch.simulate.experiment import Experiment, lay_out
 from fdi_torch.simulate.integrate import ReferenceEngine
-from fdi_torch.simulate.own_steps import judged, own_step
+from fdi_torch.simulate.own_steps import OwnSteps, judged, own_step
 from fdi_torch.simulate.traced import TracedEngine
 
 
@@ -33,7 +33,11 @@ def experiment(tolerance: float | None, step: float = 20.0, samples: int = 41) -
     units = ("m^3/s", "m^3/s"), ("m", "m", "m")
     held = flows[torch.arange(samples) // 5 * 5]
     recording = Recording(time, held, nothing, ("Q1", "Q2"), ("h1", "h2", "h3"), *units)
-    return lay_out(recording, ("Q1", "Q2"), step, tolerance)
+    return lay_out(recording, ("Q1", "Q2"), step, None if tolerance is None else own_steps(tolerance))
+
+
+def own_steps(tolerance: float) -> OwnSteps:
+    return OwnSteps.within(tolerance, three_tank())
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +65,7 @@ def test_a_fixed_step_as_short_as_the_shortest_is_no_better(truth: Tensor) -> No
     network, space = rig()
     theta, tolerance = faults(space), 1e-6
     own = CompiledEngine(network, space, experiment(tolerance)).levels(theta)
-    fixed = CompiledEngine(network, space, experiment(None, step=shortest_step(tolerance))).levels(theta)
+    fixed = CompiledEngine(network, space, experiment(None, step=own_steps(tolerance).shortest)).levels(theta)
     assert float((own - truth).abs().max()) < 3.0 * float((fixed - truth).abs().max())
 
 

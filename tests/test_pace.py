@@ -19,11 +19,15 @@ from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.hybrid import estimate_parameters
 from fdi_torch.jobs.run_setup import fitting_of, recordings_of, wanted_space
 from fdi_torch.monitor.stepper import usual_step
+from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import length_scale, time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.equilibrium import equilibrium
+from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.own_steps import OwnSteps
 from fdi_torch.simulate.record import clean_readings, with_noise
+from fdi_torch.simulate.traced import TracedEngine
 
 SCALES = [(0.01, 1.0), (100.0, 1.0), (1.0, 0.05), (1.0, 60.0), (0.1, 0.05), (20.0, 60.0)]
 FAULTS = {"T1.leak.size": 0.2, "P13.plugging.size": 0.3}
@@ -85,6 +89,21 @@ def test_levels_scale_with_the_rig(metres: float, seconds: float) -> None:
     usual, usual_rest, other, other_rest = readings
     torch.testing.assert_close(other, usual, rtol=1e-7, atol=1e-8)
     torch.testing.assert_close(other_rest, usual_rest, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize(("metres", "seconds"), [(0.01, 1.0), (10.0, 100.0), (1.0, 0.01)])
+def test_steps_of_a_lane_s_own_scale_with_the_rig(metres: float, seconds: float) -> None:
+    """Chosen by powers of ten, which the scales of a plant are, so that nothing but rounding is left."""
+    found = []
+    for m, s in ((1.0, 1.0), (metres, seconds)):
+        plant, blank = experiment(m, s)
+        own = OwnSteps.like(0.5 * s, plant)
+        assert own.shortest == pytest.approx(0.5 * s)
+        network = build_network(plant, placements_for(FAULTS))
+        space = ParameterSpace(network.constants[name] for name in FAULTS)
+        engine = TracedEngine(network, space, lay_out(blank.stretch(0, 12), plant.channels(), s, own))
+        found.append(engine.readings(space.vector(FAULTS)[None]) / m)
+    torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize(("metres", "seconds"), [(0.01, 60.0), (100.0, 0.05)])

@@ -21,7 +21,8 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.choose import adaptive_engine, make_engine
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.equilibrium import equilibrium
-from fdi_torch.simulate.experiment import lay_out, tolerance_like
+from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.own_steps import OwnSteps
 
 StartLevel = Literal["equilibrium", "free"] | float
 StartLevels = StartLevel | Mapping[str, StartLevel]
@@ -70,10 +71,10 @@ class Fitting:
         """An engine for each recording, in steps no longer than `step` s, or by an adaptive solver about as exact."""
         engines = []
         for network, own, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True):
-            own_steps = not adaptive and self._takes_own_steps(recording, network, step)
-            longest = LONGEST_STEP * time_scale(self.plant) if adaptive or own_steps else step
-            tolerance = tolerance_like(step) if own_steps else None
-            experiment = lay_out(recording, self.plant.channels(), longest, tolerance)
+            divides = not adaptive and self._takes_own_steps(recording, network, step)
+            longest = LONGEST_STEP * time_scale(self.plant) if adaptive or divides else step
+            own_steps = OwnSteps.like(step, self.plant) if divides else None
+            experiment = lay_out(recording, self.plant.channels(), longest, own_steps)
             if adaptive:
                 engines.append(adaptive_engine(network, own, experiment, step))
             else:
@@ -141,12 +142,13 @@ def start_levels(
     unknown = set(by_tank) - {tank.name for tank in plant.tanks}
     if unknown:
         raise ValueError(f"start levels: expected tanks of plant {plant.name}, got {', '.join(sorted(unknown))}")
-    rest = None
+    rest = shown = None
     levels, free = [], []
     for i, tank in enumerate(plant.tanks):
         choice = by_tank.get(tank.name, "free")
         if choice == "free":
-            parameter = _free_start(plant, network, tank, recording)
+            shown = shown or levels_shown_first(plant, network, recording)
+            parameter = _free_start(tank, shown[i])
             levels.append(parameter.nominal)
             free.append(parameter)
         elif choice == "equilibrium" and tank.start_level is None:
@@ -163,16 +165,16 @@ def _first_inputs(plant: PlantDescription, recording: Recording) -> Tensor:
     return recording.inputs[0, columns]
 
 
-def _free_start(plant: PlantDescription, network: TankNetwork, tank: Tank, recording: Recording) -> Parameter:
-    seen = first_level(plant, network, tank.name, recording)
-    level = min(max(0.5 * tank.height if seen is None else seen, 0.0), tank.height)
-    reach = tank.height if seen is None else START_SEARCH_SHARE * tank.height
+def _free_start(tank: Tank, shown: float | None) -> Parameter:
+    """shown: the level (m) that the first readings show; None where no sensor sees the tank."""
+    level = min(max(0.5 * tank.height if shown is None else shown, 0.0), tank.height)
+    reach = tank.height if shown is None else START_SEARCH_SHARE * tank.height
     low, high = max(0.0, level - reach), min(tank.height, level + reach)
     return Parameter(f"{tank.name}.start_level", "m", level, low, high, meaning=f"level of {tank.name} at t = 0")
 
 
-def first_level(plant: PlantDescription, network: TankNetwork, tank: str, recording: Recording) -> float | None:
-    """The level that the first few readings of a tank's sensor show, m; None where no sensor sees it."""
+def levels_shown_first(plant: PlantDescription, network: TankNetwork, recording: Recording) -> list[float | None]:
+    """The level of each tank that the first few readings of its sensor show, m; None where no sensor sees it."""
     readings, seen = [], set()
     for sensor in plant.sensors:
         valid = recording.outputs[:0, 0]
@@ -181,11 +183,9 @@ def first_level(plant: PlantDescription, network: TankNetwork, tank: str, record
             valid = recording.outputs[:, column][recording.mask[:, column]][:FIRST_READINGS]
         seen |= {sensor.tank} if len(valid) else set()
         readings.append(valid.median() if len(valid) else network.nominal.new_tensor(torch.nan))
-    if tank not in seen:
-        return None
     values = network.bind(ParameterSpace(), network.nominal.new_zeros(0))
     levels = levels_behind(network, readings, network.start_levels(values), network.nominal.new_zeros(()), values)
-    return float(levels[[t.name for t in plant.tanks].index(tank)])
+    return [float(h) if tank.name in seen else None for tank, h in zip(plant.tanks, levels, strict=True)]
 
 
 def _expect_variation(recording: Recording, plant: PlantDescription) -> None:

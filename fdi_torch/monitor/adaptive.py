@@ -13,8 +13,10 @@ from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import PlantState, Stepper, slopes
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.pace import length_scale
 
 FORGET = 1e-3  # share of a parameter's deviation that the design of (15) forgets in a sample
+WANDER = 1e-6  # of a level in a sample, in units of the plant's length scale
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,8 @@ def designed_rate(
     output = slopes(lambda x: model.read(x, float(samples.time[1])), z)
     keep = torch.ones_like(z)
     keep[model.tanks :] = 1.0 - FORGET
-    process = torch.diag(torch.cat([torch.full_like(levels, 1e-6), wander]) ** 2)
+    levels_wander = WANDER * length_scale(model.network.description)
+    process = torch.diag(torch.cat([torch.full_like(levels, levels_wander), wander]) ** 2)
     linear, reading = Linear(keep * transition, output), torch.diag(reading_std**2)
     predicted = riccati(linear, process, reading)
     gain = torch.linalg.solve(output @ predicted @ output.mT + reading, output @ predicted).mT

@@ -20,12 +20,16 @@ from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import PlaceValues, TankNetwork
+from fdi_torch.plant.pace import length_scale
 from fdi_torch.simulate.actuation import Actuation, moved
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.midpoint import newton_step
 from fdi_torch.simulate.pointwise import partials
 from fdi_torch.simulate.scan import scan_in_time
 from fdi_torch.simulate.seen import Look, Sight
+
+# A level that moves by no more has settled, in units of the plant's length scale: of the whole plant, of one tank.
+SETTLED, ONE_SETTLED = 1e-7, 1e-5
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,7 @@ class Collocation:
         self._moving = [j for j in range(len(space)) if j not in self._start_columns]
         self._below_rims = network.below_rims()
         self._rims = [t.height for t in network.description.tanks]
+        self._length = length_scale(network.description)
         self._names = [space.names[j] for j in self._moving]
         self._actuation = Actuation(network, experiment, self._names)
         self._sight = Sight(network, experiment, self._names)
@@ -98,16 +103,16 @@ class Collocation:
         found, _, _, _, defect = newton_step(self.experiment.steps, path, rates, by_level, by_theta, start, none)
         return found.movedim(2, 1), defect
 
-    def settle(self, theta: Tensor, levels: Tensor, rounds: int = 12, tolerance: float = 1e-7) -> Linearised:
-        """Newton steps at fixed theta until no level moves by more than `tolerance` (m)."""
+    def settle(self, theta: Tensor, levels: Tensor, rounds: int = 12) -> Linearised:
+        """Newton steps at fixed theta from levels (L, K+1, tanks) in m until they have settled."""
         for _ in range(rounds):
             found = self.linearise(theta, levels)
             levels = found.levels
-            if float(found.defect.max()) < tolerance:
+            if float(found.defect.max()) < SETTLED * self._length:
                 break
         return found
 
-    def driven(self, theta: Tensor, levels: Tensor, tank: int, rounds: int = 8, tolerance: float = 1e-5) -> Tensor:
+    def driven(self, theta: Tensor, levels: Tensor, tank: int, rounds: int = 8) -> Tensor:
         """levels (L, K+1, tanks) with that of one tank as the model has it while all others are what they are."""
         levels = levels.clone()
         for _ in range(rounds):
@@ -122,7 +127,7 @@ class Collocation:
                 :, 0, 0
             ]
             levels[..., tank] += found
-            if float(found.abs().max()) < tolerance:
+            if float(found.abs().max()) < ONE_SETTLED * self._length:
                 break
         return levels
 

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from fdi_torch.plant.signals import CumulativeSignal
 from fdi_torch.recording import Hold, Recording
+from fdi_torch.simulate.own_steps import OwnSteps
 
 BLOCK = 1 << 17
-_SHORTEST = 2000.0  # s for 1 m
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,7 @@ class Experiment:
     sample_times (S,) s; sample k lies at share `sample_share` (0..1] of step `sample_step` (the first at 0 of step 0).
     resolution: the time below which roots and rims are drawn smooth, s; the longest step, or with
     a tolerance the shortest of a lane's own.
-    tolerance: None, or m: each lane divides the steps by itself. At 1e-6 m and less, over random faults of three
-    tanks, the largest error of a level was 1.5 to 2 times this.
+    tolerance: None, or m: each lane divides the steps by itself (`OwnSteps`).
     """
 
     nodes: Tensor
@@ -64,20 +63,18 @@ class Experiment:
         return torch.diff(times, prepend=times[:1] - first)
 
 
-def lay_out(recording: Recording, channels: tuple[str, ...], step: float, tolerance: float | None = None) -> Experiment:
-    """The experiment that a recording was, in steps no longer than `step` (s), which lanes divide for a tolerance (m).
+def lay_out(recording: Recording, channels: tuple[str, ...], step: float, own: OwnSteps | None = None) -> Experiment:
+    """The experiment that a recording was, in steps no longer than `step` (s), which lanes divide into `own` ones.
 
     channels: the plant's input channels, by name. Raises ValueError where the recording lacks one or does not know it.
     """
     if not step > 0:
         raise ValueError(f"expected a positive integration step, got {step} s")
-    if tolerance is not None and not tolerance > 0:
-        raise ValueError(f"expected a positive tolerance, got {tolerance} m")
     if len(recording) < 2:
         raise ValueError(f"{recording.source}: expected at least two samples, got {len(recording)}")
     inputs = _select(recording, channels)
     time = recording.time - recording.time[0]
-    nodes = grid_nodes(time, inputs, recording.hold, step, every=tolerance is not None)
+    nodes = grid_nodes(time, inputs, recording.hold, step, every=own is not None)
     signal = CumulativeSignal(time, inputs, recording.hold)
     starts, steps = nodes[:-1], torch.diff(nodes)
     means = torch.empty(len(starts), len(channels), dtype=time.dtype, device=time.device)
@@ -93,23 +90,9 @@ def lay_out(recording: Recording, channels: tuple[str, ...], step: float, tolera
         sample_times=time,
         sample_step=index,
         sample_share=share,
-        resolution=steps.max() if tolerance is None else steps.new_tensor(shortest_step(tolerance)),
-        tolerance=tolerance,
+        resolution=steps.max() if own is None else steps.new_tensor(own.shortest),
+        tolerance=None if own is None else own.tolerance,
     )
-
-
-def shortest_step(tolerance: float) -> float:
-    """The shortest step (s) that a lane may take for a tolerance (m).
-
-    A step over a root's kink is wrong by step^1.5, and so is a root drawn smooth for that step. The factor is that of
-    the largest error of fixed steps over random faults of three tanks.
-    """
-    return _SHORTEST * tolerance ** (2.0 / 3.0)
-
-
-def tolerance_like(step: float) -> float:
-    """The tolerance (m) for which a lane's own steps are about as exact as fixed ones of `step` (s)."""
-    return (step / _SHORTEST) ** 1.5
 
 
 def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float, every: bool = False) -> Tensor:

@@ -50,10 +50,10 @@ class Joint:
         found = [part.corrected(own, piece) for part, own, piece in pieces]
         return torch.cat([f[0] for f in found], dim=1), torch.stack([f[1] for f in found]).amax(dim=0)
 
-    def settle(self, theta: Tensor, levels: Tensor, rounds: int = 12, tolerance: float = 1e-7) -> Linearised:
-        """Newton steps at fixed theta until no level moves by more than `tolerance` (m)."""
+    def settle(self, theta: Tensor, levels: Tensor, rounds: int = 12) -> Linearised:
+        """Newton steps at fixed theta from levels (L, N, tanks) in m until those of every recording have settled."""
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
-        return self._joined([part.settle(own, piece, rounds, tolerance) for part, own, piece in pieces])
+        return self._joined([part.settle(own, piece, rounds) for part, own, piece in pieces])
 
     def driven(self, theta: Tensor, levels: Tensor, tank: int) -> Tensor:
         """levels (L, N, tanks) with that of one tank as the model has it while all others are what they are."""

@@ -5,11 +5,49 @@ The same rules stand in kernel.hpp, lane by lane; here they are tensors (L,). A 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.pace import length_scale, time_scale
+
 # RK4 is stable on the real axis down to -2.785; a step is kept below the one and chosen for the other.
 STABLE, CALM = 2.6, 2.2
+# A step over a root's kink is wrong by step^1.5, and so is a root drawn smooth for that step: by 1 m for one so long,
+# in units of the plant's time and length scales. From the largest error of fixed steps over random faults of three
+# tanks.
+STEP_FOR_ONE_METRE = 2000.0
+
+
+@dataclass(frozen=True)
+class OwnSteps:
+    """How exactly lanes divide the time by themselves.
+
+    tolerance, m: of a level's error over a step; at 1e-6 m and less, over random faults of three tanks, the largest
+    error of a whole simulation was 1.5 to 2 times this. shortest, s: the shortest step that a lane may take.
+    """
+
+    tolerance: float
+    shortest: float
+
+    @classmethod
+    def within(cls, tolerance: float, plant: PlantDescription) -> OwnSteps:
+        """Steps for a tolerance (m). Raises ValueError unless it is positive."""
+        if not tolerance > 0:
+            raise ValueError(f"expected a positive tolerance, got {tolerance} m")
+        return cls(tolerance, _step_of_unit_error(plant) * (tolerance / length_scale(plant)) ** (2.0 / 3.0))
+
+    @classmethod
+    def like(cls, step: float, plant: PlantDescription) -> OwnSteps:
+        """Steps about as exact as fixed ones of `step` s."""
+        return cls.within(length_scale(plant) * (step / _step_of_unit_error(plant)) ** 1.5, plant)
+
+
+def _step_of_unit_error(plant: PlantDescription) -> float:
+    """The step, s, whose error is the plant's length scale."""
+    return STEP_FOR_ONE_METRE * time_scale(plant)
 
 
 def own_step(gone: Tensor, pace: Tensor, span: Tensor) -> Tensor:

@@ -45,8 +45,8 @@ class Ends:
         self.seen, self.closely = seen, closely
 
     def __call__(self, name: str) -> tuple[float, float]:
-        low = min(float(s[name].min()) for s in self.seen)
-        return low, max(*(float(s[name].max()) for s in self.seen), low + 1e-9)
+        low, high = min(float(s[name].min()) for s in self.seen), max(float(s[name].max()) for s in self.seen)
+        return low, max(high, low + 1e-9 * (max(abs(low), abs(high)) or 1.0))
 
     def bends(self, s: Signals, name: str, count: int) -> list[Tensor]:
         return bends(s[name], self(name), 2 * count if self.closely else count)

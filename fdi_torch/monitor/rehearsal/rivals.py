@@ -11,10 +11,11 @@ from torch import Tensor
 
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty, fisher_information
-from fdi_torch.monitor.adaptive import JointModel, adaptive_observer, designed_rate, joint_filter
+from fdi_torch.monitor.adaptive import WANDER, JointModel, adaptive_observer, designed_rate, joint_filter
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.window_fit import ESTIMATORS, WindowData, cut
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.pace import length_scale
 from fdi_torch.simulate.record import noise_level
 
 # Integration steps (s) of the data, and of the bounds: fine, so that their error is nobody's.
@@ -25,6 +26,7 @@ RIVALS = (*ESTIMATORS, *FILTERS)
 SMALLEST, LARGEST = 0.1, 0.7
 CLOSE = 0.05  # of a parameter's range: "to 5 %"
 FAR = 5.0  # bounds; what is further and not close is a failure
+START_STD = 1e-4  # of a level before the first reading, in units of the plant's length scale
 
 
 @dataclass(frozen=True)
@@ -162,9 +164,9 @@ def _filtered(rival: str, runs: Runs, looks: Sequence[int]) -> Tensor:
     spread = _spread(space)
     levels, theta = start.expand(count, -1), space.nominal().expand(count, -1)
     if rival == "kalman":
-        tanks = len(start)
-        start_std = torch.cat([torch.full((tanks,), 1e-4, dtype=torch.float64), spread])
-        wander = torch.cat([torch.full((tanks,), 1e-6, dtype=torch.float64), 1e-4 * spread])
+        length = length_scale(network.description)
+        start_std = torch.cat([torch.full_like(start, START_STD * length), spread])
+        wander = torch.cat([torch.full_like(start, WANDER * length), 1e-4 * spread])
         seen = joint_filter(model, runs.samples, levels, theta, start_std, wander, runs.std)
     else:
         gain, rate = designed_rate(model, runs.samples, start, space.nominal(), 3e-2 * spread, noise)
