@@ -7,7 +7,6 @@ from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.follow import follow
 from fdi_torch.logbook.inspect import Inspection, inspect_log
 from fdi_torch.logbook.live import Live, serve
-from fdi_torch.logbook.messages import Trickle
 from fdi_torch.logbook.payload import as_array, unpack
 from fdi_torch.logbook.reader import Message, Run, read_run
 from fdi_torch.logbook.recover import Recovery, recover
@@ -15,6 +14,7 @@ from fdi_torch.logbook.replay import Replay, replay
 from fdi_torch.logbook.resume import last_state, set_aside, unfinished
 from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, number_at, own_signals, series
 from fdi_torch.logbook.terminate import Terminated, exit_on_sigterm
+from fdi_torch.logbook.trickle import Trickle
 from fdi_torch.logbook.writer import Listener, RunLog
 
 __all__ = [

@@ -1,16 +1,10 @@
-"""Messages of any topic: encoded, numbered, each on a channel that describes its fields.
-
-A topic's channel is registered with its first message. A later message with further fields gets a further channel of
-the same topic, so that every message is described by a schema.
-"""
+"""Messages of any topic: encoded, numbered, each on a channel that describes its fields."""
 
 from __future__ import annotations
 
 import math
 import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, count, repeat
 from typing import Any
 
@@ -20,46 +14,32 @@ import orjson
 from fdi_torch.logbook.block import Block, Timed, block_of
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, as_it_is, plain
-from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, Topic, json_schema, named_kinds, topic_definition
+from fdi_torch.logbook.register import Register
 from fdi_torch.logbook.sink import EPOCH_NS, log_time_of
+from fdi_torch.logbook.trickle import PutOff, Trickle
 
 Named = Mapping[str, Any]
 _RESERVED = ("t", NON_FINITE, WALL, "masked")
 _BLOCK = 4096
 _FEW = 32
 """So few samples are written faster one by one."""
-_TOGETHER, _TOGETHER_BYTES = 512, 1 << 22
-
-
-@dataclass(frozen=True, eq=False)
-class Trickle:
-    """Messages of one topic that come one at a time and may be written a little later, many at a time.
-
-    told: time and fields of each, worked out of what was kept for it, which must not have changed.
-    """
-
-    topic: str
-    told: Callable[[Sequence[Any]], Iterable[tuple[float, Named]]]
-    units: Mapping[str, str] | None = None
 
 
 class Messages:
     """Encodes messages and hands them to `put`, with their log time in ns.
 
-    What comes in a slow trickle can be put off (`later`), and is then encoded many at a time: a processor that has been
-    busy with other things takes several times as long over each alone. keep((trickle, item)): the same with nothing
-    else done, for what comes so often that even `later` counts; for when not `due`, after a first `later`.
+    What comes in a slow trickle can be put off (`later`), and is then encoded many at a time. keep((trickle, item)):
+    the same with nothing else done, for what comes so often that even `later` counts; for when not `due`, after a
+    first `later`.
     """
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
-        self._put_off: deque[tuple[Trickle, Any]] = deque()
-        self._put_off_bytes = 0
-        self.keep = self._put_off.append
+        self._put_off = PutOff()
+        self.keep = self._put_off.keep
         self.due = False
         self._latest = 0.0
-        self._described: dict[str, tuple[frozenset[str], Channel]] = {}
-        self._sequence: dict[str, int] = {}
+        self.register = Register()
 
     def put(self, messages: Iterable[Timed]) -> None:
         raise NotImplementedError
@@ -111,43 +91,30 @@ class Messages:
             message = plain(message)
             data = orjson.dumps({**message, WALL: self.wall()} if wall else message)
         self._latest = max(self._latest, t)
-        channel = self._channel(topic, fields, message, units, about)
+        channel = self.register.channel(topic, fields, message, units, about)
         log_time = log_time_of(t)
-        return channel, log_time, log_time, self._next(topic), data
+        return channel, log_time, log_time, self.register.next_number(topic), data
 
     def later(self, trickle: Trickle, item: Any, size: int = 0) -> None:
         """One message, soon: before the next one that is written at once. size: about how many bytes the item keeps.
 
         The first of a topic is written at once, so that errors show.
         """
-        if trickle.topic not in self._described:
+        if trickle.topic not in self.register:
             ((t, fields),) = trickle.told((item,))
             self.write(trickle.topic, fields, t, units=trickle.units)
             return
-        self.keep((trickle, item))  # needs no lock, so that a search goes on at once
-        self._put_off_bytes += size
+        self._put_off.add(trickle, item, size)
         if self.due:
             self.flush()
-        elif len(self._put_off) >= _TOGETHER or self._put_off_bytes > _TOGETHER_BYTES:
+        elif self._put_off.is_enough:
             self.settle()
 
     def settle(self) -> None:
-        """Writes what was put off, in its order, though another thread puts off more meanwhile."""
+        """Writes what was put off, in its order."""
         with self._lock:
-            self._put_off_bytes = 0
             if self._put_off:
-                self.put(self._settled())
-
-    def _settled(self) -> Iterator[Timed]:
-        while self._put_off:
-            taken = [self._put_off.popleft() for _ in range(len(self._put_off))]
-            items: dict[Trickle, list[Any]] = {}
-            for trickle, item in taken:
-                items.setdefault(trickle, []).append(item)
-            told = {trickle: iter(trickle.told(own)) for trickle, own in items.items()}
-            for trickle, _ in taken:
-                t, fields = next(told[trickle])
-                yield self._timed(trickle.topic, fields, t, trickle.units)
+                self.put(self._timed(of.topic, fields, t, of.units) for of, t, fields in self._put_off.taken())
 
     def samples(
         self,
@@ -208,9 +175,9 @@ class Messages:
             ]
             for topic, _, names, units, _, about in signals:
                 numbers = dict.fromkeys(names, 0.0)
-                self._channel(topic, numbers, numbers, dict(zip(names, units, strict=True)), about)
+                self.register.channel(topic, numbers, numbers, dict(zip(names, units, strict=True)), about)
             named = [names for _, _, names, *_ in signals]
-            channels, sequences = self._follow(topics, len(clock))
+            channels, sequences = self.register.next_numbers(topics, len(clock))
             whole = all(np.isfinite(block).all() for block in blocks) and not any(part.any() for part in hidden)
             if whole and len(clock) > _FEW:
                 self.put_block(block_of(channels, sequences, named, blocks, clock, log_times))
@@ -219,67 +186,14 @@ class Messages:
                 self.put(_in_turn(channels, sequences, log_times.tolist(), encoded))
         self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
 
-    def _follow(self, topics: Sequence[str], count: int) -> tuple[list[Channel], list[int]]:
-        """The channels of so many more messages of each topic, and the sequence numbers of the first ones."""
-        sequences = [self._sequence.get(topic, 0) for topic in topics]
-        self._sequence.update({topic: first + count for topic, first in zip(topics, sequences, strict=True)})
-        return [self._described[topic][1] for topic in topics], sequences
-
     def follow_on(self, channel: Channel, sequence: int, t: float) -> None:
         """Number and describe what comes as if the message (channel, sequence, t) had just been written."""
-        if self._described.get(channel.topic, (None, None))[1] != channel:
-            properties = orjson.loads(channel.schema_data)["properties"]
-            self._described[channel.topic] = (frozenset(properties), channel)
-        self._sequence[channel.topic] = sequence + 1
+        self.register.follow_on(channel, sequence)
         self._latest = max(self._latest, t)
 
     def sample(self, topic: str, t: float, values: Named, units: Mapping[str, str] | None = None) -> None:
         """One sample of a signal that arrives bit by bit, such as "/plant/output" or "/plant/truth"."""
         self.write(topic, values, t, units=units)
-
-    def _channel(
-        self,
-        topic: str,
-        fields: Named,
-        message: Named,
-        told_units: Mapping[str, str] | None,
-        about: Mapping[str, str] | None,
-    ) -> Channel:
-        """The topic's channel; a new one where the message has fields that it does not describe."""
-        known, channel = self._described.get(topic, (frozenset(), None))
-        if channel is not None and known.issuperset(fields):
-            return channel
-        present = [name for name, value in fields.items() if value is not None]
-        if channel is not None and known.issuperset(present):
-            return channel
-        definition = topic_definition(topic)
-        named = named_kinds(definition, channel.schema_data) if channel else {}
-        named.update({name: _kind(message.get(name)) for name in present if name not in definition.fields})
-        _check_names(topic, definition, named)
-        units = {f"unit.{name}": unit for name, (_, unit, _) in definition.fields.items() if unit}
-        previous = dict(channel.metadata) if channel else {}
-        pairs = {
-            "schema_version": FORMAT_VERSION,
-            "unit.t": "s",
-            **units,
-            **previous,
-            **units_of(told_units),
-            **(about or {}),
-        }
-        schema = json_schema(definition, named)
-        channel = Channel(topic, "json", definition.schema, "jsonschema", schema, tuple(pairs.items()))
-        self._described[topic] = (frozenset({"t", *definition.fields, *named}), channel)
-        return channel
-
-    def _next(self, topic: str) -> int:
-        number = self._sequence.get(topic, 0)
-        self._sequence[topic] = number + 1
-        return number
-
-
-def units_of(units: Mapping[str, str] | None) -> dict[str, str]:
-    """Units as channel metadata: {"h1": "m"} -> {"unit.h1": "m"}."""
-    return {f"unit.{name}": unit for name, unit in (units or {}).items()}
 
 
 def _in_turn(
@@ -315,21 +229,3 @@ def _check_signal(topic: str, values: np.ndarray, names: Sequence[str], samples:
     for name in names:
         if name in _RESERVED:
             raise ValueError(f"{topic}: expected a name other than {', '.join(_RESERVED)}, got {name}; rename it")
-
-
-def _check_names(topic: str, definition: Topic, named: Mapping[str, Kind]) -> None:
-    if named and not definition.named:
-        raise ValueError(f"{topic}: expected only {', '.join(definition.fields)}, got {', '.join(named)}")
-    for name in named:
-        if name in (NON_FINITE, WALL):
-            raise ValueError(f"{topic}: expected a name other than {NON_FINITE} and {WALL}, got {name}; rename it")
-
-
-def _kind(value: Any) -> Kind:
-    """JSON kind of a plain value; None stands for a number that was left out as non-finite."""
-    if isinstance(value, list):
-        first = value[0] if value else 0.0
-        return "texts" if isinstance(first, str) else "integers" if type(first) is int else "numbers"
-    if isinstance(value, bool):
-        return "boolean"
-    return "text" if isinstance(value, str) else "number"

@@ -11,9 +11,10 @@ from typing import Any
 
 import orjson
 
-from fdi_torch.logbook.messages import Messages, Named, Trickle
+from fdi_torch.logbook.messages import Messages, Named
 from fdi_torch.logbook.payload import as_array, pack
 from fdi_torch.logbook.sink import log_time_of
+from fdi_torch.logbook.trickle import Trickle
 
 _LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
 
