@@ -130,6 +130,21 @@ def test_what_varies_is_told_by_the_stretch_that_a_run_settles_in_and_errors_are
     assert again.own["Q.gain"] == pytest.approx(told.own["Q.gain"], rel=1e-4)
 
 
+def test_water_that_goes_missing_while_the_plant_settles_bends_nothing_and_the_run_goes_on_from_where_it_led() -> None:
+    """A pump that delivers 70 % of what it is asked for in the first 20 s, and all of it ever after."""
+    asked = filling(1.0, 0.0, 1)
+    short = asked.inputs.clone()
+    short[asked.time < 20.0, 0] *= 0.7
+    missed = float((asked.inputs - short)[:, 0].sum()) / 0.01  # m: of a tank of 100 cm^2
+    levels = predict(tank(varying=[]), replace(asked, inputs=short), start_samples=1).readings
+    noise = 1e-4 * torch.randn(201, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    run = replace(asked, outputs=levels + noise)
+    assert missed > 0.03 and predict(tank(), run, start_samples=3).rmse["h"] > 0.5 * missed
+    found = predict(tank(), run, settle=30.0)
+    assert found.settled and found.rmse["h"] < 1e-3
+    assert found.own["h.offset"] == pytest.approx(0.0, abs=1e-3)
+
+
 def test_a_run_needs_something_to_settle_in_and_something_left() -> None:
     run = filling(1.1, 0.0, 1)
     for seconds in (0.0, 200.0, 1e4):

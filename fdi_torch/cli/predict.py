@@ -54,8 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--settle",
         metavar="TIME",
         type=seconds,
-        help="take start levels, and what the plant file says varies from run to run, from all of so much of each run "
-        "('30 s'), and count errors after it",
+        help="take what the plant file says varies from run to run, and the levels to go on from, from all of so much "
+        "of each run ('30 s'), and count errors after it",
     )
     parser.add_argument(
         "--vary",

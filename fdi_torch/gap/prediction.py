@@ -3,13 +3,13 @@
 What the plant file says varies from recording to recording (the zero of a sensor that is zeroed before each run) is
 taken from the same samples, within its tolerance: a tank that reads less than nothing is empty, and its sensor off.
 Where the recording was cut from a longer one in which a pump had run, its hose is full. A longer stretch at the start
-tells more of what varies, and is then no part of what is predicted.
+tells more of what varies, and the levels at its end; it is then no part of what is predicted (`settling`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from fdi_torch.effects import effect, once_run
 from fdi_torch.gap.fitting import Fitter
-from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.settling import rough_noise, settle
 from fdi_torch.gap.subject import Subject, subject_of
 from fdi_torch.names import matching
 from fdi_torch.parameters import ParameterSpace
@@ -66,8 +66,9 @@ def predict(
     a long run of close samples the MOST_STEPS-th part of it), and less where a rim that runs over, or another sharp
     bend, keeps the trajectory from settling.
 
-    settle: s; all of so much is used for the start, in place of start_samples, and errors are counted after it. vary:
-    patterns of constants with a tolerance that are taken from there too, beside those that the plant file says.
+    settle: s; all of so much is used for the start, in place of start_samples: the run goes on from the levels at its
+    end, and errors are counted after it. vary: patterns of constants with a tolerance that are taken from there too,
+    beside those that the plant file says.
 
     Raises ValueError where there is no first sample to start from, or none left to predict.
     """
@@ -112,25 +113,19 @@ def _varying(plant: PlantDescription, patterns: Collection[str]) -> PlantDescrip
 
 
 def _run(subject: Subject, start_samples: int, counted: int) -> Prediction:
-    plant, recording = subject.plant, subject.recording
+    plant = subject.plant
     early = subject.mask.clone()
     early[start_samples:] = False
     if not bool(early.any()):
-        raise ValueError(f"{recording.source}: expected readings among the first {start_samples} samples, got none")
-    spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    fitter = Fitter(replace(subject, mask=early), Noise(1e-2 * spread, torch.zeros_like(spread)))
-    network = fitter.network([])
-    tanks = [f"{t.name}.start_level" for t in plant.tanks]
-    names = [*tanks, *plant.varying]
-    engine = Collocation(network, ParameterSpace(network.constants[n] for n in names), subject.experiment)
-    theta = torch.stack([engine.space.vector(start) for start in _starts(plant, fitter.first_levels())])
-    theta, cost, near = fitter.descend(engine, theta, engine.settle(theta, engine.constant_guess(theta)).levels, ROUNDS)
-    best = int(torch.nan_to_num(cost, nan=torch.inf).argmin())
-    run = engine.settle(theta[best : best + 1], near.levels[best : best + 1], CORRECTIONS)
+        source = subject.recording.source
+        raise ValueError(f"{source}: expected readings among the first {start_samples} samples, got none")
+    fitter = Fitter(replace(subject, mask=early), rough_noise(subject))
+    engine, theta, levels = _by_stretch(fitter, counted) if counted else _by_samples(fitter)
+    run = engine.settle(theta, levels, CORRECTIONS)
     readings = run.readings[0]
     residuals = torch.where(subject.mask, subject.readings - readings, torch.zeros_like(readings))
     rmse = torch.sqrt((residuals[counted:] ** 2).sum(dim=0) / subject.mask[counted:].sum(dim=0))
-    values = dict(zip(names, theta[best].tolist(), strict=True))
+    values = dict(zip(engine.space.names, theta[0].tolist(), strict=True))
     return Prediction(
         readings,
         residuals,
@@ -140,6 +135,38 @@ def _run(subject: Subject, start_samples: int, counted: int) -> Prediction:
         float(run.defect.max()) < SETTLED * length_scale(plant),
         float(run.defect.max()),
     )
+
+
+Begun = tuple[Collocation, Tensor, Tensor]
+"""The engine, parameters (1, P) and a guess of the levels (1, K+1, tanks)."""
+
+
+def _by_samples(fitter: Fitter) -> Begun:
+    """Start levels, and what varies, from the readings that the fitter sees."""
+    plant = fitter.subject.plant
+    engine = _engine(fitter, (), [*(f"{t.name}.start_level" for t in plant.tanks), *plant.varying])
+    theta = torch.stack([engine.space.vector(start) for start in _starts(plant, fitter.first_levels())])
+    guess = engine.settle(theta, engine.constant_guess(theta)).levels
+    theta, cost, near = fitter.descend(engine, theta, guess, ROUNDS)
+    best = int(torch.nan_to_num(cost, nan=torch.inf).argmin())
+    return engine, theta[best : best + 1], near.levels[best : best + 1]
+
+
+def _by_stretch(fitter: Fitter, samples: int) -> Begun:
+    """The same from the first so many samples, in which water may come and go unseen."""
+    subject = fitter.subject
+    plant = replace(subject.plant, tolerances={n: subject.plant.tolerances[n] for n in subject.plant.varying})
+    first, step = subject.recording.stretch(0, samples), float(subject.experiment.steps.max())
+    stretch = subject_of(plant, subject.believed, first, step)
+    found = settle(stretch, _starts(plant, fitter.first_levels()))
+    engine = _engine(fitter, found.placements, list(found.values))
+    theta = engine.space.vector(found.values).unsqueeze(0)
+    return engine, theta, engine.constant_guess(theta)
+
+
+def _engine(fitter: Fitter, placements: Sequence[Placement], names: Sequence[str]) -> Collocation:
+    network = fitter.network(placements)
+    return Collocation(network, ParameterSpace(network.constants[n] for n in names), fitter.subject.experiment)
 
 
 def _starts(plant: PlantDescription, seen: Mapping[str, float]) -> list[dict[str, float]]:

@@ -1,0 +1,118 @@
+"""What the first stretch of a run tells of it: start levels, what varies from run to run, and the levels at its end.
+
+A plant's equations are wrong by more than its sensors' noise, and for long: were what they miss taken for noise, a hose
+or a zero would be bent until it made good for it. So water may come and go unseen while the plant settles, a constant
+flow into each tank for each part of the stretch. How much of it there may be, as a share of what runs out of a full
+tank, is told by the stretch itself: the size is taken under which its readings are likeliest (the evidence, MacKay
+1992, by Laplace's approximation). After the stretch there is none, and the levels go on from where it led them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.fitting import Candidate, Fit, Fitter
+from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.subject import Subject
+from fdi_torch.parameters import Parameter
+from fdi_torch.plant.constants import flow_scale
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Effect, Local, Placement, Stage, Values
+
+PARTS = 8  # of the stretch
+SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)  # of what runs out of a full tank
+ROUNDS = 30
+FINEST, COARSEST = 1e-4, 1e-2  # of the spread of a sensor's readings: its noise lies between
+NORMAL_MEDIAN = 0.6745  # of the size of a normal number, in standard deviations
+
+
+class UnseenFlow(Effect):
+    """A constant inflow during each part of the stretch, normal about none; none after it."""
+
+    name = "unseen_flow"
+    stage = Stage.BALANCE
+    places: ClassVar[tuple[str, ...]] = ("tank",)
+
+    def __init__(self, seconds: float, parts: int, share: float) -> None:
+        self.edges = [seconds * j / parts for j in range(parts + 1)]
+        self.share = share
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        std = self.share * flow_scale(plant, place)
+        return tuple(Parameter(f"flow_{j}", "m^3/s", 0.0, std=std) for j in range(len(self.edges) - 1))
+
+    def inflow(self, local: Local, p: Values) -> Tensor:
+        after = [local.clock.share_after(local.clock.start.new_tensor(edge)) for edge in self.edges]
+        total = torch.zeros_like(after[0])
+        for j, (begun, ended) in enumerate(pairwise(after)):
+            total = total + p[f"flow_{j}"] * (begun - ended)
+        return total
+
+
+@dataclass(frozen=True)
+class Settled:
+    """placements: what came and went unseen. values: by name, those of its flows among them, SI."""
+
+    placements: tuple[Placement, ...]
+    values: Mapping[str, float]
+
+
+def settle(stretch: Subject, starts: Sequence[Mapping[str, float]]) -> Settled:
+    """stretch: the beginning of a recording, all of whose readings are used; what its plant has a tolerance for is
+    fitted. starts: of the start levels, m.
+    """
+    plant, seconds = stretch.plant, float(stretch.experiment.nodes[-1])
+    parts = max(1, min(PARTS, len(stretch.recording) // 2))
+    fitter = Fitter(stretch, rough_noise(stretch))
+    plain = fitter.fit(Candidate(starts=tuple(starts)), rounds=ROUNDS)
+    fitter = Fitter(stretch, _fine_noise(stretch, plain))
+    best = fitter.fit(Candidate(), plain, rounds=ROUNDS)
+    bent = {n: best.values[n] for n in plant.varying}
+    believed = {n: best.space[n].nominal for n in plant.varying}
+    likeliest = _surprise(fitter, best)
+    for share in SHARES:
+        unseen = UnseenFlow(seconds, parts, share)
+        placements = tuple(Placement(unseen, tank.name) for tank in plant.tanks)
+        none = {f"{p.prefix}.{q.name}": 0.0 for p in placements for q in unseen.parameters(p.location, plant)}
+        # What varies was bent as far as it goes where nothing flowed unseen: it also begins at what is believed.
+        both = tuple(none | varying for varying in (bent, believed))
+        fit = fitter.fit(Candidate(placements, both), plain, rounds=ROUNDS)
+        if (found := _surprise(fitter, fit)) < likeliest:
+            best, likeliest = fit, found
+    return Settled(best.candidate.placements, best.values)
+
+
+def _surprise(fitter: Fitter, fit: Fit) -> float:
+    """Twice the negative logarithm of the evidence, but for what all fits of the stretch have in common."""
+    scale = fitter.box(fit.space)[2]
+    _, _, curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.near, scale)
+    found = fit.cost + float(torch.logdet(curvature[0]))
+    return found if math.isfinite(found) else math.inf
+
+
+def rough_noise(subject: Subject) -> Noise:
+    """Where nothing is known of the sensors: white, a hundredth of how much their readings vary."""
+    spread = _spread(subject)
+    return Noise(COARSEST * spread, torch.zeros_like(spread))
+
+
+def _fine_noise(stretch: Subject, fit: Fit) -> Noise:
+    """White, told by how far of three residuals in a row the second lies from between its neighbours (the median)."""
+    spread, left = _spread(stretch), stretch.readings - fit.near.readings[0]
+    seen = stretch.mask[2:] & stretch.mask[1:-1] & stretch.mask[:-2]
+    off = (left[2:] - 2.0 * left[1:-1] + left[:-2]).abs() / (NORMAL_MEDIAN * math.sqrt(6.0))
+    size = spread.clone()
+    for c in seen.any(dim=0).nonzero().flatten().tolist():
+        size[c] = off[seen[:, c], c].median()
+    return Noise(torch.minimum(torch.maximum(size, FINEST * spread), COARSEST * spread), torch.zeros_like(spread))
+
+
+def _spread(subject: Subject) -> Tensor:
+    return subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
