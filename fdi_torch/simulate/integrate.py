@@ -193,7 +193,7 @@ class ReferenceEngine:
         for i, delay in self.network.reading_delays(values).items():
             seen[i] = late(seen[i], self.experiment.sample_times, delay)
         times = self.experiment.sample_times
-        intervals = torch.diff(times, prepend=2 * times[:1] - times[1:2])
+        intervals = self.experiment.sample_intervals
         if self.network.reading_memory() == 0:
             clock = self._clock((times - intervals).unsqueeze(1), intervals.unsqueeze(1))
             readings, _ = self.network.read(seen, (), clock, values)

@@ -5,8 +5,7 @@ Slower than the compiled engine and faster than differentiating through torchdif
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -15,15 +14,11 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.expression import Varies
 from fdi_torch.simulate.injection import Injection, expect_injectable
 from fdi_torch.simulate.integrate import hermite
-from fdi_torch.simulate.operations import OPERATIONS
+from fdi_torch.simulate.interpreter import Change, Interpreter
 from fdi_torch.simulate.own_steps import judged, own_step
 from fdi_torch.simulate.program import Program, build_program
-from fdi_torch.simulate.section import Place, Row, Section
-
-Change = Tensor | None
 
 
 class TracedEngine:
@@ -77,21 +72,6 @@ class TracedEngine:
         return values, slopes.movedim(0, -1).reshape(*values.shape, theta.shape[-1])
 
 
-@dataclass
-class _State:
-    """Values (L,) and changes (P, L) by place; a change of None is zero."""
-
-    values: dict[Place, Tensor] = field(default_factory=dict)
-    changes: dict[Place, Change] = field(default_factory=dict)
-
-    def group(self, kind: str, count: int) -> list[tuple[Tensor, Change]]:
-        return [(self.values[kind, i], self.changes.get((kind, i))) for i in range(count)]
-
-    def put(self, kind: str, values: list[tuple[Tensor, Change]]) -> None:
-        for i, (value, change) in enumerate(values):
-            self.values[kind, i], self.changes[kind, i] = value, change
-
-
 class _Run:
     """One simulation of lanes (L, P)."""
 
@@ -104,15 +84,9 @@ class _Run:
         injection: Injection | None = None,
     ) -> None:
         self.program, self.experiment, self.lanes, self.injection = program, experiment, lanes, injection
-        self.state = _State()
-        self.constants: dict[int, Tensor] = {}
-        self.orders: dict[int, list[int]] = {}
-        self.tables = {
-            "theta": lanes.unbind(-1),
-            "nominal": network.nominal.to(lanes).unbind(),
-            "lifted": lanes.new_tensor(program.graph.lifted).unbind(),
-            "resolution": [experiment.resolution.to(lanes)],
-        }
+        self.resolution = experiment.resolution.to(lanes)
+        interpreter = Interpreter(program, lanes, network.nominal, self.resolution)
+        self.state, self.compute, self.full = interpreter.state, interpreter.run, interpreter.full
         self.history: list[list[tuple[Tensor, Change]]] = []
         self.pace = lanes.new_full((len(lanes),), torch.inf)
 
@@ -121,13 +95,13 @@ class _Run:
         e, p, state = self.experiment, self.program, self.state
         firsts = torch.searchsorted(e.sample_step, torch.arange(len(e.nodes))).tolist()
         shares = e.sample_share.tolist()
-        self._section(p.prepare)
+        self.compute(p.prepare)
         if self.injection is not None:
             self._begin_with("level", self.injection.start)
         for k in range(len(e.nodes) - 1):
             self._enter(k)
             if k == 0:
-                self._section(p.settle_commands)
+                self.compute(p.settle_commands)
                 self._remember("command_memory", 0, p.command_memory)
             mine = list(range(firsts[k], firsts[k + 1]))
             for s in [s for s in mine if shares[s] <= 0.0]:
@@ -137,7 +111,7 @@ class _Run:
             before = self._levels()
             self._step(k)
             if any(0.0 < shares[s] < 1.0 for s in mine):
-                self._section(p.end)
+                self.compute(p.end)
             for s in [s for s in mine if shares[s] > 0.0]:
                 state.put("sample", self._between(before, k, e.sample_share[s]))
                 yield s
@@ -153,9 +127,9 @@ class _Run:
         self.state.put("seen", [seen[tank] for tank in p.sensor_tanks])
         self._see_late(s)
         if s == 0:
-            self._section(p.settle_readings)
+            self.compute(p.settle_readings)
             self._remember("reading_memory", p.command_memory, p.reading_memory)
-        self._section(p.read)
+        self.compute(p.read)
         return self.state.group("reading", p.sensors)
 
     def correct(self, s: int, values: Tensor, weight: Tensor) -> Tensor:
@@ -180,27 +154,22 @@ class _Run:
         if self.injection is not None and self.injection.memory is not None:
             self._begin_with(kind, self.injection.memory[..., first : first + count])
 
-    def full(self, change: Change) -> Tensor:
-        """(P, L), zeros where nothing changes."""
-        return self.lanes.new_zeros(self.lanes.shape[::-1]) if change is None else change.expand(self.lanes.shape[::-1])
-
     def _step(self, k: int) -> None:
         """A step of the grid: at once, or each lane in as many of its own as it needs."""
         e, p, values = self.experiment, self.program, self.state.values
         if e.tolerance is None:
-            return self._section(p.step)
-        self._section(p.act)
+            return self.compute(p.step)
+        self.compute(p.act)
         start, span = values["clock", 0], values["clock", 1]
         gone = torch.zeros_like(self.pace)
         while bool((gone < span).any()):
             own = own_step(gone, self.pace, span)
             values["part", 0], values["part", 1] = start + gone, own
             before = self._levels()
-            self._section(p.step)
+            self.compute(p.step)
             error = torch.stack([values["error", i].expand_as(own).abs() for i in range(p.tanks)]).amax(dim=0)
-            shortest = self.tables["resolution"][0]
             stiffness = values["stiffness", 0]
-            kept, gone, self.pace = judged(own, error, stiffness, gone, self.pace, span, e.tolerance, shortest)
+            kept, gone, self.pace = judged(own, error, stiffness, gone, self.pace, span, e.tolerance, self.resolution)
             rows = zip(self._levels(), before, strict=True)
             self.state.put("level", [self._either(kept, now, then) for now, then in rows])
 
@@ -271,52 +240,3 @@ class _Run:
         index = right.expand(1, *past.shape[1:])
         first, last = past.gather(0, index - 1)[0], past.gather(0, index)[0]
         return first + share * (last - first) + moved * self.full(self.state.changes.get(("reading_delay", j)))
-
-    def _section(self, section: Section) -> None:
-        """Computes the outputs and their changes and stores them, `next_` ones under the plain name."""
-        wanted = [o.node for o in section]
-        wanted += [n for o in section for n in [*(c for c, _ in o.row.terms), *o.row.theta.values()]]
-        known = self._evaluate(wanted, id(section))
-        changes: dict[Place, Change] = {}
-        for o in section:
-            changes[o.place] = self._change(o.row, known, changes)
-        for (kind, i), node in ((o.place, o.node) for o in section):
-            place = (kind.removeprefix("next_"), i)
-            self.state.values[place] = known[node]
-            if self.program.tangent:
-                self.state.changes[place] = changes[kind, i]
-
-    def _change(self, row: Row, known: Mapping[int, Tensor], fresh: Mapping[Place, Change]) -> Change:
-        total: Change = None
-        for factor, place in row.terms:
-            change = fresh[place] if place in fresh else self.state.changes.get(place)
-            if change is not None:
-                total = known[factor] * change if total is None else total + known[factor] * change
-        if not row.theta:
-            return total
-        own = self.lanes.new_zeros(self.lanes.shape[::-1])
-        for q, slope in row.theta.items():
-            own[q] = known[slope]
-        return own if total is None else total + own
-
-    def _evaluate(self, wanted: list[int], section: int) -> dict[int, Tensor]:
-        nodes = self.program.graph.nodes
-        if section not in self.orders:
-            self.orders[section] = self.program.graph.reach(wanted)
-        known: dict[int, Tensor] = {}
-        for i in self.orders[section]:
-            if i not in self.constants:
-                value = self._compute(i, known)
-                (known if nodes[i].varies & Varies.STEP else self.constants)[i] = value
-            if i in self.constants:
-                known[i] = self.constants[i]
-        return known
-
-    def _compute(self, i: int, known: Mapping[int, Tensor]) -> Tensor:
-        node = self.program.graph.nodes[i]
-        if node.operation == "literal":
-            return self.lanes.new_tensor(node.value)
-        if node.operation == "input":
-            table = self.tables.get(node.kind)
-            return self.state.values[node.kind, node.index] if table is None else table[node.index]
-        return OPERATIONS[node.operation].torch(*(known[a] for a in node.arguments))
