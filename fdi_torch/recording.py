@@ -20,6 +20,7 @@ class Recording:
     time (T,) in s, strictly increasing. inputs (T, M) and outputs (T, N) in the SI units named beside them.
     mask (T, N): True where a reading counts; a missing reading is NaN in outputs and False here.
     An unknown input is NaN; `known_stretches` cuts the recording there. hold: how inputs run between samples.
+    notes: what the reader did to the file's rows, in sentences.
     ran: inputs that were on, or may have been, before the first sample, as far as what it was cut from tells.
     """
 
@@ -35,6 +36,7 @@ class Recording:
     source: str = "memory"
     sha256: str = ""
     ran: frozenset[str] = frozenset()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.mask is None:

@@ -285,7 +285,10 @@ def test_columns_by_mapping_constants_and_missing_sensors(tmp_path: Path) -> Non
         ({"columns": {"Q1": {"column": "h1_cm"}}}, "Q1: expected a unit of the kind m\\^3/s .* got one of the kind m;"),
         ({"start": "50 s"}, "expected at least two samples between start 50 s"),
         ({"start_levels": {"T9": "free"}}, "rig.csv: start_levels.T9: expected a tank .* got 'T9'"),
-        ({"start": "5 s", "stop": "6 s"}, "expected a stretch with all inputs known, got none; give the unknown one"),
+        (
+            {"start": "5 s", "stop": "6 s"},
+            "a stretch with all inputs known, got none: unknown are Q2 at 0.5 of",
+        ),
         ({"file": "rigg.csv"}, "rigg.csv: expected a file, got none there .* the nearest is 'rig.csv'"),
     ],
 )

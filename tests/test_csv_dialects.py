@@ -55,7 +55,11 @@ def test_words_for_nothing_read_are_missing_readings(tmp_path: Path, word: str) 
     ("text", "sentence"),
     [
         (PLAIN.replace("50.5", '"50,5"'), "got '50,5'; write it with a point"),
-        (PLAIN.replace("t_s", "t").replace("\n5,", "\n29/03/2026,"), "row 2, column t: expected a time stamp such as"),
+        (PLAIN.replace("t_s", "t"), r"row 2, column t: expected a time stamp, got the number 0; .* t: \{unit: ms\}"),
+        (
+            PLAIN.replace("t_s", "t").replace("\n0,", "\n29/03/2026,"),
+            r"row 2, column t: expected a time stamp such as .* t: \{stamps: '%d/%m/%Y %H:%M:%S'\}",
+        ),
         (
             PLAIN.replace("h1_cm", "h1_cm,h1_mm").replace("\n", ",1\n"),
             "expected one column for h1, got h1_cm and h1_mm",
@@ -64,7 +68,7 @@ def test_words_for_nothing_read_are_missing_readings(tmp_path: Path, word: str) 
         ("Logger 7\n" + PLAIN, "row 1: expected a header line .* put # before what stands above"),
         (
             STAMPED.format("2026-10-25 02:59:55", "2026-10-25 02:00:00", "2026-10-25 02:00:05"),
-            r"its offset \(\+01:00\)",
+            r"say in which zone this is: columns: \{t: \{zone: Europe/Berlin\}\}",
         ),
         (b"PK\x03\x04\x00\x00", "got a zip archive or an Excel workbook; save the sheet as CSV"),
         (b"PAR1\x00\x00", "got a Parquet file"),

@@ -110,7 +110,7 @@ def test_a_growing_csv_file_is_followed_row_by_row(tmp_path: Path, capsys: pytes
     events = monitored(["--config", config(tmp_path), "--follow", "--idle", "1.5"], capsys)
     thread.join()
     assert kinds(events)[:2] == ["alarm", "isolated"]
-    assert "expected a number or an empty cell, got 'oops'; the row is left out" in texts(events)
+    assert "got 'oops'; say what it means, as in words: {oops: null}" in texts(events)
     assert "no samples for 41 s" in texts(events)
     whole = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
     assert [e["time"] for e in events if e["kind"] == "alarm"] == [e["time"] for e in whole if e["kind"] == "alarm"]

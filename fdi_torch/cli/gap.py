@@ -72,6 +72,9 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     keep_memory()
     plant = load_plant(arguments.plant)
     recordings = named_recordings(arguments.recording, plant, Path.cwd())
+    holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
+    for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
+        screen.note(note)
     library = _names(arguments.library) or None
     if arguments.plan:
         with one_thread():
@@ -80,7 +83,6 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         raise ValueError(f"--step: expected a positive number of seconds, got {arguments.step:g}")
     if arguments.most < 1:
         raise ValueError(f"--most: expected at least one effect, got {arguments.most}")
-    holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
     left_out = _names(arguments.leave_out)
     if arguments.refit:
         with one_thread():

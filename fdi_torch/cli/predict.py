@@ -83,6 +83,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     if not names:
         raise ValueError("expected a recording, got none; name a CSV, MCAP or YAML file")
     recordings = [r for name in names for r in _recordings(name, plant, arguments)]
+    for note in dict.fromkeys(note for r in recordings for note in r.notes):
+        screen.note(note)
     found = [(recording, _predict(plant, recording, arguments)) for recording in recordings]
     first = f"{arguments.start_samples} samples" if arguments.settle is None else f"{arguments.settle:g} s"
     screen.say(f"free run of {plant.name}, start levels from the first {first}")

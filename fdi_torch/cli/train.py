@@ -92,8 +92,8 @@ def in_words(done: TrainResult) -> list[str]:
 
 
 def not_counted(recordings: Sequence[Recording]) -> list[str]:
-    """What of each file does not count: readings that are missing or masked, and time without known inputs."""
-    lines = []
+    """What was done to the rows of each file, and what does not count: readings missing or masked, unknown inputs."""
+    lines = list(dict.fromkeys(note for r in recordings for note in r.notes))
     for source in dict.fromkeys(r.source for r in recordings):
         masks = [r.mask for r in recordings if r.source == source]
         missing, all_of_them = sum(int((~mask).sum()) for mask in masks), sum(mask.numel() for mask in masks)

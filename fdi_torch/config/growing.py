@@ -10,7 +10,7 @@ import numpy as np
 
 from fdi_torch.config.files import find_data
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import RecordingConfig, channel_mapping, expect_units
+from fdi_torch.config.recordings import ColumnConfig, RecordingConfig, channel_mapping, expect_units
 from fdi_torch.logbook import LogError, Message, follow, number_at
 from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.plant.description import PlantDescription
@@ -31,6 +31,11 @@ def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, i
     """
     if config.mask or config.every != 1:
         raise ConfigError([f"{config.file}: expected neither mask nor every for a file that is followed; leave them"])
+    if config.also or config.tags:
+        raise ConfigError([f"{config.file}: expected a file with a row an instant to follow; leave also and tags"])
+    clock = config.columns.get("t", ColumnConfig())
+    if clock.zone or clock.sort:
+        raise ConfigError([f"{config.file}: expected neither zone nor sort for a file that is followed; leave them"])
     path = _find(config.file, base)
     rows = _mcap_rows if ".mcap" in path.suffixes else _csv_rows
     start = -np.inf if config.start is None else config.start

@@ -15,6 +15,8 @@ from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription, Pump, Sensor
 from fdi_torch.recording import Recording
 
+MANY_RUNS = 5
+"""So many stretches without an input are told in one sentence."""
 GAP_STEPS = 3.0
 """A gap is a step longer than this many usual ones."""
 JITTER_SHARE = 0.05
@@ -31,7 +33,9 @@ SMALL_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Finding:
-    """kind: clock, gap, constant, clipped, frozen, quantised, range, unit, missing or unknown. values: SI, by name."""
+    """kind: read, clock, gap, constant, clipped, frozen, quantised, range, unit, missing or unknown. values: SI, by
+    name.
+    """
 
     kind: str
     channel: str
@@ -77,6 +81,7 @@ def check_recording(recording: Recording, plant: PlantDescription) -> RecordingC
         interval=interval,
         channels=tuple(_summaries(recording)),
         findings=(
+            *(Finding("read", "t", note) for note in recording.notes),
             *_clock_findings(recording.time, steps, interval),
             *_unknown_inputs(recording),
             *_missing_readings(recording),
@@ -129,10 +134,24 @@ def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[Fi
 
 def _unknown_inputs(recording: Recording) -> Iterator[Finding]:
     for name, values in zip(recording.input_names, recording.inputs.T, strict=True):
-        for first, last in _runs(torch.isnan(values)):
+        unknown = torch.isnan(values)
+        runs = _runs(unknown)
+        if len(runs) > MANY_RUNS:
+            text = (
+                f"unknown at {int(unknown.sum())} of {len(values)} samples, in {len(runs)} stretches: the recording is "
+                f"cut at each; where an empty cell means the last value, say for how long: columns: "
+                f"{{{name}: {{held: {_usual_step(recording.time[~unknown]):.3g} s}}}}"
+            )
+            yield Finding("unknown", name, text, {"count": int(unknown.sum()), "stretches": len(runs)})
+            continue
+        for first, last in runs:
             start, stop = float(recording.time[first]), float(recording.time[last])
             text = f"unknown from {start:g} s to {stop:g} s ({last - first + 1} samples): the recording is cut there"
             yield Finding("unknown", name, text, {"start": start, "stop": stop})
+
+
+def _usual_step(time: Tensor) -> float:
+    return float(torch.diff(time).median()) if len(time) > 1 else 0.0
 
 
 def _missing_readings(recording: Recording) -> Iterator[Finding]:

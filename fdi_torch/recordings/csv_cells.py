@@ -3,40 +3,64 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fdi_torch.recordings.csv_text import Heading
+from fdi_torch.recordings.stamps import seconds_of
 
-MISSING_WORDS = frozenset(
-    {"", "nan", "na", "n/a", "null", "none", "-", "bad", "bad input", "no data"}
+BAD = float("inf")
+"""A cell that says that nothing could be read, unlike an empty one (NaN), where nothing was logged."""
+BAD_WORDS = frozenset(
+    {"nan", "na", "n/a", "null", "none", "-", "--", "---", "bad", "bad input", "no data", "invalid", "error", "err"}
     | {"#n/a", "#div/0!", "#value!", "#ref!", "#num!", "#name?", "#null!"}
+    | {"i/o timeout", "timeout", "comm fail", "no result", "pt created", "scan off", "not connect", "shutdown"}
+    | {"calc failed", "configure", "over range", "under range", "out of serv", "offline", "disconnected"}
 )
+GOOD_WORDS = frozenset({"good", "ok", "valid", "g", "192", "0xc0", "0x00c0", "good, non-specific", "0x000000c0"})
+"""What servers write beside a value that counts; 192 is OPC's."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What cells of a column mean beyond numbers. words: by lower case, in the column's unit; BAD where nothing was
+    read. quality: position of the column that tells whether a value counts, `good` the words by which it does.
+    """
+
+    words: Mapping[str, float] = field(default_factory=dict)
+    quality: int | None = None
+    good: frozenset[str] = GOOD_WORDS
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Which columns (positions) are read, and which of them holds time stamps instead of numbers."""
+    """Which columns (positions) are read, which of them holds time stamps instead of numbers and how these are read,
+    and by which rules. sparse: whether an empty cell is another thing than one that says that nothing was read.
+    """
 
     path: Path
     heading: Heading
     positions: list[int]
     stamps: int | None = None
+    read_stamp: Callable[[str], float] = seconds_of
+    rules: Mapping[int, Rule] = field(default_factory=dict)
+    sparse: bool = False
 
 
 def parse_fast(lines: list[str], columns: Columns) -> np.ndarray:
     """Well-formed lines, in C, as (rows, columns) float64. Raises ValueError for anything else."""
     delimiter, width = columns.heading.delimiter, len(columns.heading.names)
-    if any(line.count(delimiter) != width - 1 for line in lines):
-        raise ValueError("uneven rows")
+    if columns.rules or columns.sparse or any(line.count(delimiter) != width - 1 for line in lines):
+        raise ValueError("uneven rows, or cells with more than numbers")
     if delimiter != ",":
         lines = [line.replace(",", ".") for line in lines]
-    stamps: dict[int | str, Callable[[str], Any]] = {} if columns.stamps is None else {columns.stamps: seconds_of}
+    stamps: dict[int | str, Callable[[str], Any]] = {}
+    if columns.stamps is not None:
+        stamps = {columns.stamps: columns.read_stamp}
     return np.loadtxt(
         lines,
         delimiter=delimiter,
@@ -49,7 +73,9 @@ def parse_fast(lines: list[str], columns: Columns) -> np.ndarray:
 
 
 def parse_carefully(lines: list[str], columns: Columns, above: int) -> np.ndarray:
-    """Cell by cell: knows missing cells (NaN), and names the wrong one. above: lines of the file before these."""
+    """Cell by cell: knows empty cells (NaN) and bad ones (BAD), and names the wrong one. above: lines of the file
+    before these.
+    """
     return np.array(list(_rows(lines, columns, above)), dtype=np.float64).reshape(-1, len(columns.positions))
 
 
@@ -65,35 +91,50 @@ def _rows(lines: list[str], columns: Columns, above: int) -> Iterator[list[float
         row = []
         for p in columns.positions:
             try:
-                row.append(seconds_of(cells[p]) if p == columns.stamps else _number(cells[p], delimiter))
+                row.append(columns.read_stamp(cells[p]) if p == columns.stamps else _value(cells, p, columns))
             except ValueError as error:
                 raise ValueError(f"{columns.path}: row {number}, column {names[p]}: {error}") from None
         yield row
 
 
-def _number(cell: str, delimiter: str) -> float:
+def _value(cells: list[str], position: int, columns: Columns) -> float:
+    """The number in a cell by its column's rule."""
+    rule, delimiter = columns.rules.get(position), columns.heading.delimiter
+    if rule is None:
+        return number_in(cells[position], delimiter)
+    return ruled(cells[position], None if rule.quality is None else cells[rule.quality], rule, delimiter)
+
+
+def ruled(cell: str, quality: str | None, rule: Rule, delimiter: str) -> float:
+    """The number in a cell, given what its column's words mean and how good it is said to be."""
+    text = cell.strip().lower()
+    if text and quality is not None and quality.strip().lower() not in rule.good:
+        return BAD
+    if text in rule.words:
+        return rule.words[text]
+    number = number_in(cell, delimiter)
+    return next((value for word, value in rule.words.items() if _is_number(word, number)), number)
+
+
+def _is_number(word: str, number: float) -> bool:
+    """Whether a word is that number, as -9999 is -9999.0."""
+    try:
+        return float(word) == number
+    except ValueError:
+        return False
+
+
+def number_in(cell: str, delimiter: str) -> float:
     text = cell.strip()
-    if text.lower() in MISSING_WORDS:
+    if not text:
         return float("nan")
+    if text.lower() in BAD_WORDS:
+        return BAD
     if delimiter != "," and "." not in text:
         text = text.replace(",", ".")
     try:
         return float(text)
     except ValueError:
-        hint = "; write it with a point, as in 1180.5" if "," in text else ""
-        raise ValueError(f"expected a number or an empty cell, got '{cell.strip()}'{hint}") from None
-
-
-def seconds_of(stamp: str) -> float:
-    """An ISO 8601 time stamp in seconds since 1970; one without an offset is taken for UTC. NaN for an empty cell."""
-    text = stamp.strip().strip('"')
-    if not text:
-        return float("nan")
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError:
-        raise ValueError(
-            f"expected a time stamp such as 2026-03-29T08:30:00 or 2026-03-29 08:30:00.25+01:00, got '{text}'; "
-            "write it so, or as numbers under a header such as t_s"
-        ) from None
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+        fix = f"say what it means, as in words: {{{text}: null}} for what does not count"
+        fix = "write it with a point, as in 1180.5" if "," in text else fix
+        raise ValueError(f"expected a number or an empty cell, got '{cell.strip()}'; {fix}") from None

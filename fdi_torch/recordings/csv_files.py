@@ -2,13 +2,13 @@
 
 A header of the form name_unit (`t_s`, `Q1_cm3_s`, `h1_cm`) or name [unit] tells all; other headers are mapped by
 `ChannelSource`. Empty and non-finite cells are allowed in channels (a missing reading, an unknown command), never in
-time. Where time has no unit it is ISO time stamps; of these, and of seconds since 1970, the first is t = 0.
+time. Where time has no unit it is time stamps; of these, and of seconds since 1970, the first is t = 0.
 """
 
 from __future__ import annotations
 
-import difflib
 import gzip
+import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -17,31 +17,29 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from fdi_torch.parameters import header_unit, si_unit_of, unit_factor
+from fdi_torch.parameters import header_unit, unit_factor
 from fdi_torch.recording import Hold, Recording
+from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
-from fdi_torch.recordings.csv_text import Heading, heading_of, open_csv
-from fdi_torch.recordings.source import ChannelSource, file_sha256
+from fdi_torch.recordings.csv_tags import read_tags
+from fdi_torch.recordings.csv_text import heading_of, open_csv
+from fdi_torch.recordings.sheets import Sheet, in_order, telling_rows, woven
+from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, file_sha256
+from fdi_torch.recordings.stamps import from_zone
 
 LINES_PER_BLOCK = 1 << 16
 SINCE_1970 = 1e8  # s; later than that is no rig's own clock
-TIME_NAMES = ("t", "time", "timestamp", "datetime", "date time", "date_time", "date/time")
 
 
 @dataclass(frozen=True)
-class Bound:
-    """A channel tied to the file: position of its column (or a constant), factor into SI, SI unit.
+class Read:
+    """What one file has of the channels asked of it: sheets, SI units, constants, and sentences on what was done."""
 
-    stamps: its cells are time stamps.
-    """
-
-    name: str
-    header: str
-    position: int | None
-    factor: float
-    si_unit: str
-    constant: float = float("nan")
-    stamps: bool = False
+    sheets: Sequence[Sheet]
+    units: Mapping[str, str]
+    constants: Mapping[str, float]
+    stamps: bool
+    notes: Sequence[str]
 
 
 def read_csv(
@@ -56,26 +54,123 @@ def read_csv(
     Raises ValueError, naming file, row and column, for a missing column (with the nearest one there is), a cell that
     is no number, time that does not increase, and a file without rows.
     """
-    mapping = mapping or {}
-    with open_csv(path) as handle:
-        heading, lines = heading_of(path, handle)
-        clock = bind_clock(path, heading.names, mapping.get("t"))
-        bound_inputs = [bind(path, heading.names, name, mapping.get(name)) for name in inputs]
-        bound_outputs = [bind(path, heading.names, name, mapping.get(name)) for name in outputs]
-        columns = columns_of(path, heading, [clock, *bound_inputs, *bound_outputs])
-        table = _read_table(lines, columns)
+    return read_csv_files([FileSource(path, mapping or {})], inputs, outputs, hold)
+
+
+def read_csv_files(
+    files: Sequence[FileSource], inputs: Sequence[str], outputs: Sequence[str], hold: Hold = "zero_order"
+) -> Recording:
+    """The same from several files, on the union of their times: a channel is taken from the first file whose `columns`
+    name it, or else that has it in its header.
+    """
+    shares = _shared_out(files, (*inputs, *outputs))
+    parts = [_read(file, names) for file, names in zip(files, shares, strict=True) if names]
+    sources = {n: f.columns[n] for f, names in zip(files, shares, strict=True) for n in names if n in f.columns}
+    stands = {name: sources[name].held if name in sources else 0.0 for name in inputs}
+    whole = woven([sheet for part in parts for sheet in part.sheets], stands, hold)
+    constants = {name: value for part in parts for name, value in part.constants.items()}
+    units = {name: unit for part in parts for name, unit in part.units.items()}
+    commands, readings = (_columns(whole, names, constants) for names in (inputs, outputs))
+    rows = telling_rows(commands, readings, hold) if sum(len(part.sheets) for part in parts) > 1 else slice(None)
+    seconds = whole.seconds[rows]
+    since_1970 = any(part.stamps for part in parts) or float(seconds[0]) > SINCE_1970
     return Recording(
-        time=torch.from_numpy(_clock(table[:, 0], clock, columns)),
-        inputs=torch.from_numpy(channels_in_si(table, columns, bound_inputs)),
-        outputs=torch.from_numpy(channels_in_si(table, columns, bound_outputs)),
+        time=torch.from_numpy(np.round(seconds - seconds[0], 6) if since_1970 else seconds),
+        inputs=torch.from_numpy(commands[rows]),
+        outputs=torch.from_numpy(readings[rows]),
         input_names=tuple(inputs),
         output_names=tuple(outputs),
-        input_units=tuple(b.si_unit for b in bound_inputs),
-        output_units=tuple(b.si_unit for b in bound_outputs),
+        input_units=tuple(units[name] for name in inputs),
+        output_units=tuple(units[name] for name in outputs),
         hold=hold,
-        source=str(path),
-        sha256=file_sha256(path),
+        source=str(files[0].path),
+        sha256=_sha256([file.path for file in files]),
+        notes=tuple(note for part in parts for note in part.notes),
     )
+
+
+def _shared_out(files: Sequence[FileSource], names: Sequence[str]) -> list[list[str]]:
+    """Which channels are taken from which file; what none has, from the first, which says so."""
+    shares: list[list[str]] = [[] for _ in files]
+    headers = [_named_in(read_header(file.path)) if len(files) > 1 else set() for file in files]
+    for name in names:
+        said = [k for k, file in enumerate(files) if name in file.columns]
+        there = [k for k, header in enumerate(headers) if name in header]
+        shares[(said or there or [0])[0]].append(name)
+    return shares
+
+
+def _named_in(header: Sequence[str]) -> set[str]:
+    return {*header, *(split[0] for column in header if (split := header_unit(column)))}
+
+
+def _read(file: FileSource, names: Sequence[str]) -> Read:
+    return _read_tagged(file, names) if file.tags else _read_rows(file, names)
+
+
+def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
+    """A file with a row an instant: one sheet."""
+    path, given = file.path, file.columns.get("t")
+    with open_csv(path) as handle:
+        heading, lines = heading_of(path, handle)
+        clock = bind_clock(path, heading.names, given)
+        bounds = [bind(path, heading.names, name, file.columns.get(name)) for name in names]
+        sparse = any(file.columns[name].held > 0.0 for name in names if name in file.columns)
+        columns = columns_of(path, heading, [clock, *bounds], given, sparse)
+        table, notes = _read_table(lines, columns)
+    place, first = f"{path}: row {{}}, column {clock.header}", heading.lines + 1
+    seconds = _clock(table[:, 0], clock, given, place, first)
+    there = [b for b in bounds if b.position is not None]
+    values = channels_in_si(table, columns, there)
+    order = in_order(seconds, values, _sorted(given), place, first, _summer(clock, given))
+    sheet = Sheet(str(path), order.seconds, tuple(b.name for b in there), order.values)
+    return Read([sheet], *_kinds(bounds), clock.stamps, [f"{path.name}: {n}" for n in (*notes, *order.told)])
+
+
+def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
+    """A file with a row a value: a sheet a channel."""
+    path, given = file.path, file.columns.get("t")
+    constant = [name for name in names if (source := file.columns.get(name)) and source.constant is not None]
+    clock, found = read_tags(file, [name for name in names if name not in constant])
+    sheets, notes = [], []
+    for bound, rows, stamps, numbers in found:
+        place = f"{path}: row {{}} ({bound.header}), column {clock.header}"
+        seconds = _clock(stamps, clock, given, place, 0, rows)
+        values = (numbers * np.float64(bound.factor))[:, None]
+        order = in_order(seconds, values, _sorted(given), place, 0, _summer(clock, given), rows)
+        sheets.append(Sheet(f"{path} ({bound.header})", order.seconds, (bound.name,), order.values))
+        notes += [f"{path.name}: {bound.header}: {note}" for note in order.told]
+    bounds = [bound for bound, *_ in found] + [bind(path, (), name, file.columns[name]) for name in constant]
+    return Read(sheets, *_kinds(bounds), clock.stamps, notes)
+
+
+def _kinds(bounds: Sequence[Bound]) -> tuple[dict[str, str], dict[str, float]]:
+    """SI units of the channels, and the values of those that are constant."""
+    return {b.name: b.si_unit for b in bounds}, {b.name: b.constant for b in bounds if b.position is None}
+
+
+def _columns(whole: Sheet, names: Sequence[str], constants: Mapping[str, float]) -> np.ndarray:
+    """The named channels (T, C)."""
+    table = np.empty((len(whole.seconds), len(names)))
+    for k, name in enumerate(names):
+        table[:, k] = constants[name] if name in constants else whole.values[:, whole.names.index(name)]
+    return table
+
+
+def _sorted(clock: ChannelSource | None) -> bool:
+    return isinstance(clock, ClockSource) and clock.sort
+
+
+def _summer(clock: Bound, given: ChannelSource | None) -> str:
+    zoned = isinstance(given, ClockSource) and given.zone
+    told = "where summer time ends, say in which zone this is: columns: {t: {zone: Europe/Berlin}}"
+    return told if clock.stamps and not zoned else ""
+
+
+def _sha256(paths: Sequence[Path]) -> str:
+    """Of the file, or of several files' one after the other."""
+    each = [file_sha256(path) for path in paths]
+    return each[0] if len(each) == 1 else hashlib.sha256("".join(each).encode()).hexdigest()
 
 
 def read_header(path: Path) -> tuple[str, ...]:
@@ -84,74 +179,13 @@ def read_header(path: Path) -> tuple[str, ...]:
         return heading_of(path, handle)[0].names
 
 
-def bind_clock(path: Path, header: Sequence[str], source: ChannelSource | None) -> Bound:
-    """The column of time: the one mapped, or t_UNIT or time_UNIT, or one of `TIME_NAMES` that holds time stamps."""
-    if source is None:
-        split = {h: header_unit(h) for h in header}
-        timed = [h for h, found in split.items() if found and found[0].lower() in ("t", "time")]
-        stamped = [h for h in header if h.lower() in TIME_NAMES]
-        source = ChannelSource((timed or stamped or ["t"])[0])
-    column = _find_column(path, header, "t", source.column)
-    if source.unit is None and header_unit(column) is None:
-        return Bound("t", column, header.index(column), 1.0, "s", stamps=True)
-    return bind(path, header, "t", source, "s")
-
-
-def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | None, want: str | None = None) -> Bound:
-    source = source or ChannelSource()
-    if source.constant is not None:
-        unit = source.unit or "1"
-        return Bound(name, name, None, 1.0, unit, source.constant)
-    column = _find_column(path, header, name, source.column)
-    unit = source.unit or _unit_in(path, column, name)
-    try:
-        si_unit = want or si_unit_of(unit)
-        factor = unit_factor(unit, si_unit)
-    except ValueError as error:
-        raise ValueError(f"{path}: column {column}: {error}") from error
-    return Bound(name, column, header.index(column), factor, si_unit)
-
-
-def _find_column(path: Path, header: Sequence[str], name: str, column: str | None) -> str:
-    """The column mapped to a channel: by its whole header, or by the name in a header of the form name_unit."""
-    wanted = column or name
-    splits = [(h, header_unit(h)) for h in header]
-    meant = [h for h in header if h == wanted] or [h for h, split in splits if split and split[0] == wanted]
-    if len(meant) > 1:
-        fix = f"map one under columns: {{{name}: {{column: {meant[0]}}}}}" if meant[0] != meant[1] else "rename one"
-        raise ValueError(f"{path}: expected one column for {name}, got {' and '.join(meant)}; {fix}")
-    if meant:
-        return meant[0]
-    names = {split[0]: h for h, split in splits if split}
-    near = difflib.get_close_matches(wanted, [*header, *names], n=1, cutoff=0.5)
-    near = [h for h in header if h.lower().startswith(wanted.lower())] or near if len(wanted) > 1 else near
-    hint = f"; the nearest is {names.get(near[0], near[0])}" if near else ""
-    raise ValueError(
-        f"{path}: expected a column for {name} ('{wanted}' or '{wanted}_UNIT'), got {', '.join(header)}{hint}; "
-        f"map it under columns: {{{name}: {{column: ..., unit: ...}}}}"
-    )
-
-
-def _unit_in(path: Path, column: str, name: str) -> str:
-    split = header_unit(column)
-    if split is None:
-        raise ValueError(
-            f"{path}: column {column}: expected a header of the form name_unit such as h1_cm, got no unit in it; "
-            f"give the unit under columns: {{{name}: {{column: {column}, unit: ...}}}}"
-        )
-    return split[1]
-
-
-def columns_of(path: Path, heading: Heading, bounds: Sequence[Bound]) -> Columns:
-    """The columns of the file that are read, each once, in the order of their first use: time comes first."""
-    positions = list(dict.fromkeys(b.position for b in bounds if b.position is not None))
-    return Columns(path, heading, positions, next((b.position for b in bounds if b.stamps), None))
-
-
-def _read_table(lines: Iterator[str], columns: Columns) -> np.ndarray:
-    """The wanted columns as (rows, columns) float64; missing cells are NaN."""
-    blocks, above = [], columns.heading.lines
+def _read_table(lines: Iterator[str], columns: Columns) -> tuple[np.ndarray, list[str]]:
+    """The wanted columns as (rows, columns) float64, cells without a number not finite; and what was left out."""
+    blocks, above, notes = [], columns.heading.lines, []
     for block in _blocks(columns.path, lines):
+        if cut := cut_off(block[-1], columns):
+            block = block[:-1]
+            notes.append(f"the last line is cut off and left out: '{cut}'")
         try:
             blocks.append(parse_fast(block, columns))
         except ValueError:
@@ -160,7 +194,13 @@ def _read_table(lines: Iterator[str], columns: Columns) -> np.ndarray:
     table = np.concatenate(blocks) if blocks else np.empty((0, len(columns.positions)))
     if len(table) < 2:
         raise ValueError(f"{columns.path}: expected at least two rows of numbers, got {len(table)}")
-    return table
+    return table, notes
+
+
+def cut_off(line: str, columns: Columns) -> str:
+    """What there is of a last line that a program had not yet written to its end; nothing where it is whole."""
+    whole = line.endswith(("\n", "\r")) or line.count(columns.heading.delimiter) >= len(columns.heading.names) - 1
+    return "" if whole else line[:60]
 
 
 def _blocks(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
@@ -171,22 +211,22 @@ def _blocks(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
         raise ValueError(f"{path}: expected a whole CSV file, got one that is cut off or damaged: {error}") from error
 
 
-def _clock(seconds: np.ndarray, clock: Bound, columns: Columns) -> np.ndarray:
-    place, first = f"{columns.path}: row {{}}, column {clock.header}", columns.heading.lines + 1
-    seconds = from_first(seconds * clock.factor, seconds[0] * clock.factor, clock)
+def _clock(
+    cells: np.ndarray, clock: Bound, given: ChannelSource | None, place: str, first: int, rows: np.ndarray | None = None
+) -> np.ndarray:
+    """Seconds (R,), since 1970 for time stamps. place: of a row, whose number is counted
+    from `first`, or stands in `rows`.
+    """
+    seconds = cells * clock.factor
     if not np.isfinite(seconds).all():
-        row = first + int(np.flatnonzero(~np.isfinite(seconds))[0])
-        raise ValueError(f"{place.format(row)}: expected a time in every row, got none")
-    back = np.flatnonzero(np.diff(seconds) <= 0)
-    if len(back):
-        before, after = seconds[back[0]], seconds[back[0] + 1]
-        rows = "one such row" if len(back) == 1 else f"{len(back)} such rows"
-        summer = "; where summer time ends, give each stamp its offset (+01:00)" if clock.stamps else ""
-        raise ValueError(
-            f"{place.format(first + 1 + int(back[0]))}: expected time that increases, got "
-            f"{after:g} s after {before:g} s ({rows}); sort the rows or drop the repeated ones{summer}"
-        )
-    return seconds
+        row = int(np.flatnonzero(~np.isfinite(seconds))[0])
+        number = first + row if rows is None else int(rows[row])
+        raise ValueError(f"{place.format(number)}: expected a time in every row, got none")
+    if not isinstance(given, ClockSource):
+        given = ClockSource()
+    if given.zone:
+        seconds = from_zone(seconds, given.zone)
+    return seconds + given.shift if given.shift else seconds
 
 
 def from_first(seconds: np.ndarray, first: float, clock: Bound) -> np.ndarray:
@@ -195,12 +235,11 @@ def from_first(seconds: np.ndarray, first: float, clock: Bound) -> np.ndarray:
 
 
 def channels_in_si(table: np.ndarray, columns: Columns, bounds: Sequence[Bound]) -> np.ndarray:
-    """The bound channels in SI as (rows, channels); what is not finite becomes NaN."""
+    """The bound channels in SI as (rows, channels)."""
     channels = np.empty((len(table), len(bounds)))
     for i, bound in enumerate(bounds):
         source = bound.constant if bound.position is None else table[:, columns.positions.index(bound.position)]
         channels[:, i] = source * np.float64(bound.factor)
-    channels[~np.isfinite(channels)] = np.nan
     return channels
 
 

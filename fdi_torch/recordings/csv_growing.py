@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fdi_torch.recordings.csv_binding import bind, bind_clock, columns_of
 from fdi_torch.recordings.csv_cells import parse_carefully
-from fdi_torch.recordings.csv_files import bind, bind_clock, channels_in_si, columns_of, from_first
+from fdi_torch.recordings.csv_files import channels_in_si, from_first
 from fdi_torch.recordings.csv_text import heading_of, open_csv
+from fdi_torch.recordings.sheets import held
 from fdi_torch.recordings.source import ChannelSource
 
 
@@ -37,7 +39,11 @@ class GrowingCsv:
         self._clock = bind_clock(path, heading.names, mapping.get("t"))
         self._inputs = [bind(path, heading.names, name, mapping.get(name)) for name in inputs]
         self._outputs = [bind(path, heading.names, name, mapping.get(name)) for name in outputs]
-        self._columns = columns_of(path, heading, [self._clock, *self._inputs, *self._outputs])
+        sources = [mapping.get(name, ChannelSource()) for name in inputs]
+        self._held = {k: source.held for k, source in enumerate(sources) if source.held > 0.0}
+        bounds = [self._clock, *self._inputs, *self._outputs]
+        self._columns = columns_of(path, heading, bounds, mapping.get("t"), bool(self._held))
+        self._logged = np.empty((0, 1 + len(inputs)))  # the last row in which each held input was logged
         self._line = heading.lines
         self._first: float | None = None
         self.input_units = tuple(b.si_unit for b in self._inputs)
@@ -64,7 +70,19 @@ class GrowingCsv:
             self._line += 1
         table = np.array(rows).reshape(len(rows), len(self._columns.positions))
         inputs, outputs = (channels_in_si(table, self._columns, bounds) for bounds in (self._inputs, self._outputs))
-        return self._seconds(table[:, 0]), inputs, outputs, troubles
+        seconds = self._seconds(table[:, 0])
+        outputs[~np.isfinite(outputs)] = np.nan
+        return seconds, self._standing(seconds, inputs), outputs, troubles
+
+    def _standing(self, seconds: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Inputs (R, M) with the last value that was logged, also before these rows, where it still stands."""
+        rows = np.concatenate([self._logged, np.column_stack([seconds, inputs])])
+        before = len(self._logged)
+        if self._held and len(rows):
+            last = {int(np.flatnonzero(~np.isnan(c))[-1]) for c in rows[:, 1:].T if not np.isnan(c).all()}
+            self._logged = rows[sorted(last)]
+        stands = [held(rows[:, 0], c, self._held.get(k, 0.0), "zero_order") for k, c in enumerate(rows[:, 1:].T)]
+        return np.stack(stands, axis=1)[before:] if stands else inputs
 
     def _seconds(self, clock: np.ndarray) -> np.ndarray:
         seconds = clock * self._clock.factor

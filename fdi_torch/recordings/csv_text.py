@@ -91,7 +91,9 @@ def _with_units(names: list[str], delimiter: str, number: int, rest: Iterator[st
     if below is None:
         return Heading(tuple(names), delimiter, number), rest
     units = _cells(below, delimiter)
-    bare = len(units) == len(names) and not any(header_unit(name) for name in names)
+    bare = len(units) == len(names) and all(
+        not unit or not header_unit(n) for n, unit in zip(names, units, strict=True)
+    )
     if bare and any(units) and all(not unit or _is_unit(unit) for unit in units):
         named = tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True))
         return Heading(named, delimiter, number + 1), rest

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -13,15 +13,53 @@ from fdi_torch.recording import Hold, Recording
 
 @dataclass(frozen=True)
 class ChannelSource:
-    """Where a channel's numbers come from.
+    """Where a channel's numbers come from, and what its cells mean.
 
-    column: its header (the channel's own name where None). unit: of the numbers in it (from the header where None).
-    constant: the value (SI, in `unit`) of a channel that the file does not hold; NaN where it was never recorded.
+    column: its header (the channel's own name where None), or its tag. unit: of the numbers in it (from the header
+    where None). constant: the value (SI, in `unit`) of a channel that the file does not hold; NaN where it was never
+    recorded. held: how long an input's value stands where cells after it are empty, s. words: what a cell with that
+    text means, in `unit`; NaN: nothing was read. quality: header of the column that tells whether the value counts;
+    good: the words by which it does.
     """
 
     column: str | None = None
     unit: str | None = None
     constant: float | None = None
+    held: float = 0.0
+    words: Mapping[str, float] = field(default_factory=dict)
+    quality: str | None = None
+    good: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ClockSource(ChannelSource):
+    """Where time stands. stamps: how time stamps are written (as for strptime; ISO 8601 where None). zone: in which
+    their local time is, by its IANA name. shift: added to this clock, s. sort: rows may stand in any order.
+    """
+
+    stamps: str | None = None
+    zone: str | None = None
+    shift: float = 0.0
+    sort: bool = False
+
+
+@dataclass(frozen=True)
+class TagRows:
+    """Columns of a file with a row for each value: of the tag, of the value, and of its quality (or None)."""
+
+    tag: str
+    value: str
+    quality: str | None = None
+
+
+@dataclass(frozen=True)
+class FileSource:
+    """A file, what its columns are to channels (time is `t`), and how its rows are laid out (None: one an
+    instant)."""
+
+    path: Path
+    columns: Mapping[str, ChannelSource] = field(default_factory=dict)
+    tags: TagRows | None = None
 
 
 class Reader(Protocol):

@@ -1,0 +1,92 @@
+"""Time stamps as loggers write them, as seconds since 1970: ISO 8601, day.month.year, or a format that is given."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import numpy as np
+
+QUARTER = 900.0
+"""Local time changes by whole quarters of an hour, s."""
+BACK = 1000.0
+"""A clock that goes back by more than this was put back, s."""
+_DOTTED = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})[ T](\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,6}))?)?$")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def stamp_reader(form: str | None, zone: str | None) -> Callable[[str], float]:
+    """From a stamp's text to seconds since 1970; NaN for an empty cell. A stamp without an offset is taken for UTC.
+
+    Raises ValueError for a stamp that is written otherwise, and for one with an offset where a zone is given.
+    """
+
+    def seconds(text: str) -> float:
+        stamp = text.strip().strip('"')
+        if not stamp:
+            return float("nan")
+        moment = _with_format(stamp, form) if form else _plain(stamp)
+        if moment.tzinfo is None:
+            return (moment.replace(tzinfo=UTC) - _EPOCH).total_seconds()
+        if zone:
+            raise ValueError(f"expected local time of {zone}, got '{stamp}' with its offset; leave the zone out")
+        return moment.timestamp()
+
+    return seconds
+
+
+seconds_of = stamp_reader(None, None)
+"""An ISO 8601 time stamp, or one such as 29.3.2026 08:30:00, in seconds since 1970."""
+
+
+def _plain(stamp: str) -> datetime:
+    try:
+        return datetime.fromisoformat(stamp)
+    except ValueError:
+        pass
+    if match := _DOTTED.match(stamp):
+        day, month, year, hour, minute, second, fraction = (part or "0" for part in match.groups())
+        moment = (int(part) for part in (year, month, day, hour, minute, second))
+        return datetime(*moment) + timedelta(microseconds=int(fraction.ljust(6, "0")))  # type: ignore[arg-type]
+    if stamp.replace(".", "", 1).isdigit():
+        raise ValueError(f"expected a time stamp, got the number {stamp}; give its unit, as in t: {{unit: ms}}")
+    raise ValueError(
+        f"expected a time stamp such as 2026-03-29T08:30:00 or 2026-03-29 08:30:00.25+01:00, got '{stamp}'; "
+        "say how it is written, as in t: {stamps: '%d/%m/%Y %H:%M:%S'}"
+    )
+
+
+def _with_format(stamp: str, form: str) -> datetime:
+    try:
+        return datetime.strptime(stamp, form)
+    except ValueError as error:
+        raise ValueError(f"expected a time stamp like '{form}', got '{stamp}' ({error})") from None
+
+
+def expect_zone(zone: str) -> None:
+    """Raises ValueError for a zone that is none."""
+    try:
+        ZoneInfo(zone)
+    except (ZoneInfoNotFoundError, ValueError) as error:
+        raise ValueError(f"expected a time zone by its IANA name such as Europe/Berlin, got '{zone}'") from error
+
+
+def from_zone(local: np.ndarray, zone: str) -> np.ndarray:
+    """Local time of a zone, as seconds since 1970 if it were UTC (R,), as seconds since 1970.
+
+    An hour that comes twice is the first until the clock goes back within it, and the second from there on.
+    """
+    quarters, place = np.unique(np.floor(local / QUARTER), return_inverse=True)
+    naive = [_EPOCH.replace(tzinfo=None) + timedelta(seconds=float(q) * QUARTER) for q in quarters]
+    first, second = (np.array([_offset(moment, zone, fold) for moment in naive])[place] for fold in (0, 1))
+    twice = first > second
+    back = np.zeros(len(local), dtype=bool)
+    back[1:] = (np.diff(local) < -BACK) & twice[1:]
+    return local - np.where(twice & np.logical_or.accumulate(back), second, first)
+
+
+def _offset(moment: datetime, zone: str, fold: int) -> float:
+    offset = moment.replace(tzinfo=ZoneInfo(zone), fold=fold).utcoffset()
+    return offset.total_seconds() if offset else 0.0

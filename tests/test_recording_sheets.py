@@ -1,0 +1,214 @@
+"""Recordings as plants keep them: channels at rates of their own, in one file or several, with odd clocks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from fdi_torch.config.plant import load_plant
+from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.recordings import RecordingConfig, load_recordings, read_recording
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.check import check_recording
+from fdi_torch.recordings.csv_growing import GrowingCsv
+from fdi_torch.recordings.source import ChannelSource
+
+PLANT = """
+tanks: {T: {area: 0.5 m^2, height: 2 m}}
+pipes: {OUT: {source: T, target: outside, area: 5 cm^2, discharge_coefficient: 0.6, valve: V}}
+pumps: {Q: {target: T, max_flow: 100 l/min}}
+sensors: {h: {tank: T}}
+"""
+PLAIN = "t_s,Q_l_min,V_pct,h_mm\n0,60,50,500\n1,60,50,501\n2,60,50,502\n3,30,50,503\n4,30,80,504\n5,30,80,505\n"
+MIXED = "t_s,Q_l_min,V_pct,h_mm\n0,60,50,500\n1,,,501\n2,,,502\n3,30,,503\n4,,80,504\n5,,,505\n"
+HELD = {"Q": {"held": "3 s"}, "V": {"held": "always"}}
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> PlantDescription:
+    (tmp_path / "rig.yaml").write_text(PLANT)
+    return load_plant(str(tmp_path / "rig.yaml"))
+
+
+def read(plant: PlantDescription, folder: Path, text: str, **keys: object) -> Recording:
+    (folder / "run.csv").write_text(text)
+    return read_recording(RecordingConfig.model_validate({"file": "run.csv", **keys}), plant, folder)
+
+
+def same(a: Recording, b: Recording) -> bool:
+    def equal(x: Tensor, y: Tensor) -> bool:
+        return torch.equal(torch.nan_to_num(x, nan=-1.0), torch.nan_to_num(y, nan=-1.0))
+
+    return equal(a.time, b.time) and equal(a.inputs, b.inputs) and equal(a.outputs, b.outputs)
+
+
+def test_a_held_input_is_what_a_file_with_every_cell_says(plant: PlantDescription, tmp_path: Path) -> None:
+    assert same(read(plant, tmp_path, MIXED, columns=HELD), read(plant, tmp_path, PLAIN))
+
+
+def test_an_input_stands_no_longer_than_was_said(plant: PlantDescription, tmp_path: Path) -> None:
+    short = read(plant, tmp_path, MIXED, columns=HELD | {"Q": {"held": "1 s"}})
+    assert torch.isnan(short.inputs[:, 0]).tolist() == [False, False, True, False, False, True]
+
+
+def test_a_bad_value_ends_the_one_before(plant: PlantDescription, tmp_path: Path) -> None:
+    recording = read(plant, tmp_path, MIXED.replace("1,,,501", "1,I/O Timeout,,501"), columns=HELD)
+    assert torch.isnan(recording.inputs[:, 0]).tolist() == [False, True, True, False, False, False]
+
+
+def test_under_a_linear_hold_the_line_to_the_next_value_counts(plant: PlantDescription, tmp_path: Path) -> None:
+    recording = read(plant, tmp_path, MIXED, columns=HELD, hold="linear")
+    torch.testing.assert_close(60e3 * recording.inputs[:4, 0], torch.tensor([60.0, 50.0, 40.0, 30.0]).double())
+    assert torch.isnan(recording.inputs[4:, 0]).all()  # no value follows
+
+
+def test_channels_in_files_of_their_own_are_one_recording(plant: PlantDescription, tmp_path: Path) -> None:
+    (tmp_path / "flow.csv").write_text("time;F\n;l/min\n2026-03-29T08:29:23+02:00;60,0\n2026-03-29T08:29:26+02:00;30\n")
+    (tmp_path / "valve.csv").write_text("epoch_ms,V (%)\n1774765799000,50\n1774765804000,80\n1774765990000,10\n")
+    levels = "Time,h [mm]\n" + "".join(f"2026-03-29T06:30:0{k}.000Z,{500 + k}\n" for k in range(6))
+    flow = {"file": "flow.csv", "columns": {"t": {"shift": "37 s"}, "Q": {"column": "F", "held": "3 s"}}}
+    valve = {"file": "valve.csv", "columns": {"V": {"held": "always"}}}
+    assert same(read(plant, tmp_path, levels, also=[flow, valve]), read(plant, tmp_path, PLAIN))
+    late = {"file": "flow.csv", "columns": {"t": {"shift": "2 h"}, "Q": {"column": "F", "held": "3 s"}}}
+    with pytest.raises(ConfigError, match=r"flow.csv: expected time in common with .* columns: \{t: \{shift: 37 s\}\}"):
+        read(plant, tmp_path, levels, also=[late, valve | {"columns": {"V": {"held": "always"}, "t": {}}}])
+
+
+def test_an_input_that_moves_between_readings_has_a_row_of_its_own(plant: PlantDescription, tmp_path: Path) -> None:
+    (tmp_path / "valve.csv").write_text("t_s,V_pct\n-7,50\n1.5,50\n3.25,80\n4,80\n")
+    levels = "t_s,Q_l_min,h_mm\n0,60,500\n3,60,501\n6,30,502\n"
+    always = [{"file": "valve.csv", "columns": {"V": {"held": "always"}}}]
+    recording = read(plant, tmp_path, levels, also=always)
+    assert recording.time.tolist() == [0.0, 3.0, 3.25, 6.0]
+    assert (60e3 * recording.inputs[:, 0]).tolist() == pytest.approx([60.0, 60.0, 60.0, 30.0])
+    assert recording.inputs[:, 1].tolist() == pytest.approx([0.5, 0.5, 0.8, 0.8])
+    assert recording.mask[:, 0].tolist() == [True, True, False, True]
+    ended = read(plant, tmp_path, levels, also=["valve.csv"])
+    assert torch.isnan(ended.inputs[:, 1]).tolist() == [False, False, False, True]
+    linear = read(plant, tmp_path, levels, also=always, hold="linear")
+    assert linear.time.tolist() == [0.0, 1.5, 3.0, 3.25, 4.0, 6.0]
+    assert (60e3 * linear.inputs[:, 0]).tolist() == pytest.approx([60.0, 60.0, 60.0, 57.5, 50.0, 30.0])
+    assert linear.inputs[2, 1].item() == pytest.approx(0.5 + 0.3 * 1.5 / 1.75)
+
+
+LONG = "Tag,Time,Value,Quality\n" + "".join(
+    f"{tag},2026-03-29 08:30:0{k},{value},Good\n"
+    for k, tag, value in [(0, "F1", 60), (3, "F1", 30), (0, "GV", 50), (4, "GV", 80)]
+    + [(k, "LI", 500 + k) for k in range(6)]
+)
+TAGS = {"tag": "Tag", "value": "Value", "quality": "Quality"}
+LONG_COLUMNS = {
+    "Q": {"column": "F1", "unit": "l/min", "held": "3 s"},
+    "V": {"column": "GV", "unit": "%", "held": "always"},
+    "h": {"column": "LI", "unit": "mm"},
+}
+
+
+def test_a_row_for_each_value(plant: PlantDescription, tmp_path: Path) -> None:
+    assert same(read(plant, tmp_path, LONG, tags=TAGS, columns=LONG_COLUMNS), read(plant, tmp_path, PLAIN))
+    bad = read(plant, tmp_path, LONG.replace("502,Good", "502,Uncertain"), tags=TAGS, columns=LONG_COLUMNS)
+    assert bad.time.tolist() == [0.0, 1.0, 3.0, 4.0, 5.0]
+    with pytest.raises(ConfigError, match=r"expected rows of the tag F for Q, got F1.*; name it under columns"):
+        columns = LONG_COLUMNS | {"Q": {"column": "F", "unit": "l/min"}}
+        read(plant, tmp_path, LONG, tags=TAGS, columns=columns)
+    with pytest.raises(ConfigError, match=r"h: expected the unit of LI, got none; give it under columns: \{h: \{unit"):
+        read(plant, tmp_path, LONG, tags=TAGS, columns=LONG_COLUMNS | {"h": {"column": "LI"}})
+    with pytest.raises(ConfigError, match="expected a column 'Wert', got Tag, Time, Value, Quality"):
+        read(plant, tmp_path, LONG, tags=TAGS | {"value": "Wert"}, columns=LONG_COLUMNS)
+
+
+def test_quality_and_words_say_what_a_cell_means(plant: PlantDescription, tmp_path: Path) -> None:
+    text = "t_s,Q_l_min,V,h_mm,h.Q\n0,60,OPEN,500,192\n1,60,OPEN,501,0\n2,-9999.0,CLOSED,502,good\n3,60,OPEN,503,GOOD\n"
+    columns = {
+        "Q": {"words": {-9999: None}},
+        "V": {"column": "V", "unit": "%", "words": {"open": 100, "CLOSED": 0}},
+        "h": {"quality": "h.Q"},
+    }
+    recording = read(plant, tmp_path, text, columns=columns)
+    assert recording.mask[:, 0].tolist() == [True, False, True, True]
+    assert torch.isnan(recording.inputs[:, 0]).tolist() == [False, False, True, False]
+    assert recording.inputs[:, 1].tolist() == [1.0, 1.0, 0.0, 1.0]
+    chosen = read(plant, tmp_path, text, columns=columns | {"h": {"quality": "h.Q", "good": [0]}})
+    assert chosen.mask[:, 0].tolist() == [False, True, False, False]
+
+
+def test_rows_in_any_order_are_sorted_where_that_is_said(plant: PlantDescription, tmp_path: Path) -> None:
+    head, *rows = PLAIN.splitlines()
+    mixed = "\n".join([head, rows[0], rows[0], rows[2], rows[1], *rows[3:], "4,,,504", "3,30,50,503"])
+    with pytest.raises(ConfigError, match=r"row 5, column t_s: expected time that increases.*\{t: \{sort: true\}\}"):
+        read(plant, tmp_path, mixed)
+    recording = read(plant, tmp_path, mixed, columns={"t": {"sort": True}})
+    assert same(recording, read(plant, tmp_path, PLAIN))
+    found = {f.text for f in check_recording(recording, plant).findings if f.kind == "read"}
+    assert found == {
+        "run.csv: one row repeating the one before left out",
+        "run.csv: rows sorted by time: 3 came late, 2 had the time of another",
+    }
+
+
+@pytest.mark.parametrize("first", ["2026-03-29 00:59:58", "2026-10-25 00:59:58", "2026-07-01 00:00:00"])
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S", "%d.%m.%Y %H:%M:%S", "%m/%d/%Y %I:%M:%S %p"])
+def test_local_time_goes_on_where_clocks_are_changed(
+    plant: PlantDescription, tmp_path: Path, first: str, form: str
+) -> None:
+    from datetime import UTC, datetime, timedelta
+    from zoneinfo import ZoneInfo
+
+    start, berlin = datetime.fromisoformat(first).replace(tzinfo=UTC), ZoneInfo("Europe/Berlin")
+    stamps = [(start + timedelta(seconds=k)).astimezone(berlin).strftime(form) for k in range(6)]
+    rows = PLAIN.replace("t_s", "Zeit").splitlines()
+    text = "\n".join([rows[0], *(s + row[1:] for s, row in zip(stamps, rows[1:], strict=True))])
+    clock = {"zone": "Europe/Berlin"} | ({"stamps": form} if "/" in form else {})
+    assert same(read(plant, tmp_path, text, columns={"t": clock}), read(plant, tmp_path, PLAIN))
+
+
+def test_a_last_line_that_is_cut_off_is_left_out_with_a_word(plant: PlantDescription, tmp_path: Path) -> None:
+    recording = read(plant, tmp_path, PLAIN + "6,3")
+    assert same(recording, read(plant, tmp_path, PLAIN))
+    assert recording.notes == ("run.csv: the last line is cut off and left out: '6,3'",)
+
+
+@pytest.mark.parametrize(
+    ("columns", "sentence"),
+    [
+        ({"h": {"held": "3 s"}}, r"run.csv: columns.h.held: expected this key of an input only; leave it out"),
+        ({"Q": {"zone": "Europe/Berlin"}}, r"columns.Q.zone: expected this key of t only"),
+        ({"t": {"held": "3 s"}}, r"columns.t.held: expected this key of a channel only"),
+        ({"V": {"words": {"OPEN": "100 %"}}}, r"columns.V.words.OPEN: expected a number in the unit of the column"),
+        ({"h": {"quality": "h.Q"}}, r"expected a column 'h.Q', got t_s, Q_l_min, V_pct, h_mm"),
+    ],
+)
+def test_what_says_nothing_is_refused(
+    plant: PlantDescription, tmp_path: Path, columns: dict[str, object], sentence: str
+) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        read(plant, tmp_path, PLAIN, columns=columns)
+
+
+def test_empty_cells_of_inputs_without_held_are_told_once_with_the_fix(plant: PlantDescription, tmp_path: Path) -> None:
+    rows = "".join(f"{k},{60 if k % 2 == 0 else ''},50,{500 + k}\n" for k in range(40))
+    recording = read(plant, tmp_path, "t_s,Q_l_min,V_pct,h_mm\n" + rows)
+    [found] = [f for f in check_recording(recording, plant).findings if f.kind == "unknown"]
+    assert "unknown at 20 of 40 samples, in 20 stretches" in found.text
+    assert "columns: {Q: {held: 2 s}}" in found.text
+    with pytest.raises(ConfigError, match=r"unknown are Q at 0.5 of the samples; .* columns: \{Q: \{held: 10 s\}\}"):
+        load_recordings([RecordingConfig(file="run.csv")], plant, tmp_path)
+
+
+def test_held_inputs_are_followed_as_rows_come(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(MIXED.splitlines()[:2]) + "\n")
+    mapping = {"Q": ChannelSource(held=3.0), "V": ChannelSource(held=float("inf"))}
+    growing = GrowingCsv(path, ["Q", "V"], ["h"], mapping)
+    found = []
+    for line in ["", *MIXED.splitlines()[2:], "9,,,509"]:
+        with path.open("a") as file:
+            file.write(line + "\n" if line else "")
+        found += growing.new()[1].tolist()
+    assert [row[0] for row in found[:6]] == pytest.approx([1e-3] * 3 + [5e-4] * 3)
+    assert [row[1] for row in found] == pytest.approx([0.5] * 4 + [0.8] * 3)
+    assert found[6][0] != found[6][0]  # 6 s after the last value
