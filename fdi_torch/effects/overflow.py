@@ -39,7 +39,7 @@ class Overflow(Effect):
         ]
         return (
             Parameter("below_rim", "m", 0.0, 0.0, 0.95 * tank.height, meaning="how far below the rim it runs over"),
-            Parameter("crest", "1", 1.0, 1e-3, 1.0, meaning="length of the crest as a share of the rim"),
+            Parameter("crest", "1", 1.0, 1e-2, 1.0, meaning="length of the crest as a share of the rim"),
             *into,
         )
 
@@ -49,7 +49,7 @@ class Overflow(Effect):
         low, high = reach.levels[place]
         depths = [tank.height - level for level in (*inside((0.5 * (low + high), high), 3), high)]
         shares = [{}, *({f"to_{t.name}": 0.7} for t in plant.tanks if t.name not in (place, tank.overflow_to))]
-        return [{"below_rim": max(d, 0.0), "crest": 0.01} | share for d in depths for share in shares]
+        return [{"below_rim": max(d, 0.0), "crest": 0.03} | share for d in depths for share in shares]
 
     def inflow(self, local: Local, p: Values) -> Tensor:
         over_rim = local.level - local.height
