@@ -95,12 +95,24 @@ def test_cusum_is_pages_recursion() -> None:
         assert float(cusum(e, drift)[k]) == pytest.approx(float(torch.maximum(up, down).max()), abs=1e-12)
 
 
-def test_glr_is_the_largest_normalised_sum() -> None:
-    e = noise(40, 2)
-    lengths = window_lengths(10)
-    k = 25
+@pytest.mark.parametrize(("samples", "k"), [(40, 25), (8, 7)], ids=["within", "a window as long as all samples"])
+def test_glr_is_the_largest_normalised_sum(samples: int, k: int) -> None:
+    e = noise(samples, 2) + 3.0
+    lengths = window_lengths(8)
     expected = max(float(e[k - n + 1 : k + 1].sum(0).square().sum() / n) for n in lengths)
     assert float(glr(e, lengths)[k]) == pytest.approx(expected, rel=1e-12)
+
+
+def test_channels_share_what_the_glr_suffers_from_spreads_that_are_off() -> None:
+    """Windows that exceed the threshold by chance point anywhere: rates drawn channel by channel, by Monte Carlo."""
+    learnt = fit_whitening(noise(1000, 3), 0)
+    direction = noise(200_000, 3, seed=2)
+    share = (direction / torch.linalg.vector_norm(direction, dim=1, keepdim=True)).square()
+    off = noise(200_000, 3, seed=3) * learnt.slow_error
+    # ln of the rate goes as half the threshold, about ln of the run length, times the variance: 2 d.
+    rates = torch.exp(2.0 * math.log(20000.0) * (share * off).sum(1))
+    claimed = more_alarms("glr", 20000.0, 3, 0.5, learnt)
+    assert claimed - 1.0 == pytest.approx(float(rates.mean()) - 1.0, rel=0.1)
 
 
 def test_an_alarm_starts_the_detector_afresh() -> None:

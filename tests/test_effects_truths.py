@@ -270,6 +270,11 @@ def test_a_draw_ends_when_it_should() -> None:
     assert float(filled((draw,), height=3.0)[0]) == pytest.approx((30e-3 - 2e-3) / 160e-4, rel=1e-9)
 
 
+def test_an_empty_tank_has_nothing_to_draw_from() -> None:
+    draw = PlacedEffect("unmetered_flow", "T1", {"flow": -80e-6, "begin": 0.0, "duration": 1e4})
+    assert filled((draw,), height=3.0).tolist() == pytest.approx([0.0, 30e-3 / 160e-4, 0.0])
+
+
 def test_reach_of_a_recording() -> None:
     plant = replace(
         three_tank(), tanks=(*three_tank().tanks, Tank("T4", 0.01, 0.7)), sensors=(Sensor("d1", "T1", "V", -2.0, 9.0),)

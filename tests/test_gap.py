@@ -12,9 +12,10 @@ from torch import Tensor
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.gap.answer import adopted
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step
+from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, slow_excess
 from fdi_torch.gap.library import STANDARD, canonical, library_of
 from fdi_torch.gap.plan import plan
+from fdi_torch.gap.screening import Screen
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -100,11 +101,32 @@ def test_a_transmitter_that_averages_is_told_and_undone(samples: int, slow: floa
     assert float(hidden[mask].var()) == pytest.approx(1.0, abs=0.05)
 
 
+def test_a_constant_offset_is_slow_and_counts_with_all_its_squares() -> None:
+    assert slow_excess(torch.full((600, 2), 3.0, dtype=torch.float64)) == pytest.approx(2 * 600 * 3.0**2)
+
+
+def test_rounded_readings_are_no_mean_of_several() -> None:
+    """What rounding adds has a colour of its own, from which no averaging transmitter follows."""
+    fresh = noise(6007, 0.0, 0.002, 9)
+    mean = torch.stack([fresh[j : j + 6000] for j in range(8)]).mean(dim=0)
+    mask = torch.ones_like(mean, dtype=torch.bool)
+    assert estimate_noise(mean, mask).mean_of == 8
+    assert estimate_noise(mean, mask, (False, False, True)).mean_of == 0
+
+
 def test_a_rounded_channel_shows_its_step_and_a_printed_one_does_not() -> None:
     x = 0.3 + 0.1 * torch.sin(torch.arange(2000, dtype=torch.float64) / 90) + noise(2000, 0.0, 0.001, 1)[:, 0]
     assert lattice_step((x / 0.013).round() * 0.013, 0.001) == pytest.approx(0.013, rel=1e-6)
     assert lattice_step((x * 1e6).round() / 1e6, 0.001) == 0.0
     assert lattice_step(x, 0.001) == 0.0
+
+
+def test_a_pair_promises_nothing_where_one_of_the_two_would_have_to_turn_round() -> None:
+    """Columns along (1, 0) and (4, 3) / 5 close all of (2, 1); of (2, -1) only what the first does alone."""
+    columns = torch.tensor([[1.0, 0.8], [0.0, 0.6]], dtype=torch.float64)
+    for left, together in (([2.0, 1.0], 5.0), ([2.0, -1.0], 0.0)):
+        score = columns.T @ torch.tensor(left, dtype=torch.float64)
+        assert float(Screen((), score, columns.T @ columns).pair_gain()[0, 1]) == pytest.approx(together)
 
 
 def test_a_sound_rig_with_constants_within_tolerance_has_no_gap() -> None:

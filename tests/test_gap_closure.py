@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from fdi_torch.gap.answer import Answer
+from fdi_torch.gap.closure import carried_over
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlacedEffect
@@ -72,6 +73,15 @@ def test_what_has_no_name_closes_a_gap_elsewhere_too_as_far_as_it_depends_on_loc
     assert answer.verdict == "unknown" and answer.where[0][0] == "P13"
     assert answer.closure["closed"] > 0.8
     assert answer.closure["ceiling"] == pytest.approx(answer.closure["augmented"])
+
+
+def test_another_day_has_a_free_form_s_mean_course_and_none_of_its_waves() -> None:
+    form = {"head_0": 0.1, "time_0": 0.2, "time_1": 0.4, "sine_0": 0.3, "cosine_0": 0.3}
+    values = {f"P13.free_flow.{name}": value for name, value in form.items()} | {"Q1.pump_gain.time_0": 5.0}
+    carried = carried_over(values)
+    expected = {"head_0": 0.1, "time_0": 0.3, "time_1": 0.3, "sine_0": 0.0, "cosine_0": 0.0}
+    assert {n.removeprefix("P13.free_flow."): v for n, v in carried.items() if "P13" in n} == pytest.approx(expected)
+    assert carried["Q1.pump_gain.time_0"] == 5.0, "no free form's"
 
 
 def test_arrays_of_all_models_are_there_for_the_page(answer: Answer) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
-from fdi_torch.gap.evidence import temperature
+from fdi_torch.gap import evidence
+from fdi_torch.gap.evidence import log_prior, opinions, plainest, temperature
 from fdi_torch.gap.fitting import Candidate, Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.folds import FOLDS, STRETCHES, held_out_cost
@@ -45,3 +49,30 @@ def test_evidence_is_tempered_by_what_the_best_explanation_leaves() -> None:
     assert temperature(4e5, 100.0) == pytest.approx(6.0)
     assert temperature(200.0, 0.0) == pytest.approx(1.001)
     assert temperature(4e6, 0.0) == pytest.approx(21.0), "five millionths of a gap part nobody"
+
+
+def test_the_plainest_good_explanation_is_taken_before_one_that_closes_little_more() -> None:
+    fits: list[Any] = [SimpleNamespace(key=range(n), cost=cost) for n, cost in enumerate((5000.0, 110.0, 100.0))]
+    assert len(plainest(fits, gap=1e4).key) == 1, "the second effect closes a thousandth of the gap"
+    assert len(plainest(fits, gap=1e3).key) == 2, "a hundredth"
+
+
+def test_all_sets_of_effects_of_one_size_share_one_prior() -> None:
+    """So that which effects a library of many holds is no evidence for there being several."""
+    choices = 7
+    one, two = (
+        log_prior(SimpleNamespace(key=[("any", place) for place in places]), choices)  # type: ignore[arg-type]
+        for places in (["T1"], ["T1", "T2"])
+    )
+    assert math.exp(one) * choices == pytest.approx(0.1)
+    assert math.exp(two) * choices**2 / 2 == pytest.approx(0.1**2), "a set has no order"
+
+
+def test_nothing_is_beyond_doubt_that_predictions_of_unseen_stretches_are_against(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told = (("T1", 0.0, 900.0), ("T2", -20.0, 100.0), ("T3", -30.0, 0.0))  # log evidence, cost; of the last none asks
+    fits: list[Any] = [SimpleNamespace(key=[("any", place)], evidence=e, left=cost) for place, e, cost in told]
+    monkeypatch.setattr(evidence, "log_evidence", lambda fitter, fit, heat, choices: fit.evidence)
+    monkeypatch.setattr(evidence, "held_out_cost", lambda fitter, fit: fit.left)
+    assert opinions(None, fits, 1.0, 7) == pytest.approx([0.9, 0.1, 0.0], abs=1e-8)  # type: ignore[arg-type]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -80,6 +82,28 @@ def test_correlation_keeps_its_digits_next_to_one() -> None:
     nearby = truth + 1e-9
     assert float(p.cost(truth, LANE)) < 1e-25
     assert 1e-20 < float(p.cost(nearby, LANE)) < 1e-16
+
+
+def test_the_likelihood_of_exact_readings_is_finite_and_greatest_at_the_truth() -> None:
+    p = problem("likelihood", noise=0.0)
+    truth = torch.tensor([[[1.3, 0.8], [1.3, 0.8 + 1e-7]]], dtype=torch.float64)
+    at, beside = p.cost(truth, LANE)[0].tolist()
+    assert math.isfinite(at) and at < beside
+    assert torch.isfinite(p.linearise(truth[0, :1], LANE).curvature).all()
+
+
+def test_noise_is_as_large_as_it_was_whatever_the_parameters_took_up() -> None:
+    """Five samples of two channels for two parameters: the mean square of residuals alone would be a fifth short."""
+    engine, lanes = Decay(5), torch.arange(2000)
+    truth = torch.tensor([1.3, 0.8], dtype=torch.float64)
+    drawn = torch.randn(2000, 5, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    values = engine.readings(truth) + 1e-3 * drawn
+    known = torch.full((2,), 1e-3, dtype=torch.float64)
+    p = Problem(space(), [Term(engine, Readings(values, torch.ones_like(values)), noise_std=known)], "likelihood")
+    low, high = (torch.full((2,), end, dtype=torch.float64) for end in (0.0, 3.0))
+    found = levenberg_marquardt(p.linearise, truth.expand(2000, 2), low, high)
+    (noise,) = p.noise(found.theta, lanes)
+    assert float(noise.square().mean().sqrt()) == pytest.approx(1e-3, rel=0.02)
 
 
 def test_known_noise_gives_half_chi_square() -> None:

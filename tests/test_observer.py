@@ -113,6 +113,15 @@ def test_a_gain_that_lets_errors_grow_is_refused_with_the_place() -> None:
         observer.check_stable(samples, observer.run(samples, REST))
 
 
+def test_a_gain_that_lets_errors_stand_is_refused() -> None:
+    """Tanks that nothing leaves keep every error that no gain takes away."""
+    closed = replace(PLANT, pipes=(), tolerances={}, tanks=tuple(replace(t, leak_reference=None) for t in PLANT.tanks))
+    observer = Observer(build_network(closed), hand_gain(torch.zeros(3, 3, dtype=torch.float64)))
+    samples = at_rest(20, std=0.0)
+    with pytest.raises(ValueError, match="lets them grow by 1 a sample"):
+        observer.check_stable(samples, observer.run(samples, REST))
+
+
 def test_a_gain_of_the_wrong_shape_is_refused() -> None:
     with pytest.raises(ValueError, match="expected a gain of 3 tanks x 3 sensors, got 2 x 3"):
         Observer(NETWORK, hand_gain(torch.zeros(2, 3, dtype=torch.float64)))

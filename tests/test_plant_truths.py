@@ -15,9 +15,10 @@ from fdi_torch.effects import build_network
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.lpv import lpv_form
+from fdi_torch.plant.orifice import rim_strength, weir_flow
 from fdi_torch.plant.signals import Clock, CumulativeSignal
 from fdi_torch.simulate.equilibrium import equilibrium
-from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.experiment import grid_nodes, lay_out
 from fdi_torch.simulate.integrate import ReferenceEngine
 
 
@@ -231,6 +232,21 @@ def test_overflow_goes_where_the_plant_says() -> None:
     levels = ReferenceEngine(build_network(plant), space, lay_out(recording, plant.channels(), 0.1)).levels(theta)[0]
     assert float(levels.sum(1)[-1]) == pytest.approx(0.3 + 5e-5 * 100 / 0.02, rel=1e-9)
     assert 0.3 < float(levels[-1, 0]) < 0.31
+
+
+def test_nothing_runs_over_a_rim_that_is_not_reached_however_coarse_the_steps() -> None:
+    metres, inflow, area = torch.tensor([-0.1, 0.0, 0.1], dtype=torch.float64), 5e-5, torch.tensor(160e-4).double()
+    spill = weir_flow(metres, inflow, area, rim_strength(area, torch.tensor(9.81).double()), torch.tensor(1e5).double())
+    assert spill[:2].tolist() == [0.0, 0.0] and float(spill[2]) > 0.99 * inflow
+
+
+@pytest.mark.parametrize(("every", "hit"), [(11.0, True), (9.0, False)])
+def test_switches_are_step_ends_unless_they_come_faster_than_half_a_step(every: float, hit: bool) -> None:
+    time = torch.arange(1000, dtype=torch.float64)
+    commands = (time // every % 2).unsqueeze(1)
+    nodes = set(grid_nodes(time, commands, "zero_order", 20.0).tolist())
+    switches = set(torch.arange(every, 999.0, every, dtype=torch.float64).tolist())
+    assert switches <= nodes if hit else len(switches & nodes) < 0.2 * len(switches)
 
 
 def test_no_steady_state_is_said() -> None:

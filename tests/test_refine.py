@@ -85,6 +85,14 @@ def test_rosenbrock_from_the_classical_start() -> None:
     assert problem.calls <= 60
 
 
+def test_steps_that_are_short_for_their_damping_are_no_end() -> None:
+    problem = LeastSquares(rosenbrock)
+    result = levenberg_marquardt(
+        problem.linearise, rows([-1.2, 1.0]), -FREE[1][:2], FREE[1][:2], replace(TIGHT, damping=1e12)
+    )
+    torch.testing.assert_close(result.theta, torch.ones(1, 2, dtype=DOUBLE), rtol=0, atol=1e-8)
+
+
 @pytest.mark.parametrize("bounds", [FREE, BOXED], ids=["free", "boxed"])
 def test_exponentials_end_where_scipy_ends(bounds: tuple[Tensor, Tensor]) -> None:
     low, high = bounds
