@@ -41,15 +41,22 @@ def noise(samples: int, ar: float, std: float, seed: int) -> Tensor:
 
 
 def recorded(
-    values: dict[str, float], seed: int, samples: int = 1000, std: float = 1e-3, ar: float = 0.0, steady: bool = False
+    values: dict[str, float],
+    seed: int,
+    samples: int = 1000,
+    std: float = 1e-3,
+    ar: float = 0.0,
+    steady: bool = False,
+    inputs: Tensor | None = None,
 ) -> Recording:
-    """The three tanks with some parameters changed, under random steps or steady inputs, read with noise (m)."""
+    """The three tanks with some parameters changed, under random steps, steady or given inputs, read with noise (m)."""
     plant = believed()
     generator = torch.Generator().manual_seed(seed)
     time = torch.arange(samples, dtype=torch.float64)
     levels = 15e-6 + 60e-6 * torch.rand(samples // 70 + 1, 2, generator=generator, dtype=torch.float64)
     levels = torch.full_like(levels, 50e-6) if steady else levels
-    blank = blank_recording(plant, levels.repeat_interleave(70, dim=0)[:samples], time)
+    steps = levels.repeat_interleave(70, dim=0)[:samples]
+    blank = blank_recording(plant, steps if inputs is None else inputs, time)
     network = build_network(plant, placements_for(values))
     names = [*values, *(n for n in ("P13.discharge_coefficient",) if n not in values)]
     space = ParameterSpace(network.constants[n] for n in names)

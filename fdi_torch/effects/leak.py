@@ -37,7 +37,8 @@ class Leak(Effect):
     def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
         low, high = reach.levels[place]
         at_height = [{"size": 0.1, "height": height} for height in (0.5 * low, *inside((low, high), 3))]
-        return [{"size": 0.1}, *at_height, {"size": 0.1, "onset": 0.5 * reach.duration}]
+        growing = {"size": 0.1, "onset": 0.3 * reach.duration, "ramp": 0.7 * reach.duration}
+        return [{"size": 0.1}, *at_height, {"size": 0.1, "onset": 0.5 * reach.duration}, growing]
 
     def inflow(self, local: Local, p: Values) -> Tensor:
         head = torch.clamp(local.level - p["height"], min=0.0)

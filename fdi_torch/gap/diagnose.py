@@ -21,6 +21,7 @@ from fdi_torch.gap.limits import unclipped, with_clipped_noise
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.strays import most_astray
 from fdi_torch.gap.subject import Subject
+from fdi_torch.gap.tied import tied
 from fdi_torch.gap.where.suspects import Suspect, parted, suspects
 from fdi_torch.gap.which import Search, search
 from fdi_torch.plant.description import PlantDescription
@@ -30,9 +31,11 @@ from fdi_torch.recording import Recording
 CONTENT = 0.95
 PATIENT = 40  # rounds for the recalibration, on which all else rests
 LEFT_SHARE, LEFT_LEAST = 2e-3, 150.0  # share of the gap, and chi-square units, worth asking other forms about
-AMONG_OTHERS_SHARE = 1e-2  # the same where one of the effects found is at the likeliest place
+AMONG_OTHERS_SHARE = 3e-3  # the same where one of the effects found is at the likeliest place
 SAME_PLACE_SHARE = 3e-2  # the same where one effect at the likeliest place leaves it: its equation is a little off
 FAR_BETTER = 0.35
+MANY = 3  # effects at several places, for which one place that does as well is the plainer explanation
+CHANCES = 2  # causes tied to the clock, for which the same holds: each is a coincidence
 DOUBT = 0.1  # that of two effects at one place one is there only because the other's equation is a little off
 Tell = Callable[[float, str], None]
 
@@ -102,12 +105,14 @@ def _unnamed(fitter: Fitter, named: Fit, found: Search, place: Suspect) -> bool:
 
     Equations that differ a little leave a little open; where one place alone does far better than all that has a name,
     or nothing named does, it has no name. So too where it does what otherwise takes effects at several other places,
-    and where two forms of one law are needed at one place: the law there is a third one.
+    or many, or several that happen at moments of their own; and where two forms of one law are needed at one place: the
+    law there is then a third one.
     """
     gap, left, free = whole_gap(fitter, found), left_open(fitter, named), place.leaves
     if stacked(named.key):
         return True
-    if left < LEFT_LEAST and not _scattered(named):
+    coincidence = len(tied(named)) >= CHANCES
+    if left < LEFT_LEAST and not (_scattered(named) or coincidence):
         return False
     nothing_named = left > UNEXPLAINED * gap
     there = [at == place.location for _, at in named.key]
@@ -117,9 +122,11 @@ def _unnamed(fitter: Fitter, named: Fit, found: Search, place: Suspect) -> bool:
     little = 0.5 * max(LEFT_SHARE * gap, LEFT_LEAST)
     single = min((left_open(fitter, f) for f in found.fits if len(f.key) == 1), default=gap)
     elsewhere = _scattered(named) and all(at != place.location for _, at in named.key)
+    as_well, needed = free < left + little, single > left + 4.0 * little
     # A small gap is closed by many forms of one place as well as by a few effects at several.
     large = LEFT_SHARE * gap > LEFT_LEAST
-    one_for_many = large and elsewhere and free < left + little and single > left + 4.0 * little
+    many = coincidence or (_scattered(named) and len(named.key) >= MANY)
+    one_for_many = as_well and needed and ((large and elsewhere) or many)
     return nothing_named or far_better or one_for_many
 
 
