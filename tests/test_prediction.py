@@ -1,5 +1,6 @@
 """Free runs of a plant file, and the joint refit of what it holds."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -152,6 +153,25 @@ def test_a_run_needs_something_to_settle_in_and_something_left() -> None:
             predict(tank(), run, settle=seconds)
     with pytest.raises(ValueError, match=r"with a tolerance to vary .*got 'Z.gain'; the nearest is 'Q.gain'"):
         predict(tank(), run, vary=("Z.gain",))
+
+
+@pytest.mark.parametrize("start", [0.05, 0.0503, 0.0506, 0.0509, 0.0512])
+def test_a_tank_that_runs_dry_over_an_outlet_that_ends_below_it_settles_at_its_floor(start: float) -> None:
+    """A drain hose 10 cm long, open from the start; 10 cm^3/s come in from 150 s on, less than it draws from the floor:
+    5e-5 m^2 * 0.6 * sqrt(2 g d) = 42 cm^3/s.
+    """
+    effects = [{"effect": "outlet_drop", "location": "OUT", "parameters": {"drop": "10 cm"}}]
+    time = torch.arange(0.0, 300.0, 2.0, dtype=torch.float64)
+    inputs = torch.stack([1e-5 * (time > 150.0), torch.ones_like(time)], dim=1)
+    blank = torch.full((150, 1), start, dtype=torch.float64)
+    run = Recording(time, inputs, blank, ("Q", "v"), ("h",), ("m^3/s", "1"), ("m",))
+    found = predict(tank(effects=effects, varying=[]), run, start_samples=1, step=2.0)
+    level = found.readings[:, 0]
+    assert found.settled
+    # A dh/dt = -C a sqrt(2 g (h + d)) ends after (A / C a) sqrt(2 / g) (sqrt(h0 + d) - sqrt(d)), some 14 s
+    dry = 1e-2 / (0.6 * 5e-5) * math.sqrt(2.0 / 9.81) * (math.sqrt(start + 0.1) - math.sqrt(0.1))
+    assert float(level[time < dry - 2.0].min()) > 1e-3
+    assert float(level[time > dry + 2.0].abs().max()) < 1e-6
 
 
 def test_a_sensor_that_reads_less_than_nothing_is_off_and_its_tank_empty() -> None:

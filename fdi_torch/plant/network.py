@@ -19,7 +19,7 @@ from fdi_torch.plant.constants import constant_parameters
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor
 from fdi_torch.plant.effect import Effect, Memory, Placement, Stage, Values, fits
 from fdi_torch.plant.moment import Constants, Moment, PlaceValues
-from fdi_torch.plant.orifice import weir_flow
+from fdi_torch.plant.orifice import held, weir_flow
 from fdi_torch.plant.signals import Clock
 
 
@@ -163,14 +163,13 @@ class TankNetwork(nn.Module):
         return kept
 
     def level_rates(self, now: Moment, net: Sequence[Tensor]) -> list[Tensor]:
-        """STORAGE: dh/dt = net inflow / area(h); an empty tank cannot lose more, m/s."""
+        """STORAGE: dh/dt = net inflow / area(h); a tank cannot lose more than it holds, m/s."""
         rates = []
         for tank, inflow in zip(self.description.tanks, net, strict=True):
             area = now.values[tank.name]["area"]
             for effect, p in self._effects(tank.name, Stage.STORAGE, now):
                 area = effect.area(area, now.at_tank(tank.name), p)
-            kept = torch.where(now.levels[tank.name] <= 0.0, torch.clamp(inflow, min=0.0), inflow)
-            rates.append(kept / area)
+            rates.append(held(inflow / area, now.levels[tank.name], now.clock.resolution))
         return rates
 
     def read(

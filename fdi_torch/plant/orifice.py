@@ -11,6 +11,7 @@ from torch import Tensor
 # and rims at that one: enough below the limit for several orifices on one tank.
 STABLE_RATE_TIMES_STEP = 2.2
 STABLE_SPILL_TIMES_STEP = 1.7
+EMPTYING_RATE_TIMES_STEP = 2.0
 WEIR_COEFFICIENT = 0.6
 _DRY = 1e-9  # m; keeps the weir's slope finite where nothing runs over it
 
@@ -44,6 +45,17 @@ def rim_strength(tank_area: Tensor, gravity: Tensor) -> Tensor:
     """
     crest = 2.0 * torch.sqrt(math.pi * tank_area)
     return (2.0 / 3.0) * WEIR_COEFFICIENT * torch.sqrt(2.0 * gravity) * crest
+
+
+def held(rate: Tensor, level: Tensor, resolution: Tensor) -> Tensor:
+    """dh/dt (m/s) of a tank at `level` m that would change by `rate`: one that runs dry stays at its floor.
+
+    What draws at an empty tank (a drain whose end lies lower, evaporation) would have the rate jump there, where no
+    step ends: so the last of the level goes no faster than 2 / r of it, r = `resolution` s. The implicit midpoint rule
+    then ends a step of r at the floor, and RK4 is stable.
+    """
+    slowest = -EMPTYING_RATE_TIMES_STEP * torch.clamp(level, min=0.0) / resolution
+    return torch.maximum(rate, slowest)
 
 
 def weir_flow(
