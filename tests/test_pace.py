@@ -18,6 +18,9 @@ from fdi_torch.effects import EFFECTS, all_placements, build_network, placements
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.hybrid import estimate_parameters
 from fdi_torch.jobs.run_setup import fitting_of, recordings_of, wanted_space
+from fdi_torch.monitor.prepare import prepare
+from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
@@ -28,6 +31,7 @@ from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.own_steps import OwnSteps
 from fdi_torch.simulate.record import clean_readings, with_noise
 from fdi_torch.simulate.traced import TracedEngine
+from tests.test_monitor import NAMES, SPACE, followed, recorded, step_to
 
 SCALES = [(0.01, 1.0), (100.0, 1.0), (1.0, 0.05), (1.0, 60.0), (0.1, 0.05), (20.0, 60.0)]
 FAULTS = {"T1.leak.size": 0.2, "P13.plugging.size": 0.3}
@@ -131,6 +135,27 @@ def test_times_of_a_monitor_that_nobody_chose_follow_the_plant() -> None:
     assert (usual.window.lookback, usual.window.confirm, usual.false_alarms_every, usual.step) == (300, 90, 20000, 1)
     assert (config.window.lookback, config.window.confirm, config.false_alarms_every) == (30000, 90, 2e6)
     assert config.step == usual_step(scaled(three_tank(), 1.0, 60.0)) == 100
+
+
+def test_the_monitor_says_the_same_of_a_rig_of_another_size() -> None:
+    """A start level that is off by metres, beside readings that are off by millimetres, would alarm on small rigs."""
+    runs = (recorded(lambda t: SPACE.nominal(), 400, seed=99), recorded(step_to("T3.leak.size", 0.05, 100.0), 200))
+    said = []
+    for m, s in ((1.0, 1.0), (0.1, 100.0)):
+        plant = scaled(load_plant("three_tank"), m, s)
+        quiet, faulty = (
+            Samples(run.time * s, run.inputs * m**3 / s, run.readings * m, run.hold) for run in runs
+        )  # fmt: skip
+        names = ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3
+        settings = MonitorSettings(120.0 * s, 40.0 * s, longest=400.0 * s, incipient=False, together=1)
+        learnt = Recording(quiet.time, quiet.inputs, quiet.readings, *names)
+        watch = prepare(plant, learnt, NAMES, time_between_false_alarms=20000.0 * s, settings=settings).monitor
+        _, events = followed(watch, faulty)
+        assert [e.kind for e in events][:2] == ["alarm", "isolated"]
+        said.append([(e.kind, e.time / s, e.faults, e.sizes, (e.onset or 0.0) / s) for e in events])
+    for usual, other in zip(*said, strict=True):
+        assert (other[0], other[2]) == (usual[0], usual[2])
+        assert [other[1], *other[3], other[4]] == pytest.approx([usual[1], *usual[3], usual[4]], rel=1e-5)
 
 
 def test_an_onset_is_sought_within_the_recording() -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 from fdi_torch.monitor.stepper import Stepper, slopes
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import PlaceValues
+from fdi_torch.plant.pace import length_scale
 
 DOUBLINGS = 60
 OPENING = 2000  # samples at most until the gain has settled
@@ -68,7 +69,8 @@ def linearised(stepper: Stepper, levels: Tensor, inputs: Tensor, span: float, va
 
 def kalman_gain(linear: Linear, process_std: Tensor, reading_std: Tensor, start_std: Tensor) -> Gain:
     """The gain of least error for levels that wander by process_std (*batch, tanks) m a sample, readings that err by
-    reading_std (*batch, sensors), and a start that is known to start_std (tanks) m.
+    reading_std (*batch, sensors), and a start that is known to start_std (tanks) m. All in units of the noise where
+    that is unknown: only their ratios count.
 
     Steady: the discrete algebraic Riccati equation. Raises ValueError where an unmeasured level cannot be observed.
     """
@@ -155,6 +157,14 @@ def spectral_radius(linear: Linear, gain: Tensor) -> Tensor:
 def start_uncertainty(plant: PlantDescription, like: Tensor) -> Tensor:
     """How far each start level may be off when only the first reading tells, (tanks,) m."""
     return like.new_tensor([START_SHARE * tank.height for tank in plant.tanks])
+
+
+def start_beside_noise(plant: PlantDescription, like: Tensor) -> Tensor:
+    """The same (tanks,) in units of a reading's noise that is not known: about one, for the first reading has it too.
+
+    More for tanks that are taller than others, in units of the plant's length scale.
+    """
+    return start_uncertainty(plant, like) / length_scale(plant)
 
 
 def _radius(linear: Linear, gain: Tensor) -> float:

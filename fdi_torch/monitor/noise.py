@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.gain import Gain, Linear, kalman_gain, linearised, riccati, start_uncertainty
+from fdi_torch.monitor.gain import Gain, Linear, kalman_gain, linearised, riccati, start_beside_noise
 from fdi_torch.monitor.observer import Observation, Observer, bound, first_levels
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
@@ -112,7 +112,7 @@ def _gain(network: TankNetwork, linear: Linear, exponents: Tensor) -> Gain:
     """Gains for ratios 10^exponents, one lane each."""
     unit = torch.linalg.vector_norm(linear.output, dim=-1)  # reading per metre of its tank's level
     shares = (10.0**exponents).unsqueeze(-1)
-    start_std = start_uncertainty(network.description, unit)
+    start_std = start_beside_noise(network.description, unit)
     return kalman_gain(linear, shares.expand(-1, len(start_std)), unit.expand(len(exponents), -1), start_std)
 
 

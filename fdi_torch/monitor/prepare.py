@@ -14,7 +14,7 @@ from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
 from fdi_torch.monitor.detection import Chart, make_detector
 from fdi_torch.monitor.doubts import fault_doubts, residual_doubts
-from fdi_torch.monitor.gain import Gain, hand_gain, start_uncertainty, timed_gain
+from fdi_torch.monitor.gain import Gain, hand_gain, start_beside_noise, timed_gain
 from fdi_torch.monitor.noise import Noise, learn_noise, noise_of_gain, operating_point
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.online import SHAPE, Monitor, faults_of
@@ -116,7 +116,7 @@ def _wished(
     unit = torch.linalg.vector_norm(linear.output, dim=-1)
     span = float(torch.diff(samples.time).median())
     assert wish.time_constant is not None
-    return timed_gain(linear, span, wish.time_constant, unit, start_uncertainty(network.description, unit))
+    return timed_gain(linear, span, wish.time_constant, unit, start_beside_noise(network.description, unit))
 
 
 def with_shapes(faults: Sequence[str], plant: PlantDescription) -> list[str]:
