@@ -8,6 +8,7 @@ has to close more than is left open beside it. Where it is the cause it leaves n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 
 from fdi_torch.gap.fitting import Fit, Fitter, Key, left_open
@@ -26,13 +27,13 @@ def tied(fit: Fit) -> list[tuple[str, str]]:
 
 def pays(fitter: Fitter, fit: Fit, fits: Mapping[Key, Fit]) -> bool:
     """Whether each of its causes that are tied to the clock closes more than the fit leaves open, as far as there is a
-    fit without it to tell.
+    fit without it to tell: of the others, or of some of them, for more effects never leave more.
     """
-    rests = [rest for cause in tied(fit) if (rest := fits.get(fit.key - {cause}))]
-    if not rests:
+    without = [min((f.cost for f in fits.values() if f.key <= fit.key - {c}), default=math.inf) for c in tied(fit)]
+    if all(math.isinf(cost) for cost in without):
         return True
     left = left_open(fitter, fit)
-    return left < LEAST or min(rest.cost for rest in rests) - fit.cost > left
+    return left < LEAST or min(without) - fit.cost > left
 
 
 def paying(fitter: Fitter, some: Iterable[Fit], fits: Mapping[Key, Fit]) -> list[Fit]:
