@@ -62,6 +62,15 @@ class Recording:
     def __len__(self) -> int:
         return len(self.time)
 
+    @property
+    def interval(self) -> float:
+        """The usual sampling interval, s: of the sensor that is read most often, by the median between its readings.
+
+        Rows that hold another sensor's reading, or only an input, say nothing of it.
+        """
+        times = [self.time[column] for column in self.mask.T if int(column.sum()) > 1] or [self.time]
+        return min(float(torch.median(torch.diff(each))) for each in times) if len(self) > 1 else 0.0
+
     def to(self, device: torch.device) -> Recording:
         """The same with its tensors on a device."""
         tensors = {name: getattr(self, name).to(device) for name in ("time", "inputs", "outputs", "mask")}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -91,3 +93,13 @@ def test_time_must_increase() -> None:
 def test_shapes_must_agree() -> None:
     with pytest.raises(ValueError, match=r"expected inputs of shape \(2, 1\), got \(3, 1\)"):
         recording([0, 1], [0, 0, 0], [0, 0])
+
+
+def test_the_interval_is_that_of_the_sensor_read_most_often() -> None:
+    """Not of rows that another sensor's clock, or an input between readings, puts a moment beside them."""
+    time = torch.tensor([0.0, 0.002, 1.0, 1.4, 2.0, 2.002, 3.0, 4.0, 4.002], dtype=torch.float64)
+    outputs = torch.full((9, 2), torch.nan, dtype=torch.float64)
+    outputs[[0, 2, 4, 6, 7], 0], outputs[[1, 5, 8], 1] = 1.0, 2.0
+    both = Recording(time, torch.zeros(9, 1), outputs, ("Q",), ("a", "b"), ("m^3/s",), ("m", "m"))
+    assert both.interval == 1.0
+    assert replace(both, mask=torch.zeros(9, 2, dtype=torch.bool)).interval == pytest.approx(0.4)

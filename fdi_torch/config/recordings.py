@@ -157,10 +157,10 @@ def _unknown(whole: Recording) -> str:
 
 def named_recordings(name: str, plant: PlantDescription, base: Path) -> list[Recording]:
     """What stands for recordings on a command line: a CSV or MCAP file, or a YAML file with a list under `recordings`,
-    as in a run file; each of the latter in stretches whose inputs are known.
+    as in a run file; each in stretches whose inputs are known.
     """
     if Path(name).suffix not in (".yaml", ".yml"):
-        return [read_recording(RecordingConfig(file=name), plant, base)]
+        return [part.recording for part in load_recordings([RecordingConfig(file=name)], plant, base)]
     path = find_file(name, base)
     listed = read_extended(path).get("recordings")
     if not listed:

@@ -6,8 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
-
 from fdi_torch.effects import effect
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.limits import told_limits
@@ -124,7 +122,7 @@ def laid_out(
 
 def _step(plant: PlantDescription, recording: Recording) -> float:
     """A whole part of the sampling interval, s."""
-    interval = float(torch.median(torch.diff(recording.time)))
+    interval = recording.interval
     return interval / math.ceil(interval / (LONGEST_STEP * time_scale(plant)) - 1e-9)
 
 

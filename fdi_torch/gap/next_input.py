@@ -39,7 +39,7 @@ def next_input(fitter: Fitter, first: Fit, second: Fit) -> Mapping[str, Any] | N
             continue
         total, when = parted
         if best is None or total > best["separation"]:
-            interval = float(torch.median(torch.diff(recording.time)))
+            interval = recording.interval
             samples = None if when is None else round(when / interval) + 1
             best = {"separation": total, "parted_after": when, "parted_after_samples": samples}
             best |= {"input": _table(recording, interval)}
@@ -49,7 +49,7 @@ def next_input(fitter: Fitter, first: Fit, second: Fit) -> Mapping[str, Any] | N
 def _design(fitter: Fitter, hold: float, generator: torch.Generator) -> Recording:
     """Random steps of all channels, none of which changes with another."""
     subject = fitter.subject
-    interval = float(torch.median(torch.diff(subject.recording.time)))
+    interval = subject.recording.interval
     duration = time_scale(fitter.subject.plant) * DURATION
     time = torch.arange(0.0, duration, interval, dtype=torch.float64)
     columns = []

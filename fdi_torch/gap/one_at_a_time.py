@@ -38,7 +38,7 @@ def one_at_a_time(
     """The answer, in the format of a diagnosis, of fitting those effects singly that promise most to first order."""
     found = library_of(plant, library, leave_out)
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
-    step = float(torch.median(torch.diff(recording.time)))
+    step = recording.interval
     subject = subject_of(plant, believed, recording, step)
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     null = Fitter(subject, _white(1e-2 * spread)).fit(Candidate())

@@ -80,7 +80,7 @@ def refit(
         varying=tuple(n for n in varying if n not in held),
     )
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    step = step or 0.5 * float(torch.median(torch.diff(recordings[0].time)))
+    step = step or 0.5 * recordings[0].interval
     subject = laid_out(bare, placed, recordings, step)
     start = {n: v for n, v in _start(kept, plant, recordings).items() if n not in tolerances}
     start = {n: v for n, v in start.items() if n not in held}
