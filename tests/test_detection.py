@@ -20,7 +20,7 @@ from fdi_torch.monitor.detection import (
     window_lengths,
 )
 from fdi_torch.monitor.run_length import cusum_run_length, cusum_threshold, fixed_threshold, highest, threshold_of
-from fdi_torch.monitor.whitening import fit_whitening
+from fdi_torch.monitor.whitening import fit_whitening, score_whitenings
 
 
 def noise(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -149,6 +149,14 @@ def test_channels_that_move_together_are_separated() -> None:
     mixed = torch.stack([e[:, 0], 0.9 * e[:, 0] + 0.3 * e[:, 1]], dim=1)
     white = fit_whitening(mixed)(mixed)
     assert (white[:, 0] * white[:, 1]).mean().abs() < 0.03
+
+
+def test_an_order_needs_ten_samples_for_each_of_its_coefficients() -> None:
+    """Two channels, 60 samples: three orders at most, though what has lasted for five samples would ask for more."""
+    drive, series = noise(60, 2), torch.zeros(60, 2, dtype=torch.float64)
+    for k in range(60):
+        series[k] = drive[k] + (0.9 * series[k - 5] if k >= 5 else 0.0)
+    assert max(learnt.order for _, learnt in score_whitenings(series)) == 3
 
 
 def test_misuse_is_refused() -> None:

@@ -1,12 +1,15 @@
-"""A rig that is slower and larger is diagnosed like the one on the bench."""
+"""A rig that is slower, larger or told in other units is diagnosed like the one on the bench."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+from fdi_torch.config.plant import load_plant
+from fdi_torch.config.recordings import named_recordings
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.where.forms import memories, slews
 from fdi_torch.plant.description import PlantDescription
@@ -76,3 +79,38 @@ def test_a_rig_of_powers_of_ten_has_the_same_numbers(cause: dict[str, float], me
             scale = per_unit[amount.unit]
             assert there.parameters[name].value == pytest.approx(scale * amount.value, rel=1e-6)
             assert there.parameters[name].std == pytest.approx(scale * amount.std, rel=1e-6)
+
+
+SAME_TANKS = """
+name: three_tank
+tanks: {T1: {area: 1.6 dm^2, height: 1000 mm, leak_reference: P13}, T2: {area: 24.80005 in^2, height: 1 m,
+    leak_reference: OUT2}, T3: {area: 0.016 m^2, height: 39.370079 in, leak_reference: P32}}
+pipes:
+  P13: {source: T1, target: T3, area: 60 mm^2, discharge_coefficient: 60 %}
+  P32: {source: T3, target: T2, area: 0.6 cm^2, discharge_coefficient: 0.6}
+  OUT2: {source: T2, target: outside, area: 6e-5 m^2, discharge_coefficient: 0.6}
+pumps: {Q1: {target: T1, max_flow: 5.4 l/min}, Q2: {target: T2, max_flow: 0.324 m^3/h}}
+sensors: {h1: {tank: T1}, h2: {tank: T2}, h3: {tank: T3}}
+tolerances: {"*.discharge_coefficient": 3 %}
+"""
+
+
+def test_a_rig_told_in_other_units_has_the_same_verdict_and_numbers(tmp_path: Path) -> None:
+    """Minutes, litres an hour, inches and millimetres, by the headers, beside SI."""
+    bench = recorded({"Q1.pump_lag.time_constant": 15.0}, 5)
+    usual = diagnose(believed(), bench, settings=Settings(SMALL))
+    (tmp_path / "plant.yaml").write_text(SAME_TANKS)
+    units = {"t [min]": 1 / 60, "Q1 (l/h)": 3.6e6, "Q2_l/min": 6e4, "h1 [mm]": 1e3, "h2 [in]": 1 / 0.0254, "h3_cm": 1e2}
+    table = torch.cat([bench.time.unsqueeze(1), bench.inputs, bench.outputs], dim=1)
+    rows = (table * torch.tensor(list(units.values()), dtype=table.dtype)).tolist()
+    lines = [",".join(units), *(",".join(map(repr, row)) for row in rows)]
+    (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
+    plant = load_plant(tmp_path / "plant.yaml")
+    (run,) = named_recordings(str(tmp_path / "run.csv"), plant, tmp_path)
+    found = diagnose(plant, run, settings=Settings(SMALL))
+    assert found.verdict == usual.verdict == "named"
+    assert dict(found.where) == pytest.approx(dict(usual.where), abs=1e-5)
+    (there,), (here,) = found.causes, usual.causes
+    assert (there.effect, there.location) == (here.effect, here.location)
+    amount, expected = there.parameters["time_constant"], here.parameters["time_constant"]
+    assert (amount.value, amount.std) == pytest.approx((expected.value, expected.std), rel=1e-6)

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from fdi_torch.effects import build_network
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.lpv import lpv_form
 from fdi_torch.plant.orifice import rim_strength, weir_flow
 from fdi_torch.plant.signals import Clock, CumulativeSignal
@@ -247,6 +247,25 @@ def test_switches_are_step_ends_unless_they_come_faster_than_half_a_step(every: 
     nodes = set(grid_nodes(time, commands, "zero_order", 20.0).tolist())
     switches = set(torch.arange(every, 999.0, every, dtype=torch.float64).tolist())
     assert switches <= nodes if hit else len(switches & nodes) < 0.2 * len(switches)
+
+
+def test_at_rest_a_tank_that_nothing_feeds_is_empty() -> None:
+    """A constant draw from it would take the level below its floor."""
+    draw = PlacedEffect("unmetered_flow", "T3", {"flow": -5e-6, "begin": 0.0, "duration": 1e9})
+    plant = replace(three_tank(), effects=(draw,))
+    assert equilibrium(build_network(plant), torch.zeros(2, dtype=torch.float64)).tolist() == pytest.approx([0.0] * 3)
+
+
+def test_a_pump_delivers_nothing_for_a_negative_command_and_no_more_than_it_can() -> None:
+    plant = three_tank((0.2, 0.2, 0.0))
+    time = torch.arange(0.0, 110.0, 10.0, dtype=torch.float64)
+    commands = torch.tensor([[-50e-6, 1.0]], dtype=torch.float64).expand(len(time), 2)
+    space, theta = nothing()
+    network = build_network(replace(plant, pipes=(), tanks=tuple(replace(t, leak_reference=None) for t in plant.tanks)))
+    levels = ReferenceEngine(network, space, lay_out(blank_recording(plant, commands, time), ("Q1", "Q2"), 1.0)).levels(
+        theta
+    )
+    assert levels[0, -1].tolist() == pytest.approx([0.2, 0.2 + 90e-6 * 100.0 / 160e-4, 0.0])
 
 
 def test_no_steady_state_is_said() -> None:

@@ -50,6 +50,14 @@ def test_masked_readings_stop_counting_and_inputs_stay() -> None:
     assert torch.equal(masked.inputs, ramp(6).inputs)
 
 
+def test_what_may_have_been_on_before_a_stretch_is_remembered() -> None:
+    """A pump whose hose must not be empty: it ran, or nobody knows."""
+    for before, ran in ((0.0, set()), (-1.0, set()), (2.0, {"Q1"}), (float("nan"), {"Q1"})):
+        whole = recording([0, 1, 2, 3], [before, 0, 0, 5], [0, 0, 0, 0])
+        assert whole.ran == set() and whole.stretch(2, 4).ran == ran
+        assert whole.stretch(2, 4).stretch(1, 2).ran == ran, "on it goes"
+
+
 def test_masks_run_forward() -> None:
     with pytest.raises(ValueError, match=r"expected masks with start < stop, got \[5, 2\] s"):
         ramp(6).masked([(5.0, 2.0)])

@@ -72,6 +72,15 @@ def test_gap_in_the_clock() -> None:
     assert (channel, text) == ("t", "1 gaps longer than 3 sampling intervals (1 s), the longest of 31 s after 200 s")
 
 
+@pytest.mark.parametrize("missing", [2, 3])
+def test_a_gap_is_longer_than_three_sampling_intervals(missing: int) -> None:
+    whole, keep = healthy(), torch.ones(400, dtype=torch.bool)
+    keep[100 : 100 + missing] = False
+    fields = {name: getattr(whole, name)[keep] for name in ("time", "inputs", "outputs", "mask")}
+    kinds = [finding.kind for finding in check_recording(replace(whole, **fields), PLANT).findings]
+    assert ("gap" in kinds) is (missing == 3)
+
+
 def test_jittering_clock() -> None:
     jitter = 0.2 * torch.rand(400, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert (
