@@ -174,6 +174,23 @@ def test_a_tank_that_runs_dry_over_an_outlet_that_ends_below_it_settles_at_its_f
     assert float(level[time > dry + 2.0].abs().max()) < 1e-6
 
 
+def test_a_tank_that_is_filled_again_after_it_ran_dry_settles() -> None:
+    """A first guess has it dry where it is not, for as long as it takes to empty: that must not have to be unlearnt
+    one step at a time.
+    """
+    effects = [{"effect": "outlet_drop", "location": "OUT", "parameters": {"drop": "5 cm"}}]
+    plant = tank(tanks={"T": {"area": "400 cm^2", "height": "50 cm"}}, effects=effects, varying=[])
+    time = torch.arange(0.0, 1200.0, 2.0, dtype=torch.float64)
+    inputs = torch.stack([6e-5 * (time % 600.0 < 250.0), (time % 600.0 >= 200.0).double()], dim=1)
+    blank = torch.zeros(600, 1, dtype=torch.float64)
+    found = predict(plant, Recording(time, inputs, blank, ("Q", "v"), ("h",), ("m^3/s", "1"), ("m",)), 1, step=2.0)
+    level = found.readings[:, 0]
+    assert found.settled
+    assert float(level[100]) == pytest.approx(0.3, abs=1e-6)  # 200 s of 60 cm^3/s into 400 cm^2
+    assert float(level[299].abs()) < 1e-6
+    torch.testing.assert_close(level[:300], level[300:], rtol=0.0, atol=1e-6)  # empty between, so both cycles are one
+
+
 def test_a_sensor_that_reads_less_than_nothing_is_off_and_its_tank_empty() -> None:
     run = filling(1.0, 0.0, 1)
     early = replace(run, outputs=run.outputs - float(run.outputs[0]) - 0.01)

@@ -54,7 +54,8 @@ def held(rate: Tensor, level: Tensor, resolution: Tensor) -> Tensor:
     step ends: so the last of the level goes no faster than 2 / r of it, r = `resolution` s. The implicit midpoint rule
     then ends a step of r at the floor, and RK4 is stable.
     """
-    slowest = -EMPTYING_RATE_TIMES_STEP * torch.clamp(level, min=0.0) / resolution
+    # At the floor itself without a slope: a guess that it is dry gives way at once to water that comes after all.
+    slowest = torch.where(level > 0.0, -EMPTYING_RATE_TIMES_STEP * level / resolution, 0.0)
     return torch.maximum(rate, slowest)
 
 
