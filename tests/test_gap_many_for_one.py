@@ -1,4 +1,4 @@
-"""One place that does alone what takes many effects, or several at moments of their own, has a cause without a name."""
+"""One place that does alone what takes effects elsewhere, or a coincidence of several, has a cause without a name."""
 
 from __future__ import annotations
 
@@ -11,26 +11,31 @@ import torch
 
 from fdi_torch.gap import diagnose as module
 from fdi_torch.gap.diagnose import Settings, _unnamed, diagnose
+from fdi_torch.gap.where.suspects import Suspect
 from tests.test_gap import believed, recorded
 
 LIBRARY = ("pump_gain", "pump_saturation", "coefficient_drift", "unmetered_flow", "leak", "flow_exponent")
 DRAW, DRIFT, GAIN, LEAK = ("unmetered_flow", "T2"), ("coefficient_drift", "P32"), ("pump_gain", "Q2"), ("leak", "T2")
-ANYTHING: Any = None
+BIAS = ("sensor_drift", "h3")
 
 
 @pytest.mark.parametrize(
-    ("causes", "alone", "tied", "nameless"),
+    ("causes", "alone", "behind", "tied", "nameless"),
     [
-        ({GAIN, LEAK}, 0.0, (), False),  # two effects are two causes
-        ({GAIN, LEAK, DRIFT}, 0.0, (DRIFT,), True),  # three are one where one place does as well
-        ({GAIN, LEAK, DRIFT}, 5e3, (DRIFT,), False),
-        ({DRAW, DRIFT}, 0.0, (DRAW, DRIFT), True),  # so are two at moments of their own
-        ({DRAW, DRIFT}, 5e3, (DRAW, DRIFT), False),
+        ({GAIN, LEAK}, 0.0, 9.0, (), False),  # two effects are two causes
+        ({DRAW, LEAK}, 0.0, 9.0, (DRAW, LEAK), True),  # one, where each has a moment of its own
+        ({DRAW, LEAK}, 5e3, 9.0, (DRAW, LEAK), False),  # unless one place does not do as well
+        ({DRAW, DRIFT}, 0.0, 9.0, (DRAW, DRIFT), False),  # or they have no tank in common
+        ({DRIFT, BIAS}, 0.0, 9.0, (DRIFT, BIAS), True),  # or the place is another one
+        ({GAIN, DRIFT}, 300.0, 9.0, (), False),  # two at places that come as near to it each alone
+        ({GAIN, DRIFT}, 300.0, 900.0, (), True),  # and at places that alone do not
+        ({GAIN, DRIFT}, 5e3, 900.0, (), False),
     ],
 )
 def test_one_place_for_many(
     causes: set[tuple[str, str]],
     alone: float,
+    behind: float,
     tied: tuple[tuple[str, str], ...],
     nameless: bool,
     monkeypatch: pytest.MonkeyPatch,
@@ -41,9 +46,10 @@ def test_one_place_for_many(
     monkeypatch.setattr(module, "whole_gap", lambda fitter, found: 4e4)
     monkeypatch.setattr(module, "tied", lambda fit: list(tied))
     found: Any = SimpleNamespace(fits=[named, *singles])
-    likeliest: Any = SimpleNamespace(location="T2", leaves=alone)
+    places = [Suspect("T2", alone, 0.0), *(Suspect(p, 9e3, -behind) for p in ("Q2", "P32", "h3"))]
     fit: Any = named
-    assert _unnamed(ANYTHING, fit, found, likeliest) is nameless
+    fitter: Any = SimpleNamespace(subject=SimpleNamespace(plant=believed()))
+    assert _unnamed(fitter, fit, found, places) is nameless
 
 
 def test_a_pump_whose_supply_runs_low_is_no_drift_of_the_outlet() -> None:

@@ -22,6 +22,7 @@ from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.strays import most_astray
 from fdi_torch.gap.subject import Subject
 from fdi_torch.gap.tied import tied
+from fdi_torch.gap.where.components import balance_of
 from fdi_torch.gap.where.suspects import Suspect, parted, suspects
 from fdi_torch.gap.which import Search, search
 from fdi_torch.plant.description import PlantDescription
@@ -34,8 +35,8 @@ LEFT_SHARE, LEFT_LEAST = 2e-3, 150.0  # share of the gap, and chi-square units, 
 AMONG_OTHERS_SHARE = 3e-3  # the same where one of the effects found is at the likeliest place
 SAME_PLACE_SHARE = 3e-2  # the same where one effect at the likeliest place leaves it: its equation is a little off
 FAR_BETTER = 0.35
-MANY = 3  # effects at several places, for which one place that does as well is the plainer explanation
-CHANCES = 2  # causes tied to the clock, for which the same holds: each is a coincidence
+DECISIVE = 120.0  # nats by which a place is ahead of all that are named, to be the likelier one whatever the gap
+DECISIVE_SHARE = 1e-2  # of the gap that it may leave then beyond what the effects leave
 DOUBT = 0.1  # that of two effects at one place one is there only because the other's equation is a little off
 Tell = Callable[[float, str], None]
 
@@ -75,7 +76,7 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
     unknown = None
     # A gap without a name is a gap: hardly any is such that nothing in the library helps. Slow noise is.
     alarmed = chance(found) < ALARM
-    if not case.named_only and alarmed and _unnamed(fitter, weighed.fits[0], found, places[0]):
+    if not case.named_only and alarmed and _unnamed(fitter, weighed.fits[0], found, places):
         places = parted(fitter, found.null, places)
         unknown = fitted_free_form(fitter, found.null, places[0].location, places[0].periods, reach)
     standing = _content(weighed.explanations)
@@ -100,18 +101,18 @@ def _places(fitter: Fitter, found: Search, named: Fit, plant: PlantDescription) 
     return suspects(fitter, found.null, possible_places(plant), waves=much, closely=closely)
 
 
-def _unnamed(fitter: Fitter, named: Fit, found: Search, place: Suspect) -> bool:
-    """Whether one place alone does what no effect of the library does.
+def _unnamed(fitter: Fitter, named: Fit, found: Search, places: Sequence[Suspect]) -> bool:
+    """Whether the likeliest place alone does what no effect of the library does.
 
     Equations that differ a little leave a little open; where one place alone does far better than all that has a name,
     or nothing named does, it has no name. So too where it does what otherwise takes effects at several other places,
-    or many, or several that happen at moments of their own; and where two forms of one law are needed at one place: the
-    law there is then a third one.
+    or a coincidence of them; and where two forms of one law are needed at one place: the law there is then a third one.
     """
-    gap, left, free = whole_gap(fitter, found), left_open(fitter, named), place.leaves
+    place, gap, left = places[0], whole_gap(fitter, found), left_open(fitter, named)
+    free = place.leaves
     if stacked(named.key):
         return True
-    coincidence = len(tied(named)) >= CHANCES
+    coincidence = _coincidence(fitter, named, place)
     if left < LEFT_LEAST and not (_scattered(named) or coincidence):
         return False
     nothing_named = left > UNEXPLAINED * gap
@@ -121,13 +122,24 @@ def _unnamed(fitter: Fitter, named: Fit, found: Search, place: Suspect) -> bool:
     far_better = free < FAR_BETTER * left and left - free > worth_asking
     little = 0.5 * max(LEFT_SHARE * gap, LEFT_LEAST)
     single = min((left_open(fitter, f) for f in found.fits if len(f.key) == 1), default=gap)
-    elsewhere = _scattered(named) and all(at != place.location for _, at in named.key)
+    elsewhere = _scattered(named) and not any(there)
     as_well, needed = free < left + little, single > left + 4.0 * little
-    # A small gap is closed by many forms of one place as well as by a few effects at several.
+    # A small gap is closed by many forms of one place as well as by a few effects at several, unless theirs cannot.
     large = LEFT_SHARE * gap > LEFT_LEAST
-    many = coincidence or (_scattered(named) and len(named.key) >= MANY)
-    one_for_many = as_well and needed and ((large and elsewhere) or many)
+    theirs = [s.evidence for s in places if s.location in {at for _, at in named.key}]
+    if elsewhere and max(theirs, default=0.0) < -DECISIVE:
+        large, as_well = True, free < left + max(little, DECISIVE_SHARE * gap)
+    one_for_many = as_well and needed and ((large and elsewhere) or coincidence)
     return nothing_named or far_better or one_for_many
+
+
+def _coincidence(fitter: Fitter, named: Fit, place: Suspect) -> bool:
+    """Whether several causes, each at a moment of its own, stand in for one place: in its balance, or all elsewhere."""
+    plant, moments = fitter.subject.plant, [at for _, at in tied(named)]
+    balance = balance_of(place.location, plant)
+    here = [at for at in moments if at == place.location or (balance and balance_of(at, plant) == balance)]
+    elsewhere = all(at != place.location for _, at in named.key)
+    return len(moments if elsewhere else here) > 1
 
 
 def _scattered(fit: Fit) -> bool:
