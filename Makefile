@@ -1,5 +1,5 @@
 # Two commands: `make run` (the built-in example) and `make test`. Both make .venv first, once.
-# Needed beforehand: make, Python 3.11 with venv, pip.
+# Needed beforehand: make, Python 3.11 or later with venv, pip.
 
 PYTHON ?= python3
 VENV := .venv

@@ -29,6 +29,7 @@ RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
 DOORS = {
     "pint": ("parameters.py",),
     "torchdiffeq": ("simulate/integrate.py",),
+    "scipy": ("monitor/rehearsal/false_alarms.py",),
     "mcap": ("logbook/",),
     "yaml": ("config/",),
     "pydantic": ("config/",),

@@ -6,13 +6,12 @@ import json
 from pathlib import Path
 
 import pytest
-from scipy import stats
 
 from fdi_torch.cli import MISUSE, main
 from fdi_torch.config.rehearsal import load_rehearsal
 from fdi_torch.jobs.rehearsal import rehearse
 from fdi_torch.logbook import read_run
-from fdi_torch.monitor.rehearsal.false_alarms import as_asked, mean_time, student
+from fdi_torch.monitor.rehearsal.false_alarms import as_asked, mean_time
 
 RIVALS = """
 inputs: [50 cm^3/s, 50 cm^3/s]
@@ -61,10 +60,11 @@ def test_misuse_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_times_between_false_alarms_come_with_the_spread_of_calibrations() -> None:
-    assert student(7) == pytest.approx(float(stats.t.ppf(0.975, 7)), rel=1e-3)
     mean, low, high = mean_time([90] * 8, 20000.0, 90.0)
     assert mean == 20000.0 and low == pytest.approx(20000.0 / (1.0 + 1.96 / 720**0.5)) and high > mean
     assert mean_time([60, 120] * 4, 20000.0, 90.0)[1] < low
+    # Two values 20 apart: 12.706 standard errors of 10 (Student's t with one degree of freedom).
+    assert mean_time([990, 1010], 20000.0, 1000.0)[1] == pytest.approx(20000.0 / 1.12706, rel=1e-5)
 
 
 def test_a_count_agrees_with_what_was_asked_for_by_chance_and_by_its_calibration() -> None:

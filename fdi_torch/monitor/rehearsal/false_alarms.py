@@ -88,21 +88,17 @@ def as_asked(count: int, expected: float, rate_error: float) -> bool:
     return abs(math.log(max(count, 0.5) / expected)) <= error
 
 
-def student(freedom: int) -> float:
-    """The factor of a 95 % interval whose spread is known from `freedom` + 1 values (Abramowitz & Stegun 26.7.5)."""
-    z, n = NORMAL, float(freedom)
-    first, second = (z**3 + z) / 4.0, (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0
-    third = (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0
-    return z + first / n + second / n**2 + third / n**3
-
-
 def mean_time(counts: Sequence[int], every: float, expected: float) -> tuple[float, float, float]:
     """Mean time between false alarms over calibrations, s, and its 95 % interval; counts vary by chance and by
     calibration, both of which their spread holds (that of Poisson counts at least).
     """
+    from scipy.special import (
+        stdtrit,  # Student's t; a tenth of a second, which only a finished rehearsal has to wait for
+    )
+
     mean, error = statistics.fmean(counts), NORMAL * statistics.fmean(counts) ** 0.5
     if len(counts) > 1:
-        error = max(error, student(len(counts) - 1) * statistics.stdev(counts))
+        error = max(error, float(stdtrit(len(counts) - 1, 0.975)) * statistics.stdev(counts))
     error /= len(counts) ** 0.5
     mean = max(mean, 0.5)
     return every * expected / mean, every * expected / (mean + error), every * expected / max(mean - error, 0.5)
