@@ -38,11 +38,11 @@ def test_a_limit_that_the_plant_has_already_or_that_is_not_searched_is_not_told(
     time = torch.arange(len(values), dtype=torch.float64)
     recording = Recording(time, values[:, :0], values, (), (sensor.column,), (), (sensor.unit,))
     saturation = place("sensor_saturation", sensor.name)
-    (told,) = told_limits(plant, recording, [], [saturation])
+    (told,) = told_limits(plant, [recording], [], [saturation])
     assert told.prefix == saturation.prefix
     assert told.values == {"limit": pytest.approx(8.0)}
-    assert told_limits(plant, recording, [saturation], [saturation]) == []
-    assert told_limits(plant, recording, [], []) == []
+    assert told_limits(plant, [recording], [saturation], [saturation]) == []
+    assert told_limits(plant, [recording], [], []) == []
 
 
 @pytest.mark.parametrize("behind", [False, True])

@@ -70,7 +70,10 @@ def test_a_key_that_a_gap_diagnosis_lacks_is_refused(
 ) -> None:
     words = ["replay", str(logged), "--set", "seed=3", "--out", str(tmp_path / "x.mcap"), "--quiet"]
     assert cli.main(words) == cli.MISUSE
-    assert "expected one of library, leave_out, step, most, named_only, got seed" in capsys.readouterr().err
+    assert (
+        "expected one of library, leave_out, step, most, named_only, cross_validate, got seed"
+        in capsys.readouterr().err
+    )
 
 
 def test_every_setting_of_a_diagnosis_can_be_asked_anew(logged: Path) -> None:

@@ -58,6 +58,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--step", metavar="S", type=float, help="of the simulation, s (as sampled, on a bench <= 5)")
     parser.add_argument("--most", metavar="N", type=int, default=DEEPEST, help=f"effects at once, at most ({DEEPEST})")
     parser.add_argument("--named-only", action="store_true", help="never unknown: the best that has a name, on the way")
+    parser.add_argument(
+        "--cross-validate",
+        action="store_true",
+        help="choose among explanations by free runs along stretches that they were not fitted to (minutes)",
+    )
     parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the causes found among its effects")
     parser.add_argument(
         "--with-constants", action="store_true", help="--adopt also writes the constants as fitted beside the causes"
@@ -90,7 +95,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     folder = Path(arguments.out)
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
-        settings = Settings(library, left_out, arguments.step, arguments.most, arguments.named_only)
+        asked = arguments.named_only, arguments.cross_validate
+        settings = Settings(library, left_out, arguments.step, arguments.most, *asked)
         answer = run_gap(log, plant, recordings, holdouts, settings, advance)
         advance(1.0, "done")
     written = _keep(arguments, plant, answer, screen)

@@ -25,6 +25,7 @@ class Overflow(Effect):
     stage = Stage.BALANCE
     places = ("tank",)
     smooth = False
+    of_build = True
     mistaken_for = ("pump_cut_out", "sensor_saturation", "leak", "pump_saturation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
@@ -48,7 +49,9 @@ class Overflow(Effect):
         assert isinstance(tank, Tank)
         low, high = reach.levels[place]
         depths = [tank.height - level for level in (*inside((0.5 * (low + high), high), 3), high)]
-        shares = [{}, *({f"to_{t.name}": 0.7} for t in plant.tanks if t.name not in (place, tank.overflow_to))]
+        above = _above(place, plant)
+        others = [t.name for t in plant.tanks if t.name not in (place, tank.overflow_to, *above)]
+        shares = [{}, *({f"to_{name}": 0.7} for name in others)]
         return [{"below_rim": max(d, 0.0), "crest": 0.03} | share for d in depths for share in shares]
 
     def inflow(self, local: Local, p: Values) -> Tensor:
@@ -62,3 +65,11 @@ class Overflow(Effect):
         area = local.constants["area"]
         strength = rim_strength(area, local.gravity) * crest
         return weir_flow(above, local.net, area, strength, local.clock.resolution)
+
+
+def _above(place: str, plant: PlantDescription) -> set[str]:
+    """The tanks that pour into this one in free fall, by way of others or not: nothing that runs over gets there."""
+    found: set[str] = set()
+    while new := {p.source for p in plant.pipes if p.free_fall and p.target in {place, *found}} - found:
+        found |= new
+    return found

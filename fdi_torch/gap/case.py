@@ -29,7 +29,7 @@ class Settings:
     """library, leave_out: as in `library_of`. step: of the simulation, s; None: as in `laid_out`.
 
     most: effects that one explanation may have. named_only: the best of what has a name, however much it leaves open:
-    a step on the way where many causes come together.
+    a step on the way where many causes come together. cross_validate: as in `gap/stretches.py`.
     """
 
     library: tuple[str, ...] | None = None
@@ -37,6 +37,7 @@ class Settings:
     step: float | None = None
     most: int = DEEPEST
     named_only: bool = False
+    cross_validate: bool = False
 
 
 PLAIN = Settings()
@@ -46,7 +47,7 @@ PLAIN = Settings()
 class Case:
     """library: the effects at places to search. subject: the recordings, for the plant with the limits of its sensors
     that their values tell (`told`); held: the hold-outs. strays: what was masked in the recordings, and in the
-    hold-outs. most, named_only: as in `Settings`.
+    hold-outs. most, named_only, cross_validate: as in `Settings`.
     """
 
     library: tuple[Placement, ...]
@@ -56,6 +57,7 @@ class Case:
     held: tuple[Subject, ...]
     most: int
     named_only: bool = False
+    cross_validate: bool = False
     strays: tuple[Sequence[Strays], Sequence[Strays]] = ((), ())
 
 
@@ -71,11 +73,12 @@ def case_of(
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     recordings, strays = _without_strays(plant, believed, recordings, settings.step)
     holdouts, strays_held = _without_strays(plant, believed, holdouts, settings.step)
-    told = told_limits(plant, recordings[0], believed, library) if len(recordings) == 1 else []
+    told = told_limits(plant, recordings, believed, library)
     believed += told
     subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recordings, *((h,) for h in holdouts)))
     apart = (strays, strays_held)
-    return Case(library, tuple(recordings), told, subject, tuple(held), settings.most, settings.named_only, apart)
+    asked = settings.most, settings.named_only, settings.cross_validate
+    return Case(library, tuple(recordings), told, subject, tuple(held), *asked, apart)
 
 
 def _without_strays(

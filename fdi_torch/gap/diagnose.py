@@ -20,6 +20,7 @@ from fdi_torch.gap.library import canonical, possible_places, stacked
 from fdi_torch.gap.limits import unclipped, with_clipped_noise
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.strays import most_astray
+from fdi_torch.gap.stretches import chosen
 from fdi_torch.gap.subject import Subject
 from fdi_torch.gap.tied import tied
 from fdi_torch.gap.where.components import balance_of
@@ -68,7 +69,12 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
     options = options_of([p for p in library if not p.effect.rounds and p.prefix not in known], fitter, reach)
     found = search(fitter, null, options, case.most)
     tell(0.6, "where")
-    weighed = _weighed(fitter, found, len(library), plant)
+    if case.cross_validate:
+        tell(0.4, "which predicts stretches that it was not fitted to")
+        choice = chosen(fitter, found, plant, reach)
+        found, weighed = choice.search, choice.weighed
+    else:
+        weighed = _weighed(fitter, found, len(library), plant)
     places = _places(fitter, found, weighed.fits[0], plant)
     rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
     rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]

@@ -44,21 +44,28 @@ def limits_of(values: Tensor) -> dict[str, float]:
 
 
 def told_limits(
-    plant: PlantDescription, recording: Recording, believed: Sequence[Placement], library: Sequence[Placement]
+    plant: PlantDescription,
+    recordings: Sequence[Recording],
+    believed: Sequence[Placement],
+    library: Sequence[Placement],
 ) -> list[Placement]:
-    """Limits of sensors that the plant does not have yet, as effects with their values."""
+    """Limits of sensors that the plant does not have yet, as effects with their values; of all recordings together."""
     told = []
     known, offered = {p.prefix for p in believed}, {p.prefix for p in library}
     for sensor in plant.sensors:
-        if sensor.column not in recording.output_names:
+        values = [r.outputs[r.mask[:, i], i] for r in recordings for i in _columns(r, sensor.column)]
+        if not values:
             continue
-        i = recording.output_names.index(sensor.column)
         given = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
-        for name, limit in limits_of(recording.outputs[recording.mask[:, i], i]).items():
+        for name, limit in limits_of(torch.cat(values)).items():
             placement = Placement(effect(name), sensor.name, {"limit": limit})
             if given[name] is None and placement.prefix in offered - known:
                 told.append(placement)
     return told
+
+
+def _columns(recording: Recording, name: str) -> list[int]:
+    return [i for i, column in enumerate(recording.output_names) if column == name]
 
 
 def unclipped(noise: Noise, subject: Subject, believed: Tensor) -> Noise:

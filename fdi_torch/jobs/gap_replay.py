@@ -16,7 +16,8 @@ from fdi_torch.logbook import LogError
 from fdi_torch.logbook import Run as LoggedRun
 
 LISTS, NUMBERS, YES_OR_NO = ("library", "leave_out"), ("step", "most"), {"true": True, "false": False}
-KEYS = (*LISTS, *NUMBERS, "named_only")
+ASKED = ("named_only", "cross_validate")
+KEYS = (*LISTS, *NUMBERS, *ASKED)
 
 
 def gap_again(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
@@ -33,7 +34,7 @@ def settings_of(log: LoggedRun, overrides: Iterable[str] = ()) -> Settings:
     """What the diagnosis was asked, with some of it changed. Raises ValueError for a key that there is not."""
     logged = log.metadata.get("fdi_torch.config", {})
     try:
-        since_later = {"settings.most": str(DEEPEST), "settings.named_only": "false"}
+        since_later = {"settings.most": str(DEEPEST)} | {f"settings.{key}": "false" for key in ASKED}
         told = {key: json.loads((since_later | logged)[f"settings.{key}"]) for key in KEYS}
     except (KeyError, ValueError) as error:
         raise LogError(f"{log.path}: expected the settings of a gap diagnosis, got none; run fdi gap again") from error
@@ -43,14 +44,14 @@ def settings_of(log: LoggedRun, overrides: Iterable[str] = ()) -> Settings:
             raise ValueError(f"--set {override}: expected one of {', '.join(KEYS)}, got {key}")
         told[key] = _given(key, value)
     library = tuple(told["library"]) if told["library"] else None
-    return Settings(library, tuple(told["leave_out"]), told["step"], told["most"], told["named_only"])
+    return Settings(library, tuple(told["leave_out"]), told["step"], told["most"], *(told[k] for k in ASKED))
 
 
 def _given(key: str, value: str) -> Any:
     """The value of an override. Raises ValueError where it is of another kind."""
     if key in LISTS:
         return [name for name in value.split(",") if name]
-    if key == "named_only":
+    if key in ASKED:
         if value not in YES_OR_NO:
             raise ValueError(f"--set {key}={value}: expected true or false, got {value or 'nothing'}")
         return YES_OR_NO[value]

@@ -73,7 +73,8 @@ class Effect:
     of 'pump', 'pipe', 'outlet', 'valve', 'tank', 'tank_pair', 'sensor'. memory: how many memory states it keeps.
     smooth: whether the size's gradient at nominal is not zero. mistaken_for: effects that explain nearly the same data.
     delays, rounds: whether it makes the signal late, or the reading coarse. at_first: whether it acts only until its
-    component has run for the first time. on_clock: parameters that tie it to the clock of one recording where they are
+    component has run for the first time. of_build: whether it comes with how a component is built, so that one of the
+    same make is expected to have it too. on_clock: parameters that tie it to the clock of one recording where they are
     fitted (a moment, a phase, a pace since the start).
     The first of its parameters is its size: where that is nominal, the effect is not there. The others are its
     shape: nominal there is a typical value, or one (an onset of 0, a ramp of 0) that keeps the effect simple.
@@ -87,6 +88,7 @@ class Effect:
     delays: ClassVar[bool] = False
     rounds: ClassVar[bool] = False
     at_first: ClassVar[bool] = False
+    of_build: ClassVar[bool] = False
     on_clock: ClassVar[tuple[str, ...]] = ("onset",)
     mistaken_for: ClassVar[tuple[str, ...]] = ()
 
