@@ -33,6 +33,18 @@ def test_cusum_run_length_is_the_published_one(threshold: float, run_length: flo
     assert cusum_run_length(threshold, 0.5) == pytest.approx(run_length, rel=2e-3)
 
 
+def test_a_sensor_that_is_read_rarely_is_heard_as_soon_in_its_own_readings() -> None:
+    """A missing reading is none: it neither counts for rest nor silences the channels that are read."""
+    rare = torch.full((400, 2), torch.nan, dtype=torch.float64)
+    rare[::10, 1] = noise(40) + 1.5
+    alone = cusum(rare[::10, 1:], 0.5)
+    torch.testing.assert_close(cusum(rare, 0.5)[::10], alone)
+    white = fit_whitening(
+        torch.stack([noise(400), torch.where(torch.arange(400) % 2 == 0, noise(400, seed=1), torch.nan)], 1)
+    )
+    assert torch.isfinite(white(torch.stack([torch.ones(4), torch.full((4,), torch.nan)], 1).double())[:, 0]).all()
+
+
 def test_fixed_threshold_shares_the_false_alarms_among_channels() -> None:
     h = fixed_threshold(370.4, 1)
     assert h == pytest.approx(3.0, abs=1e-3)

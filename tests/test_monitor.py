@@ -120,6 +120,43 @@ def test_a_fault_is_alarmed_named_and_sized_with_its_onset(name: str, size: floa
     assert abs(found.onset - 199.5) < 0.5 + 4 * found.onset_std
 
 
+@pytest.mark.parametrize("period", [(1, 2, 1), (1, 1, 10)])
+def test_sensors_may_be_read_at_rates_of_their_own_and_never_together(period: tuple[int, ...]) -> None:
+    """Half the readings: standard errors are larger by their square root, no more and no less."""
+
+    def thinned(samples: Samples) -> Samples:
+        row = torch.arange(len(samples))
+        read = torch.stack([row % 2 == k % 2 for k in period], dim=1)
+        if max(period) > 2:
+            read = torch.stack([row % k == 0 for k in period], dim=1)
+        return replace(samples, readings=torch.where(read, samples.readings, torch.nan))
+
+    fault_free = recorded(lambda t: SPACE.nominal(), 600, seed=99)
+    run = recorded(step_to("T3.leak.size", 0.05, 300.0), 500, seed=3)
+    learnt = learn_noise(NETWORK, thinned(fault_free), SPACE, SPACE.nominal())[0]
+    whole, rare = monitor(), replace_noise(monitor(), learnt)
+    assert learnt.whitening.order == 0
+    assert learnt.reading_std.tolist() == pytest.approx([STD] * 3, rel=0.15)
+    found = [[e for e in followed(m, s)[1] if e.kind == "isolated"] for m, s in ((whole, run), (rare, thinned(run)))]
+    assert [[e.faults for e in events] for events in found] == [[("T3.leak.size",)]] * 2
+    first, second = (events[0] for events in found)
+    assert abs(second.sizes[0] - 0.05) < 3.0 * second.stds[0]
+    assert abs(second.onset - 300.0) < 3.0 * second.onset_std
+    assert 1.0 < second.stds[0] / first.stds[0] < 2.2
+
+
+def replace_noise(watch: Monitor, learnt: Noise) -> Monitor:
+    return Monitor(watch.network, watch.space, learnt, watch.detector, watch.settings)
+
+
+def test_random_moments_are_no_gaps() -> None:
+    run = recorded(lambda t: SPACE.nominal(), 3000)
+    gaps = torch.empty(3000, dtype=torch.float64).exponential_(generator=torch.Generator().manual_seed(1))
+    samples = replace(run, time=torch.cumsum(gaps, 0))
+    assert float(gaps.max()) > 10.0 * float(gaps.median())
+    assert [notice for _, notice in continuous(samples.stretch(0, 1), samples.stretch(1, 3000))] == [""]
+
+
 def test_a_fault_that_goes_away_is_recovered() -> None:
     _, events = followed(monitor(), recorded(step_to("T1.leak.size", 0.1, 150.0, 330.0), 460))
     kinds = [event.kind for event in events]

@@ -12,6 +12,7 @@ from fdi_torch.config.monitor import MonitorConfig, load_monitor
 from fdi_torch.jobs.monitor import Listening, watch
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.prepare import Prepared
+from fdi_torch.parameters import display_unit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,10 +47,13 @@ def _tell(event: Event, screen: Screen) -> None:
 
 def _introduce(prepared: Prepared, screen: Screen) -> None:
     noise, detector = prepared.noise, prepared.monitor.detector
-    stds = ", ".join(f"{std:.3g}" for std in noise.reading_std.tolist())
+    stds = ", ".join(
+        f"{sensor.name} {display_unit(sensor.unit)[1] * std:.3g} {display_unit(sensor.unit)[0]}".rstrip()
+        for sensor, std in zip(prepared.monitor.network.description.sensors, noise.reading_std.tolist(), strict=True)
+    )
     wander = "" if noise.ratio != noise.ratio else f", levels wander {noise.ratio:.2g} times as much a sample"
     screen.note(
-        f"noise of the readings {stds} (SI){wander}, residual coloured to order {noise.whitening.order}; "
+        f"noise of the readings: {stds}{wander}, residual coloured to order {noise.whitening.order}; "
         f"{detector.chart} above {detector.threshold:.3g}; observer errors shrink to {prepared.radius:.4f} a sample at "
         "least"
     )

@@ -133,7 +133,7 @@ class ChangedObserver:
         """State (tanks + M,) after the first sample of a run, its levels from the readings, and the residual there."""
         first = samples.stretch(0, 1)
         if levels is None:
-            levels = first_levels(self.network, first, self.network.bind(self.space, believed))
+            levels = first_levels(self.network, samples, self.network.bind(self.space, believed))
         ran = run_lanes(
             self.changing,
             self._columns,

@@ -150,9 +150,11 @@ def largest(white: Tensor) -> Tensor:
 
 
 def cusum(white: Tensor, drift: float) -> Tensor:
-    """The highest of 2 C one-sided sums g = max(0, g +- e - drift) (Page 1954), as a sum less its running minimum."""
-    known = torch.nan_to_num(white, nan=0.0)
-    sums = torch.cumsum(torch.cat([known, -known], dim=-1) - drift, dim=-2)
+    """The highest of 2 C one-sided sums g = max(0, g +- e - drift) (Page 1954), as a sum less its running minimum.
+
+    A missing reading changes none: a sensor that is read rarely would else never gather what its readings show.
+    """
+    sums = torch.cumsum(torch.nan_to_num(torch.cat([white, -white], dim=-1) - drift, nan=0.0), dim=-2)
     lowest = torch.cummin(sums, dim=-2).values.clamp(max=0.0)
     return (sums - lowest).amax(dim=-1)
 

@@ -86,10 +86,11 @@ class MonitorState:
 
 
 def begin(
-    observer: ChangedObserver, first: Samples, believed: Tensor, healthy: Tensor, levels: Tensor | None = None
+    observer: ChangedObserver, samples: Samples, believed: Tensor, healthy: Tensor, levels: Tensor | None = None
 ) -> MonitorState:
-    """The state after one sample; levels (tanks,) from the readings where not given."""
-    state, residual = observer.first_state(first, believed, levels)
+    """The state after the first of some samples; levels (tanks,) from the readings where not given."""
+    first = samples.stretch(0, 1)
+    state, residual = observer.first_state(samples, believed, levels)
     white, effects = observer.whitening(residual[None]), len(observer.effects)
     blind, none = state.expand(effects, -1), torch.zeros_like(residual)
     effect = none.expand(1, effects, -1)

@@ -16,6 +16,7 @@ from fdi_torch.plant.behind import levels_behind
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 
 CHECKED_POINTS = 200
+FIRST_SAMPLES = 100  # among which a sensor that is read rarely tells its level at the start
 MARGIN = 0.01  # by which errors may grow in a sample now and then, as long as they decay on the whole
 
 
@@ -163,9 +164,18 @@ def bound(network: TankNetwork, space: ParameterSpace | None, theta: Tensor | No
     return network.bind(space, theta)
 
 
+def _first_readings(readings: Tensor) -> Tensor:
+    """The first that is there of each sensor, (*batch, S, sensors) -> (*batch, sensors); NaN where there is none."""
+    first = torch.isfinite(readings).to(torch.int8).argmax(dim=-2, keepdim=True)
+    return readings.gather(-2, first).squeeze(-2)
+
+
 def first_levels(network: TankNetwork, samples: Samples, values: PlaceValues) -> Tensor:
-    """Levels (*batch, tanks) that the first reading of each sensor shows; the nominal start level where none does."""
+    """Levels (*batch, tanks) that the first reading of each sensor shows; the nominal start level where none does.
+
+    Where a sensor is not read at the first sample its next reading is taken, within FIRST_SAMPLES.
+    """
     start = [level.expand(samples.batch) for level in network.start_levels(values)]
-    readings = samples.readings[..., 0, :].unbind(-1)
+    readings = _first_readings(samples.readings[..., :FIRST_SAMPLES, :]).unbind(-1)
     found = levels_behind(network, readings, start, samples.time[0], values)
     return torch.stack(torch.broadcast_tensors(*found), dim=-1)

@@ -66,7 +66,7 @@ class Monitor:
     def start(self, samples: Samples, believed: Tensor | None = None, levels: Tensor | None = None) -> MonitorState:
         """The state after the first of some samples."""
         theta = self.space.nominal() if believed is None else believed
-        return begin(self.observer, samples.stretch(0, 1), theta, self._healthy(theta), levels)
+        return begin(self.observer, samples, theta, self._healthy(theta), levels)
 
     def advance(
         self, state: MonitorState, samples: Samples, show: Callable[[Seen], None] | None = None
@@ -79,7 +79,7 @@ class Monitor:
         for stretch, notice in continuous(state.samples, samples):
             if notice:
                 events.append(Event(float(stretch.time[0]), "notice", notice))
-                state = begin(self.observer, stretch.stretch(0, 1), state.believed, state.healthy)
+                state = begin(self.observer, stretch, state.believed, state.healthy)
                 stretch = stretch.stretch(1, len(stretch))
             while len(stretch):
                 state, taken, news = self._take(state, stretch, show)

@@ -67,22 +67,28 @@ def fit_whitening(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> White
 def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> list[tuple[float, Whitening]]:
     """Whitenings of all orders with and without a mean, and their Bayesian information criterion, best first.
 
+    Where the channels are hardly ever read together each is taken for itself, without colour.
     Raises ValueError where the recording is too short, or a channel does not vary.
     """
-    known = torch.isfinite(residual).all(dim=1)
-    if int(known.sum()) < FEWEST_SAMPLES:
+    each, known = torch.isfinite(residual).sum(dim=0), torch.isfinite(residual).all(dim=1)
+    if int(each.min()) < FEWEST_SAMPLES:
         raise ValueError(
-            f"expected at least {FEWEST_SAMPLES} fault-free samples to learn the noise from, got {int(known.sum())}; "
+            f"expected at least {FEWEST_SAMPLES} fault-free samples to learn the noise from, got {int(each.min())}; "
             "give a longer recording"
         )
-    flat = residual[known].std(dim=0) <= 1e-12 * residual[known].abs().amax()
+    centred = residual - residual.nanmean(dim=0)
+    flat = centred.square().nanmean(dim=0).sqrt() <= 1e-12 * residual.nan_to_num().abs().amax()
     if bool(flat.any()):
         raise ValueError(
             f"expected residuals that vary, got none in channel {int(flat.nonzero()[0]) + 1}: no noise can be learnt "
             "from it; give a recording with measurement noise"
         )
-    # An order needs ten samples for each of its coefficients.
+    if int(known.sum()) < FEWEST_SAMPLES:
+        return sorted((_apart(residual, mean) for mean in (False, True)), key=lambda fit: fit[0])
+    # An order needs ten samples for each of its coefficients, and rows that follow each other.
     highest_order = min(highest_order, int(known.sum()) // (10 * residual.shape[1]))
+    while highest_order and 4 * int(known.unfold(0, highest_order + 1, 1).all(dim=1).sum()) < int(known.sum()):
+        highest_order -= 1
     fits = [_fit(residual, order, highest_order, mean) for order in range(highest_order + 1) for mean in (False, True)]
     return sorted(fits, key=lambda fit: fit[0])
 
@@ -108,6 +114,16 @@ def _fit(residual: Tensor, order: int, highest: int, with_mean: bool) -> tuple[f
     return score, Whitening(mean, matrices, whitener, len(error), slow)
 
 
+def _apart(residual: Tensor, with_mean: bool) -> tuple[float, Whitening]:
+    """Each channel's own spread, and the criterion over all readings."""
+    count, channels = torch.isfinite(residual).sum(dim=0), residual.shape[1]
+    mean = residual.nanmean(dim=0) if with_mean else residual.new_zeros(channels)
+    variance = (residual - mean).square().nanmean(dim=0)
+    score = float((count * variance.log() + int(with_mean) * count.log()).sum())
+    none = residual.new_zeros(0, channels, channels)
+    return score, Whitening(mean, none, torch.diag(variance.rsqrt()), int(count.min()), (2.0 * count) ** -0.5)
+
+
 def _slow_error(regressors: Tensor, matrices: Tensor, whitener: Tensor, count: int) -> Tensor:
     """What errors of A do to slow sums of e: W dA(1) (I - A(1))^-1 W^-1 on its diagonal, rows of W dA having the least
     squares covariance (X' X)^-1, beside 1 / (2 n) of the spread itself (delta method).
@@ -123,5 +139,8 @@ def _slow_error(regressors: Tensor, matrices: Tensor, whitener: Tensor, count: i
 
 
 def _apply(matrix: Tensor, values: Tensor) -> Tensor:
-    """matrix (C, C) times values (..., C) as explicit sums, so that a lane does not depend on its neighbours."""
-    return sum((matrix[:, c] * values[..., c : c + 1] for c in range(values.shape[-1])), torch.zeros_like(values))
+    """matrix (C, C) times values (..., C) as explicit sums, so that a lane does not depend on its neighbours, nor a
+    channel on the missing reading of another that has no part in it.
+    """
+    columns = ((matrix[:, c], values[..., c : c + 1]) for c in range(values.shape[-1]))
+    return sum((torch.where(part == 0.0, 0.0, part * value) for part, value in columns), torch.zeros_like(values))

@@ -69,7 +69,7 @@ class WindowMonitor:
     def start(self, samples: Samples, believed: Tensor | None = None, levels: Tensor | None = None) -> WindowState:
         """The state after the first of some samples."""
         theta = self.space.nominal() if believed is None else believed
-        state = begin(self._observer, samples.stretch(0, 1), theta, theta, levels)
+        state = begin(self._observer, samples, theta, theta, levels)
         return WindowState(state, state.reachable + self.length)
 
     def advance(
