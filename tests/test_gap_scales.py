@@ -61,14 +61,31 @@ def test_a_rig_scaled_in_time_and_size_has_the_same_verdict(left_out: tuple[str,
         assert cause.parameters["time_constant"].value == pytest.approx(SLOWER * 15.0, rel=0.02)
 
 
+def told(recording: Recording, metres: float, seconds: float) -> Recording:
+    """What a rig of other lengths and at another pace would have recorded."""
+    inputs, outputs = recording.inputs * metres**3 / seconds, recording.outputs * metres
+    return replace(recording, time=recording.time * seconds, inputs=inputs, outputs=outputs)
+
+
+@pytest.mark.parametrize(("metres", "seconds"), [(0.1, 1.0), (10.0, 100.0)])
+def test_what_a_free_function_leaves_open_scales_with_the_rig(metres: float, seconds: float) -> None:
+    bench, later = recorded({"Q1.pump_lag.time_constant": 15.0}, 41), recorded({"Q1.pump_lag.time_constant": 15.0}, 42)
+    closures = []
+    for m, s in ((1.0, 1.0), (metres, seconds)):
+        runs, settings = (told(bench, m, s), told(later, m, s)), Settings(("pump_lag", "leak"), ("pump_lag",))
+        answer = diagnose(similar(believed(), m, s), *runs, settings=settings)
+        assert answer.verdict == "unknown"
+        closures.append([answer.closure[model] / m for model in ("nominal", "recalibrated", "ceiling", "noise_floor")])
+    assert closures[1] == pytest.approx(closures[0], rel=1e-6)
+
+
 @pytest.mark.parametrize(("metres", "seconds"), [(0.01, 1.0), (10.0, 100.0), (1.0, 0.01)])
 @pytest.mark.parametrize("cause", [{"Q1.pump_lag.time_constant": 15.0}, {"T3.leak.size": 0.1}])
 def test_a_rig_of_powers_of_ten_has_the_same_numbers(cause: dict[str, float], metres: float, seconds: float) -> None:
     """A constant in metres, seconds or m^3/s that is not the plant's own would show here."""
     bench, library = recorded(cause, 5), (*SMALL, "leak")
     usual = diagnose(believed(), bench, settings=Settings(library))
-    inputs, outputs = bench.inputs * metres**3 / seconds, bench.outputs * metres
-    other = replace(bench, time=bench.time * seconds, inputs=inputs, outputs=outputs)
+    other = told(bench, metres, seconds)
     found = diagnose(similar(believed(), metres, seconds), other, settings=Settings(library))
     assert found.verdict == usual.verdict == "named"
     assert [(c.effect, c.location) for c in found.causes] == [(c.effect, c.location) for c in usual.causes]

@@ -18,6 +18,7 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor
 from fdi_torch.plant.effect import Effect, Local, Memory, Placement, Stage, Values, place_kind
+from fdi_torch.plant.pace import area_scale, length_scale, time_scale
 from fdi_torch.plant.reach import Range, Reach
 from fdi_torch.plant.signals import Clock
 
@@ -25,6 +26,7 @@ LOCAL_NODES, TIME_NODES = 8, 16
 HEAD_NODES = 14
 PRIOR = 0.2
 ROUNDS = 16
+NARROWEST = 1e-6  # of a grid, in units of the plant's scales
 UNIT = 0.01  # size of a coefficient at which its effect on the readings is taken
 
 
@@ -156,41 +158,44 @@ def shape_of(fit: Fit) -> dict[str, object]:
 
 
 def _free_at(place: str, plant: PlantDescription, reach: Reach, periods: Sequence[float]) -> list[Effect]:
-    kind, time = place_kind(plant, place), _grid((0.0, reach.duration), TIME_NODES)
+    kind, length = place_kind(plant, place), length_scale(plant)
+    time = _grid((0.0, reach.duration), TIME_NODES, time_scale(plant))
     if kind == "tank_pair":
         first, second = place.split("-")
         ends = reach.levels[first], reach.levels[second]
-        grid = _root_grid((ends[0][0] - ends[1][1], ends[0][1] - ends[1][0]), HEAD_NODES)
+        grid = _root_grid((ends[0][0] - ends[1][1], ends[0][1] - ends[1][0]), HEAD_NODES, length)
         return [FreeInflow({"difference": grid, "time": time}, 0.3 * flow_scale(plant, first), periods)]
     if kind == "tank":
-        levels, flow = _grid(reach.levels[place], LOCAL_NODES), 0.3 * flow_scale(plant, place)
+        levels, flow = _grid(reach.levels[place], LOCAL_NODES, length), 0.3 * flow_scale(plant, place)
         return [FreeInflow({"level": levels, "time": time}, flow, periods), FreeArea({"level": levels}, 1.0)]
     component = plant.component(place)
     if isinstance(component, Sensor):
-        readings = _grid(reach.readings[place], LOCAL_NODES)
+        readings = _grid(reach.readings[place], LOCAL_NODES, length if component.unit == "m" else 1.0)
         return [FreeReading({"reading": readings, "time": time}, 0.2 * reading_span(plant, component), periods)]
     if isinstance(component, Pump):
-        command = _grid(reach.commands[component.channel], LOCAL_NODES)
-        nodes = {"command": command, "level": _grid(reach.levels[component.target], 5), "time": time}
+        flows = area_scale(plant) * length / time_scale(plant) if component.gain_unit == "1" else 1.0
+        command = _grid(reach.commands[component.channel], LOCAL_NODES, flows)
+        nodes = {"command": command, "level": _grid(reach.levels[component.target], 5, length), "time": time}
         return [FreeFlow(nodes, component.gain * max(abs(command[0]), abs(command[-1])), periods)]
     assert isinstance(component, Pipe)
     near = reach.levels[component.source]
     far = reach.levels[component.target] if not component.is_outlet else (0.0, 0.0)
     heads = near if component.is_outlet else (near[0] - far[1], near[1] - far[0])
     flow = 0.5 * flow_scale(plant, component.source)
-    return [FreeFlow({"head": _root_grid(heads, HEAD_NODES), "time": time}, flow, periods)]
+    return [FreeFlow({"head": _root_grid(heads, HEAD_NODES, length), "time": time}, flow, periods)]
 
 
-def _grid(span: Range, count: int) -> list[float]:
+def _grid(span: Range, count: int, scale: float) -> list[float]:
+    """scale: of the plant, in the unit of the span, which is drawn wider where hardly anything varied."""
     low, high = span
-    width = max(high - low, 1e-6)
+    width = max(high - low, NARROWEST * scale)
     return [low + width * j / (count - 1) for j in range(count)]
 
 
-def _root_grid(span: Range, count: int) -> list[float]:
+def _root_grid(span: Range, count: int, scale: float) -> list[float]:
     """Even in the signed root of a head, where flows bend most, with zero among the nodes if it lies inside."""
     ends = (math.copysign(math.sqrt(abs(span[0])), span[0]), math.copysign(math.sqrt(abs(span[1])), span[1]))
-    roots = _grid(ends, count)
+    roots = _grid(ends, count, math.sqrt(scale))
     if ends[0] < 0.0 < ends[1]:
         nearest = min(range(1, count - 1), key=lambda j: abs(roots[j]))
         roots[nearest] = 0.0
