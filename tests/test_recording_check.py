@@ -181,3 +181,27 @@ def test_what_is_odd_about_a_real_rig_is_found(real_data: Path) -> None:
     file = RecordingConfig(file=str(real_data / "dts200" / "exp5_pump_staircase_drain__2194.csv"))
     kinds = {(f.kind, f.channel) for f in check_recording(read_recording(file, rig), rig).findings}
     assert {("unknown", "qL_cmd"), ("clipped", "h2_R"), ("frozen", "h1_L"), ("range", "h2_R")} <= kinds
+
+
+def test_readings_logged_on_change_are_told() -> None:
+    """A level with a little noise, written where it has moved by 2 mm, or a minute has gone by."""
+    whole = healthy(4000)
+    values, time = whole.outputs[:, 0] + 0.1 * torch.sin(whole.time / 300), whole.time
+    kept = [0]
+    for k in range(1, len(time)):
+        if abs(float(values[k] - values[kept[-1]])) >= 2e-2 or float(time[k] - time[kept[-1]]) >= 60.0:
+            kept.append(k)
+    outputs = torch.full_like(whole.outputs, torch.nan)
+    outputs[kept, 0] = values[kept]
+    outputs[:, 1:] = whole.outputs[:, 1:]
+    check = check_recording(replace(whole, outputs=outputs, mask=torch.isfinite(outputs)), PLANT)
+    [finding] = [f for f in check.findings if f.kind == "on change"]
+    assert finding.channel == "h1"
+    assert finding.values["step"] == pytest.approx(2e-2, rel=0.1)
+
+
+def test_a_jump_by_an_hour_asks_for_the_zone() -> None:
+    time = torch.where(torch.arange(400) < 200, torch.arange(400), torch.arange(400) + 3600).double()
+    check = check_recording(replace(healthy(), time=time), PLANT)
+    assert [f.kind for f in check.findings] == ["clock", "gap"]
+    assert "say in which zone, as in columns: {t: {zone: Europe/Berlin}}" in check.findings[0].text

@@ -17,10 +17,15 @@ from fdi_torch.recording import Recording
 
 MANY_RUNS = 5
 """So many stretches without an input are told in one sentence."""
+HOUR = 3600.0  # s
 GAP_STEPS = 3.0
 """A gap is a step longer than this many usual ones."""
 JITTER_SHARE = 0.05
 FROZEN_SAMPLES = 20
+ODD_SHARE, FEWEST_STEPS, ALIKE, IRREGULAR, FINER = 0.1, 40, 2.0, 3.0, 5.0
+"""Logged on change: all steps but a tenth are at least one that is not far below the usual one and far above the
+resolution, and the times between them differ by more than a factor of three.
+"""
 CLIPPED_SAMPLES = 5
 CLIPPED_PILE = 5.0
 """Clipped: the extreme value occurs this many times as often as its neighbour."""
@@ -33,7 +38,8 @@ SMALL_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Finding:
-    """kind: read, clock, gap, constant, clipped, frozen, quantised, range, unit, missing or unknown. values: SI, by
+    """kind: read, clock, gap, constant, clipped, frozen, quantised, range, unit, missing,
+    on change or unknown. values: SI, by
     name.
     """
 
@@ -72,8 +78,10 @@ class RecordingCheck:
 
 def check_recording(recording: Recording, plant: PlantDescription) -> RecordingCheck:
     """Clock, missing and unknown stretches, and each channel by itself and against the plant."""
-    steps = torch.diff(recording.time)
-    interval = float(steps.median()) if len(steps) else 0.0
+    read = recording.time[torch.isfinite(recording.outputs).any(dim=1)]
+    time = read if len(read) > 1 else recording.time  # rows with an input alone are no samples
+    steps = torch.diff(time)
+    interval = recording.interval
     return RecordingCheck(
         source=recording.source,
         samples=len(recording),
@@ -82,7 +90,7 @@ def check_recording(recording: Recording, plant: PlantDescription) -> RecordingC
         channels=tuple(_summaries(recording)),
         findings=(
             *(Finding("read", "t", note) for note in recording.notes),
-            *_clock_findings(recording.time, steps, interval),
+            *_clock_findings(time, steps, interval),
             *_unknown_inputs(recording),
             *_missing_readings(recording),
             *_reading_findings(recording),
@@ -117,6 +125,13 @@ def resolution(values: Tensor) -> float:
 
 
 def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[Finding]:
+    jump = ((steps - HOUR).abs() <= GAP_STEPS * interval).nonzero().flatten()
+    if len(jump):
+        text = (
+            f"jumps by an hour after {float(time[jump[0]]):g} s: where this is local time and summer time begins, say "
+            "in which zone, as in columns: {t: {zone: Europe/Berlin}}"
+        )
+        yield Finding("clock", "t", text, {"after": float(time[jump[0]])})
     gaps = (steps > GAP_STEPS * interval).nonzero().flatten()
     if len(gaps):
         longest = int(gaps[steps[gaps].argmax()])
@@ -172,9 +187,24 @@ def _reading_findings(recording: Recording) -> Iterator[Finding]:
             text = f"constant at {_shown(values[0], unit)}: its correlation with anything is undefined"
             yield Finding("constant", name, text, {"value": float(values[0])})
             continue
+        yield from _on_change(name, values, recording.time[mask], unit)
         yield from _clipped(name, values, unit)
         yield from _frozen(name, values, recording.time[mask])
         yield from _quantised(name, values, unit)
+
+
+def _on_change(name: str, values: Tensor, time: Tensor, unit: str) -> Iterator[Finding]:
+    """Logged where it has moved by a least step: readings that follow each other hardly ever lie closer."""
+    steps, waits = torch.diff(values).abs(), torch.diff(time)
+    least = float(steps.quantile(ODD_SHARE)) if len(steps) >= FEWEST_STEPS else 0.0
+    usual = float(steps.median())
+    irregular = float(waits.quantile(0.9)) > IRREGULAR * float(waits.quantile(0.1))
+    if irregular and least > 0.0 and usual < ALIKE * least and least > FINER * resolution(values):
+        text = (
+            f"seems to be logged on change, when it has moved by {_shown(least, unit)}: readings come early or late by "
+            "as much, which standard errors do not know; where exactness matters log at a fixed rate"
+        )
+        yield Finding("on change", name, text, {"step": least})
 
 
 def _clipped(name: str, values: Tensor, unit: str) -> Iterator[Finding]:
@@ -270,8 +300,8 @@ def _valve_findings(valve: str, opening: Tensor) -> Iterator[Finding]:
 
 
 def _shown(value: Tensor | float, unit: str) -> str:
-    label, scale = display_unit(unit)
-    return f"{scale * float(value):.4g} {label}".rstrip()
+    label, scale = ("%", 100.0) if unit == "1" else display_unit(unit)
+    return f"{scale * float(value):.4g} {label}"
 
 
 def _runs(flags: Tensor) -> list[tuple[int, int]]:
