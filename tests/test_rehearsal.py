@@ -8,13 +8,14 @@ import torch
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import set_up
+from fdi_torch.estimate.proportion import wilson
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.following import observe
 from fdi_torch.monitor.noise import learn_noise
 from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.prepare import with_shapes
 from fdi_torch.monitor.rehearsal.alarms import count_false_alarms, delays, detectors
-from fdi_torch.monitor.rehearsal.naming import Kind, confusions, name, smallest_isolable, wilson
+from fdi_torch.monitor.rehearsal.naming import Kind, confusions, name, smallest_isolable
 from fdi_torch.monitor.rehearsal.rivals import RIVALS, compare, draw_runs, track
 from fdi_torch.monitor.rehearsal.runs import Course, LevelControl, Rig, fault_free
 from fdi_torch.monitor.rehearsal.scoring import score

@@ -22,7 +22,7 @@ _ROUNDS = ((30, _signed(0xBF58476D1CE4E5B9)), (27, _signed(0x94D049BB133111EB)),
 
 
 def mix(words: Tensor) -> Tensor:
-    """splitmix64's finaliser on int64 of any shape; a new tensor."""
+    """splitmix64's finaliser (Steele, Lea & Flood 2014) on int64 of any shape; a new tensor."""
     words = words.clone()
     shifted = torch.empty_like(words)
     for shift, factor in _ROUNDS:

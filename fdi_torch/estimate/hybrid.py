@@ -122,7 +122,9 @@ def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
 
 
 def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Tensor) -> tuple[float, float]:
-    """The steps of search and refinement: those asked for, or the longest whose error over the box is small enough."""
+    """The steps (s) of search and refinement: those asked for, or the longest whose error is small enough over the box
+    from low (P,) to high (P,).
+    """
     points = probe_points(low, high)
     spans = [float(r.time[-1] - r.time[0]) for r in fitting.recordings]
     longest, scale = max(min(spans) / 20.0, 1e-6), time_scale(fitting.plant)
@@ -154,6 +156,7 @@ def search(
     on_generation: Callable[[Search], None] | None,
     resume: Search | None = None,
 ) -> EvolutionResult:
+    """Differential evolution on one problem in the box from low (P,) to high (P,), or on from where one stopped."""
     low, high = low.unsqueeze(0), high.unsqueeze(0)
     return evolve(problem.cost, low, high, settings.search, seed, on_generation=on_generation, resume=resume)
 
@@ -181,7 +184,9 @@ def refine_to_convergence(
     step: float,
     on_iteration: Callable[[Progress], None] | None,
 ) -> tuple[Refined, float]:
-    """Refines from every start, takes the best, and halves the step until standard errors and values stand still."""
+    """Refines from every start (K, P) in the box from low (P,) to high (P,), takes the best, and halves the step (s)
+    until standard errors and values stand still; with the step that it came to.
+    """
 
     def run(theta: Tensor, at: float) -> Refined:
         linearise = fitting.problem(at, settings.objectives[1]).linearise
@@ -211,7 +216,9 @@ def refine_adaptively(
     coarse: float,
     on_iteration: Callable[[Progress], None] | None,
 ) -> Refined:
-    """Refines from every start in coarse steps, and goes on from the best with an adaptive solver, then a tight one."""
+    """Refines from every start (K, P) in coarse steps (s), and goes on from the best with an adaptive solver, then a
+    tight one.
+    """
 
     def run(problem: Problem, theta: Tensor, enough: float) -> Refined:
         stop = near_enough(settings, enough)

@@ -126,7 +126,7 @@ class Problem:
 
 
 def of_lanes(data: Readings, lanes: Tensor) -> Readings:
-    """The readings of some problems; readings shared by all are passed on as they are."""
+    """The readings of the problems `lanes` (L,); readings shared by all are passed on as they are."""
     if data.values.dim() == 2:
         return data
     return Readings(data.values[lanes], data.weight[lanes], None if data.ar is None else data.ar[lanes])
@@ -180,7 +180,10 @@ def correlation_loss(sums: Tensor, data: Readings) -> Tensor:
 
 
 def correlation_expansion(gram: Tensor, data: Readings) -> Linearisation:
-    """Gauss-Newton expansion of the sum of 1 - rho = |z - f|^2 / 2; z, f: readings and predictions at unit norm."""
+    """Gauss-Newton expansion of the sum of 1 - rho = |z - f|^2 / 2; z, f: readings and predictions at unit norm.
+
+    gram (L, C, P+3, P+3): sums of products, see `Engine.gram`.
+    """
     count = data.weight.sum(-2).expand(gram.shape[:-2])
     centred = gram - gram[..., :, -1:] * gram[..., -1:, :] / count[..., None, None]
     jj, jr, jy = centred[..., :-3, :-3], centred[..., :-3, -3], centred[..., :-3, -2]

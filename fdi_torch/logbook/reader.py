@@ -61,6 +61,8 @@ class Message:
 
 @dataclass(frozen=True)
 class Attachment:
+    """A file inside the log; size in bytes, frame: where it lies."""
+
     name: str
     media_type: str
     size: int
@@ -232,6 +234,7 @@ def open_part(
 
 
 def map_file(path: Path) -> Any:
+    """The whole file as memory. Raises LogError where it is empty or cannot be opened."""
     try:
         with open(path, "rb") as file:
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

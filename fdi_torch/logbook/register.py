@@ -17,6 +17,8 @@ from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, Topic, json_schema, 
 
 
 class Register:
+    """One channel a topic at a time; sequence numbers count on over all of its channels."""
+
     def __init__(self) -> None:
         self._described: dict[str, tuple[frozenset[str], Channel]] = {}
         self._count: dict[str, int] = {}

@@ -124,6 +124,7 @@ def stream_of(data: bytes) -> ReadDataStream:
 
 
 def body_of(data: Buffer, frame: Frame) -> bytes:
+    """The record without its opcode and length."""
     return bytes(data[frame.start + 9 : frame.end])
 
 

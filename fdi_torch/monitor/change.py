@@ -45,7 +45,7 @@ class Changes:
 
 
 def unchanged(believed: Tensor) -> Changes:
-    """The hypothesis that nothing changes."""
+    """The hypothesis that nothing of what is believed (P,) changes, as one lane."""
     return Changes(believed[None], believed.new_tensor([NEVER]), torch.tensor([False]))
 
 

@@ -54,6 +54,7 @@ def _chosen(samples: Samples, rows: Sequence[int]) -> Samples:
 
 
 def joined(first: Samples, second: Samples) -> Samples:
+    """Samples of one clock, one after the other; how inputs run is as in the second."""
     return Samples(
         torch.cat([first.time, second.time]),
         torch.cat([first.inputs, second.inputs]),

@@ -145,7 +145,7 @@ def _steepness(chart: str, run_length: float, channels: int, drift: float, learn
 
 
 def largest(white: Tensor) -> Tensor:
-    """max over channels of |e|."""
+    """max over channels of |e|, (*batch, S, C) -> (*batch, S)."""
     return torch.nan_to_num(white, nan=0.0).abs().amax(dim=-1)
 
 

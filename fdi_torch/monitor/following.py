@@ -108,7 +108,7 @@ def observe(observer: ChangedObserver, state: MonitorState, samples: Samples) ->
 
 
 def believe(observer: ChangedObserver, state: MonitorState, change: Change, believed: Tensor) -> MonitorState:
-    """The observer run again from the change's onset with the new values; the detector starts afresh."""
+    """The observer run again from the change's onset with the new values (P,); the detector starts afresh."""
     finding = change.finding
     window = state.window(finding.onset)
     incipient, standing = finding.hypothesis.incipient, state.standing(observer)

@@ -124,6 +124,7 @@ def hand_gain(matrix: Tensor) -> Gain:
 def timed_gain(linear: Linear, span: float, time_constant: float, reading_std: Tensor, start_std: Tensor) -> Gain:
     """The Kalman gain whose slowest error decays with `time_constant` s, found by bisection over the wander.
 
+    span: s between samples. reading_std (sensors,) and start_std (tanks,) as in `kalman_gain`: their ratios count.
     Raises ValueError where no gain is that fast, because a level is not measured, or that slow.
     """
     if not time_constant > 0:

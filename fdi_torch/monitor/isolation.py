@@ -83,7 +83,7 @@ def _point(finding: Finding) -> Tensor:
 
 
 def needless(finding: Finding, believed: Tensor) -> bool:
-    """Whether one of several faults is, to three standard errors, what was believed of it."""
+    """Whether one of several faults is, to three standard errors, what was believed (P,) of it."""
     sizes = [c for c in finding.hypothesis.sizes if c in finding.hypothesis.free]
     change = (finding.value - believed).abs() <= 3.0 * finding.std
     return len(finding.hypothesis.sizes) > 1 and any(bool(change[c]) for c in sizes)
@@ -120,7 +120,7 @@ def doubted(found: Sequence[Finding], base: float) -> list[Finding]:
 
 
 def refit(observer: ChangedObserver, window: Window, believed: Tensor, findings: Sequence[Finding]) -> list[Finding]:
-    """The same hypotheses on another window, from the values found before."""
+    """The same hypotheses on another window, beside what is believed (P,), from the values found before; best first."""
     base = _misfit(observer.white(window, believed, unchanged(believed)))
     starts = torch.stack([_point(f) for f in findings])
     return doubted(fit(observer, window, believed, [f.hypothesis for f in findings], starts, base), base)
@@ -134,7 +134,10 @@ def fit(
     starts: Tensor,
     base: float,
 ) -> list[Finding]:
-    """Sizes and onset of each hypothesis by Levenberg-Marquardt on the white innovations, all side by side."""
+    """Sizes and onset of each hypothesis by Levenberg-Marquardt on the white innovations, all side by side.
+
+    believed (P,); starts (H, P+1): values and onset (s) of each; base: the misfit without a change.
+    """
     free = torch.zeros(len(hypotheses), len(believed) + 1, dtype=torch.bool)
     free[:, -1] = True
     for i, hypothesis in enumerate(hypotheses):

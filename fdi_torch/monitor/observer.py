@@ -156,7 +156,7 @@ class Observer:
 
 
 def bound(network: TankNetwork, space: ParameterSpace | None, theta: Tensor | None) -> PlaceValues:
-    """Every constant of the plant, those of `space` from theta."""
+    """Every constant of the plant, those of `space` from theta (*batch, P). ValueError for one without the other."""
     if (space is None) != (theta is None):
         raise ValueError("expected a parameter space together with its values, got one of the two; give both or none")
     if space is None or theta is None:

@@ -20,7 +20,10 @@ MANY = 4  # faults that stand: of more than these not every set is tried for hav
 
 
 def returns(believed: Tensor, healthy: Tensor, faults: Sequence[Fault]) -> list[Hypothesis]:
-    """Faults that are believed in and may have gone: each set of them, or of many each one, all but one, and all."""
+    """Faults that are believed in and may have gone: each set of them, or of many each one, all but one, and all.
+
+    believed, healthy (P,): a fault stands where the two differ.
+    """
     standing = [f for f in faults if bool((believed != healthy)[list(f.columns)].any())]
     count = len(standing)
     sizes = range(1, count + 1) if count <= MANY else (1, count - 1, count)

@@ -34,7 +34,7 @@ def told_at(theta: Tensor, swings: Sequence[tuple[int, int]], free: Tensor, mome
 
 
 def within_a_turn(theta: Tensor, swings: Sequence[tuple[int, int]], free: Tensor) -> Tensor:
-    """theta with the free phases between -pi and pi."""
+    """theta (L, P') with the phases that are free (L, P') between -pi and pi."""
     turned = theta.clone()
     for _, phase in swings:
         inside = torch.remainder(theta[:, phase] + math.pi, 2.0 * math.pi) - math.pi
@@ -43,7 +43,7 @@ def within_a_turn(theta: Tensor, swings: Sequence[tuple[int, int]], free: Tensor
 
 
 def period_step(period: Tensor, length: float) -> Tensor:
-    """A change of the period, s, that turns the phase at either end of a window of `length` s by TURN."""
+    """A change of periods of any shape, s, that turns the phase at either end of a window of `length` s by TURN."""
     return TURN * period.square() / (math.pi * length)
 
 

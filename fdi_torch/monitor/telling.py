@@ -40,6 +40,7 @@ def rivals_of(space: ParameterSpace, found: Sequence[Finding]) -> tuple[str, ...
 
 
 def names_of(space: ParameterSpace, finding: Finding) -> tuple[str, ...]:
+    """Parameters that a finding says have changed, by their full names."""
     return tuple(space.names[c] for c in finding.hypothesis.columns)
 
 

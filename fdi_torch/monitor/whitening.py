@@ -65,7 +65,8 @@ def fit_whitening(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> White
 
 
 def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> list[tuple[float, Whitening]]:
-    """Whitenings of all orders with and without a mean, and their Bayesian information criterion, best first.
+    """Whitenings of residuals (S, C) of all orders with and without a mean, and their Bayesian information criterion,
+    best first.
 
     Where the channels are hardly ever read together each is taken for itself, without colour.
     Raises ValueError where the recording is too short, or a channel does not vary.

@@ -79,7 +79,7 @@ class WindowEstimate:
 
 
 Estimator = Callable[[WindowData, Tensor, int], WindowEstimate]
-"""(window, last estimate (R, P), seed) -> estimate."""
+"""(window, last estimate (R, P), seed) -> estimate of each run."""
 
 
 def evolution(window: WindowData, before: Tensor, seed: int) -> WindowEstimate:

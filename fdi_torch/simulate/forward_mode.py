@@ -23,7 +23,7 @@ _FACTORIES = {"zeros_like", "ones_like", "full_like", "new_zeros", "new_ones", "
 
 
 def with_slope(value: Tensor, slope: Tensor | None = None) -> Tensor:
-    """A tensor with that slope; with one of zero where it has none."""
+    """A tensor of any shape with that slope, of the same shape; with one of zero where it has none."""
     if slope is None:
         if not value.is_floating_point() or forward_ad.unpack_dual(value).tangent is not None:
             return value

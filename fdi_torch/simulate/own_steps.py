@@ -51,7 +51,9 @@ def _step_of_unit_error(plant: PlantDescription) -> float:
 
 
 def own_step(gone: Tensor, pace: Tensor, span: Tensor) -> Tensor:
-    """How far each lane goes next, s: as far as its pace, not leaving a short step over; `span` where it is there."""
+    """How far each lane (L,) goes next, s, after `gone` s of `span`: as far as its pace, not leaving a short step over;
+    `span` where it is there.
+    """
     rest = span - gone
     own = torch.where(rest <= pace, rest, torch.where(rest < 2.0 * pace, rest / 2.0, pace))
     return torch.where(rest > 0.0, own, span)

@@ -59,6 +59,7 @@ def each_on(client: Client, work: Callable[[T], R], items: Iterable[T]) -> Itera
 
 @contextmanager
 def connected(address: str, workers: int | None = None) -> Iterator[Client]:
+    """A scheduler at an address, or so many worker processes here. Raises ValueError without Dask or a scheduler."""
     try:
         import dask
         from distributed import Client, LocalCluster

@@ -10,6 +10,7 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.proportion import wilson
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.study.monte_carlo import Trial, is_converged
 from fdi_torch.study.plan import ESTIMATORS, Plan, Setting
@@ -102,6 +103,7 @@ def column(trials: Sequence[Trial], name: str) -> Tensor:
 
 
 def bound_name(estimator: str) -> str:
+    """Which of a trial's bounds is the estimator's own: correlation does not see a reading's scale."""
     return "correlation_bound" if estimator == "correlation" else "bound"
 
 
@@ -136,6 +138,7 @@ def _failures(name: str, error: Tensor, trials: Sequence[Trial], setting: Settin
 
 
 def mean_with_error(values: Tensor) -> Ratio:
+    """Mean of (N,) and its interval, from the spread of the values."""
     mean = float(values.mean())
     reach = _REACH * float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else math.inf
     return Ratio(mean, mean - reach, mean + reach)
@@ -162,10 +165,8 @@ def covered(error: Tensor, std: Tensor) -> Ratio:
 
 
 def share(count: int, trials: int) -> Ratio:
-    p, z2 = count / trials, _REACH * _REACH
-    centre = (p + z2 / (2 * trials)) / (1 + z2 / trials)
-    reach = _REACH * math.sqrt(p * (1 - p) / trials + z2 / (4 * trials * trials)) / (1 + z2 / trials)
-    return Ratio(p, centre - reach, centre + reach)
+    """Of so many trials, with its interval (Wilson 1927)."""
+    return Ratio(count / trials, *wilson(count, trials))
 
 
 def _ends(name: str, ratio: Ratio | None) -> dict[str, float]:

@@ -62,6 +62,7 @@ class Limits:
 
 
 def limits(engine: Engine, trials: Trials) -> Limits:
+    """Cramer-Rao bounds of all trials, and what the linearised efficient estimator makes of their own noise."""
     predicted = engine.readings(trials.truth)
     shifted = predicted + trials.noise
     gram = engine.gram(trials.truth[:, None], Readings(shifted, torch.ones_like(shifted)))[:, 0]

@@ -61,6 +61,7 @@ def count_false_alarms(
     samples: int,
     generator: torch.Generator,
 ) -> list[FalseAlarms]:
+    """Alarms of each detector in so many fault-free runs. every: s between false alarms, as asked for."""
     seen = rig.run(fault_free(rig.space, runs), samples, generator)
     white = white_residuals(rig, noise, seen)
     seconds = runs * (samples - 1) * rig.sampling

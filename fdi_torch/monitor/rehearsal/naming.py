@@ -95,7 +95,7 @@ class Named:
 
 
 def name(monitor: Monitor, samples: Samples, believed: Tensor, levels: Tensor, onset: float) -> Named:
-    """Follows one run to its end."""
+    """Follows one run to its end. believed (P,) and levels (tanks,) m at its first sample, onset s of what happens."""
     state = monitor.start(samples, believed, levels)
     _, events = monitor.advance(state, samples.stretch(1, len(samples)))
     return _said(events, onset)
@@ -112,17 +112,6 @@ def _said(events: Sequence[Event], onset: float) -> Named:
 def _sizes(event: Event) -> tuple[str, ...]:
     """The faults that an event names, without the period and phase of one that swings."""
     return tuple(name for name in event.faults if name.rpartition(".")[2] not in SHAPE)
-
-
-def wilson(right: int, count: int, confidence: float = 0.95) -> tuple[float, float]:
-    """The interval of a share of `count` (Wilson 1927)."""
-    if not count:
-        return 0.0, 1.0
-    z = NormalDist().inv_cdf(0.5 + 0.5 * confidence)
-    share, spread = right / count, z * z / count
-    middle = (share + 0.5 * spread) / (1.0 + spread)
-    half = z * (share * (1.0 - share) / count + 0.25 * z * z / count**2) ** 0.5 / (1.0 + spread)
-    return middle - half, middle + half
 
 
 def confusions(truth: Sequence[str], said: Sequence[tuple[str, ...]], most: int = 8) -> list[tuple[str, str, int]]:

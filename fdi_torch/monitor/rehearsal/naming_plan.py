@@ -10,11 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.proportion import wilson
 from fdi_torch.monitor.detection import Chart, make_detector
 from fdi_torch.monitor.following import observe
 from fdi_torch.monitor.noise import Noise, learn_noise
 from fdi_torch.monitor.online import Monitor
-from fdi_torch.monitor.rehearsal.naming import Kind, confusions, name, smallest_isolable, wilson
+from fdi_torch.monitor.rehearsal.naming import Kind, confusions, name, smallest_isolable
 from fdi_torch.monitor.rehearsal.pieces import Numbers, Piece, Shown, quantiles, seeded
 from fdi_torch.monitor.rehearsal.runs import Controller, Course, LevelControl, Rig, fault_free
 from fdi_torch.monitor.samples import Samples
@@ -126,7 +127,11 @@ class NamingPlan:
 
 
 def moving_set_points(steady: Tensor, levels: Tensor, swing: float, highest: float) -> Callable[[], Controller]:
-    """Level control of the pumped tanks whose set points move up and down by `swing` m each minute."""
+    """Level control of the pumped tanks whose set points move up and down by `swing` m each minute.
+
+    steady (channels,): the commands at rest. levels (channels,) m: of the tanks then, which the first sensors read.
+    Commands stay within 0 and `highest`. For tanks on a bench: gain 15 cm^2/s, reset in 100 s.
+    """
 
     def made() -> Controller:
         control, clock = LevelControl(steady, levels, list(range(len(levels))), 1.5e-3, 0.01, highest), [0.0]
@@ -144,7 +149,7 @@ def moving_set_points(steady: Tensor, levels: Tensor, swing: float, highest: flo
 
 
 def moving_commands(steady: Tensor, share: float) -> Callable[[], Controller]:
-    """No control: commands that change by up to `share` of themselves each minute."""
+    """No control: commands (channels,) that change by up to `share` of themselves each minute."""
 
     def made() -> Controller:
         clock = [0.0]

@@ -28,6 +28,7 @@ class Course:
 
 
 def fault_free(space: ParameterSpace, runs: int) -> Course:
+    """So many runs in which nothing ever happens."""
     theta = space.nominal().expand(runs, -1)
     return Course(theta, torch.full((runs,), 1e30, dtype=theta.dtype), torch.zeros(runs, dtype=theta.dtype))
 
