@@ -96,7 +96,7 @@ def lay_out(recording: Recording, channels: tuple[str, ...], step: float, own: O
 
 
 def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float, every: bool = False) -> Tensor:
-    """Step ends (K+1,) s from the first to the last sample, time (S,) s: at switches of the inputs (S, M), and at samples
+    """Step ends (K+1,) s from the first to the last sample, time (S,) s: at switches of inputs (S, M), and at samples
     where these are not denser than `step` s.
 
     every: at every sample. Switches that come faster than half a step are averaged over instead.
