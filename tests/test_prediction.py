@@ -146,6 +146,28 @@ def test_water_that_goes_missing_while_the_plant_settles_bends_nothing_and_the_r
     assert found.own["h.offset"] == pytest.approx(0.0, abs=1e-3)
 
 
+def test_a_tank_at_rest_in_steps_of_its_sensor_leaves_the_zero_where_it_is_believed() -> None:
+    """The valve opens in the last seconds of the stretch, faster than the plant has it; before, nothing moves."""
+    asked = filling(1.0, 0.0, 1)
+    time = asked.time
+    opened = (time > 36.0).double()
+    still = torch.zeros_like(time)
+    start = torch.full_like(asked.outputs, 0.3)
+    wide = tank(
+        pipes={"OUT": {"source": "T", "area": "0.8 cm^2", "discharge_coefficient": 0.6, "valve": "v"}}, varying=[]
+    )
+    full = replace(asked, inputs=torch.stack([still, opened], dim=1), outputs=start)
+    levels = predict(wide, full, start_samples=1).readings
+    run = replace(full, outputs=(levels / 4e-5).round() * 4e-5)
+    found = predict(tank(tolerances={"h.offset": "1 mm"}), run, settle=40.0)
+    assert abs(found.own["h.offset"]) < 1e-3
+    after = int((time <= 40.0).sum())
+    more = (
+        0.6 * 0.3e-4 * math.sqrt(2 * 9.81 * 0.3) / 1e-2
+    )  # m/s that the plant does not know of, for 4 s in the stretch
+    assert abs(float(found.residuals[after, 0])) < 2.0 * more
+
+
 def test_a_run_needs_something_to_settle_in_and_something_left() -> None:
     run = filling(1.1, 0.0, 1)
     for seconds in (0.0, 200.0, 1e4):

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from fdi_torch.effects import effect, once_run
 from fdi_torch.gap.fitting import Fitter
-from fdi_torch.gap.settling import rough_noise, settle
+from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.settling import settle
 from fdi_torch.gap.subject import Subject, subject_of
 from fdi_torch.names import matching
 from fdi_torch.parameters import ParameterSpace
@@ -119,7 +120,8 @@ def _run(subject: Subject, start_samples: int, counted: int) -> Prediction:
     if not bool(early.any()):
         source = subject.recording.source
         raise ValueError(f"{source}: expected readings among the first {start_samples} samples, got none")
-    fitter = Fitter(replace(subject, mask=early), rough_noise(subject))
+    spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+    fitter = Fitter(replace(subject, mask=early), Noise(1e-2 * spread, torch.zeros_like(spread)))
     engine, theta, levels = _by_stretch(fitter, counted) if counted else _by_samples(fitter)
     run = engine.settle(theta, levels, CORRECTIONS)
     readings = run.readings[0]
@@ -158,7 +160,7 @@ def _by_stretch(fitter: Fitter, samples: int) -> Begun:
     plant = replace(subject.plant, tolerances={n: subject.plant.tolerances[n] for n in subject.plant.varying})
     first, step = subject.recording.stretch(0, samples), float(subject.experiment.steps.max())
     stretch = subject_of(plant, subject.believed, first, step)
-    found = settle(stretch, _starts(plant, fitter.first_levels()))
+    found = settle(stretch, _starts(plant, fitter.first_levels()), fitter.noise)
     engine = _engine(fitter, found.placements, list(found.values))
     theta = engine.space.vector(found.values).unsqueeze(0)
     return engine, theta, engine.constant_guess(theta)

@@ -22,15 +22,14 @@ from fdi_torch.gap.fitting import Candidate, Fit, Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.subject import Subject
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.constants import flow_scale
+from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Placement, Stage, Values
 
 PARTS = 8  # of the stretch
 SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)  # of what runs out of a full tank
 ROUNDS = 30
-FINEST, COARSEST = 1e-4, 1e-2  # of the spread of a sensor's readings: its noise lies between
-NORMAL_MEDIAN = 0.6745  # of the size of a normal number, in standard deviations
+FINEST, COARSEST = 1e-5, 1e-2  # of what a sensor reads from floor to rim: its noise lies between
 
 
 class UnseenFlow(Effect):
@@ -64,13 +63,13 @@ class Settled:
     values: Mapping[str, float]
 
 
-def settle(stretch: Subject, starts: Sequence[Mapping[str, float]]) -> Settled:
+def settle(stretch: Subject, starts: Sequence[Mapping[str, float]], rough: Noise) -> Settled:
     """stretch: the beginning of a recording, all of whose readings are used; what its plant has a tolerance for is
-    fitted. starts: of the start levels, m.
+    fitted. starts: of the start levels, m. rough: what the sensors' noise is taken for until the stretch has told it.
     """
     plant, seconds = stretch.plant, float(stretch.experiment.nodes[-1])
     parts = max(1, min(PARTS, len(stretch.recording) // 2))
-    fitter = Fitter(stretch, rough_noise(stretch))
+    fitter = Fitter(stretch, rough)
     plain = fitter.fit(Candidate(starts=tuple(starts)), rounds=ROUNDS)
     fitter = Fitter(stretch, _fine_noise(stretch, plain))
     best = fitter.fit(Candidate(), plain, rounds=ROUNDS)
@@ -97,22 +96,14 @@ def _surprise(fitter: Fitter, fit: Fit) -> float:
     return found if math.isfinite(found) else math.inf
 
 
-def rough_noise(subject: Subject) -> Noise:
-    """Where nothing is known of the sensors: white, a hundredth of how much their readings vary."""
-    spread = _spread(subject)
-    return Noise(COARSEST * spread, torch.zeros_like(spread))
-
-
 def _fine_noise(stretch: Subject, fit: Fit) -> Noise:
-    """White, told by how far of three residuals in a row the second lies from between its neighbours (the median)."""
-    spread, left = _spread(stretch), stretch.readings - fit.near.readings[0]
+    """White, told by how far of three residuals in a row the second lies from between its neighbours: what of a model's
+    error is as fast counts as noise. (Not by the median: a sensor of coarse steps stands still most of the time.)
+    """
+    span = torch.tensor([reading_span(stretch.plant, s) for s in stretch.plant.sensors], dtype=torch.float64)
+    left, size = stretch.readings - fit.near.readings[0], COARSEST * span
     seen = stretch.mask[2:] & stretch.mask[1:-1] & stretch.mask[:-2]
-    off = (left[2:] - 2.0 * left[1:-1] + left[:-2]).abs() / (NORMAL_MEDIAN * math.sqrt(6.0))
-    size = spread.clone()
+    off = (left[2:] - 2.0 * left[1:-1] + left[:-2]) / math.sqrt(6.0)
     for c in seen.any(dim=0).nonzero().flatten().tolist():
-        size[c] = off[seen[:, c], c].median()
-    return Noise(torch.minimum(torch.maximum(size, FINEST * spread), COARSEST * spread), torch.zeros_like(spread))
-
-
-def _spread(subject: Subject) -> Tensor:
-    return subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+        size[c] = off[seen[:, c], c].square().mean().sqrt()
+    return Noise(torch.minimum(torch.maximum(size, FINEST * span), COARSEST * span), torch.zeros_like(span))
