@@ -8,9 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from fdi_torch.effects import placements_for
 from fdi_torch.gap.answer import Answer
-from fdi_torch.gap.closure import carried_over
+from fdi_torch.gap.closure import Model, carried_over, run_all
 from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.subject import subject_of
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlacedEffect
 from fdi_torch.recording import Recording
@@ -82,6 +85,16 @@ def test_another_day_has_a_free_form_s_mean_course_and_none_of_its_waves() -> No
     expected = {"head_0": 0.1, "time_0": 0.3, "time_1": 0.3, "sine_0": 0.0, "cosine_0": 0.0}
     assert {n.removeprefix("P13.free_flow."): v for n, v in carried.items() if "P13" in n} == pytest.approx(expected)
     assert carried["Q1.pump_gain.time_0"] == 5.0, "no free form's"
+
+
+def test_the_floor_of_a_hold_out_is_the_noise_even_where_the_augmented_model_runs_away() -> None:
+    held = subject_of(believed(), (), recorded({}, 5, samples=600), 1.0)
+    noise = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    swinging = {"h1.sensor_oscillation.amplitude": 0.05, "h1.sensor_oscillation.period": 5.0}
+    models = {"recalibrated": Model(), "augmented": Model(placements_for(swinging), swinging)}
+    found = run_all(held, noise, models, [0.0, 0.0, 0.0])
+    assert found.squares("augmented").sum() > 1.5 * found.squares("recalibrated").sum()
+    assert found.noise.std.tolist() == pytest.approx([1e-3] * 3, rel=0.1)
 
 
 def test_arrays_of_all_models_are_there_for_the_page(answer: Answer) -> None:
@@ -185,6 +198,14 @@ def test_an_unknown_oscillation_is_said_with_its_period() -> None:
     period = float(remark.split("period of ")[1].split(" s")[0])
     assert period == pytest.approx(90.0, rel=0.03)  # the grid of periods is 5 % wide
     assert answer.curves[0]["variable"].startswith("time within each")
+
+
+def test_a_free_form_that_fails_on_a_hold_out_is_said() -> None:
+    """A lag without its name: a function of what the pump sees now does not carry over."""
+    lag = {"Q1.pump_lag.time_constant": 15.0}
+    answer = diagnose(believed(), recorded(lag, 41), recorded(lag, 42, samples=500), Settings(leave_out=("pump_lag",)))
+    assert answer.verdict == "unknown" and answer.closure["augmented"] > answer.closure["recalibrated"]
+    assert any("stands for what is unknown at Q1 does worse on memory than none" in said for said in answer.remarks)
 
 
 def test_sensors_of_several_units_are_told_each_in_its_own_and_together_in_levels_of_their_noise() -> None:

@@ -41,7 +41,8 @@ def model_of(fit: Fit) -> Model:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Free runs (S, C) of each model on one hold-out, and the noise found in the augmented one."""
+    """Free runs (S, C) of each model on one hold-out, and the noise found about the augmented one, or the recalibrated
+    one where that stays nearer: a free form may run away where it was not fitted."""
 
     subject: Subject
     runs: Mapping[str, Tensor]
@@ -75,8 +76,10 @@ def run_all(subject: Subject, noise: Noise, models: Mapping[str, Model], lattice
     runs, levels = {}, None
     for name, model in models.items():
         runs[name], levels = free_run(subject, noise, model, levels)
-    fast = estimate_noise(subject.readings - runs["augmented"], subject.mask, [step > 0.0 for step in lattice])
-    return HeldOut(subject, runs, with_rounding(fast, lattice, runs["augmented"]))
+    residuals = (subject.readings - runs[m] for m in ("augmented", "recalibrated") if m in runs)
+    nearest = min(residuals, key=lambda r: float(torch.where(subject.mask, r * r, 0.0).sum()))
+    fast = estimate_noise(nearest, subject.mask, [step > 0.0 for step in lattice])
+    return HeldOut(subject, runs, with_rounding(fast, lattice, subject.readings - nearest))
 
 
 def closure(held: Sequence[HeldOut]) -> Closure:

@@ -21,6 +21,7 @@ from fdi_torch.plant.description import PlantDescription
 
 AT_END = 1e-3  # of a parameter's range
 SHOWN_TIMES = 5  # of strays
+WORSE = 1.1  # times the error of the recalibrated plant
 SWINGS = 0.03  # amplitude of an oscillation worth a word, as a share of the free form's scale
 
 
@@ -41,6 +42,7 @@ def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
         )
     remarks += [_astray(s) for group in found.strays for s in group]
     remarks += [*_believed_outside(subject.plant), *_at_their_ends(found), *_period(found)]
+    remarks += [_carries_nothing(found, h) for h in held if found.unnamed and _worse(h)]
     return remarks + [sentence for h in held if (sentence := other_rig(found, h))]
 
 
@@ -53,6 +55,22 @@ def _astray(strays: Strays) -> str:
     return (
         f"{count} of {strays.sensor} in {source} jump away and back, or stand still, as no tank can; left out of all "
         f"fits ({when})"
+    )
+
+
+def _worse(held: HeldOut) -> bool:
+    """Whether the free form runs farther from a hold-out than the recalibrated plant does."""
+    with_form, without = (float((held.weight * held.squares(m)).sum()) for m in ("augmented", "recalibrated"))
+    return with_form > WORSE**2 * without
+
+
+def _carries_nothing(found: Finding, held: HeldOut) -> str:
+    """What a free form says that fails on a hold-out."""
+    source = Path(held.subject.recording.source).name or "the hold-out"
+    return (
+        f"the free function that stands for what is unknown at {' and '.join(guilty_places(found))} does worse on "
+        f"{source} than none: what is missing there keeps a memory or has times of its own, or goes beyond what the "
+        "recording shows; take the place from this answer, not the function"
     )
 
 
