@@ -198,3 +198,17 @@ def test_who_reads_may_stop_reading() -> None:
     words = f"{sys.executable} -m fdi_torch check --keys | head -1"
     done = subprocess.run(words, shell=True, capture_output=True, text=True, check=True)
     assert (done.stdout.split()[0], done.stderr) == ("name", "")
+
+
+def test_an_interrupted_job_says_what_is_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also while its libraries load, which is most of a short command."""
+
+    def interrupted(name: str) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.importlib, "import_module", interrupted)
+    for name, left in (("train", "in its log, and --resume goes on from there"), ("report", "report: interrupted")):
+        assert cli.main([name, "--quiet"]) == cli.INTERRUPTED
+        assert capsys.readouterr().err.strip().endswith(left)

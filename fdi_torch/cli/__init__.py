@@ -41,6 +41,11 @@ COMMANDS = {
 LONG = ("train", "study", "gap", "monitor", "challenge", "paper")
 """Commands that work for more than a moment, and say so at once."""
 
+_LOGGED = "; what was computed until now is in its log"
+KEPT = dict.fromkeys(("train", "study", "rehearse"), f"{_LOGGED}, and --resume goes on from there")
+KEPT |= dict.fromkeys(("monitor", "challenge"), _LOGGED)
+"""Of commands that log as they go, what is left of one that was interrupted; the others write at their end."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
@@ -70,6 +75,14 @@ def _overview() -> str:
 
 
 def _run(name: str, words: list[str]) -> int:
+    try:
+        return _carried_out(name, words)
+    except KeyboardInterrupt:  # also while libraries load
+        sys.stderr.write(f"fdi {name}: interrupted{KEPT.get(name, '')}\n")
+        return INTERRUPTED
+
+
+def _carried_out(name: str, words: list[str]) -> int:
     _say_that_it_began(name, words)
     command = importlib.import_module(f"fdi_torch.cli.{name}")
     arguments = _parser(name, command).parse_args(words)
@@ -81,9 +94,6 @@ def _run(name: str, words: list[str]) -> int:
     screen = Screen(json=arguments.json, quiet=arguments.quiet)
     try:
         return int(command.run(arguments, screen))
-    except KeyboardInterrupt:
-        screen.complain(f"fdi {name}: interrupted; what was computed until now is kept")
-        return INTERRUPTED
     except BrokenPipeError:
         raise
     except (ValueError, OSError) as error:

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from typing import Any
 
 MOST_ROWS = 300
+NARROW = 3
+_TAGS = re.compile("<[^>]*>")
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff\u202a-\u202e\u2066-\u2069]")
 
 
@@ -44,15 +46,20 @@ def join(parts: Sequence[Any], between: str = "") -> Markup:
 
 
 def table(header: Sequence[Any], rows: Sequence[Sequence[Any]], left: int = 1) -> Markup:
-    """Rows under a header, the first `left` columns flush left; very long tables are cut, and say so."""
+    """Rows under a header, the first `left` columns flush left; very long tables are cut, and say so.
+
+    One of more than NARROW columns is `wide`: a phone shows its rows as cards, each cell beside its `data-label`.
+    """
+    labels = [_TAGS.sub("", name) if isinstance(name, Markup) else clean(name) for name in header]
     sides = ["l" if i < left else "r" for i in range(len(header))]
     head = tag("tr", *(tag("th", name, class_=side) for name, side in zip(header, sides, strict=True)))
     shown = [
-        tag("tr", *(tag("td", cell, class_=side) for cell, side in zip(row, sides, strict=True)))
+        tag("tr", *(tag("td", c, class_=s, data_label=n) for c, s, n in zip(row, sides, labels, strict=True)))
         for row in rows[:MOST_ROWS]
     ]
     cut = [] if len(rows) <= MOST_ROWS else [tag("p", f"and {len(rows) - MOST_ROWS} rows more", class_="note")]
-    return join([tag("div", tag("table", tag("thead", head), tag("tbody", *shown)), class_="scroll"), *cut])
+    width = {"class_": "wide"} if len(header) > NARROW else {}
+    return join([tag("div", tag("table", tag("thead", head), tag("tbody", *shown), **width), class_="scroll"), *cut])
 
 
 def pairs(entries: Sequence[tuple[Any, Any]]) -> Markup:

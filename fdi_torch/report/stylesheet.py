@@ -1,6 +1,7 @@
 """How the page looks: one column of cards, light or dark as the reader's system is, and on paper.
 
-A table that is wider than its card scrolls, with a shadow at the side where there is more of it.
+A table that is wider than its card scrolls, with a shadow at the side where there is more of it; on a phone the rows of
+a wide one are cards.
 """
 
 STYLESHEET = """
@@ -55,7 +56,13 @@ summary { cursor: pointer; color: var(--model); padding: .2rem 0; }
 ul { margin: .3rem 0; padding-left: 1.2rem; }
 @media (max-width: 480px) { main { padding: 1rem .6rem 2rem; } section { padding: .8rem .7rem; border-radius: 8px; }
   dl div { grid-template-columns: 1fr; gap: 0; } h2 { font-size: 1.3rem; }
-  table { font-size: .8rem; } th, td { padding-right: .55rem; } th { white-space: normal; } td.l { min-width: 3em; } }
+  table { font-size: .8rem; } th, td { padding-right: .55rem; } th { white-space: normal; } td.l { min-width: 3em; }
+  table.wide, .wide tbody, .wide tr { display: block; } .wide thead { display: none; }
+  .wide tr { border-bottom: 1px solid var(--faint); padding: .35rem 0; font-size: .9rem; }
+  .wide td { display: flex; justify-content: space-between; gap: 1rem; border: 0; padding: .05rem 0; min-width: 0;
+    text-align: right; white-space: normal; overflow-wrap: anywhere; } .wide td:empty { display: none; }
+  .wide td::before { content: attr(data-label); color: var(--soft); text-align: left; }
+  .wide td:first-child { font-weight: 600; } .wide td:first-child::before { font-weight: 400; } }
 @media print { :root { color-scheme: light; --ink: #000000; --soft: #444444; --faint: #bbbbbb; --paper: #ffffff;
   --ground: #ffffff; --model: #0b6cab; --mark: #b84a00; --other: #0b7558; }
   body { font-size: 10.5pt; } main { padding: 0; max-width: none; } section { border: 0; padding: 0; margin: 1rem 0; }
