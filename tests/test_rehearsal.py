@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -16,6 +18,7 @@ from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.prepare import with_shapes
 from fdi_torch.monitor.rehearsal.alarms import count_false_alarms, delays, detectors
 from fdi_torch.monitor.rehearsal.naming import Kind, confusions, name, smallest_isolable
+from fdi_torch.monitor.rehearsal.naming_plan import moving_set_points
 from fdi_torch.monitor.rehearsal.rivals import RIVALS, compare, draw_runs, track
 from fdi_torch.monitor.rehearsal.runs import Course, LevelControl, Rig, fault_free
 from fdi_torch.monitor.rehearsal.scoring import score
@@ -150,3 +153,21 @@ def test_shares_come_with_their_interval_and_wrong_answers_with_their_number() -
 def test_alarms_are_hits_with_a_delay_misses_or_false() -> None:
     found = score([3.0, 12.0, 14.0, 95.0], [10.0, 50.0, 100.0], early=6.0, late=5.0)
     assert found.hits == ((10.0, 2.0), (100.0, -5.0)) and found.misses == (50.0,) and found.false == (3.0, 14.0)
+
+
+def test_each_pump_is_controlled_by_the_sensor_of_its_own_tank() -> None:
+    """Into the outer two of three tanks, whose levels are read in volts, from a lower one, by pumps in volts."""
+    sensors = tuple(replace(s, unit="V", gain=-20.0, offset=9.0) for s in PLANT.sensors)
+    pumps = (PLANT.pumps[0], replace(PLANT.pumps[1], target="T3"))
+    plant = replace(PLANT, sensors=sensors, pumps=tuple(replace(p, gain=1e-5, gain_unit="m^3/s/V") for p in pumps))
+    network, volts = build_network(plant), torch.tensor([4.0, 2.0], dtype=torch.float64)
+    levels = equilibrium(network, volts)
+    swing = 0.02
+    made = moving_set_points(plant, volts, levels, swing)
+    rig = Rig(network, ParameterSpace(), volts, levels, torch.zeros(3, dtype=torch.float64), controller=made)
+    seen = rig.run(fault_free(ParameterSpace(), 1), 600, torch.Generator().manual_seed(0)).readings[0]
+    off = (seen - 9.0) / -20.0 - levels
+    assert float(off[300:, [0, 2]].abs().max()) < 1.5 * swing
+    assert float(off[300:, [0, 2]].abs().amax(0).min()) > 0.5 * swing, "it moves"
+    with pytest.raises(ValueError, match="expected a sensor at every tank that is pumped into, got none at T3"):
+        moving_set_points(replace(plant, sensors=sensors[:2]), volts, levels, swing)

@@ -169,9 +169,7 @@ def _rig(
     if loop == "open":
         controller = moving_commands(inputs, c.naming.share if c.naming else 0.0)
     elif loop == "closed":
-        fed = [[t.name for t in plant.tanks].index(pump.target) for pump in plant.pumps]
-        highest, swing = min(p.max_flow for p in plant.pumps), c.naming.swing if c.naming else 0.0
-        controller = moving_set_points(inputs, levels[fed], swing, highest)
+        controller = moving_set_points(plant, inputs, levels, c.naming.swing if c.naming else 0.0)
     return Rig(network, space, inputs, levels, std, c.sampling, noise.wander, noise.colour, controller)
 
 

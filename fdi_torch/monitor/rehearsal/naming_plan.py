@@ -20,11 +20,14 @@ from fdi_torch.monitor.rehearsal.pieces import Numbers, Piece, Shown, quantiles,
 from fdi_torch.monitor.rehearsal.runs import Controller, Course, LevelControl, Rig, fault_free
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.settings import MonitorSettings
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.pace import area_scale, time_scale
 
 PART = 10  # runs of a piece
 NAME = "naming"
 LARGEST_SHARE = 0.9  # of the way to the end of a parameter's range: what needs more is left out
 PERIOD = 40.0  # s, of a simulated oscillation
+GAIN, RESET = 1.5e-3, 0.01  # m^2/s and 1/s, of a level control on a bench
 
 
 @dataclass(frozen=True)
@@ -126,21 +129,36 @@ class NamingPlan:
         return Shown(f"faults of {self.times:g} times the smallest isolable size", header, tuple(rows) if own else ())
 
 
-def moving_set_points(steady: Tensor, levels: Tensor, swing: float, highest: float) -> Callable[[], Controller]:
-    """Level control of the pumped tanks whose set points move up and down by `swing` m each minute.
+def moving_set_points(
+    plant: PlantDescription, steady: Tensor, levels: Tensor, swing: float
+) -> Callable[[], Controller]:
+    """Level control of the pumped tanks whose set points move up and down by `swing` m each minute of a bench.
 
-    steady (channels,): the commands at rest. levels (channels,) m: of the tanks then, which the first sensors read.
-    Commands stay within 0 and `highest`. For tanks on a bench: gain 15 cm^2/s, reset in 100 s.
+    steady (channels,): the commands at rest, one for each pump. levels (tanks,) m: then.
+    Raises ValueError where a pump's channel is not its own, or its tank has no sensor.
     """
+    pumps, tanks = plant.pumps, [t.name for t in plant.tanks]
+    if [p.channel for p in pumps] != list(plant.channels()):
+        raise ValueError(f"closed loop: expected a channel for each pump, got {', '.join(plant.channels())}")
+    reading = [next((i for i, s in enumerate(plant.sensors) if s.tank == p.target), -1) for p in pumps]
+    if -1 in reading:
+        tank = pumps[reading.index(-1)].target
+        raise ValueError(f"closed loop: expected a sensor at every tank that is pumped into, got none at {tank}")
+    sensors, pace = [plant.sensors[i] for i in reading], time_scale(plant)
+    at_rest = levels[[tanks.index(p.target) for p in pumps]]
+    slope, offset, pumped = (
+        levels.new_tensor(x) for x in ([s.gain for s in sensors], [s.offset for s in sensors], [p.gain for p in pumps])
+    )
+    gain, highest = GAIN * area_scale(plant) / pace / (slope * pumped), levels.new_tensor([p.max_flow for p in pumps])
 
     def made() -> Controller:
-        control, clock = LevelControl(steady, levels, list(range(len(levels))), 1.5e-3, 0.01, highest), [0.0]
+        control, clock = LevelControl(steady, at_rest, reading, gain, RESET / pace, highest / pumped), [0.0]
 
         def command(readings: Tensor, span: Tensor) -> Tensor:
             clock[0] += float(span)
-            minute = int(clock[0] // 60.0)
-            signs = torch.tensor([1.0 if (minute + i) % 2 else -1.0 for i in range(len(levels))], dtype=levels.dtype)
-            control.wanted = levels + swing * signs * (0.4 + 0.3 * (minute % 3))
+            minute = int(clock[0] // (60.0 * pace))
+            signs = torch.tensor([1.0 if (minute + i) % 2 else -1.0 for i in range(len(pumps))], dtype=levels.dtype)
+            control.wanted = slope * (at_rest + swing * signs * (0.4 + 0.3 * (minute % 3))) + offset
             return control(readings, span)
 
         return command

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -103,18 +103,25 @@ class Rig:
 class LevelControl:
     """Proportional-integral control of each pump by the level of one sensor, starting from a steady command.
 
-    sensors: index for each channel; gains in m^2/s and 1/s. Commands stay within 0 and `highest`.
+    Of each channel: wanted (channels,) in its sensor's unit, sensors: its index, gain (channels,) or one for all:
+    command per reading, reset in 1/s. Commands stay within 0 and `highest`.
     """
 
     def __init__(
-        self, steady: Tensor, wanted: Tensor, sensors: list[int], gain: float, reset: float, highest: float
+        self,
+        steady: Tensor,
+        wanted: Tensor,
+        sensors: Sequence[int],
+        gain: Tensor | float,
+        reset: float,
+        highest: Tensor | float,
     ) -> None:
-        self.steady, self.wanted, self.sensors = steady, wanted, sensors
-        self.gain, self.reset, self.highest = gain, reset, highest
+        self.steady, self.wanted, self.sensors = steady, wanted, list(sensors)
+        self.gain, self.reset, self.highest = gain, reset, torch.as_tensor(highest, dtype=steady.dtype)
         self._sum: Tensor | None = None
 
     def __call__(self, readings: Tensor, span: Tensor) -> Tensor:
         error = self.wanted - readings[:, self.sensors]
         self._sum = error * span if self._sum is None else self._sum + error * span
         command = self.steady + self.gain * (error + self.reset * self._sum)
-        return command.clamp(0.0, self.highest)
+        return torch.minimum(command.clamp(min=0.0), self.highest)
