@@ -54,7 +54,7 @@ def rehearse(
                 log.trial(number, known[number][1], group=piece.group, seed=seed, status="done")
                 log.flush()
         tables = tabled(rehearsal, [known[number] for number in sorted(known)])
-        log.result({"tables": [{"title": t.title, "header": t.header, "rows": t.rows} for t in tables]})
+        log.result({"tables": [{"title": t.title, "header": t.header, "rows": t.rows, "said": t.said} for t in tables]})
     return Rehearsed(tables, len(pieces), len(known) - found, time.monotonic() - started, path)
 
 

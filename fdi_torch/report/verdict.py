@@ -5,6 +5,7 @@ from __future__ import annotations
 from fdi_torch.report.findings import Finding, fault_at, findings
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
+from fdi_torch.report.sections.rehearsal import rehearsal_tables
 from fdi_torch.report.sections.study import ESTIMATORS
 from fdi_torch.report.windows import told_windows
 
@@ -74,10 +75,14 @@ def challenge_words(material: Material) -> str:
 
 
 def rehearsal_words(material: Material) -> str:
-    """What was tried: pieces are grouped under the name of their rehearsal."""
+    """What its tables come to; without a result what was tried, for pieces are grouped under their rehearsal's name."""
+    tables = rehearsal_tables(material)
+    if any(told.get("said") for told in tables):
+        words = "; ".join(str(told["said"]) for told in tables if told.get("said"))
+        return words[:1].upper() + words[1:]
     groups = [str(m.get("group", "")) for m in material.of("/study/trial")] if material.kind == "rehearsal" else []
     tried = _listed(list(dict.fromkeys(group.partition("/")[0] for group in groups)))
-    return tried[:1].upper() + tried[1:]
+    return tried[:1].upper() + tried[1:] + ("" if tables or not tried else ", without a result yet")
 
 
 def study_words(material: Material) -> str:

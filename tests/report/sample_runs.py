@@ -218,6 +218,7 @@ def write_rehearsal(path: Path) -> Path:
     with RunLog(path, "rehearsal", config_text="faults_found: {}\n", **FIXED) as log:
         log.trial(0, {"delay": [3.0, 4.0], "early": 0.0}, group="faults found/0.2", seed="0/0", status="done")
         log.trial(1, {"fixed": 0.0}, group="naming/open", seed="0/1", status="done")
-        tables = [{"title": "faults found", "header": header, "rows": rows}, {"title": "rows of another kind"}]
+        said = {"said": "0 of 2 faults missed, 1 of 1 named right"}
+        tables = [{"title": "faults found", "header": header, "rows": rows, **said}, {"title": "rows of another kind"}]
         log.result({"tables": tables})
     return path

@@ -125,10 +125,12 @@ def test_a_challenge_page_shows_scores_confusion_and_misses(tmp_path: Path) -> N
 def test_a_rehearsal_page_shows_the_tables_of_the_command(tmp_path: Path) -> None:
     made = report(write_rehearsal, tmp_path)
     text = page([made])
-    assert headline(made.material) == "Faults found and naming"
+    assert headline(made.material) == "0 of 2 faults missed, 1 of 1 named right"
     assert titles(made)[:3] == ["The rig", "What the monitor did", "Configuration"]
     assert "1 of 1 (21 .. 100 %)" in text and "too short" not in text.partition("Provenance")[0]
     assert NASTY not in text
+    del made.material.run.metadata["fdi_torch.result"]
+    assert headline(made.material) == "Faults found and naming, without a result yet"
 
 
 def test_a_page_of_windows_shows_when_each_fault_was_there() -> None:

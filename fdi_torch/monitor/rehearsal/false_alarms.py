@@ -63,7 +63,7 @@ class FalseAlarmPlan:
 
     def shown(self, found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Shown:
         """Achieved over asked for mean times: of all calibrations together, and the single ones' spread."""
-        rows = []
+        rows, as_often, tried = [], 0, 0
         for kind in self.rigs:
             own = found.get(f"{NAME}/{kind}", ())
             for chart in CHARTS if own else ():
@@ -75,9 +75,11 @@ class FalseAlarmPlan:
                 errors = [float(n[f"{chart} error"]) for n in own]
                 within = sum(as_asked(c, expected, error) for c, error in zip(counts, errors, strict=True))
                 rows.append((kind, chart, str(len(counts)), alarms, *words, f"{within} of {len(counts)}"))
+                as_often, tried = as_often + within, tried + len(counts)
         what = ("noise", "detector", "calibrations", "alarms (asked)")
         header = (*what, "s between", "95 %", "single calibrations", "within own 95 %")
-        return Shown(f"false alarms, {self.every:g} s between them asked for", header, tuple(rows))
+        said = f"{as_often} of {tried} calibrations alarm falsely as often as asked for" if tried else ""
+        return Shown(f"false alarms, {self.every:g} s between them asked for", header, tuple(rows), said)
 
 
 def as_asked(count: int, expected: float, rate_error: float) -> bool:

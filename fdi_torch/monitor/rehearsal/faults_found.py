@@ -86,7 +86,7 @@ class FaultsFoundPlan:
         return Course(theta, onset, torch.zeros_like(onset)), [space.names[c] for c in which]
 
     def shown(self, found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Shown:
-        rows = []
+        rows, counted = [], [0, 0, 0, 0]
         for size in self.sizes:
             own = found.get(f"{NAME}/{size:g}", ())
             for chart in CHARTS if own else ():
@@ -101,9 +101,11 @@ class FaultsFoundPlan:
                 delay = f"{q[0]:.0f} ({q[1]:.0f} .. {q[2]:.0f})"
                 named = f"{right} of {len(said)} ({100 * low:.0f} .. {100 * high:.0f} %)"
                 wrong = "; ".join(f"{_short(t)} as {_short(s)}: {n}" for t, s, n in mixed)
+                counted = [a + b for a, b in zip(counted, (missed, len(late), right, len(said)), strict=True)]
                 rows.append((f"{100 * size:g} %", chart, str(len(late)), delay, str(missed), str(early), named, wrong))
         header = ("size", "detector", "runs", "delay, s (5 .. 95 %)", "missed", "early", "named right", "mostly wrong")
-        return Shown("faults found", header, tuple(rows))
+        found_so = f"{counted[0]} of {counted[1]} faults missed, {counted[2]} of {counted[3]} named right"
+        return Shown("faults found", header, tuple(rows), found_so if rows else "")
 
 
 def _one(samples: Samples, run: int) -> Samples:

@@ -125,8 +125,10 @@ class NamingPlan:
         wrong = [(t, s) for t, s in wrong if s != (t.partition(" ")[0],)]
         mixed = confusions([t for t, _ in wrong], [s for _, s in wrong], 12)
         rows += [("", "", "", "", "", "", f"{t} as {s}: {n}".replace(".size", "")) for t, s, n in mixed]
+        told = f"{right} of {len(said)} faults named right in {self.loop} loop" if own else ""
         header = ("loop", "runs", "named right", "missed", "false alarms", "delay, s (50, 95 %)", "wrong")
-        return Shown(f"faults of {self.times:g} times the smallest isolable size", header, tuple(rows) if own else ())
+        title = f"faults of {self.times:g} times the smallest isolable size"
+        return Shown(title, header, tuple(rows) if own else (), told)
 
 
 def moving_set_points(

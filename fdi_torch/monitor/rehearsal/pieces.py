@@ -20,11 +20,12 @@ class Piece:
 
 @dataclass(frozen=True)
 class Shown:
-    """A table: its title, its header and its rows of words."""
+    """A table: its title, its header and its rows of words; said: what it comes to, for a headline."""
 
     title: str
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    said: str = ""
 
 
 def seeded(*numbers: int) -> torch.Generator:
