@@ -20,6 +20,7 @@ class Recording:
     time (T,) in s, strictly increasing. inputs (T, M) and outputs (T, N) in the SI units named beside them.
     mask (T, N): True where a reading counts; a missing reading is NaN in outputs and False here.
     An unknown input is NaN; `known_stretches` cuts the recording there. hold: how inputs run between samples.
+    began: its time 0 in seconds since 1970, where its clock tells.
     notes: what the reader did to the file's rows, in sentences.
     ran: inputs that were on, or may have been, before the first sample, as far as what it was cut from tells.
     """
@@ -37,6 +38,7 @@ class Recording:
     sha256: str = ""
     ran: frozenset[str] = frozenset()
     notes: tuple[str, ...] = ()
+    began: float | None = None
 
     def __post_init__(self) -> None:
         if self.mask is None:

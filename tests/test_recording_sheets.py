@@ -212,3 +212,13 @@ def test_held_inputs_are_followed_as_rows_come(tmp_path: Path) -> None:
     assert [row[0] for row in found[:6]] == pytest.approx([1e-3] * 3 + [5e-4] * 3)
     assert [row[1] for row in found] == pytest.approx([0.5] * 4 + [0.8] * 3)
     assert found[6][0] != found[6][0]  # 6 s after the last value
+
+
+def test_stretches_may_be_named_by_stamps(plant: PlantDescription, tmp_path: Path) -> None:
+    text = "Zeit" + PLAIN.replace("t_s", "").replace("\n", "\n2026-03-29 03:00:0")[: -len("2026-03-29 03:00:0")]
+    zone = {"t": {"zone": "Europe/Berlin"}}
+    cut = read(plant, tmp_path, text, columns=zone, start="2026-03-29 03:00:02", mask=[["2026-03-29T01:00:03Z", "4 s"]])
+    assert cut.time.tolist() == [2.0, 3.0, 4.0, 5.0]
+    assert cut.mask[:, 0].tolist() == [True, False, False, True]
+    with pytest.raises(ConfigError, match=r"expected a moment in s as in '300 s', .* its clock tells no date"):
+        read(plant, tmp_path, PLAIN, start="2026-03-29 03:00:02")

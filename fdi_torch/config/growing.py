@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,8 @@ def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, i
         raise ConfigError([f"{config.file}: expected neither zone nor sort for a file that is followed; leave them"])
     path = _find(config.file, base)
     rows = _mcap_rows if ".mcap" in path.suffixes else _csv_rows
+    if isinstance(config.start, datetime) or isinstance(config.stop, datetime):
+        raise ConfigError([f"{config.file}: expected start and stop in s for a file that is followed, got a stamp"])
     start = -np.inf if config.start is None else config.start
     stop = np.inf if config.stop is None else config.stop
     try:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from zoneinfo import ZoneInfo
 
 import torch
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
@@ -108,12 +111,37 @@ class FileConfig(Strict):
         return {"file": data} if isinstance(data, str) else data
 
 
+def _moment(value: Any) -> float | datetime:
+    """Seconds of the recording's clock, or a time stamp, which YAML may have read as one."""
+    if isinstance(value, str) and _STAMP.match(value):
+        return datetime.fromisoformat(value)
+    return value if isinstance(value, datetime) else quantity(value, "s")
+
+
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d")
+Moment = Annotated[float | datetime, BeforeValidator(_moment)]
+
+
+def in_seconds(moment: float | datetime, recording: Recording, config: RecordingConfig) -> float:
+    """On the recording's clock. A stamp without offset is in the zone of `t`, as the file's own are, or else UTC.
+
+    Raises ValueError where the clock does not tell the date.
+    """
+    if not isinstance(moment, datetime):
+        return moment
+    if recording.began is None:
+        raise ValueError(f"{config.file}: expected a moment in s as in '300 s', got {moment}: its clock tells no date")
+    zone = config.columns["t"].zone if "t" in config.columns else None
+    local = moment if moment.tzinfo else moment.replace(tzinfo=ZoneInfo(zone) if zone else UTC)
+    return local.timestamp() - recording.began
+
+
 class RecordingConfig(FileConfig):
     also: list[FileConfig] = Field(default_factory=list, description="CSV files with further channels of the same run")
-    start: Seconds | None = Field(None, description="first time used, s")
-    stop: Seconds | None = Field(None, description="last time used, s")
-    mask: list[tuple[Seconds, Seconds]] = Field(
-        default_factory=list, description="intervals whose readings do not count, s"
+    start: Moment | None = Field(None, description="first time used, s, or a stamp such as 2026-03-29 08:30:00")
+    stop: Moment | None = Field(None, description="last time used, s, or a stamp")
+    mask: list[tuple[Moment, Moment]] = Field(
+        default_factory=list, description="intervals whose readings do not count, s or stamps"
     )
     every: int = Field(1, ge=1, description="use every n-th sample only")
     hold: Literal["zero_order", "linear"] = Field("zero_order", description="how inputs run between samples")
@@ -180,9 +208,10 @@ def read_recording(config: RecordingConfig, plant: PlantDescription, base: Path 
         recording = _read(config, path, base or Path.cwd(), plant, channels, columns)
         names = (*recording.input_names, *recording.output_names)
         expect_units(recording.source, names, (*recording.input_units, *recording.output_units), plant)
-        start = -math.inf if config.start is None else config.start
-        window = recording.window(start, math.inf if config.stop is None else config.stop)
-        return window.masked(config.mask).every(config.every)
+        start = -math.inf if config.start is None else in_seconds(config.start, recording, config)
+        stop = math.inf if config.stop is None else in_seconds(config.stop, recording, config)
+        masks = [(in_seconds(a, recording, config), in_seconds(b, recording, config)) for a, b in config.mask]
+        return recording.window(start, stop).masked(masks).every(config.every)
     except (ValueError, LogError) as error:
         raise ConfigError([str(error)]) from error
 

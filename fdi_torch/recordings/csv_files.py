@@ -85,6 +85,7 @@ def read_csv_files(
         hold=hold,
         source=str(files[0].path),
         sha256=_sha256([file.path for file in files]),
+        began=float(seconds[0]) if since_1970 else None,
         notes=tuple(note for part in parts for note in part.notes),
     )
 
