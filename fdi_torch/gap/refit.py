@@ -6,7 +6,6 @@ a tolerance stays near what the plant file says (valves of one make are nearly a
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.fitting import Candidate, Fit, Fitter
 from fdi_torch.gap.floor import Noise, estimate_noise
 from fdi_torch.gap.limits import limits_of
+from fdi_torch.gap.smooth_start import first_fit, followed
 from fdi_torch.gap.spread import TOLD, Own
 from fdi_torch.gap.standard_errors import standard_errors
 from fdi_torch.names import matching
@@ -88,12 +88,13 @@ def refit(
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     size = 1e-2 * spread if white is None else torch.full_like(spread, white)
     fitter = Fitter(subject, Noise(size, torch.zeros_like(spread)))
-    null = _with_a_trajectory(fitter.fit(Candidate(), rounds=ROUNDS), recordings)
+    null = _with_a_trajectory(first_fit(fitter, Candidate(), ROUNDS), recordings)
     fit, base = null, null if white is None else None
     for _ in range(TURNS if white is None else 1):
         if white is None:
             fitter = Fitter(subject, estimate_noise(subject.readings - fit.near.readings[0], subject.mask))
-        fit = base = _with_a_trajectory(fitter.fit(Candidate(tuple(free), (start,)), base, rounds=ROUNDS), recordings)
+        candidate = Candidate(tuple(free), (start,))
+        fit = base = _with_a_trajectory(first_fit(fitter, candidate, ROUNDS, base), recordings)
         found = {n: v for n, v in fit.effect_values.items() if n in start}
         start = {n: v for n, v in found.items() if n not in _undetermined(fitter, fit)}
     own = _own(fitter, fit)
@@ -103,7 +104,7 @@ def refit(
 
 def _with_a_trajectory(fit: Fit, recordings: Sequence[Recording]) -> Fit:
     """The fit. Raises ValueError where its levels over time were never found, so that nothing can be said of it."""
-    if math.isfinite(fit.cost) and bool(torch.isfinite(fit.near.jacobian).all()):
+    if followed(fit):
         return fit
     named = ", ".join(dict.fromkeys(r.source for r in recordings if r.source)) or "the recordings"
     raise ValueError(
