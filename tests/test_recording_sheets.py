@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from fdi_torch.config.loaded_recordings import load_recordings, read_recording
 from fdi_torch.config.plant import load_plant
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import RecordingConfig, load_recordings, read_recording
+from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import check_recording

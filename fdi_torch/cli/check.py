@@ -7,8 +7,9 @@ from pathlib import Path
 
 from fdi_torch.cli.options import add_config, add_keys
 from fdi_torch.cli.screen import Screen
+from fdi_torch.config.loaded_recordings import known_parts, read_recording
 from fdi_torch.config.plant import PlantConfig, load_plant
-from fdi_torch.config.recordings import RecordingConfig, known_parts, read_recording
+from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.config.run import load_run
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription

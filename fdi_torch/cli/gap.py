@@ -16,9 +16,9 @@ from fdi_torch.cli.allocation import keep_memory
 from fdi_torch.cli.gap_refit import add_refit_arguments, run_refit
 from fdi_torch.cli.gap_text import next_steps, show, show_plan
 from fdi_torch.cli.screen import Screen
+from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant import load_plant
 from fdi_torch.config.plant_writer import dump_plant
-from fdi_torch.config.recordings import named_recordings
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.next_input import planned

@@ -1,9 +1,10 @@
 """Configuration: strict models of plant files and run files, with units; what is wrong is said in sentences."""
 
+from fdi_torch.config.loaded_recordings import LoadedRecording, load_recordings, read_recording
 from fdi_torch.config.plant import build_plant, load_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import LoadedRecording, RecordingConfig, load_recordings, read_recording
+from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.config.run import Run, RunConfig, build_run, load_run
 
 __all__ = [

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fdi_torch.config.channels import channel_mapping, expect_units
 from fdi_torch.config.files import find_data
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import ColumnConfig, RecordingConfig, channel_mapping, expect_units
+from fdi_torch.config.recordings import ColumnConfig, RecordingConfig
 from fdi_torch.logbook import LogError, Message, follow, number_at
 from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.plant.description import PlantDescription

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from fdi_torch.config.growing import Row, growing_rows
+from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor import MonitorRun
-from fdi_torch.config.recordings import read_recording
 from fdi_torch.jobs.arrived import reaching, recording_of, samples_of
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.logbook import Listener, RunLog

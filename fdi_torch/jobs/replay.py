@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.files import with_overrides
+from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.logged import logged_mapping
-from fdi_torch.config.recordings import LoadedRecording
 from fdi_torch.config.run import Run, build_run
 from fdi_torch.config.study import build_study
 from fdi_torch.jobs import study as study_job

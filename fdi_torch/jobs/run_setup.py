@@ -9,8 +9,8 @@ from dataclasses import replace
 import torch
 
 from fdi_torch.config.estimation import EstimationConfig, estimated_space, parameter_values, placements_of
+from fdi_torch.config.loaded_recordings import LoadedRecording, load_recordings
 from fdi_torch.config.problems import ConfigError, told_in
-from fdi_torch.config.recordings import LoadedRecording, load_recordings
 from fdi_torch.config.run import Run
 from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.effects import build_network

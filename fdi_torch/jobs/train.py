@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fdi_torch.config.recordings import LoadedRecording
+from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.run import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting

@@ -8,8 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import LoadedRecording, StartLevel
+from fdi_torch.config.recordings import StartLevel
 from fdi_torch.config.run import Run
 from fdi_torch.effects import once_run
 from fdi_torch.estimate.stretches import Stretch, stretches_of

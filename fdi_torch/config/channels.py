@@ -1,0 +1,106 @@
+"""Which column of a file, or which constant, each of the plant's channels is."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from fdi_torch.config.recordings import ColumnConfig, FileConfig
+from fdi_torch.config.strict import Amount, quantity
+from fdi_torch.names import unknown
+from fdi_torch.parameters import header_unit
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recordings.csv_files import read_header
+from fdi_torch.recordings.source import ChannelSource, ClockSource
+
+
+def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, ChannelSource]:
+    units = _units(plant)
+    mapping: dict[str, ChannelSource] = {}
+    for name, column in config.columns.items():
+        place = f"{config.file}: columns.{name}"
+        if name != "t" and name not in units:
+            raise ValueError(f"{place}: {unknown('a channel of the plant or t', name, [*units, 't'])}")
+        _expect_keys_that_fit(place, name, column, plant)
+        mapping[name] = _clock_source(column) if name == "t" else _channel_source(place, column, units[name])
+    return mapping
+
+
+def _expect_keys_that_fit(place: str, name: str, column: ColumnConfig, plant: PlantDescription) -> None:
+    """Raises ValueError for a key that says nothing of that channel."""
+    only_clock, only_input = ("stamps", "zone", "shift", "sort"), ("held",)
+    only_channel = ("constant", "recorded", "held", "words", "quality", "good")
+    unfit = only_channel if name == "t" else only_clock
+    if name != "t" and name not in plant.channels():
+        unfit = (*unfit, *only_input)
+    for key in unfit:
+        if key in column.model_fields_set:
+            of = "a channel" if name == "t" else "an input" if key in only_input else "t"
+            raise ValueError(f"{place}.{key}: expected this key of {of} only; leave it out")
+
+
+def _clock_source(column: ColumnConfig) -> ClockSource:
+    return ClockSource(
+        column.column, column.unit, stamps=column.stamps, zone=column.zone, shift=column.shift, sort=column.sort
+    )
+
+
+def _channel_source(place: str, column: ColumnConfig, unit: str) -> ChannelSource:
+    try:
+        constant = None if column.constant is None else quantity(column.constant, unit)
+    except ValueError as error:
+        raise ValueError(f"{place}.constant: {error}") from error
+    if not column.recorded:
+        constant = float("nan")
+    if constant is not None:
+        return ChannelSource(column.column, unit, constant)
+    words = {text: _meaning(f"{place}.words.{text}", value, column.unit) for text, value in column.words.items()}
+    good = tuple(str(word) for word in column.good)
+    return ChannelSource(column.column, column.unit, None, column.held, words, column.quality, good)
+
+
+def _meaning(place: str, value: Amount | None, unit: str | None) -> float:
+    """The number that a word stands for, in the unit of its column; NaN where nothing was read."""
+    if isinstance(value, str):
+        raise ValueError(f"{place}: expected a number in the unit of the column ({unit or 'see its header'}) or null")
+    return float("nan") if value is None else float(value)
+
+
+def _units(plant: PlantDescription) -> dict[str, str]:
+    return plant.channel_units() | {sensor.column: sensor.unit for sensor in plant.sensors}
+
+
+def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant: PlantDescription) -> None:
+    """Raises ValueError where a channel's unit (SI) is of another kind than the plant's."""
+    expected = _units(plant)
+    for name, unit in zip(names, units, strict=True):
+        if unit != expected[name]:
+            raise ValueError(
+                f"{source}: {name}: expected a unit of the kind {expected[name]} (plant {plant.name}), "
+                f"got one of the kind {unit}; correct the header, columns, or the gain in the plant file"
+            )
+
+
+def unrecorded_valves(path: Path, plant: PlantDescription) -> dict[str, ChannelSource]:
+    """The valves that a CSV file lacks and the plant file says how they then stand."""
+    known = {p.valve: p.unrecorded for p in plant.pipes if p.valve and p.unrecorded is not None}
+    return {name: ChannelSource(None, "1", known[name]) for name in _lacking(path, known)}
+
+
+def missing_inputs(path: Path, plant: PlantDescription) -> list[str]:
+    """The plant's inputs that a CSV file has no column for, but valves of which the plant file says how they stand."""
+    known = unrecorded_valves(path, plant)
+    return [name for name in _lacking(path, plant.channels()) if name not in known]
+
+
+def _lacking(path: Path, names: Collection[str]) -> list[str]:
+    """Those of the names that no header of a CSV file is about; of other files none."""
+    if not names or is_log(path):
+        return []
+    header = read_header(path)
+    there = {*header, *(split[0] for column in header if (split := header_unit(column)))}
+    return [name for name in names if name not in there]
+
+
+def is_log(path: Path) -> bool:
+    return ".mcap" in path.suffixes
