@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import orjson
 
 from fdi_torch.logbook.compare import AXES
 from fdi_torch.logbook.fingerprint import canonical
@@ -150,12 +151,27 @@ def _deviations(then: Message | None, now: Message | None) -> Iterator[_Deviatio
 
 
 def _unequal(name: str, then: Any, now: Any) -> Iterator[_Deviation]:
-    """One deviation a field, or one an element where both sides are lists of equal length."""
+    """One deviation a field, or one an element of lists of equal length and of mappings, also where text tells them."""
+    if isinstance(then, str) and isinstance(now, str) and then != now:
+        then, now = _untold(then), _untold(now)
     if isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
         for place, (a, b) in enumerate(zip(then, now, strict=True)):
             yield from _unequal(f"{name}[{place}]", a, b)
+    elif isinstance(then, dict) and isinstance(now, dict):
+        for key in dict.fromkeys([*then, *now]):
+            yield from _unequal(f"{name}.{key}", then.get(key, "absent"), now.get(key, "absent"))
     elif not _same(then, now):
         yield _Deviation(name, then, now)
+
+
+def _untold(text: str) -> Any:
+    """What a text tells as JSON where it is a mapping or a list, or else the text."""
+    if not text.startswith(("{", "[")):
+        return text
+    try:
+        return orjson.loads(text)
+    except ValueError:
+        return text
 
 
 def _same(then: Any, now: Any) -> bool:

@@ -151,6 +151,22 @@ def test_the_first_event_that_differs_is_named(finished: Path, topic: str, field
     assert (found.first.topic, found.first.field) == (topic, field)
 
 
+def test_an_answer_logged_as_text_is_compared_by_its_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "gap.mcap"
+    answer = {"verdict": "named", "posterior": [{"causes": [], "probability": 0.75}], "note": "[kept"}
+    with RunLog(path, "gap", **FIXED) as log:
+        log.gap_verdict(answer)
+
+    def again(probability: float, note: str = "[kept") -> Any:
+        told = {**answer, "posterior": [{"causes": [], "probability": probability}], "note": note}
+        return replay(path, lambda run: changed(run, "/gap/verdict", answer=orjson.dumps(told).decode()))
+
+    assert again(0.75).outcome == "bit-equal"
+    assert again(0.75 * (1 + 1e-15)).outcome == "within tolerance"
+    for found, field in ((again(0.7), "answer.posterior[0].probability"), (again(0.75, "[lost"), "answer.note")):
+        assert found.outcome == "differs" and found.first is not None and found.first.field == field
+
+
 def test_a_replay_that_stops_early_or_does_other_things(finished: Path) -> None:
     def shorter(run: Run) -> list[Message]:
         return list(run.messages())[:10]
