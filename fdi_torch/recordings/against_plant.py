@@ -1,0 +1,74 @@
+"""Channels of a recording held against what its plant can read, deliver and open: units, rims, limits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from fdi_torch.plant.description import PlantDescription, Pump, Sensor
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.finding import Finding
+
+RIM_MARGIN = 0.02
+SMALL_SHARE = 0.01
+"""Wrong unit: all values below this share of the limit, or above ten times the limit."""
+
+
+def against_plant(recording: Recording, plant: PlantDescription) -> Iterator[Finding]:
+    for sensor in plant.sensors:
+        if sensor.column in recording.output_names:
+            column = recording.output_names.index(sensor.column)
+            yield from _level_findings(sensor, plant, recording.outputs[recording.mask[:, column], column])
+    for pump in plant.pumps:
+        if pump.channel in recording.input_names:
+            yield from _pump_findings(pump, recording.inputs[:, recording.input_names.index(pump.channel)])
+    for valve in dict.fromkeys(pipe.valve for pipe in plant.pipes if pipe.valve):
+        if valve in recording.input_names:
+            yield from _valve_findings(valve, recording.inputs[:, recording.input_names.index(valve)])
+
+
+def _level_findings(sensor: Sensor, plant: PlantDescription, readings: Tensor) -> Iterator[Finding]:
+    rim = next(tank.height for tank in plant.tanks if tank.name == sensor.tank)
+    levels = (readings - sensor.offset) / sensor.gain
+    if not len(levels):
+        return
+    low, high = float(levels.min()), float(levels.max())
+    if high > 10 * rim or high < SMALL_SHARE * rim:
+        text = f"highest level {100 * high:.3g} cm, rim {100 * rim:.3g} cm: a wrong unit, or empty throughout?"
+        yield Finding("unit", sensor.column, text, {"high": high, "rim": rim})
+    elif high > (1 + RIM_MARGIN) * rim:
+        above = int((levels > (1 + RIM_MARGIN) * rim).sum())
+        text = f"{above} readings lie above the rim of {sensor.tank} ({100 * high:.4g} cm of {100 * rim:.4g} cm)"
+        yield Finding("range", sensor.column, text, {"high": high, "rim": rim, "count": above})
+    if low < -RIM_MARGIN * rim:
+        below = int((levels < -RIM_MARGIN * rim).sum())
+        text = f"{below} readings lie below the floor of {sensor.tank}, down to {100 * low:.4g} cm: an offset?"
+        yield Finding("range", sensor.column, text, {"low": low, "count": below})
+
+
+def _pump_findings(pump: Pump, command: Tensor) -> Iterator[Finding]:
+    flow = pump.gain * command[torch.isfinite(command)]
+    if not len(flow):
+        return
+    low, high = float(flow.min()), float(flow.max())
+    if high > 10 * pump.max_flow or 0 < high < SMALL_SHARE * pump.max_flow:
+        text = f"its highest flow is {1e6 * high:.3g} cm^3/s of {1e6 * pump.max_flow:.3g} cm^3/s: is its unit right?"
+        yield Finding("unit", pump.channel, text, {"high": high, "limit": pump.max_flow})
+    elif high > (1 + 1e-6) * pump.max_flow:
+        text = (
+            f"asks for up to {1e6 * high:.4g} cm^3/s of {pump.name}, which delivers {1e6 * pump.max_flow:.4g} at most"
+        )
+        yield Finding("range", pump.channel, text, {"high": high, "limit": pump.max_flow})
+    if low < 0:
+        text = f"asks for a negative flow of {pump.name}, down to {1e6 * low:.4g} cm^3/s: it delivers none"
+        yield Finding("range", pump.channel, text, {"low": low})
+
+
+def _valve_findings(valve: str, opening: Tensor) -> Iterator[Finding]:
+    known = opening[torch.isfinite(opening)]
+    if len(known) and (float(known.max()) > 1 + RIM_MARGIN or float(known.min()) < -RIM_MARGIN):
+        low, high = float(known.min()), float(known.max())
+        text = f"opens from {low:.3g} to {high:.3g} where 0 is closed and 1 is open: is its unit right (pct)?"
+        yield Finding("unit", valve, text, {"low": low, "high": high})

@@ -1,0 +1,19 @@
+"""What a check of a recording says: a sentence, and the numbers behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Finding:
+    """kind: read, clock, gap, constant, clipped, frozen, quantised, range, unit, missing, on change or unknown.
+
+    values: SI, by name.
+    """
+
+    kind: str
+    channel: str
+    text: str
+    values: Mapping[str, float] = field(default_factory=dict)
