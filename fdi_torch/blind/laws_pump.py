@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fdi_torch.gap.challenge.moment import Array, Moment, Numbers
+from fdi_torch.blind.deviation import Array, Moment, Numbers
 
 Delivered = tuple[Array, Any]
 

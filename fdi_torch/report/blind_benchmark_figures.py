@@ -1,4 +1,4 @@
-"""Pictures of a withheld check: shares with their intervals, what was named for what, how sure it was."""
+"""Pictures of a blind benchmark: shares with their intervals, what was named for what, how sure it was."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Diagnoses without skill, so that a score has something to stand beside."""
+"""Diagnoses to compare with: two without skill, so that a score has something to stand beside."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.gap.challenge.places import effect_places
+from fdi_torch.blind.places import effect_places
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
 Diagnosis = Callable[..., dict[str, Any]]
 
 
-def always_null(recording: Recording, holdout: Recording, **options: Any) -> dict[str, Any]:
+def always_null(plant: PlantDescription, recording: Recording, holdout: Recording, **options: Any) -> dict[str, Any]:
     """Nothing is ever wrong."""
     return {"verdict": "no_gap", "where": [], "causes": [], "ambiguity_set": [], "posterior": []}
 
 
-def random_pair(plant: PlantDescription, seed: int) -> Diagnosis:
+def random_pair(seed: int) -> Diagnosis:
     """Names an effect and a place at random; the same for the same recording."""
-    pairs = effect_places(plant)
 
-    def diagnose(recording: Recording, holdout: Recording, **options: Any) -> dict[str, Any]:
+    def diagnose(plant: PlantDescription, recording: Recording, holdout: Recording, **options: Any) -> dict[str, Any]:
+        pairs = effect_places(plant)
         rng = np.random.default_rng([seed, zlib.crc32(recording.sha256.encode())])
         effect, place = pairs[int(rng.integers(len(pairs)))]
         cause = {"effect": effect, "location": place}

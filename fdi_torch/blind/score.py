@@ -6,10 +6,11 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from fdi_torch.gap.challenge.conditions import HELD_OUT
-from fdi_torch.gap.challenge.intervals import clopper_pearson, mean_interval, median_interval
-from fdi_torch.gap.challenge.kinds import KINDS
-from fdi_torch.gap.challenge.places import Cause, canonical, effect_places
+from fdi_torch.blind.conditions import HELD_OUT
+from fdi_torch.blind.kinds import KINDS
+from fdi_torch.blind.places import Cause, canonical, effect_places
+from fdi_torch.blind.sizes import size_errors
+from fdi_torch.blind.statistics import clopper_pearson, mean_interval, median_interval
 from fdi_torch.parameters import unit_factor
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
 
@@ -19,6 +20,7 @@ SHARES = (
     "right",
     "place",
     "in_set",
+    "cause_beside",
     "named_wrong",
     "detected",
     "missed",
@@ -44,8 +46,13 @@ def expected_utility(answer: Answer, sets: Sequence[list[Cause]], truth: list[Ca
     """Utility weighted by the posterior; where there is none, each member of the answer set counts the same."""
     post = [(_causes(x["causes"], plant), float(x["probability"])) for x in answer.get("posterior") or []]
     post = post or [(s, 1.0) for s in sets or [[]]]
-    weight = sum(w for _, w in post) or 1.0
-    return sum(w * utility(s, truth, len(effect_places(plant))) for s, w in post) / weight
+    weight, pairs = sum(w for _, w in post) or 1.0, len(effect_places(plant))
+    return sum(w * utility(_with_names(s), truth, pairs) for s, w in post) / weight
+
+
+def _with_names(causes: Sequence[Cause]) -> list[Cause]:
+    """Less what has none: an unknown is no effect-place pair."""
+    return [cause for cause in causes if cause[0] != "unknown"]
 
 
 def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> Row:
@@ -53,7 +60,7 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
     kind, true = truth["kind"], _causes(truth["causes"], plant)
     causes = _causes(answer.get("causes"), plant)
     sets = [_causes(s, plant) for s in answer.get("ambiguity_set") or []] or ([causes] if causes else [])
-    verdict, nameless = answer.get("verdict"), kind in ("unknown", "left_out")
+    verdict, denied = answer.get("verdict"), kind == "left_out"
     row: Row = {
         "kind": kind,
         "truth": true,
@@ -63,18 +70,23 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
         "set_size": len(sets),
         "crash": verdict == "crash",
         **_stated(kind, true, answer, plant),
-        "utility": expected_utility(answer, sets, [] if nameless else true, plant),
+        "utility": expected_utility(answer, sets, [] if denied else _with_names(true), plant),
     }
-    if kind == "null":
+    if not true:
         alarm = verdict != "no_gap"
         return row | {"right": not alarm, "false_alarm": alarm, "named_wrong": verdict == "named"}
     row |= {"detected": verdict not in ("no_gap", "crash")} | judge_closure(truth, answer, plant)
-    if nameless:
-        return row | _judge_nameless(true, verdict, [w["location"] for w in answer.get("where") or []])
+    unseen = [("unknown", true[0][1])] if denied else [cause for cause in true if cause[0] == "unknown"]
+    if unseen:
+        where = [w["location"] for w in answer.get("where") or []]
+        return row | _judge_unseen(unseen[0], [] if denied else _with_names(true), causes, sets, verdict, where)
+    row |= {"z": size_errors(truth, answer.get("causes") or (), plant)} if verdict in ("named", "ambiguous") else {}
     if kind == "messy":
         return row | _judge_messy(true[0], causes, verdict)
-    tolerated = verdict == "no_gap" and true in [[("leak", p.source)] for p in plant.pipes if p.target == OUTSIDE]
-    return row | _judge_named(true, causes, sets, verdict, tolerated)
+    of_outlets = [[("leak", p.source)] for p in plant.pipes if p.target == OUTSIDE]
+    tolerated = verdict == "no_gap" and true in of_outlets and not KINDS[kind].shows
+    row |= _judge_named(true, causes, sets, verdict, tolerated)
+    return row | ({"right": row["in_set"]} if kind == "dsingle" else {})
 
 
 def _stated(kind: str, true: list[Cause], answer: Answer, plant: PlantDescription) -> Row:
@@ -82,19 +94,32 @@ def _stated(kind: str, true: list[Cause], answer: Answer, plant: PlantDescriptio
     best = max(answer.get("posterior") or [], key=lambda x: float(x["probability"]), default=None)
     if best is None:
         return {}
-    causes, unknown_at = _causes(best["causes"], plant), best.get("unknown_at")
-    if kind in ("unknown", "left_out"):
-        right = unknown_at == true[0][1]
-    elif kind == "messy":
-        right = not unknown_at and true[0] in causes
+    causes = _causes(best["causes"], plant)
+    if best.get("unknown_at"):  # as the first format says it
+        causes.append(("unknown", best["unknown_at"]))
+    expected = [("unknown", true[0][1])] if kind == "left_out" else true
+    if kind == "messy":
+        right = true[0] in causes and _with_names(causes) == causes
     else:
-        right = not unknown_at and sorted(causes) == sorted(true)
+        right = sorted(causes) == sorted(expected)
     return {"stated": float(best["probability"]), "stated_right": right}
 
 
-def _judge_nameless(true: list[Cause], verdict: Any, where: list[str]) -> Row:
-    at_place = where[:1] == [true[0][1]]
-    return {"right": verdict == "unknown" and at_place, "place": at_place, "named_wrong": verdict == "named"}
+def _judge_unseen(
+    unseen: Cause, named: list[Cause], causes: list[Cause], sets: list[list[Cause]], verdict: Any, where: list[str]
+) -> Row:
+    """A law that no library holds, at its place; named: causes beside it, all of which have to be there for
+    `cause_beside`.
+    """
+    at_place = where[:1] == [unseen[1]] or unseen in causes
+    row = {"right": verdict == "unknown" and at_place, "place": at_place, "named_wrong": verdict == "named"}
+    if not named:
+        return row
+    whole = sorted([*named, unseen])
+    return row | {
+        "cause_beside": row["right"] and _with_names(causes) == named,
+        "in_set": any(sorted(s) == whole for s in sets),
+    }
 
 
 def _judge_messy(full: Cause, causes: list[Cause], verdict: Any) -> Row:
@@ -125,6 +150,8 @@ def judge_closure(truth: Mapping[str, Any], answer: Answer, plant: PlantDescript
     unit of the first sensor, the key in metres of level.
     """
     closure = answer.get("closure") or {}
+    if truth.get("disturbance"):  # the floor is then no longer the sensors' noise
+        return {}
     if not truth.get("noise_rms_m") or any(closure.get(k) is None for k in ("recalibrated", "augmented")):
         return {}
     sensor = plant.sensors[0]

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fdi_torch.gap.challenge.moment import Array
+from fdi_torch.blind.deviation import Array
 
 LONGEST = 120
 _AT = np.arange(LONGEST, dtype=np.float64)
 
 
 @dataclass(frozen=True)
-class Colour:
+class NoiseCorrelation:
     """e_i = sum_j k_j w_(i-j) with sum k_j^2 = 1. kernel: k."""
 
     name: str
@@ -35,26 +35,26 @@ class Colour:
         return std * np.stack([np.convolve(column, self.kernel, "valid") for column in white.T], axis=1)
 
 
-WHITE = Colour("white")
+WHITE = NoiseCorrelation("white")
 
 
-def autoregressive(coefficient: float) -> Colour:
+def autoregressive(coefficient: float) -> NoiseCorrelation:
     """e_i = a e_(i-1) + w_i."""
     return _of_unit_energy("autoregressive", np.power(coefficient, _AT))
 
 
-def smoothed(samples: int) -> Colour:
+def smoothed(samples: int) -> NoiseCorrelation:
     """A transmitter that shows the mean of its last few samples."""
     return _of_unit_energy("smoothed", np.ones(samples))
 
 
-def rippling(period: float, lasting: float) -> Colour:
+def rippling(period: float, lasting: float) -> NoiseCorrelation:
     """Ripples of a period that die away within so many samples (AR(2))."""
     return _of_unit_energy("rippling", np.exp(-_AT / lasting) * np.cos(2 * np.pi * _AT / period))
 
 
-def draw_colour(rng: np.random.Generator) -> Colour:
-    """Mostly AR(1)."""
+def draw_correlation(rng: np.random.Generator) -> NoiseCorrelation:
+    """A correlation at random, mostly AR(1)."""
     name = rng.choice(["autoregressive", "smoothed", "rippling"], p=[0.7, 0.15, 0.15])
     if name == "smoothed":
         return smoothed(int(rng.integers(3, 9)))
@@ -63,5 +63,5 @@ def draw_colour(rng: np.random.Generator) -> Colour:
     return autoregressive(float(rng.uniform(0.6, 0.9)))
 
 
-def _of_unit_energy(name: str, kernel: Array) -> Colour:
-    return Colour(name, kernel / np.sqrt(np.sum(kernel**2)))
+def _of_unit_energy(name: str, kernel: Array) -> NoiseCorrelation:
+    return NoiseCorrelation(name, kernel / np.sqrt(np.sum(kernel**2)))

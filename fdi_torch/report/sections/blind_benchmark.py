@@ -1,4 +1,4 @@
-"""A withheld check: how often the diagnosis was right, what it named for what, how sure it was, how long it took."""
+"""A blind benchmark: how often the diagnosis was right, what it named for what, how sure it was, how long it took."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from fdi_torch.gap.challenge.rows import Scores, group_of, tables
-from fdi_torch.gap.challenge.score import Row
-from fdi_torch.gap.challenge.table import OWN, Sheet, misses, sheets
-from fdi_torch.report.challenge_figures import calibration_panel, confusion_panel, shares_panel
+from fdi_torch.blind.rows import Scores, group_of, tables
+from fdi_torch.blind.score import Row
+from fdi_torch.blind.table import OWN, Sheet, misses, sheets
+from fdi_torch.report.blind_benchmark_figures import calibration_panel, confusion_panel, shares_panel
 from fdi_torch.report.html import Markup, folded, join, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.section import Picture, Section
@@ -27,14 +27,14 @@ LONE = ("single", "weak", "coloured", "twins", "poor")
 NAMELESS = ("unknown, there", "unknown, elsewhere", "named", "several", "no gap")
 
 
-def challenge_rows(material: Material) -> list[Row]:
+def benchmark_rows(material: Material) -> list[Row]:
     """The judged answers; none where the log is of another kind."""
     return [_row(message) for message in material.of(TRIAL)] if material.kind == "challenge" else []
 
 
 def scores_section(material: Material) -> Section | None:
     """Every score with its interval, kind by kind, beside the baselines."""
-    rows = challenge_rows(material)
+    rows = benchmark_rows(material)
     if not rows:
         return None
     words = (
@@ -67,7 +67,7 @@ def _pictures(by: Mapping[str, Scores], own: Sequence[Row], name: str) -> list[P
 
 def confusion_section(material: Material) -> Section | None:
     """Cases with one cause: what was there, and what was answered."""
-    rows = [row for row in challenge_rows(material) if row["by"] == OWN]
+    rows = [row for row in benchmark_rows(material) if row["by"] == OWN]
     pictures = []
     for k, (place, names) in enumerate(PLACES.items()):
         own = [r for r in rows if r["kind"] in LONE and r["effect"].startswith(names)]
@@ -75,7 +75,11 @@ def confusion_section(material: Material) -> Section | None:
             prefix = names[0] if names[0].endswith("_") else ""
             pairs = [(r["effect"].removeprefix(prefix), _answered(r).removeprefix(prefix)) for r in own]
             pictures.append(_confusion(f"challenge_confusion_{k + 1}", place, pairs))
-    for title, kind in (("laws without a name", "unknown"), ("effects denied", "left_out")):
+    for title, kind in (
+        ("laws without a name", "unknown"),
+        ("effects denied", "left_out"),
+        ("laws without a name, on networks", "law"),
+    ):
         pairs = [(r["effect"], _nameless(r)) for r in rows if r["kind"] == kind]
         if pairs:
             pictures.append(_confusion(f"challenge_{kind}", title, pairs, NAMELESS))
@@ -85,7 +89,7 @@ def confusion_section(material: Material) -> Section | None:
 
 def misses_section(material: Material) -> Section | None:
     """Every case that was not right, by name."""
-    sheet = misses(challenge_rows(material))
+    sheet = misses(benchmark_rows(material))
     return Section(sheet.title, [_shown(sheet)]) if sheet.rows else None
 
 

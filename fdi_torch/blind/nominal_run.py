@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_torch.gap.challenge.built import conductance
-from fdi_torch.gap.challenge.moment import Array
+from fdi_torch.blind.deviation import Array
+from fdi_torch.blind.simulator import conductance
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class NominalRun:
     """One case's sound rig.
 
     plant: as built. levels (T, N) m and asked (T, M) m^3/s of the recording; seconds: its length.

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.gap.challenge.moment import Array, Moment, Numbers
+from fdi_torch.blind.deviation import Array, Moment, Numbers
 
 Factor = tuple[Array, Any]
 _MILLIMETRE = 1e-3

@@ -1,8 +1,9 @@
-"""A challenge on disk: recordings as CSV, sealed causes, and the manifest that holds the hashes of both.
+"""A blind benchmark on disk: recordings as CSV, sealed causes, and the manifest that holds the hashes of both.
 
 spec.json          what was asked for: seed, kinds, rig
+cases/caseNNNN_plant.json: the nominal plant that the diagnosis is given (the same as .yaml, for use by hand)
 cases/caseNNNN_recording.csv.gz, cases/caseNNNN_holdout.csv.gz: the SHA-256 of the sealed key stands above the header
-manifest.jsonl     a line a case: SHA-256 of both recordings and of the sealed key
+manifest.jsonl     a line a case: SHA-256 of the plant, of both recordings and of the sealed key
 key.jsonl          a line a case: the truth; opened after the diagnosis
 answers_WHO.jsonl  a line a case: what was answered, in how many seconds, by which state of the code
 rows.jsonl         a line an answer: how it was judged; see `rows`
@@ -14,17 +15,18 @@ import gzip
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fdi_torch.gap.challenge.bench import decimals
-from fdi_torch.gap.challenge.cases import PARTS, Case
-from fdi_torch.gap.challenge.inputs import DECIMALS, command_unit
-from fdi_torch.gap.challenge.moment import Array
-from fdi_torch.gap.challenge.plants import Rig
+from fdi_torch.blind.cases import PARTS, Case
+from fdi_torch.blind.deviation import Array
+from fdi_torch.blind.inputs import DECIMALS, command_unit
+from fdi_torch.blind.plants import Rig
+from fdi_torch.blind.scaling import decimals
+from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.recordings.source import file_sha256
@@ -65,7 +67,7 @@ def sealed_line(truth: Mapping[str, Any]) -> str:
     return json.dumps(truth, sort_keys=True, separators=(",", ":"))
 
 
-def write_cases(out: Path, rig: Rig, made: Iterable[Case], secrets: Iterable[str]) -> None:
+def write_cases(out: Path, made: Iterable[Case], secrets: Iterable[str]) -> None:
     """Recordings first, then their line in the key and in the manifest: what the manifest names is complete.
 
     secrets: a random word a case, kept in the key, without which its hash would give the cause away by trial.
@@ -74,8 +76,11 @@ def write_cases(out: Path, rig: Rig, made: Iterable[Case], secrets: Iterable[str
     for case, secret in zip(made, secrets, strict=True):
         line: dict[str, Any] = {"case": case.plan.name, "leave_out": case.truth["leave_out"]}
         key = sealed_line(case.truth | {"nonce": secret})
+        path = _plant_file(out, case.plan.name)
+        path.write_text(json.dumps(asdict(case.rig.believed), indent=1) + "\n")
+        line["plant"] = file_sha256(path)
         for (part, _), commands, readings in zip(PARTS, case.commands, case.readings, strict=True):
-            text = as_csv(rig, commands, readings, digest(key))
+            text = as_csv(case.rig, commands, readings, digest(key))
             path = out / "cases" / f"{case.plan.name}_{part}.csv.gz"
             path.write_bytes(gzip.compress(text.encode(), compresslevel=5, mtime=0))
             line[part] = file_sha256(path)
@@ -99,17 +104,34 @@ def lines_of(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in whole.splitlines()]
 
 
-def read_recording(out: Path, line: Mapping[str, Any], part: str, rig: Rig) -> Recording:
+def _plant_file(out: Path, case: str) -> Path:
+    return out / "cases" / f"{case}_plant.json"
+
+
+def read_plant(out: Path, line: Mapping[str, Any]) -> PlantDescription:
+    """The nominal plant of a case, checked against its line of the manifest."""
+    path = _plant_file(out, line["case"])
+    _expect_unchanged(line, "plant", file_sha256(path))
+    data = json.loads(path.read_text())
+    kinds = {"tanks": Tank, "pipes": Pipe, "pumps": Pump, "sensors": Sensor}
+    parts = {name: tuple(kind(**fields) for fields in data[name]) for name, kind in kinds.items()}
+    return PlantDescription(**(data | parts | {"effects": (), "varying": tuple(data["varying"])}))
+
+
+def read_recording(out: Path, line: Mapping[str, Any], part: str, plant: PlantDescription) -> Recording:
     """One recording of a case, checked against its line of the manifest. Its source names the case and nothing else."""
-    case = line["case"]
-    path = out / "cases" / f"{case}_{part}.csv.gz"
-    found = read_csv(path, rig.plant.channels(), [s.column for s in rig.plant.sensors])
-    if found.sha256 != line[part]:
+    path = out / "cases" / f"{line['case']}_{part}.csv.gz"
+    found = read_csv(path, plant.channels(), [s.column for s in plant.sensors])
+    _expect_unchanged(line, part, found.sha256)
+    return replace(found, source=f"{line['case']}/{part}")
+
+
+def _expect_unchanged(line: Mapping[str, Any], part: str, found: str) -> None:
+    if found != line[part]:
         raise ValueError(
-            f"{case}: expected a {part} of SHA-256 {line[part][:12]}..., got {found.sha256[:12]}...; "
-            "it was changed after it was sealed: make the challenge anew"
+            f"{line['case']}: expected a {part} of SHA-256 {line[part][:12]}..., got {found[:12]}...; "
+            "it was changed after it was sealed: make the benchmark anew"
         )
-    return replace(found, source=f"{case}/{part}")
 
 
 def answers(out: Path, name: str) -> Path:
@@ -128,11 +150,11 @@ def open_key(out: Path) -> dict[str, dict[str, Any]]:
     keys = {line["case"]: line for line in lines_of(out / "key.jsonl")}
     for case, line in manifest(out).items():
         if case not in keys:
-            raise ValueError(f"{case}: expected a sealed key, got none; make the challenge anew")
+            raise ValueError(f"{case}: expected a sealed key, got none; make the benchmark anew")
         found = digest(sealed_line(keys[case]))
         if found != line["key"]:
             raise ValueError(
                 f"{case}: expected a key of SHA-256 {line['key'][:12]}..., got {found[:12]}...; "
-                "it was changed after it was sealed: make the challenge anew"
+                "it was changed after it was sealed: make the benchmark anew"
             )
     return keys

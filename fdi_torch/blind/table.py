@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fdi_torch.gap.challenge.rows import Scores, Tables, group_of
-from fdi_torch.gap.challenge.score import Row
+from fdi_torch.blind.rows import Scores, Tables, group_of
+from fdi_torch.blind.score import Row
 
 OWN = "fdi"
 NAMES = {
@@ -22,6 +22,7 @@ SIZES = {
     "detected": "detected",
     "set_size": "explanations",
     "utility": "utility",
+    "cause_beside": "cause named beside an unknown",
 }
 CLOSURE = {
     "closed_within": "`closed` within 3 points",
@@ -60,6 +61,11 @@ def sheets(by: Mapping[str, Scores]) -> list[Sheet]:
             "How often the best explanation is the true one, by the probability that it was given",
             ("probability given", "mean", "is true"),
             [[f"{b['low']:g} to {b['high']:g}", f"{b['stated']:.3f}", in_words(b)] for b in own["calibration"]],
+        ),
+        Sheet(
+            "Sizes of named causes, by effect: z against the truth",
+            ("effect", "root mean square of z", "within 1.96 standard errors"),
+            _rows(own["sizes"], ("rms", "within")),
         ),
         Sheet(
             "Cases with one cause, by effect; those without a name by the law that the rig follows",

@@ -1,4 +1,4 @@
-"""A rig of any size and speed as one on a bench, where the challenge's seconds, litres and centimetres are usual ones.
+"""A rig of any size and speed as one on a bench, where the benchmark's seconds, litres and centimetres are usual ones.
 
 Lengths are measured in units of `length` m, times of `time` s, areas of `area` m^2: A dh/dt = q and
 q = C_d a sqrt(2 g h) keep their form if flows are measured in area x length / time and bores a in

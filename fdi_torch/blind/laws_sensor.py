@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdi_torch.gap.challenge.moment import Array, Numbers
+from fdi_torch.blind.deviation import Array, Numbers
 
 _SUBSTEPS = 20
 

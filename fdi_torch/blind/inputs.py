@@ -7,8 +7,8 @@ from itertools import cycle, repeat
 
 import numpy as np
 
-from fdi_torch.gap.challenge.moment import Array
-from fdi_torch.gap.challenge.plants import Rig
+from fdi_torch.blind.deviation import Array
+from fdi_torch.blind.plants import Rig
 from fdi_torch.plant.description import PlantDescription, Pump
 
 SHORTEST_HOLD, LONGEST_HOLD = 40, 220
@@ -97,6 +97,7 @@ def _held(rng: np.random.Generator, samples: int, values: Iterator[float]) -> Ar
 Signal = Callable[[np.random.Generator, int], Array]
 SIGNALS: dict[str, dict[Signal, float]] = {
     "rich": {steps: 0.7, ramps: 0.15, waves: 0.15},
+    "steps": {steps: 1.0},
     "poor": {two_steps: 0.6, one_step: 0.12, one_hill: 0.12, two_levels: 0.16},
 }
 """Signals and how often each is taken."""

@@ -1,4 +1,4 @@
-"""What is kept of a withheld check: judged answers, scores as JSON and as Markdown, and a log for the page."""
+"""What is kept of a blind benchmark: judged answers, scores as JSON and as Markdown, a log for the page, plants."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.gap.challenge import Row, Tables, tables
-from fdi_torch.gap.challenge.rows import write_rows
-from fdi_torch.gap.challenge.run import without_nan
-from fdi_torch.gap.challenge.table import OWN, markdown
+from fdi_torch.blind import Row, Tables, tables
+from fdi_torch.blind.files import manifest, read_plant
+from fdi_torch.blind.rows import write_rows
+from fdi_torch.blind.run import without_nan
+from fdi_torch.blind.table import OWN, markdown
+from fdi_torch.config.plant_writer import dump_plant
+from fdi_torch.disk import write_text
 from fdi_torch.logbook import RunLog
 from fdi_torch.recordings.source import file_sha256
 
@@ -24,10 +27,9 @@ def conclude(out: Path, rows: Sequence[Row], config: Mapping[str, Any], sources:
     """
     data = [{"path": str(path), "sha256": file_sha256(path)} for path in sources]
     found = tables(rows)
-    out.mkdir(parents=True, exist_ok=True)
     write_rows(out, rows)
-    (out / "scores.json").write_text(json.dumps(without_nan(found), indent=1) + "\n", encoding="utf-8")
-    (out / "scores.md").write_text(markdown(found, rows), encoding="utf-8")
+    write_text(out / "scores.json", json.dumps(without_nan(found), indent=1) + "\n")
+    write_text(out / "scores.md", markdown(found, rows))
     _log(out / LOG, rows, found, config, data)
     return found
 
@@ -53,3 +55,11 @@ def _fields(row: Row) -> dict[str, Any]:
 
 def _hits(score: Mapping[str, Any]) -> dict[str, str]:
     return {n: f"{s['hits']}/{s['of']}" for n, s in score.items() if isinstance(s, Mapping) and "hits" in s}
+
+
+def write_plants(out: Path) -> None:
+    """The nominal plant of each case as a plant file, so that `fdi gap` can be run on a case by hand."""
+    for case, line in manifest(out).items():
+        path = out / "cases" / f"{case}_plant.yaml"
+        if not path.exists():
+            path.write_text(dump_plant(read_plant(out, line)), encoding="utf-8")

@@ -1,10 +1,10 @@
-"""The rigs the challenge is held on, with numbers of their own: nothing is read from the library's plant files."""
+"""The rigs of the blind benchmark, with numbers of their own: nothing is read from the library's plant files."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fdi_torch.gap.challenge.bench import SAME, Scales
+from fdi_torch.blind.scaling import SAME, Scales
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 
 CM, CM2, CM3 = 1e-2, 1e-4, 1e-6
@@ -17,6 +17,8 @@ class Rig:
     plant: on the bench. full_size: the plant that is diagnosed, where that is of another size; scales: how much larger.
     input_low, input_high: range of the commanded flow as a share of a pump's max_flow, for ordinary inputs.
     noise_unit: m; noise levels are drawn as 0.05, 0.1 or 0.2 of it.
+    lowest, highest: shares of the rim between which the rig without any effect has to stay. rest (N,) m: its levels
+    at middling inputs, where they are known.
     """
 
     plant: PlantDescription
@@ -25,6 +27,13 @@ class Rig:
     noise_unit: float = 1.0 * CM
     full_size: PlantDescription | None = None
     scales: Scales = SAME
+    lowest: float = 0.0
+    highest: float = 0.85
+    rest: tuple[float, ...] | None = None
+
+    @property
+    def name(self) -> str:
+        return self.plant.name
 
     @property
     def believed(self) -> PlantDescription:

@@ -8,25 +8,34 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi_torch.gap.challenge.places import EFFECTS, TWINS, Cause, are_twins, canonical, effect_places, places
-from fdi_torch.gap.challenge.plants import Rig
-from fdi_torch.gap.challenge.unknown import Unknown, unknown_to
+from fdi_torch.blind.places import EFFECTS, TWINS, Cause, are_twins, canonical, effect_places, places
+from fdi_torch.blind.plants import Rig
+from fdi_torch.blind.unseen_laws import Unknown, unknown_to
 from fdi_torch.plant.description import PlantDescription
 
 
 @dataclass(frozen=True)
 class Kind:
-    """strength of its full effects (1 is usual). causes: how many. faint: how many more at an eighth of usual strength.
+    """strength of its full effects (1 is usual). causes: how many. perhaps: how many more in every other case.
+    faint: how many more at an eighth of usual strength. unseen: whether a law is added that no library holds.
 
-    inputs: as in `draw_conditions`. coloured: chance of coloured noise.
+    inputs: as in `draw_conditions`. coloured: chance of correlated noise. disturbed: whether flows are disturbed at
+    random. unmeasured: share of the levels. looped: whether a level is controlled. shows: whether causes are drawn
+    anew until each moves the readings.
     """
 
     name: str
     strength: float = 1.0
     causes: int = 1
+    perhaps: int = 0
     faint: int = 0
+    unseen: bool = False
     inputs: str = "rich"
     coloured: float = 0.0
+    disturbed: bool = False
+    unmeasured: float = 0.0
+    looped: bool = False
+    shows: bool = False
 
 
 FAINT = 0.125
@@ -38,21 +47,33 @@ KINDS = {
         Kind("coloured", coloured=1.0),
         Kind("null", causes=0, coloured=0.3),
         Kind("pair", causes=2),
-        Kind("unknown"),
+        Kind("unknown", causes=0, unseen=True),
         Kind("messy", faint=3),
         Kind("poor", inputs="poor"),
         Kind("twins", strength=0.6),
         Kind("left_out"),
+        Kind("dnull", causes=0, inputs="steps", disturbed=True),
+        Kind("dsingle", inputs="steps", disturbed=True, shows=True),
+        Kind("site", perhaps=1, inputs="steps", shows=True),
+        Kind("hidden", inputs="steps", unmeasured=1 / 3, shows=True),
+        Kind("law", causes=0, unseen=True, inputs="steps", shows=True),
+        Kind("mixed", unseen=True, inputs="steps", shows=True),
+        Kind("loop", inputs="steps", looped=True, shows=True),
     )
 }
-STANDARD = tuple(name for name in KINDS if name != "left_out")
+ON_NETWORKS = ("site", "hidden", "law", "mixed", "null", "loop", "dnull", "dsingle")
+"""The kinds that random networks get by default."""
+_EXTRA = {"left_out", "site", "hidden", "law", "mixed", "loop"}
+STANDARD = tuple(name for name in KINDS if name not in _EXTRA)
+"""The kinds that every other rig gets by default."""
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """What is wrong with a rig, by name: full causes, then faint ones; or an effect that no library names."""
+    """What is wrong with a rig, by name: `full` causes, then faint ones; `unknown`: a law that no library names."""
 
     causes: tuple[Cause, ...] = ()
+    full: int = 0
     unknown: Unknown | None = None
     place: str = ""
     leave_out: tuple[str, ...] = ()
@@ -70,23 +91,34 @@ def in_turn(items: Sequence[str], seed: int, kind: str, index: int) -> str:
     return items[int(order[at])]
 
 
-def choose(kind: Kind, rig: Rig, seed: int, index: int, library: Collection[str], leave_out: Sequence[str]) -> Chosen:
-    """The causes of case `index` of this kind."""
-    rng, plant = case_generator(seed, kind.name, index, 2), rig.plant
-    if kind.name == "unknown":
-        return _unknown(plant, seed, index, library, rng)
+def choose(
+    kind: Kind,
+    rig: Rig,
+    seed: int,
+    index: int,
+    library: Collection[str],
+    leave_out: Sequence[str],
+    trial: int = 0,
+) -> Chosen:
+    """The causes of case `index` of this kind. trial: how often its causes were drawn already and did not show."""
+    rng, plant = case_generator(seed, kind.name, index, 2, *([trial] if trial else [])), rig.plant
     if kind.name == "twins":
-        return Chosen((_twin(plant, index, rng),))
+        return Chosen((_twin(plant, index, rng),), 1)
     if kind.name == "left_out":
         return _left_out(plant, seed, index, leave_out, rng)
     causes: list[Cause] = []
-    if kind.causes:
+    full = kind.causes + (int(rng.integers(kind.perhaps + 1)) if kind.perhaps else 0)
+    if full:
         present = [e for e in EFFECTS if places(plant, EFFECTS[e])]
-        effect = in_turn(present, seed, kind.name, index)
+        effect = in_turn(present, seed, kind.name, index) if trial < 2 else str(rng.choice(present))
         causes.append((effect, str(rng.choice(places(plant, EFFECTS[effect])))))
-    while len(causes) < kind.causes + kind.faint:
+    while len(causes) < full + kind.faint:
         causes.append(_another(plant, causes, rng))
-    return Chosen(tuple(causes))
+    if not kind.unseen:
+        return Chosen(tuple(causes), full)
+    unknown = _unseen(kind, plant, seed, index, library, trial, rng)
+    free = [p for p in places(plant, unknown.at) if all(p not in place.split("-") for _, place in causes)]
+    return Chosen(tuple(causes), full, unknown, str(rng.choice(free or places(plant, unknown.at))))
 
 
 def _another(plant: PlantDescription, causes: Sequence[Cause], rng: np.random.Generator) -> Cause:
@@ -95,14 +127,20 @@ def _another(plant: PlantDescription, causes: Sequence[Cause], rng: np.random.Ge
     return free[int(rng.integers(len(free)))]
 
 
-def _unknown(
-    plant: PlantDescription, seed: int, index: int, library: Collection[str], rng: np.random.Generator
-) -> Chosen:
+def _unseen(
+    kind: Kind,
+    plant: PlantDescription,
+    seed: int,
+    index: int,
+    library: Collection[str],
+    trial: int,
+    rng: np.random.Generator,
+) -> Unknown:
+    """A law that no library holds. Those that show only where a flow turns round need inputs that stand still."""
     found = {u.law: u for u in unknown_to(library) if places(plant, u.at)}
-    if not any(not p.is_outlet for p in plant.pipes):
+    if kind.inputs != "rich" or not any(not p.is_outlet for p in plant.pipes):
         found = {name: u for name, u in found.items() if not u.reversing}
-    unknown = found[in_turn(sorted(found), seed, "unknown", index)]
-    return Chosen(unknown=unknown, place=str(rng.choice(places(plant, unknown.at))))
+    return found[in_turn(sorted(found), seed, kind.name, index) if trial < 2 else str(rng.choice(sorted(found)))]
 
 
 def _twin(plant: PlantDescription, index: int, rng: np.random.Generator) -> Cause:
@@ -122,4 +160,4 @@ def _left_out(
     if not possible:
         raise ValueError("expected an effect to leave out that has a place in this plant, got none; name one")
     effect = in_turn(possible, seed, "left_out", index)
-    return Chosen(((effect, str(rng.choice(free[effect]))),), leave_out=(effect,))
+    return Chosen(((effect, str(rng.choice(free[effect]))),), 1, leave_out=(effect,))

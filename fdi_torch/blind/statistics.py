@@ -1,28 +1,19 @@
-"""Intervals for shares and means."""
+"""Intervals for shares, means and medians, and the F test."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-
-def binomial_tail(k: int, n: int, p: float) -> float:
-    """P(X >= k) for X binomial (n, p)."""
-    if k <= 0:
-        return 1.0
-    if p <= 0 or p >= 1:
-        return float(p >= 1)
-    log_choose = [math.lgamma(n + 1) - math.lgamma(i + 1) - math.lgamma(n - i + 1) for i in range(k, n + 1)]
-    terms = [c + i * math.log(p) + (n - i) * math.log1p(-p) for i, c in zip(range(k, n + 1), log_choose, strict=True)]
-    return min(1.0, math.fsum(math.exp(t) for t in terms))
+from scipy import stats
 
 
 def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
     """Exact interval for a share of k in n (Clopper and Pearson, 1934); (0, 1) for n = 0."""
-    tail = (1 - confidence) / 2
-    low = 0.0 if k == 0 else _root(lambda p: binomial_tail(k, n, p) - tail)
-    high = 1.0 if k == n else _root(lambda p: binomial_tail(k + 1, n, p) - (1 - tail))
-    return low, high
+    if n == 0:
+        return 0.0, 1.0
+    low, high = stats.binomtest(k, n).proportion_ci(confidence, "exact")
+    return float(low), float(high)
 
 
 def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
@@ -31,19 +22,10 @@ def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
     if not ranked:
         return math.nan, math.nan, math.nan
     median = 0.5 * (ranked[(n - 1) // 2] + ranked[n // 2])
-    outside = [k for k in range(1, n // 2 + 1) if 1 - binomial_tail(k, n, 0.5) <= 0.025]
+    outside = [k for k in range(1, n // 2 + 1) if stats.binom.cdf(k - 1, n, 0.5) <= 0.025]
     if not outside:
         return median, math.nan, math.nan
     return median, ranked[outside[-1] - 1], ranked[n - outside[-1]]
-
-
-def _root(rising: Callable[[float], float]) -> float:
-    """Where a function that rises on [0, 1] passes zero, by bisection."""
-    low, high = 0.0, 1.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if rising(middle) > 0 else (middle, high)
-    return 0.5 * (low + high)
 
 
 def mean_interval(values: Sequence[float], z: float = 1.96) -> tuple[float, float, float]:
@@ -56,3 +38,21 @@ def mean_interval(values: Sequence[float], z: float = 1.96) -> tuple[float, floa
     std = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
     half = z * std / math.sqrt(len(values))
     return mean, mean - half, mean + half
+
+
+def root_mean_square_interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Root mean square of normal values of mean 0, and its 95 % interval by chi-square."""
+    n = len(values)
+    if n == 0:
+        return math.nan, math.nan, math.nan
+    square = math.fsum(v * v for v in values)
+    low, high = (math.sqrt(square / float(stats.chi2.ppf(p, n))) for p in (0.975, 0.025))
+    return math.sqrt(square / n), low, high
+
+
+def f_test(explained: float, residual: float, parameters: int, samples: float) -> float:
+    """p-value of `parameters` columns that lower the sum of squares by `explained` to `residual`."""
+    freedom = samples - parameters
+    if freedom <= 0 or residual <= 0:
+        return 1.0
+    return float(stats.f.sf(explained / parameters / (residual / freedom), parameters, freedom))
