@@ -1,14 +1,16 @@
-"""What speaks against a part of a recording that was taken for fault-free, a sentence each."""
+"""What was learnt from the part taken for fault-free: how sure it is, and what speaks against it."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from fdi_torch.monitor.change import ChangedObserver, Window
-from fdi_torch.monitor.detection import DRIFT, Detector
+from fdi_torch.monitor.detection import DRIFT, Detector, rate_error
+from fdi_torch.monitor.events import amount, percent
 from fdi_torch.monitor.gain import kalman_gain, start_uncertainty
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
@@ -22,19 +24,38 @@ from fdi_torch.plant.network import TankNetwork
 
 # Levels that wander by so little, as a share of a reading's noise, do not wander.
 STILL = 1e-3
-# By how much a fault must explain more than none, in units of BIC; the rest must then be noise.
-CONVINCING = 30.0
+# How likely a fault within it must be before it is asked about.
+CONVINCING = 0.99
 # An offset of the white residual is told from here on, in its standard deviations: half the drift that a CUSUM allows.
 OFFSET = 0.5 * DRIFT
 SURELY = 4.0  # standard errors of it
+MANY = 30.0  # of which a Poisson number is nearly normal
+WITHIN = 2.0  # factor of the rate of false alarms that is good enough
 QUESTION = "does the recording start faulty? Name another fault_free part"
 
 
-def residual_doubts(plant: PlantDescription, noise: Noise, detector: Detector, seen: Observation) -> list[str]:
+def _most_by_chance(detector: Detector, noise: Noise, channels: int, every: float, sampling: float) -> int:
+    """How many alarms its own part raises at most, with 99 %: a Poisson number at the highest rate that is likely."""
+    error = rate_error(detector.chart, every / sampling, channels, DRIFT, noise.whitening)
+    expected = noise.whitening.samples * sampling / every * math.exp(1.96 * error)
+    if expected > MANY:
+        return math.ceil(expected + 2.33 * math.sqrt(expected))
+    count, term = 0, math.exp(-expected)
+    held = term
+    while held < 0.99:
+        count += 1
+        term *= expected / count
+        held += term
+    return count
+
+
+def residual_doubts(
+    plant: PlantDescription, noise: Noise, detector: Detector, seen: Observation, every: float
+) -> list[str]:
     """Alarms within it, and readings that lie off the observer throughout, by more than chance and enough to matter."""
     doubts = []
     alarms = detector.alarms(noise.whitening(seen.steady_residual)).nonzero().flatten()
-    if len(alarms):
+    if len(alarms) > _most_by_chance(detector, noise, len(plant.sensors), every, float(torch.diff(seen.time).median())):
         first = f"the first at {float(seen.time[alarms[0]]):g} s"
         doubts.append(f"the part taken for fault-free raises {len(alarms)} alarms itself, {first}: {QUESTION}")
     white, least = noise.whitening, max(OFFSET, SURELY * noise.whitening.samples**-0.5)
@@ -71,13 +92,31 @@ def fault_doubts(
     steady = [fault for fault in faults if not fault.shape]
     first, _ = observer.first_state(samples, believed)
     best = isolate(observer, Window(samples, first, 1), believed, steady, incipient=False, deepest=1)[0]
-    if not best.fits or best.score > -CONVINCING:
+    columns = best.hypothesis.columns
+    if not best.fits or not columns or best.mass < CONVINCING or best.onset_std == 0.0:
         return []
-    [column] = best.hypothesis.columns
-    p = space.parameters[column]
-    unit, scale = display_unit(p.unit)
-    size = f"{scale * float(best.value[column]):.3g} {unit}".strip()
-    return [f"{p.name} = {size} since {best.onset:.0f} s explains the part taken for fault-free: {QUESTION}"]
+    p, size, error = space.parameters[columns[0]], float(best.value[columns[0]]), float(best.std[columns[0]])
+    if abs(size - p.nominal) < SURELY * error:
+        return []
+    told = f"{amount(p, size, error)} since {best.onset:.0f} s, probability {percent(best.mass)}"
+    return [f"{told}, explains the part taken for fault-free: {QUESTION}"]
+
+
+def learnt_words(plant: PlantDescription, noise: Noise, detector: Detector, every: float, sampling: float) -> str:
+    """How sure the time between false alarms is, and how much fault-free time a surer one takes.
+
+    The logarithm of their rate has the standard error e, which falls with the square root of the time: so that the
+    rate lies within a factor of WITHIN (95 %), the part must be (1.96 e / ln WITHIN)^2 times as long.
+    """
+    error = rate_error(detector.chart, every / sampling, len(plant.sensors), DRIFT, noise.whitening)
+    seconds = noise.whitening.samples * sampling
+    needed = seconds * (1.96 * error / math.log(WITHIN)) ** 2
+    told = (
+        f"learnt from {seconds:g} s: one false alarm in {every:g} s, to within a factor of {math.exp(1.96 * error):.2g}"
+    )
+    if needed <= seconds:
+        return told
+    return f"{told}; a factor of {WITHIN:g} takes {needed:.0f} s without a fault: lengthen fault_free"
 
 
 def sample_spread(readings: Tensor) -> Tensor:
