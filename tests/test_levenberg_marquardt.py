@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt, L-BFGS and Adam against SciPy and closed forms; members of a batch never feel one another."""
+"""Levenberg-Marquardt against SciPy and closed forms; members of a batch never feel one another."""
 
 import math
 from collections.abc import Callable
@@ -10,10 +10,15 @@ import torch
 from scipy.optimize import least_squares, lsq_linear
 from torch import Tensor
 
-from fdi_torch.estimate.adam import AdamSettings, adam
 from fdi_torch.estimate.batch_algebra import apply, row_sum, solve_positive
-from fdi_torch.estimate.lbfgs import LbfgsSettings, lbfgs
-from fdi_torch.estimate.refine import Linearisation, Progress, RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.levenberg_marquardt import (
+    Competition,
+    Linearisation,
+    Progress,
+    RefineSettings,
+    levenberg_marquardt,
+)
+from fdi_torch.estimate.refined import Refined
 
 DOUBLE = torch.float64
 INF = math.inf
@@ -37,10 +42,6 @@ class LeastSquares:
         columns = jacobian.mT
         curvature = row_sum(columns[:, :, None, :] * columns[:, None, :, :])
         return Linearisation(0.5 * row_sum(r * r), apply(columns, r), curvature)
-
-    def value_and_gradient(self, theta: Tensor, lanes: Tensor) -> tuple[Tensor, Tensor]:
-        model = self.linearise(theta, lanes)
-        return model.cost, model.gradient
 
 
 def rosenbrock(theta: Tensor, lanes: Tensor) -> tuple[Tensor, Tensor]:
@@ -155,21 +156,10 @@ def with_trouble(theta: Tensor, lanes: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(bad[:, None], math.nan, model - DATA[lanes]), jacobian
 
 
-def refinements() -> list[tuple[str, Callable[[Callable, Tensor], object]]]:
-    def lm(residual: Callable, start: Tensor) -> object:
+def test_member_is_bit_equal_alone_and_beside_members_in_trouble() -> None:
+    def method(residual: Callable, start: Tensor) -> Refined:
         return levenberg_marquardt(LeastSquares(residual).linearise, start, *BOXED)
 
-    def quasi(residual: Callable, start: Tensor) -> object:
-        return lbfgs(LeastSquares(residual).value_and_gradient, start, *BOXED, LbfgsSettings(iterations=80))
-
-    def moments(residual: Callable, start: Tensor) -> object:
-        return adam(LeastSquares(residual).value_and_gradient, start, *BOXED, AdamSettings(iterations=40))
-
-    return [("levenberg-marquardt", lm), ("l-bfgs", quasi), ("adam", moments)]
-
-
-@pytest.mark.parametrize(("name", "method"), refinements(), ids=lambda value: value if isinstance(value, str) else "")
-def test_member_is_bit_equal_alone_and_beside_members_in_trouble(name: str, method: Callable) -> None:
     together = method(with_trouble, START)
     assert together.statuses()[4] == "failed"
     assert torch.equal(together.theta[4], START[4]) and "failed" not in np.delete(together.statuses(), 4)
@@ -210,6 +200,72 @@ def test_units_of_the_parameters_change_only_the_rounding() -> None:
     torch.testing.assert_close(scaled.theta / unit, plain.theta, rtol=1e-8, atol=0)
 
 
+@dataclass(frozen=True)
+class Point:
+    """What the valley keeps of a point: its residuals and their Jacobian."""
+
+    residual: Tensor
+    jacobian: Tensor
+
+    def lanes(self, which: Tensor) -> "Point":
+        return Point(self.residual[which], self.jacobian[which])
+
+    def replaced(self, which: Tensor, new: "Point") -> "Point":
+        return Point(self.residual.index_copy(0, which, new.residual), self.jacobian.index_copy(0, which, new.jacobian))
+
+
+class Valley:
+    """c (1 - b) read 3000 times to 0.1 %, c believed to 3 %: a curved floor, 1600 times as long as it is wide."""
+
+    low, high = rows([0.0, -1.0])[0], rows([10.0, 0.99])[0]
+    start = rows([1.0, 0.0], [1.0, -0.5], [0.8, 0.3])
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def linearise(self, theta: Tensor, lanes: Tensor) -> Linearisation:
+        self.calls += 1
+        c, b = theta.unbind(-1)
+        zero = torch.zeros_like(c)
+        weight = 3000.0**0.5 / 1e-3
+        residual = torch.stack((weight * (c * (1.0 - b) - 0.6), (c - 1.0) / 0.03), -1)
+        seen = torch.stack((weight * (1.0 - b), -weight * c), -1)
+        jacobian = torch.stack((seen, torch.stack((zero + 1.0 / 0.03, zero), -1)), -2)
+        columns = jacobian.mT
+        curvature = row_sum(columns[:, :, None, :] * columns[:, None, :, :])
+        cost = 0.5 * row_sum(residual * residual)
+        return Linearisation(cost, apply(columns, residual), curvature, Point(residual, jacobian))
+
+    def follow(self, theta: Tensor, known: Linearisation, step: Tensor) -> Linearisation:
+        return self.linearise(theta, torch.arange(len(theta)))
+
+    def bend(self, known: Linearisation, trial: Linearisation, step: Tensor) -> Tensor:
+        here, there = known.state, trial.state
+        assert isinstance(here, Point) and isinstance(there, Point)
+        return apply(here.jacobian.mT, there.residual - here.residual - apply(here.jacobian, step))
+
+
+def test_a_curved_valley_is_followed_to_its_lowest_point() -> None:
+    settings, straight, bent = RefineSettings(100, 5e-3), Valley(), Valley()
+    box = Valley.start, Valley.low, Valley.high
+    plain = levenberg_marquardt(straight.linearise, *box, settings)
+    found = levenberg_marquardt(bent.linearise, *box, settings, neighbourhood=bent)
+    assert found.converged.all() and (found.cost < 5e-3).all()
+    assert bent.calls < straight.calls and not plain.converged.any()
+    for lane in range(3):
+        alone = Valley()
+        start = Valley.start[lane : lane + 1]
+        only = levenberg_marquardt(alone.linearise, start, Valley.low, Valley.high, settings, neighbourhood=alone)
+        assert torch.equal(only.theta[0], found.theta[lane]) and torch.equal(only.cost[0], found.cost[lane])
+
+
+def test_a_lane_far_behind_is_given_up_and_has_not_converged() -> None:
+    beaten = RefineSettings(competition=Competition(behind=1e-9, share=10.0, target=0.0))
+    result = levenberg_marquardt(DECAYS.linearise, START, *FREE, beaten)
+    assert set(result.statuses()) == {"abandoned"} and not result.converged.any()
+    assert (result.iterations < levenberg_marquardt(DECAYS.linearise, START, *FREE).iterations).all()
+
+
 def test_status_says_out_of_iterations_or_stalled() -> None:
     few = levenberg_marquardt(DECAYS.linearise, START, *FREE, RefineSettings(iterations=2))
     assert set(few.statuses()) == {"max_iterations"} and set(few.iterations.tolist()) == {2}
@@ -232,25 +288,6 @@ def test_every_iteration_is_shown_and_costs_only_fall() -> None:
         assert (p.cost <= cost[p.lanes]).all() and ((p.cost < cost[p.lanes]) >= p.accepted).all()
         cost[p.lanes] = p.cost
     assert len(seen[-1].lanes) < 12
-
-
-@pytest.mark.parametrize("bounds", [FREE, BOXED], ids=["free", "boxed"])
-def test_l_bfgs_ends_where_levenberg_marquardt_ends(bounds: tuple[Tensor, Tensor]) -> None:
-    settings = LbfgsSettings(iterations=2000, decrease_tolerance=1e-15)
-    result = lbfgs(DECAYS.value_and_gradient, START, *bounds, settings)
-    exact = levenberg_marquardt(DECAYS.linearise, START, *bounds, TIGHT)
-    torch.testing.assert_close(result.cost, exact.cost, rtol=1e-9, atol=0)
-    torch.testing.assert_close(result.theta, exact.theta, rtol=2e-3, atol=0)
-    assert set(result.statuses()) == {"converged"}
-    assert torch.equal(result.held, exact.held)
-
-
-def test_adam_comes_close_to_levenberg_marquardt() -> None:
-    result = adam(DECAYS.value_and_gradient, START, *BOXED, AdamSettings(iterations=2000))
-    exact = levenberg_marquardt(DECAYS.linearise, START, *BOXED, TIGHT)
-    torch.testing.assert_close(result.cost, exact.cost, rtol=1e-6, atol=0)
-    assert set(result.statuses()) == {"converged"}
-    assert ((result.theta >= BOXED[0]) & (result.theta <= BOXED[1])).all()
 
 
 @pytest.mark.parametrize("parameters", [1, 2, 5, 30])
@@ -280,9 +317,5 @@ def test_misuse_is_refused_in_words() -> None:
         levenberg_marquardt(lambda x, _: Linearisation(x, x, x), START, *FREE)
     with pytest.raises(ValueError, match="expected low <= high"):
         levenberg_marquardt(DECAYS.linearise, START, FREE[1], FREE[0])
-    with pytest.raises(ValueError, match="expected iterations >= 1, damping > 0"):
+    with pytest.raises(ValueError, match="expected iterations >= 0, damping > 0"):
         RefineSettings(damping=0.0)
-    with pytest.raises(ValueError, match="expected iterations, memory >= 1"):
-        LbfgsSettings(memory=0)
-    with pytest.raises(ValueError, match="expected iterations >= 1, positive rate"):
-        AdamSettings(learning_rate=0.0)

@@ -11,28 +11,26 @@ import numpy as np
 import pytest
 import torch
 
+from fdi_torch.blind import cases
+from fdi_torch.blind.cases import make, plans
+from fdi_torch.blind.conditions import WIDEST, as_built, asked_of_pumps, exercised
+from fdi_torch.blind.deviation import Array, Deviation
+from fdi_torch.blind.files import as_csv
+from fdi_torch.blind.inputs import SIGNALS, commanded, with_standstills
+from fdi_torch.blind.kinds import KINDS, STANDARD, choose
+from fdi_torch.blind.laws_pipe import HEAD_LAWS, PIPE_LAWS
+from fdi_torch.blind.laws_pump import PUMP_LAWS
+from fdi_torch.blind.laws_sensor import READOUT_LAWS, SENSOR_LAWS
+from fdi_torch.blind.laws_tank import STORAGE_LAWS, TANK_LAWS
+from fdi_torch.blind.named_effects import NAMED
+from fdi_torch.blind.nominal_run import NominalRun
+from fdi_torch.blind.places import EFFECTS, canonical, effect_places
+from fdi_torch.blind.plants import Rig, cascaded_tanks, quadruple_tank, three_tank
+from fdi_torch.blind.scaling import Scales, on_bench
+from fdi_torch.blind.sensor_noise import NoiseCorrelation, autoregressive, rippling, smoothed
+from fdi_torch.blind.simulator import Drive, HiddenRigs, simulate
+from fdi_torch.blind.unseen_laws import UNKNOWN, unknown_to
 from fdi_torch.effects import build_network
-from fdi_torch.gap.challenge import cases
-from fdi_torch.gap.challenge.bench import Scales, on_bench
-from fdi_torch.gap.challenge.built import WIDEST, as_built
-from fdi_torch.gap.challenge.cases import make, plans
-from fdi_torch.gap.challenge.colours import Colour, autoregressive, rippling, smoothed
-from fdi_torch.gap.challenge.conditions import asked_of_pumps
-from fdi_torch.gap.challenge.exercise import exercised
-from fdi_torch.gap.challenge.files import as_csv
-from fdi_torch.gap.challenge.inputs import SIGNALS, commanded, with_standstills
-from fdi_torch.gap.challenge.kinds import KINDS, STANDARD, choose
-from fdi_torch.gap.challenge.known import KNOWN
-from fdi_torch.gap.challenge.laws_pipe import HEAD_LAWS, PIPE_LAWS
-from fdi_torch.gap.challenge.laws_pump import PUMP_LAWS
-from fdi_torch.gap.challenge.laws_sensor import READOUT_LAWS, SENSOR_LAWS
-from fdi_torch.gap.challenge.laws_tank import STORAGE_LAWS, TANK_LAWS
-from fdi_torch.gap.challenge.moment import Array, Deviation
-from fdi_torch.gap.challenge.places import EFFECTS, canonical, effect_places
-from fdi_torch.gap.challenge.plants import Rig, cascaded_tanks, quadruple_tank, three_tank
-from fdi_torch.gap.challenge.simulator import HiddenRigs, simulate
-from fdi_torch.gap.challenge.surroundings import Surroundings
-from fdi_torch.gap.challenge.unknown import UNKNOWN, unknown_to
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.recording import Recording
@@ -65,8 +63,8 @@ def run(
 ) -> Array:
     """Levels (T, N) of one lane."""
     rigs = HiddenRigs([conducting(plant, conductance)], [off])
-    flow = np.full((seconds + 1, len(plant.pumps), 1), asked)
-    return simulate(rigs, flow, np.array(start)[:, None])[:, :, 0]
+    flow = np.full((seconds + 1, len(plant.pumps)), asked)
+    return simulate(rigs, [Drive(flow, np.array(start))])[0].levels
 
 
 OUTLET = (Pipe("O", "A", OUTSIDE, 6e-5, 0.6),)
@@ -86,8 +84,8 @@ def test_halving_the_step_quarters_the_error() -> None:
     k = 1.6e-4
     exact = (math.sqrt(0.5) - k * 60 / (2 * AREA)) ** 2
     rigs = HiddenRigs([conducting(rig_of(OUTLET), k)], [()])
-    asked, start = np.zeros((61, 0, 1)), np.array([[0.5], [0.0]])
-    coarse, fine = (abs(simulate(rigs, asked, start, step)[-1, 0, 0] - exact) for step in (1.0, 0.5))
+    drive = Drive(np.zeros((61, 0)), np.array([0.5, 0.0]))
+    coarse, fine = (abs(simulate(rigs, [drive], step)[0].levels[-1, 0] - exact) for step in (1.0, 0.5))
     # The first, Euler, step weighs in both alike with the square of the step.
     assert coarse / fine == pytest.approx(4, rel=0.1)
 
@@ -141,8 +139,7 @@ def test_a_body_displaces_its_volume() -> None:
 def filled_by(law: str, numbers: dict[str, float], seconds: int, asked: Array) -> Array:
     """Volumes (T,) m^3 that a closed tank received from a pump that is off."""
     rigs = HiddenRigs([rig_of((), PUMP)], [(Deviation("x", "Q", law, numbers),)])
-    levels = simulate(rigs, asked[:, None, None], np.zeros((2, 1)))[:, 0, 0]
-    return levels * AREA
+    return simulate(rigs, [Drive(asked[:, None], np.zeros(2))])[0].levels[:, 0] * AREA
 
 
 def test_what_stands_above_a_rim_runs_over_into_the_tank_that_catches_it() -> None:
@@ -206,7 +203,7 @@ def test_noise_has_the_colour_and_size_asked_for() -> None:
 
 
 @pytest.mark.parametrize("colour", [smoothed(5), rippling(10.0, 4.0)], ids=lambda c: c.name)
-def test_mean_squares_of_coloured_noise_scatter_as_said(colour: Colour) -> None:
+def test_mean_squares_of_coloured_noise_scatter_as_said(colour: NoiseCorrelation) -> None:
     samples, runs = 500, 2000
     squares = np.mean(colour.noise(np.random.default_rng(3), samples, np.ones(runs)) ** 2, axis=0)
     assert squares.mean() == pytest.approx(1.0, rel=0.01)
@@ -233,7 +230,7 @@ def test_two_independent_simulations_of_a_sound_rig_agree(rig: Rig) -> None:
     commands = commanded(rig, np.random.default_rng(2), seconds + 1)
     start = [0.2 * t.height * (1 + 0.3 * i) for i, t in enumerate(plant.tanks)]
     rigs = HiddenRigs([plant], [()])
-    hidden = simulate(rigs, asked_of_pumps(plant, commands)[..., None], np.array(start)[:, None])[:, :, 0]
+    hidden = simulate(rigs, [Drive(asked_of_pumps(plant, commands), np.array(start))])[0].levels
     full = zip(rig.believed.tanks, start, strict=True)
     started = replace(rig.believed, tanks=tuple(replace(t, start_level=scales.length * h) for t, h in full))
     pump = plant.pumps[0]
@@ -270,7 +267,7 @@ def test_a_rig_of_another_size_is_recorded_in_its_own_size_and_pace(scales: Scal
 def test_a_step_that_does_not_divide_a_second_is_refused() -> None:
     rigs = HiddenRigs([rig_of(OUTLET)], [()])
     with pytest.raises(ValueError, match="a step that divides one second"):
-        simulate(rigs, np.zeros((3, 0, 1)), np.zeros((2, 1)), 0.03)
+        simulate(rigs, [Drive(np.zeros((3, 0)), np.zeros(2))], 0.03)
 
 
 def test_a_law_twice_in_a_rig_is_refused() -> None:
@@ -284,7 +281,7 @@ def test_a_tank_has_no_past_commands() -> None:
     rigs.tank_groups = HiddenRigs([rig_of((), PUMP)], [(Deviation("x", "Q", "late", {"delay": 1.0}),)]).pump_groups
     rigs.tank_groups[0].law = lambda level, other, now, p, state: (now.asked(p["delay"]), None)
     with pytest.raises(ValueError, match="use a pump law"):
-        simulate(rigs, np.zeros((3, 0, 1)), np.zeros((2, 1)))
+        simulate(rigs, [Drive(np.zeros((3, 0)), np.zeros(2))])
 
 
 @pytest.mark.parametrize(
@@ -344,13 +341,13 @@ def test_every_law_belongs_to_an_effect_or_an_unknown() -> None:
     rig = three_tank()
     built, rng = rig.plant, np.random.default_rng(4)
     levels, asked = rng.uniform(0.2, 0.5, (1000, 3)), rng.uniform(1e-5, 7e-5, (1000, 2))
-    around = Surroundings(built, levels, asked, 1.0, rng)
-    drawn = {KNOWN[effect](around, place).law for effect, place in effect_places(built) * 30}
+    around = NominalRun(built, levels, asked, 1.0, rng)
+    drawn = {NAMED[effect](around, place).law for effect, place in effect_places(built) * 30}
     assert drawn | {u.law for u in UNKNOWN} == laws and not drawn & {u.law for u in UNKNOWN}
 
 
 def test_the_vocabulary_is_the_protocols() -> None:
-    assert set(KNOWN) == set(EFFECTS)
+    assert set(NAMED) == set(EFFECTS)
     assert len(effect_places(three_tank().plant)) == 62
     assert canonical(("plugging", "OUT2"), three_tank().plant) == ("leak", "T2")
     assert canonical(("plugging", "P13"), three_tank().plant) == ("plugging", "P13")
@@ -404,7 +401,7 @@ def test_a_cause_that_another_hides_is_not_asked_for(monkeypatch: pytest.MonkeyP
     rig, plan = three_tank(), plans(1, 1, ("pair",))
     shows = Deviation("leak", "T1", "floor_hole", {"conductance": 3e-5})
     never = Deviation("overflow", "T3", "brim", {"crest": 0.99, "depth": 0.01, "flow": 7e-5})
-    monkeypatch.setattr(cases, "_deviations", lambda *_: (shows, never))
+    monkeypatch.setattr(cases, "_drawn", lambda draft, *_: replace(draft, deviations=(shows, never)))
     monkeypatch.setattr(cases, "STEP", 0.5)
     truth = make(plan, rig, 1)[0].truth
     assert truth["causes"] == [{"effect": "leak", "location": "T1"}]
