@@ -9,9 +9,11 @@ COMPILER := $(shell command -v g++ || command -v c++ || command -v clang++)
 # One thread a worker: two of them on the same core wait for each other.
 TESTS = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(shell nproc) --dist worksteal
 comma := ,
+LOWEST = tests/test_units.py tests/test_yaml_files.py tests/test_config_plant.py tests/test_config_run.py \
+	tests/test_recording_csv.py tests/test_hostile_files.py tests/test_command_line.py tests/logbook/test_reader.py
 EXTRAS := test$(if $(COMPILER),,$(comma)compiler)
 
-.PHONY: run test slow lint paper clean
+.PHONY: run test slow longest lint paper lowest clean
 
 run: $(STAMP)
 	$(BIN)/python -m fdi_torch.train
@@ -22,6 +24,9 @@ test: $(STAMP)
 slow: $(STAMP)
 	$(TESTS) -m slow
 
+longest: $(STAMP)
+	$(TESTS) -m longest
+
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -30,6 +35,12 @@ lint: $(STAMP)
 paper: $(STAMP)
 	$(BIN)/python -m fdi_torch paper
 
+# The quickest tests of every reader and writer, on the lowest versions that pyproject.toml allows.
+lowest:
+	$(PYTHON) -m venv .venv-lowest
+	.venv-lowest/bin/python -m pip install --quiet --constraint constraints-lowest.txt --editable . pytest hypothesis
+	OMP_NUM_THREADS=1 .venv-lowest/bin/python -m pytest $(LOWEST)
+
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
@@ -37,4 +48,4 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-lowest .pytest_cache .mypy_cache .ruff_cache

@@ -11,17 +11,31 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUM
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
-from benchmarks import logging, machine, monitoring, noise, precision, scaling, search, speed, threads  # noqa: E402
+from benchmarks import (  # noqa: E402
+    logging,
+    machine,
+    monitoring,
+    networks,
+    noise,
+    precision,
+    scaling,
+    search,
+    speed,
+    startup,
+    threads,
+)
 
 PARTS = {
     "speed": ("Trajectories per CPU second, 1000 s in 10 s RK4 steps, float64", speed),
     "precision": ("Trajectories per CPU second at a given worst error, 1000 random faults", precision),
     "scaling": ("Sums over the samples, fused with the simulation: many lanes, sensitivities, memory", scaling),
     "threads": ("Wall-clock time with one thread and with two, three tanks, sums over the samples", threads),
+    "networks": ("Large networks: a simulated hour, and the compiler's time, once a plant", networks),
     "search": ("CPU seconds to find a noise-free 5-parameter fault to 1e-6", search),
     "noise": ("1000 noise draws of one fault, estimated", noise),
     "monitoring": ("The monitor on three tanks, beside the time that samples take to come", monitoring),
     "logging": ("CPU seconds of a job, and of what it logs", logging),
+    "startup": ("CPU seconds before anything happens: imports and help", startup),
 }
 
 

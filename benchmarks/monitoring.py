@@ -13,8 +13,8 @@ from fdi_torch.monitor.change import ChangedObserver, Window
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.noise import Noise, learn_noise
-from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.prepare import usual_faults
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.parameters import ParameterSpace

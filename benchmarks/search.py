@@ -11,8 +11,8 @@ import torch
 from benchmarks import simulators
 from benchmarks.simulators import experiment, plant
 from fdi_torch.estimate.evolution import EvolutionSettings, evolve
+from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
 from fdi_torch.estimate.objectives import Problem, Term
-from fdi_torch.estimate.refine import levenberg_marquardt
 from fdi_torch.simulate.compiled import CompiledEngine
 from fdi_torch.simulate.engine import Readings
 

@@ -1,25 +1,42 @@
 """Fault diagnosis and sim-to-real gap diagnosis of liquid-tank plants by differentiable simulation.
 
-The names below are the public interface; each is loaded when first asked for, so that `import fdi_torch` is instant.
+The names in `__all__` are the public interface; each is loaded when first asked for, so that `import fdi_torch` is
+instant. Some functions have the name of the package that does their work: `fdi_torch.gap` is that package, and calling
+it, `fdi_torch.gap(plant, recording)`, calls the function.
 """
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
 
 _HOMES = {
-    "fdi_torch.config": ("dump_plant", "load_plant", "load_recordings", "load_run", "read_recording"),
+    "fdi_torch.config": (
+        *("ConfigError", "dump_plant", "load_plant", "load_recordings", "load_run"),
+        *("read_frame", "read_recording"),
+    ),
+    "fdi_torch.config.plant_in_code": ("Plant",),
     "fdi_torch.effects": ("EFFECTS", "build_network", "place", "placements_for"),
+    "fdi_torch.effects.catalogue": ("Catalogue", "effects"),
     "fdi_torch.estimate.fitting": ("Fitting", "set_up"),
     "fdi_torch.estimate.hybrid": ("HybridResult", "HybridSettings", "estimate_parameters"),
     "fdi_torch.estimate.evolution": ("EvolutionSettings", "evolve"),
-    "fdi_torch.estimate.refine": ("levenberg_marquardt",),
-    "fdi_torch.logbook": ("RunLog", "read_run"),
-    "fdi_torch.jobs.train": ("train",),
+    "fdi_torch.estimate.levenberg_marquardt": ("levenberg_marquardt",),
+    "fdi_torch.jobs.functions": (
+        *("FreeRun", "GapResult", "MonitorResult"),
+        *("gap", "monitor", "predict", "simulate", "study", "train"),
+    ),
+    "fdi_torch.jobs.report": ("Report", "report"),
     "fdi_torch.jobs.run_setup": ("simulate_recording",),
+    "fdi_torch.jobs.study": ("StudyResult",),
+    "fdi_torch.jobs.train": ("TrainResult",),
+    "fdi_torch.logbook": ("RunLog", "read_run"),
     "fdi_torch.parameters": ("Parameter", "ParameterSpace"),
-    "fdi_torch.plant.description": ("PlantDescription",),
+    "fdi_torch.plant.description": ("Pipe", "PlacedEffect", "PlantDescription", "Pump", "Sensor", "Tank"),
     "fdi_torch.plant.network": ("TankNetwork",),
     "fdi_torch.recording": ("Recording",),
     "fdi_torch.simulate.choose": ("make_engine",),
@@ -31,11 +48,41 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME_OF)
 
 
+class _CallableModule(ModuleType):
+    """A package below this one that is called like the public function of its name."""
+
+    @property
+    def __wrapped__(self) -> Callable[..., Any]:
+        """The function, where `inspect.signature` and help look for it."""
+        name = self.__name__.rpartition(".")[2]
+        return getattr(import_module(_HOME_OF[name]), name)
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        return self.__wrapped__(*arguments, **named)
+
+
+class _Package(ModuleType):
+    """This package: what is imported below it under the name of a public function can be called."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _HOME_OF and type(value) is ModuleType:
+            value.__class__ = _CallableModule
+        super().__setattr__(name, value)
+
+
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("fdi_torch")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'fdi_torch' has no attribute '{name}'")
-    return getattr(import_module(_HOME_OF[name]), name)
+    own = f"fdi_torch.{name}"
+    return import_module(own) if find_spec(own) else getattr(import_module(_HOME_OF[name]), name)
 
 
 def __dir__() -> list[str]:
-    return list(__all__)
+    return [*__all__, "__version__"]
+
+
+sys.modules[__name__].__class__ = _Package

@@ -6,17 +6,24 @@ import difflib
 from collections.abc import Collection, Iterable
 from fnmatch import fnmatchcase
 
+MOST_SHOWN = 80
+
+
+def shortened(text: str) -> str:
+    """A text for a message: cut off where it is long."""
+    return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."
+
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """'; the nearest is X', or nothing where no known name is near."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    near = difflib.get_close_matches(name[:MOST_SHOWN], list(known), n=1, cutoff=0.5)
     return f"; the nearest is '{near[0]}'" if near else ""
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> str:
     """The sentence for a name that is not among the known ones."""
     known = list(known)
-    return f"expected {kind} ({', '.join(known) or 'there are none'}), got '{name}'{nearest(name, known)}"
+    return f"expected {kind} ({', '.join(known) or 'there are none'}), got '{shortened(name)}'{nearest(name, known)}"
 
 
 def matching(kind: str, patterns: Iterable[str], known: Collection[str]) -> list[str]:

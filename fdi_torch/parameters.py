@@ -1,28 +1,22 @@
 """What a physical number is: its name, unit, nominal value, range, tolerance and meaning.
 
 A `ParameterSpace` is an ordered set of `Parameter`s, the bridge between names and the last
-dimension of a tensor `(*batch, P)`. All values are SI. This file is the only importer of the unit library.
+dimension of a tensor `(*batch, P)`. All values are SI.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-import pint
 import torch
 from torch import Tensor
 
-_units: pint.UnitRegistry[float] = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
-_units.define("duty = [] ")
-_units.define("lps = litre / second")
-_units.define("percent = 0.01 = pct")
-for _short, _long in {"gpm": "gallon / minute", "gph": "gallon / hour", "lpm": "l / minute", "lph": "l / hour"}.items():
-    _units.define(f"{_short} = {_long}")
+from fdi_torch.names import shortened
+from fdi_torch.units import MOST_CHARACTERS, UnitError, factor, in_unit, is_unit, number_and_unit
 
 SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
 
@@ -34,6 +28,7 @@ class Parameter:
     name: `component.field` or `component.effect.parameter`, unique in its space.
     unit: SI unit of every number below. nominal: the value believed in. low, high: the box searched.
     std: one standard deviation of the prior about nominal; infinite where nothing is known.
+    extremes: ends of the box beyond which physics does not go, such as a pipe that is closed; the others are guesses.
     """
 
     name: str
@@ -43,6 +38,7 @@ class Parameter:
     high: float = math.inf
     std: float = math.inf
     meaning: str = ""
+    extremes: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.low <= self.nominal <= self.high:
@@ -133,24 +129,23 @@ def parse_quantity(text: str, unit: str) -> float:
     Raises ValueError where the text is no quantity or has another dimension.
     """
     try:
-        quantity: Any = _units.Quantity(text)
-        return float(quantity.to(_pint_unit(unit)).magnitude)
-    except Exception as error:
-        raise ValueError(f"expected a quantity in {unit} such as '1 {unit}', got '{text}'") from error
+        return in_unit(*number_and_unit(text), unit)
+    except UnitError as error:
+        raise ValueError(f"expected a quantity in {unit} such as '1 {unit}', got '{shortened(text)}'") from error
 
 
 @lru_cache(maxsize=256)
 def unit_factor(unit: str, si_unit: str) -> float:
     """How many `si_unit` one `unit` is: unit_factor('cm', 'm') = 0.01."""
     try:
-        return float(_units.Quantity(1.0, _pint_unit(unit)).to(_pint_unit(si_unit)).magnitude)
-    except Exception as error:
-        raise ValueError(f"expected a unit that converts to {si_unit}, got '{unit}'") from error
+        return factor(unit, si_unit)
+    except UnitError as error:
+        raise ValueError(f"expected a unit that converts to {si_unit}, got '{shortened(unit)}'") from error
 
 
 def si_unit_of(unit: str) -> str:
     """The SI unit in which this project keeps a quantity given in `unit`: 'cm3_s' -> 'm^3/s'."""
-    for candidate in SI_UNITS:
+    for candidate in SI_UNITS if is_unit(unit) else ():
         try:
             unit_factor(unit, candidate)
         except ValueError:
@@ -158,7 +153,7 @@ def si_unit_of(unit: str) -> str:
         return candidate
     raise ValueError(
         "expected a unit of level, pressure, flow, time, voltage, current, frequency or share, "
-        f"got '{unit}'; write for example cm, mbar, cm3_s, V, mA, pct"
+        f"got '{shortened(unit)}'; write for example cm, mbar, cm3_s, V, mA, pct"
     )
 
 
@@ -175,16 +170,21 @@ def header_unit(header: str) -> tuple[str, str] | None:
     None where no unit stands in it. The shortest name whose rest is a unit wins: `qL_cmd_lps` is (`qL_cmd`, `lps`),
     `Q1_cm3_s` is (`Q1`, `cm3_s`). `tank_A` is a name: amperes are written mA, or in brackets.
     """
-    bracketed = _BRACKETED.match(header)
-    parts = header.split("_")
-    splits = [("_".join(parts[:i]), "_".join(parts[i:])) for i in range(1, len(parts)) if parts[i:] != ["A"]]
-    for name, unit in [bracketed.groups()] if bracketed else splits:
+    cuts = [i for i in range(max(0, len(header) - MOST_CHARACTERS - 1), len(header)) if header[i] == "_"]
+    splits = [(header[:i], header[i + 1 :]) for i in cuts if header[i + 1 :] != "A"]
+    for name, unit in [bracketed] if (bracketed := _bracketed(header)) else splits:
         try:
             si_unit_of(unit)
         except ValueError:
             continue
         return name, unit
     return None
+
+
+def _bracketed(header: str) -> tuple[str, str] | None:
+    opening = {"]": "[", ")": "("}.get(header[-1:])
+    place = header.rfind(opening) if opening else -1
+    return (header[:place].rstrip(" \t_"), header[place + 1 : -1].strip()) if place > 0 else None
 
 
 _SHOWN = {
@@ -200,13 +200,3 @@ _SHOWN = {
     "A": "mA",
     "A/m": "mA/cm",
 }
-_BRACKETED = re.compile(r"^(.+?)[\s_]*[\[(]\s*([^\])]+?)\s*[\])]$")
-_VOLUME_A_TIME = re.compile(r"^((?:[cdm]?m|ft|in)3|m?[lL]|gal)_(s|min|h)$")  # no / in the headers of some loggers
-_CUBE = re.compile(r"(?<=[a-z])([23])(?![0-9])")
-
-
-def _pint_unit(unit: str) -> str:
-    """'cm3_s' -> 'cm^3/s', 'm3/h' -> 'm^3/h'; '1' -> no unit."""
-    if unit == "1":
-        return ""
-    return _CUBE.sub(r"^\1", _VOLUME_A_TIME.sub(r"\1/\2", unit))

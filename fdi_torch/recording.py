@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from fdi_torch.names import unknown
+from fdi_torch.tables import Shown, Table, needed
+
 Hold = Literal["zero_order", "linear"]
+LONGEST, LARGEST = 5e9, 1e12
+"""Times (s, since 1970 too) and channels (SI) of a recording lie within: beyond is a slip of the unit or no number."""
 
 
-@dataclass(frozen=True)
-class Recording:
+@dataclass(frozen=True, repr=False)
+class Recording(Shown):
     """What was commanded and read on a rig, on its own clock.
 
     time (T,) in s, strictly increasing. inputs (T, M) and outputs (T, N) in the SI units named beside them.
@@ -23,6 +28,7 @@ class Recording:
     began: its time 0 in seconds since 1970, where its clock tells.
     notes: what the reader did to the file's rows, in sentences.
     ran: inputs that were on, or may have been, before the first sample, as far as what it was cut from tells.
+    trusted: whether its units, channels and clocks are as they should be, whatever they look like.
     """
 
     time: Tensor
@@ -39,6 +45,7 @@ class Recording:
     ran: frozenset[str] = frozenset()
     notes: tuple[str, ...] = ()
     began: float | None = None
+    trusted: bool = False
 
     def __post_init__(self) -> None:
         if self.mask is None:
@@ -53,6 +60,18 @@ class Recording:
                 raise ValueError(
                     f"{self.source}: expected {name} of shape {(samples, width)}, got {tuple(tensor.shape)}"
                 )
+        beyond = self.time[~(self.time.abs() <= LONGEST)]
+        if len(beyond):
+            raise ValueError(
+                f"{self.source}: expected times within {LONGEST:g} s, got {float(beyond[0]):g} s; correct the clock"
+            )
+        for name, tensor in (("inputs", self.inputs), ("readings", self.outputs)):
+            beyond = tensor[torch.isfinite(tensor) & (tensor.abs() > LARGEST)]
+            if len(beyond):
+                raise ValueError(
+                    f"{self.source}: expected {name} within {LARGEST:g} in SI units, got {float(beyond[0]):g}; "
+                    "correct the unit or the numbers"
+                )
         steps = torch.diff(self.time)
         if not bool((steps > 0).all()):
             row = int((steps <= 0).nonzero()[0]) + 1
@@ -63,6 +82,65 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def headline(self) -> str:
+        lasts = float(self.time[-1] - self.time[0]) if len(self) else 0.0
+        return f"{self.source}: {len(self)} samples, {lasts:g} s, one every {self.interval:g} s"
+
+    def table(self) -> Table:
+        """A row a channel: what it is, its range and how many samples lack it, in SI."""
+        readings = torch.where(self.mask, self.outputs, torch.nan)
+        rows = [
+            (name, role, unit, *_range(values), int((~torch.isfinite(values)).sum()))
+            for role, names, units, table in (
+                ("input", self.input_names, self.input_units, self.inputs),
+                ("output", self.output_names, self.output_units, readings),
+            )
+            for name, unit, values in zip(names, units, table.T, strict=True)
+        ]
+        return Table.of_rows(("channel", "role", "unit", "lowest", "highest", "missing"), rows)
+
+    def to_pandas(self) -> Any:
+        """A pandas.DataFrame (extra `pandas`): a column a channel in SI, indexed by time in s; masked readings are NaN.
+
+        Its `attrs["units"]` names the unit of each column.
+        """
+        frame = needed("pandas").DataFrame(self._columns(), index=self.time.cpu().numpy())
+        frame.index.name = "t"
+        frame.attrs["units"] = {"t": "s"} | self._units()
+        return frame
+
+    def to_xarray(self) -> Any:
+        """An xarray.Dataset (extra `xarray`): a variable a channel in SI over `time` in s; masked readings are NaN."""
+        units = self._units()
+        variables = {name: ("time", column, {"units": units[name]}) for name, column in self._columns().items()}
+        coordinates = {"time": ("time", self.time.cpu().numpy(), {"units": "s"})}
+        return needed("xarray").Dataset(variables, coordinates, {"source": self.source})
+
+    def compared(self, predicted: Tensor) -> Any:
+        """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI.
+
+        predicted (T, N): what a model says of the outputs.
+        """
+        measured = torch.where(self.mask, self.outputs, torch.nan)
+        series = {"measured": measured, "predicted": predicted, "residual": measured - predicted}
+        coordinates = {
+            "time": ("time", self.time.cpu().numpy(), {"units": "s"}),
+            "sensor": list(self.output_names),
+            "unit": ("sensor", list(self.output_units)),
+        }
+        variables = {name: (("time", "sensor"), values.cpu().numpy()) for name, values in series.items()}
+        return needed("xarray").Dataset(variables, coordinates, {"source": self.source})
+
+    def _columns(self) -> dict[str, Any]:
+        readings = torch.where(self.mask, self.outputs, torch.nan)
+        names = (*self.input_names, *self.output_names)
+        return dict(zip(names, torch.cat([self.inputs, readings], dim=1).T.cpu().numpy(), strict=True))
+
+    def _units(self) -> dict[str, str]:
+        names = (*self.input_names, *self.output_names)
+        return dict(zip(names, (*self.input_units, *self.output_units), strict=True))
 
     @property
     def interval(self) -> float:
@@ -77,6 +155,25 @@ class Recording:
         """The same with its tensors on a device."""
         tensors = {name: getattr(self, name).to(device) for name in ("time", "inputs", "outputs", "mask")}
         return replace(self, **tensors)
+
+    def selected(self, inputs: Sequence[str], outputs: Sequence[str]) -> Recording:
+        """The same with these channels, in this order. Raises ValueError for one that it lacks."""
+        for kind, wanted, there in (("an input", inputs, self.input_names), ("an output", outputs, self.output_names)):
+            for name in wanted:
+                if name not in there:
+                    raise ValueError(f"{self.source}: {unknown(kind, name, there)}")
+        kept = [self.input_names.index(name) for name in inputs]
+        read = [self.output_names.index(name) for name in outputs]
+        return replace(
+            self,
+            inputs=self.inputs[:, kept],
+            outputs=self.outputs[:, read],
+            mask=self.mask[:, read],
+            input_names=tuple(inputs),
+            output_names=tuple(outputs),
+            input_units=tuple(self.input_units[k] for k in kept),
+            output_units=tuple(self.output_units[k] for k in read),
+        )
 
     def stretch(self, first: int, last: int) -> Recording:
         """Samples first..last-1, with the same clock."""
@@ -120,6 +217,8 @@ class Recording:
             raise ValueError(f"{self.source}: expected every to be a whole number from 1, got {step}")
         if step == 1:
             return self
+        if step >= len(self):
+            raise ValueError(f"{self.source}: expected every below its {len(self)} samples, got {step}; lower it")
         inputs = self._held_means(step) if self.hold == "zero_order" else self.inputs[::step]
         return replace(
             self, time=self.time[::step], inputs=inputs, outputs=self.outputs[::step], mask=self.mask[::step]
@@ -139,3 +238,8 @@ class Recording:
         known = torch.isfinite(self.inputs).all(dim=1).to(torch.int8)
         edges = torch.diff(known, prepend=known.new_zeros(1), append=known.new_zeros(1)).nonzero().flatten().tolist()
         return [self.stretch(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _range(values: Tensor) -> tuple[float, float]:
+    known = values[torch.isfinite(values)]
+    return (float(known.min()), float(known.max())) if len(known) else (math.nan, math.nan)

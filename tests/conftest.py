@@ -8,6 +8,12 @@ from pathlib import Path
 import pytest
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    told = "how long the slow test draws files that a person or an attacker could write"
+    parser.addoption("--fuzz-minutes", type=float, default=2.0, help=told)
+    parser.addoption("--kills", type=int, default=6, help="how often the slow test kills each of four jobs")
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real recordings; tests that need it are skipped where it is absent."""

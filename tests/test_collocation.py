@@ -14,7 +14,7 @@ from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.integrate import ReferenceEngine
 from fdi_torch.simulate.midpoint import newton_step
-from fdi_torch.simulate.scan import linear_scan
+from fdi_torch.simulate.scan import linear_scan, scan_in_time
 from tests.rigs import constant_inputs, three_tank
 
 
@@ -32,7 +32,7 @@ def stepped(duration: float = 200.0) -> Recording:
 def loops(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both ways through a recurrence: compiled where there is a compiler, and torch's."""
     if request.param == "torch":
-        monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda: None)
+        monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda tanks: None)
 
 
 @pytest.mark.parametrize("tanks", [1, 3, 7])
@@ -46,7 +46,7 @@ def test_both_ways_through_a_newton_step_are_one(tanks: int, monkeypatch: pytest
     path[1, 0, 5] = torch.nan
     given = (draw(steps).abs(), path, rates, by_level, by_theta, start, slopes)
     found = newton_step(*given)
-    monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda: None)
+    monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda tanks: None)
     for ours, torchs in zip(found, newton_step(*given), strict=True):
         torch.testing.assert_close(ours, torchs, rtol=1e-10, atol=1e-10, equal_nan=True)
 
@@ -60,6 +60,27 @@ def test_the_scan_is_the_recurrence(count: int) -> None:
     for k in range(count):
         expected.append(a[:, k] @ expected[-1] + b[:, k])
     torch.testing.assert_close(linear_scan(a, b, first), torch.stack(expected, dim=1), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("columns", [1, 3, 21])
+@pytest.mark.parametrize("loop", [True, False], ids=["compiled", "torch"])
+def test_a_scan_with_a_gain_is_one_of_the_product(columns: int, loop: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(2)
+    draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+    a, gain, b, first = 0.4 * draw(2, 3, 3, 150), draw(2, 3, 3, 150), draw(2, 3, columns, 150), draw(2, 3, columns)
+    b[:, 1] = 0.0
+    b[:, 2, :, :80] = 0.0
+    if not loop:
+        monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda tanks: None)
+    state, expected = first, [first]
+    for k in range(150):
+        state = a[..., k] @ state + gain[..., k] @ b[..., k]
+        expected.append(state)
+    found = scan_in_time(a, b, first, gain)
+    torch.testing.assert_close(found, torch.stack(expected, dim=-1), rtol=1e-12, atol=1e-12)
+    alone = scan_in_time(a[:1], b[:1, :, :1], first[:1, :, :1], gain[:1])
+    if loop:
+        assert torch.equal(alone, found[:1, :, :1])
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import resource
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,9 +14,11 @@ from typing import Any
 
 import pytest
 
+import fdi_torch
 from fdi_torch import cli
-from fdi_torch.cli.options import overrides
+from fdi_torch.cli.options import LIVE, overrides, who_may_read
 from fdi_torch.cli.screen import Screen
+from fdi_torch.disk import DiskError, write_text
 
 CSV = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n" + "".join(
     f"{t},{50 + t % 7},50,{40 + t % 11},{30 + t % 5},{35 + t % 3}\n" for t in range(50)
@@ -47,9 +52,56 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
     assert f"usage: fdi {command}" in capsys.readouterr().out
 
 
-def test_the_overview_does_not_wait_for_torch() -> None:
-    code = "import sys; from fdi_torch.cli import main; main(['--help']); sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=False).returncode == 0
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_the_help_of_every_command_ends_in_an_example_of_it(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    text = capsys.readouterr().out
+    examples = text.partition("\nexamples:\n")[2].splitlines()
+    assert examples and all(line.startswith(f"  fdi {command}") for line in examples if line.strip())
+
+
+HELP_OF_ALL = """
+import contextlib, io, sys
+import fdi_torch
+from fdi_torch import cli
+for words in [[], *([name] for name in cli.COMMANDS)]:
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        cli.main([*words, "--help"])
+cli.main(["--version"])
+print(sorted({"torch", "numpy", "pydantic", "pint", "rich", "matplotlib", "mcap"} & sys.modules.keys()))
+"""
+
+
+def test_no_help_waits_for_a_library() -> None:
+    done = subprocess.run([sys.executable, "-c", HELP_OF_ALL], capture_output=True, text=True, check=True)
+    version, loaded = done.stdout.splitlines()
+    assert version == f"fdi_torch {fdi_torch.__version__}" and loaded == "[]"
+
+
+def test_what_help_says_by_itself_is_what_the_jobs_do() -> None:
+    """Help is shown without the jobs' modules, so that it repeats a few of their constants."""
+    from fdi_torch.blind.networks import FEWEST, MOST
+    from fdi_torch.blind.plants import RIGS
+    from fdi_torch.cli.challenge import CASES
+    from fdi_torch.cli.options import challenge, gap, predict
+    from fdi_torch.gap.prediction import START_SAMPLES
+    from fdi_torch.gap.search import DEEPEST
+    from fdi_torch.jobs.blind_benchmark import LOG
+
+    assert (gap.MOST_CAUSES, gap.START_SAMPLES, predict.START_SAMPLES) == (DEEPEST, START_SAMPLES, START_SAMPLES)
+    assert sorted(RIGS) == sorted(challenge.RIGS)
+    parser = argparse.ArgumentParser()
+    challenge.add_arguments(parser)
+    assert f"({FEWEST}..{MOST})" in parser.format_help() and f"({CASES})" in parser.format_help()
+    assert LOG in (challenge.__doc__ or "") + challenge.EXAMPLES
+
+
+def test_a_plant_is_checked_alone_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", "--plant", "three_tank", "--picture", str(tmp_path / "rig.svg")]) == cli.DONE
+    shown = capsys.readouterr().out
+    assert "plant three_tank: 3 tanks, 3 pipes, 2 pumps, 3 sensors" in shown
+    assert (tmp_path / "rig.svg").read_text().count("T1") >= 1
 
 
 def test_check_shows_channels_and_findings(rig: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -76,7 +128,7 @@ def test_check_of_a_run_file_says_what_is_usable(tmp_path: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["RIG"], "fdi check: expected a recording and --plant, or --config; fdi check --help tells more"),
+        (["RIG"], "fdi check: expected --plant, a recording and --plant, or --config; fdi check --help tells more"),
         (["RIG", "--plant", "three_tonk"], "got 'three_tonk'; the nearest is 'three_tank'"),
         (["gone.csv", "--plant", "three_tank"], "fdi check: gone.csv: expected a file, got none there"),
         (["RIG", "--plant", "dts200"], "expected a column for qL_cmd"),
@@ -200,7 +252,7 @@ def test_who_reads_may_stop_reading() -> None:
     assert (done.stdout.split()[0], done.stderr) == ("name", "")
 
 
-def test_an_interrupted_job_says_what_is_left(
+def test_a_job_that_is_interrupted_before_it_logs_promises_nothing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Also while its libraries load, which is most of a short command."""
@@ -209,6 +261,53 @@ def test_an_interrupted_job_says_what_is_left(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli.importlib, "import_module", interrupted)
-    for name, left in (("train", "in its log, and --resume goes on from there"), ("report", "report: interrupted")):
+    for name in ("train", "report"):
         assert cli.main([name, "--quiet"]) == cli.INTERRUPTED
-        assert capsys.readouterr().err.strip().endswith(left)
+        assert capsys.readouterr().err == f"fdi {name}: interrupted; the same command starts anew\n"
+
+
+@pytest.mark.parametrize(
+    ("host", "alone"), [("127.0.0.1", True), ("localhost", True), ("[::1]", True), ("0.0.0.0", False)]
+)
+def test_who_may_read_a_running_job_is_said(host: str, alone: bool) -> None:
+    assert LIVE.startswith("127.0.0.1:")
+    assert ("nobody else" in who_may_read(host)) is alone
+
+
+def with_streams(words: str, redirections: str) -> subprocess.CompletedProcess[str]:
+    line = f"{sys.executable} -m fdi_torch {words} {redirections}"
+    return subprocess.run(line, shell=True, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("redirections", "code", "complaint"),
+    [
+        (">&-", cli.DONE, ""),
+        (">&- 2>&-", cli.DONE, ""),
+        ("> /dev/full", cli.MISUSE, "fdi check: standard output: the disk is full; free some space\n"),
+        ("--json > /dev/full", cli.MISUSE, "fdi check: standard output: the disk is full; free some space\n"),
+    ],
+)
+def test_standard_output_that_cannot_be_written(rig: str, redirections: str, code: int, complaint: str) -> None:
+    done = with_streams(f"check {rig} --plant three_tank", redirections)
+    assert (done.returncode, done.stderr) == (code, complaint)
+
+
+def test_a_job_goes_on_though_nobody_reads_of_its_progress(tmp_path: Path) -> None:
+    done = with_streams(f"simulate --out {tmp_path}", "2>&1 >/dev/null | true; echo ${PIPESTATUS[0]}")
+    assert (tmp_path / "default.csv").exists() and "Traceback" not in done.stderr
+
+
+def test_a_file_that_a_full_disk_cuts_short_is_named_and_the_old_one_stays(tmp_path: Path) -> None:
+    """A limit on file size stands in for a full disk: both are an OSError at some write."""
+    path = tmp_path / "old.txt"
+    write_text(path, "old")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[0][1]))
+    try:
+        with pytest.raises(DiskError, match=r"old.txt: the limit on file size is reached; raise it"):
+            write_text(path, "new" * 1000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before[0])
+        signal.signal(signal.SIGXFSZ, before[1])
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]

@@ -114,7 +114,11 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
         ("tanks.T1.area", "160 cm", "p.yaml: tanks.T1.area: expected a quantity in m\\^2 .* got '160 cm'"),
         ("tanks.T1.area", 160, "p.yaml: tanks.T1.area: .* got the bare number 160; write its unit"),
         ("tanks.T1.area", True, "p.yaml: tanks.T1.area: expected a quantity in m\\^2, got True"),
-        ("tanks.T1.area", "nan m^2", "p.yaml: tanks.T1.area: expected a finite quantity in m\\^2, got nan m\\^2"),
+        (
+            "tanks.T1.area",
+            "nan m^2",
+            "p.yaml: tanks.T1.area: expected a quantity in m\\^2 such as '1 m\\^2', got 'nan m",
+        ),
         ("tanks.T1.area", "-160 cm^2", "p.yaml: plant p: tanks.T1.area: expected a positive number, got -0.016 m\\^2"),
         ("tanks.T3", {"area": "1 m^2"}, "p.yaml: tanks.T3.height: expected a value, got nothing; add it"),
         ("tanks", [], "p.yaml: tanks: expected keys with values, got \\[\\]"),

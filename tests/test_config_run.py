@@ -117,7 +117,7 @@ def test_overrides_reach_into_lists() -> None:
         ("estimate.parameters.9.low=1", "--set .* estimate.parameters: expected an index below 5, got '9'"),
         ("seed.deep=1", "seed: expected a valid integer, got {'deep': 1}"),
         ("seed", "--set seed: expected KEY=VALUE"),
-        ("seed={", "--set seed={: expected a YAML value"),
+        ("seed={", "--set seed={: line 1: expected YAML, got something else"),
         ("simulate.start_levels.T1=5", "start_levels: expected free, equilibrium or a level such as '50 cm', got 5"),
     ],
 )

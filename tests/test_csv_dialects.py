@@ -70,8 +70,8 @@ def test_words_for_nothing_read_are_missing_readings(tmp_path: Path, word: str) 
             STAMPED.format("2026-10-25 02:59:55", "2026-10-25 02:00:00", "2026-10-25 02:00:05"),
             r"say in which zone this is: columns: \{t: \{zone: Europe/Berlin\}\}",
         ),
-        (b"PK\x03\x04\x00\x00", "got a zip archive or an Excel workbook; save the sheet as CSV"),
-        (b"PAR1\x00\x00", "got a Parquet file"),
+        (b"PK\x03\x04\x00\x00", "expected an Excel workbook that is whole, got one that cannot be read"),
+        (b"ARROW1\x00\x00", "got a Feather file; write it as Parquet"),
         (b"t_s\x00\x00", "got something that is no text"),
     ],
 )

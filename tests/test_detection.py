@@ -12,6 +12,7 @@ from fdi_torch.monitor.detection import (
     NEVER,
     Detector,
     cusum,
+    cusum_on,
     glr,
     largest,
     make_detector,
@@ -130,9 +131,9 @@ def test_channels_share_what_the_glr_suffers_from_spreads_that_are_off() -> None
 def test_an_alarm_starts_the_detector_afresh() -> None:
     e = torch.zeros(20, 1, dtype=torch.float64)
     e[5], e[6], e[12] = 10.0, 10.0, 10.0
-    raised = Detector("cusum", lambda x: cusum(x, 0.5), 5.0, 10).alarms(e)
+    raised = Detector("cusum", lambda x: cusum(x, 0.5), 5.0, lambda x, _: cusum_on(x, 0.5, None)).alarms(e)
     assert raised.nonzero().flatten().tolist() == [5, 6, 12]
-    quiet = Detector("cusum", lambda x: cusum(x, 0.5), 15.0, 10).alarms(e)
+    quiet = Detector("cusum", lambda x: cusum(x, 0.5), 15.0, lambda x, _: cusum_on(x, 0.5, None)).alarms(e)
     assert quiet.nonzero().flatten().tolist() == [6]
 
 
@@ -179,6 +180,9 @@ def test_misuse_is_refused() -> None:
         make_detector("cusum", 1000.0, 1.0, 3, generator, drift=0.0)
     with pytest.raises(ValueError, match="at least 20 samples"):
         make_detector("fixed", 10.0, 1.0, 3, generator)
+    for every in (1e18, 1e300):
+        with pytest.raises(ValueError, match=r"below 1.9e\+12 samples"):
+            make_detector("cusum", every, 1.0, 3, generator)
     with pytest.raises(ValueError, match="at least one sample"):
         make_detector("glr", 1000.0, 1.0, 3, generator, window=0)
     with pytest.raises(ValueError, match="at least 40 fault-free samples"):
@@ -216,3 +220,9 @@ def test_thresholds_allow_for_what_their_recording_does_not_tell() -> None:
         assert 1.0 < sure < 1.05 < unsure < 2.0
     known, doubted = (make_detector("cusum", 5000.0, 1.0, 2, generator, learnt=w) for w in (None, short))
     assert doubted.threshold > known.threshold
+
+
+def test_the_rarest_alarm_that_can_be_asked_for_has_a_threshold() -> None:
+    """ln of the run length grows as 2 drift h: some 6 more than at a thousandth of it."""
+    low, high = (cusum_threshold(n, 3, 0.5) for n in (1e9, 1e12))
+    assert high - low == pytest.approx(math.log(1e3), abs=0.5)

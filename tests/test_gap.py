@@ -15,7 +15,7 @@ from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, slow_excess
 from fdi_torch.gap.library import STANDARD, canonical, library_of
 from fdi_torch.gap.plan import plan
-from fdi_torch.gap.screening import Screen
+from fdi_torch.gap.screening import Pairs
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -133,7 +133,7 @@ def test_a_pair_promises_nothing_where_one_of_the_two_would_have_to_turn_round()
     columns = torch.tensor([[1.0, 0.8], [0.0, 0.6]], dtype=torch.float64)
     for left, together in (([2.0, 1.0], 5.0), ([2.0, -1.0], 0.0)):
         score = columns.T @ torch.tensor(left, dtype=torch.float64)
-        assert float(Screen((), score, columns.T @ columns).pair_gain()[0, 1]) == pytest.approx(together)
+        assert float(Pairs((), score, columns.T @ columns).gain()[0, 1]) == pytest.approx(together)
 
 
 def test_a_sound_rig_with_constants_within_tolerance_has_no_gap() -> None:
@@ -166,7 +166,8 @@ def test_two_causes_are_named_together() -> None:
 def test_a_cause_that_the_library_lacks_is_unknown_at_its_place() -> None:
     values = {"P13.plugging.size": 0.4, "P13.plugging.onset": 450.0}
     answer = diagnose(believed(), recorded(values, 41), settings=Settings((*SMALL, "plugging"), ("plugging",)))
-    assert answer.verdict == "unknown" and not answer.causes
+    assert answer.verdict == "unknown"
+    assert [(c.effect, c.location) for c in answer.causes] == [("unknown", "P13")]
     assert answer.where[0][0] == "P13"
 
 
@@ -180,14 +181,16 @@ def test_slow_noise_that_no_effect_explains_is_no_unknown_cause() -> None:
 
 def test_the_answer_is_the_protocols() -> None:
     answer = diagnose(believed(), recorded({"Q2.pump_gain.factor": 1.12}, 51), settings=Settings(("pump_gain",)))
-    found = answer.to_dict()
-    assert found["format"] == "fdi_torch.gap/1"
-    assert found["ambiguity_set"] == [[{"effect": "pump_gain", "location": "Q2"}]]
-    assert sum(e["probability"] for e in found["posterior"]) == pytest.approx(1.0)
+    found, gain = answer.to_dict(), {"effect": "pump_gain", "location": "Q2"}
+    assert found["format"] == "fdi_torch.gap/2"
+    assert found["ambiguity_set"] == [[gain]] and found["certain"] == [gain]
+    assert 0.0 < found["unexamined"] < 0.01 and found["posterior"][0]["probability"] < 1.0
+    assert sum(e["probability"] for e in found["posterior"]) + found["unexamined"] == pytest.approx(1.0, abs=1e-3)
+    assert set(found["disturbances"]) == {"T1", "T2", "T3"}
 
 
 def test_the_library_offers_62_effects_at_places_of_the_three_tanks() -> None:
-    assert len(library_of(believed(), STANDARD)) == 62
+    assert len(library_of(believed(), STANDARD)) == 65
     assert canonical(("plugging", "OUT2"), believed()) == ("leak", "T2")
 
 

@@ -15,13 +15,13 @@ from fdi_torch.gap.fitting import Candidate, Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.impostors import DRAWS, simulated_impostors
 from fdi_torch.gap.next_input import HIGH, next_input, planned
-from fdi_torch.gap.screening import Option, Screen
+from fdi_torch.gap.screening import Option, Pairs, Screen
 from fdi_torch.plant.effect import Placement
 from tests.test_gap import believed, recorded
 
 
-def made_up(columns: torch.Tensor) -> Screen:
-    """A screen of three pump gains, as if they had these columns."""
+def made_up(columns: torch.Tensor) -> Pairs:
+    """Pairs of three pump gains, as if they had these columns."""
     places = ("Q1", "Q2", "Q1")
     names = ("pump_gain", "pump_gain", "pump_lag")
     options = []
@@ -31,7 +31,7 @@ def made_up(columns: torch.Tensor) -> Screen:
         size = parameters[0]
         start = {f"{place}.{name}.{size.name}": size.nominal + 1e-3 * (size.high - size.nominal)}
         options.append(Option(Placement(kind, place), start, parameters))
-    return Screen(tuple(options), torch.zeros(3, dtype=torch.float64), columns.T @ columns)
+    return Pairs(tuple(options), torch.zeros(3, dtype=torch.float64), columns.T @ columns)
 
 
 def test_a_twin_passes_when_the_true_cause_is_missing_and_half_the_time_when_it_is_not() -> None:
@@ -53,14 +53,16 @@ def test_effects_that_move_the_readings_differently_never_pass_for_one_another()
 
 
 def test_a_gap_that_no_other_effect_can_make_has_no_impostor() -> None:
-    screen = made_up(1e-2 * torch.eye(3, dtype=torch.float64))
-    assert simulated_impostors(screen, ("pump_gain", "Q1"), 1e9, believed()) is None
+    pairs = made_up(1e-2 * torch.eye(3, dtype=torch.float64))
+    assert simulated_impostors(pairs, ("pump_gain", "Q1"), 1e9, believed()) is None
 
 
 def test_twins_and_hidden_effects_follow_from_the_columns() -> None:
     columns = torch.zeros(4, 3, dtype=torch.float64)
     columns[0, :2], columns[1, 1], columns[2, 2] = 30.0, 3.0, 4.0
-    found = excitation(made_up(columns), believed())
+    pairs = made_up(columns)
+    strength = torch.diagonal(pairs.gram)
+    found = excitation(Screen(pairs.options, pairs.score, strength, pairs), believed())
     assert found.hidden == (("pump_lag", "Q1"),)
     ((first, second, left),) = found.twins
     assert {first, second} == {("pump_gain", "Q1"), ("pump_gain", "Q2")}

@@ -17,7 +17,7 @@ from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.jobs.gap import run_gap
-from fdi_torch.jobs.gap_replay import settings_of
+from fdi_torch.jobs.gap_replay import no_longer_done, settings_of
 from fdi_torch.logbook import own_signals, read_run
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.recordings.csv_files import write_csv
@@ -45,7 +45,8 @@ def test_a_gap_log_says_all_that_was_found(logged: Path) -> None:
     assert torch.equal(torch.as_tensor(own_signals(log).outputs), recording.outputs)
     assert torch.equal(torch.as_tensor(own_signals(log, "holdout").outputs), holdout.outputs)
     found = gather(log, believed())
-    assert re.fullmatch(r"The gap comes from pump gain at Q2 \(factor 1\.1\d+ ± 0\.0\d+\)", headline(found))
+    said = r"The gap comes from pump gain at Q2 \(factor 1\.1\d+ ± 0\.0\d+\), probability over 99\.9 %"
+    assert re.fullmatch(said, headline(found))
     assert found.of("/gap/where")[0]["location"] == found.answer["where"][0]["location"]
     assert found.arrays["holdout_augmented"].shape == (300, 3)
 
@@ -70,10 +71,19 @@ def test_a_key_that_a_gap_diagnosis_lacks_is_refused(
 ) -> None:
     words = ["replay", str(logged), "--set", "seed=3", "--out", str(tmp_path / "x.mcap"), "--quiet"]
     assert cli.main(words) == cli.MISUSE
-    assert (
-        "expected one of library, leave_out, step, most, named_only, cross_validate, got seed"
-        in capsys.readouterr().err
-    )
+    assert "expected one of library, leave_out, step, most, named_only, trusted, got seed" in capsys.readouterr().err
+
+
+def test_an_option_that_is_gone_is_said_and_the_rest_of_the_log_is_read(logged: Path) -> None:
+    run = read_run(logged)
+    assert no_longer_done(run) == []
+    old = {**run.metadata["fdi_torch.config"], "settings.cross_validate": "true"}
+    run.metadata["fdi_torch.config"] = old
+    (sentence,) = no_longer_done(run)
+    assert "--cross-validate, an option that no longer exists" in sentence
+    assert settings_of(run) == Settings(LIBRARY)
+    old["settings.cross_validate"] = "false"
+    assert no_longer_done(run) == []
 
 
 def test_every_setting_of_a_diagnosis_can_be_asked_anew(logged: Path) -> None:
@@ -97,14 +107,16 @@ def test_the_command_says_it_in_a_sentence_and_keeps_everything(
     words += [",".join(LIBRARY), "--out", str(tmp_path / "out"), "--adopt", str(better), "--with-constants", "--quiet"]
     assert cli.main(words) == cli.DONE
     shown = capsys.readouterr().out
-    assert shown.startswith("The gap comes from pump_gain at Q2 (over 99.9 % of all explanations weighed).")
+    assert shown.startswith("The gap comes from pump_gain at Q2, probability over 99.9 %.")
     assert "error of free runs on day5.csv, day7.csv, cm" in shown and "of the gap closes on data not used" in shown
     assert "day7.csv: " in shown and f"next: with {better} as their plant, train and monitor" in shown
     answer = json.loads((tmp_path / "out" / "gap.json").read_text())
     found = load_plant(better)
-    assert found.effects[0].parameters["factor"] == answer["causes"][0]["parameters"]["factor"]["value"]
+    factor = answer["causes"][0]["parameters"]["factor"]["value"]
+    assert found.effects[0].parameters["factor"] == pytest.approx(factor, rel=1e-6)  # written to seven digits
     fitted = answer["constants"]["P13.discharge_coefficient"]["augmented"]
-    assert found.pipes[0].discharge_coefficient == fitted != 0.6
+    assert found.pipes[0].discharge_coefficient == pytest.approx(fitted, rel=1e-6) and abs(fitted - 0.6) > 1e-5
+    assert f"+++ {better}" in shown and "+  - {effect: pump_gain, location: Q2" in shown
     refitted_later = {"Q2.pump_gain.factor": found.tolerances["Q2.pump_gain.factor"]}
     assert found.tolerances == believed().tolerances | refitted_later
 

@@ -25,7 +25,7 @@ def test_a_step_is_taken_only_where_its_trajectory_is_the_models(
     subject = subject_of(plant, [], replace(blank, outputs=far_off, mask=None), 1.0)  # type: ignore[arg-type]
     zero = torch.zeros(len(plant.sensors), dtype=torch.float64)
     fitter = Fitter(subject, Noise(zero + 1e-3, zero))
-    before = fitter.fit(Candidate(), rounds=0)
+    before = fitter.fit(Candidate(), cap=0)
 
     def perfect(engine: Any, theta: Any, guess: Any, shift: Any, far: float) -> Any:
         near = engine.linearise(theta, guess)
@@ -34,5 +34,5 @@ def test_a_step_is_taken_only_where_its_trajectory_is_the_models(
         )
 
     monkeypatch.setattr(fitting, "_followed", perfect)
-    after = fitter.fit(Candidate(), before, rounds=1)
+    after = fitter.fit(Candidate(), before, cap=1)
     assert (after.cost < 0.5 * before.cost) is taken

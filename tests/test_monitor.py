@@ -19,19 +19,18 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, place
 from fdi_torch.jobs.monitor import Listening, watch
 from fdi_torch.monitor.change import ChangedObserver, Window
-from fdi_torch.monitor.continuity import continuous
 from fdi_torch.monitor.detection import make_detector
-from fdi_torch.monitor.doubts import residual_doubts
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.following import MonitorState
 from fdi_torch.monitor.gain import hand_gain
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.learning import residual_doubts
+from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.noise import Noise, learn_noise
 from fdi_torch.monitor.observer import Observation, bound
-from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.prepare import fault_free_part, prepare, usual_faults
-from fdi_torch.monitor.samples import Samples, take
+from fdi_torch.monitor.samples import Arrived, Samples, continuous, take, usual_interval
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.whitening import fit_whitening
@@ -154,7 +153,10 @@ def test_random_moments_are_no_gaps() -> None:
     gaps = torch.empty(3000, dtype=torch.float64).exponential_(generator=torch.Generator().manual_seed(1))
     samples = replace(run, time=torch.cumsum(gaps, 0))
     assert float(gaps.max()) > 10.0 * float(gaps.median())
-    assert [notice for _, notice in continuous(samples.stretch(0, 1), samples.stretch(1, 3000))] == [""]
+    stretches, arrived = continuous(
+        Arrived(float(samples.time[0])), samples.stretch(1, 3000), usual_interval(samples.time)
+    )
+    assert [notice for _, notice in stretches] == [""] and arrived.last == float(samples.time[-1])
 
 
 def test_a_fault_that_goes_away_is_recovered() -> None:
@@ -175,9 +177,9 @@ def test_a_fault_whose_law_is_not_quite_the_known_one_is_one_event_until_it_goes
     _, events = followed(monitor(), recorded(truth, 800, NETWORK, space), 50)
     alarms = [event.time for event in events if event.kind == "alarm"]
     assert len(alarms) == 2 and alarms[0] < 210.0 and 700.0 <= alarms[1] < 720.0
-    assert all(event.faults == ("T1.leak.size",) for event in events if event.kind != "alarm")
-    last = events[-1]
-    assert last.kind == "recovered" and last.sizes == (0.0,) and last.onset is not None
+    assert all(event.faults == ("T1.leak.size",) for event in events if event.kind not in ("alarm", "retired"))
+    last = next(event for event in events if event.kind == "recovered")
+    assert last.sizes == (0.0,) and last.onset is not None
     assert abs(last.onset - 699.5) < 3.0
 
 
@@ -245,14 +247,14 @@ def test_an_offset_of_the_observer_is_told_where_it_is_sure_and_matters() -> Non
     seen = Observation(torch.arange(3600.0), residual, residual, one, 3)
     noise_of_it = Noise(one[0], one[0], 1.0, whitening, hand_gain(torch.eye(3, dtype=torch.float64)))
     detector = make_detector("fixed", 1e7, 1.0, 3, torch.Generator())
-    [doubt] = residual_doubts(load_plant("three_tank"), noise_of_it, detector, seen)
+    [doubt] = residual_doubts(load_plant("three_tank"), noise_of_it, detector, seen, 1e7)
     assert "h3 lies 0.04" in doubt and "cm off the observer throughout" in doubt
 
 
 def test_a_sample_that_comes_twice_is_taken_once() -> None:
     samples = recorded(lambda t: SPACE.nominal(), 6)
     twice = Samples(samples.time[[1, 1, 2]], samples.inputs[:3], samples.readings[[1, 1, 2]])
-    [(kept, notice)] = continuous(samples.stretch(0, 1), twice)
+    [(kept, notice)], _ = continuous(Arrived(0.0), twice, 1.0)
     assert kept.time.tolist() == [1.0, 2.0] and notice == ""
 
 
@@ -294,7 +296,7 @@ def test_a_fault_may_be_named_by_its_effect_alone(tmp_path: Path) -> None:
 
 
 def test_usual_faults_are_one_of_each_component() -> None:
-    assert len(usual_faults(PLANT)) == 3 + 3 + 2 + 3
+    assert len(usual_faults(PLANT)) == 3 + 3 + 2 * 2 + 3 * 3
 
 
 LEAK = Path(__file__).parents[1] / "configs" / "monitor" / "three_tank_leak.yaml"
@@ -344,9 +346,8 @@ def test_the_command_prints_one_line_of_json_an_event(
         == 0
     )
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    # The notice is that windows are longer than these 90 s.
-    assert [e["kind"] for e in events] == ["notice", "alarm", "isolated"]
-    assert all(e["format"] == "fdi_torch.event/1" for e in events)
+    assert [e["kind"] for e in events] == ["watching", "notice", "alarm", "isolated", "summary"]
+    assert all(e["format"] == "fdi_torch.event/2" for e in events)
 
 
 def test_the_report_prints_the_inseparable_pair(capsys: pytest.CaptureFixture[str]) -> None:
@@ -407,3 +408,19 @@ def test_a_level_that_is_known_at_the_start_is_not_taken_for_that_of_a_later_fau
     silent = Listening(lambda *_: None, lambda _: None, lambda ready: told.append(ready.calibrated["Q.gain"]))
     watch(load_monitor(tmp_path / "watch.yaml"), silent)
     assert told == [pytest.approx(50.0 / 45.0, rel=0.01)]
+
+
+def test_the_time_to_overflow_is_told_with_an_interval_that_holds_it() -> None:
+    """A pipe that plugs: the tank before it fills. Until then the interval becomes narrower."""
+    samples = recorded(step_to("P13.plugging.size", 0.6, 200.0), 1100, std=0.0)
+    height = PLANT.tanks[0].height
+    truth = float((samples.readings[:, 0] >= height).nonzero()[0])
+    noisy = samples.readings + STD * torch.randn(
+        samples.readings.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64
+    )
+    _, events = followed(monitor(confirm=20.0), replace(samples, readings=noisy).stretch(0, 330))
+    told = [(e.time, limit) for e in events for limit in e.limits]
+    assert len(told) >= 2 and all(limit.tank == "T1" and limit.what == "overflows" for _, limit in told)
+    assert all(time + limit.low < truth < time + limit.high for time, limit in told)
+    widths = [limit.high - limit.low for _, limit in told]
+    assert widths == sorted(widths, reverse=True)

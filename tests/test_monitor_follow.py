@@ -16,8 +16,10 @@ import yaml
 
 from fdi_torch.cli import INTERRUPTED, main
 from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.jobs.arrived import reaching
+from fdi_torch.jobs.replay import run_again
 from fdi_torch.logbook import RunLog, follow, read_run
 from fdi_torch.monitor.arrivals import Arrivals, Punctuality
 from fdi_torch.monitor.observer import bound
@@ -77,7 +79,7 @@ def monitored(words: Sequence[str], capsys: pytest.CaptureFixture[str]) -> list[
 
 
 def kinds(events: Sequence[dict[str, object]]) -> list[object]:
-    return [event["kind"] for event in events if event["kind"] != "notice"]
+    return [event["kind"] for event in events if event["kind"] not in ("notice", "watching", "summary")]
 
 
 def texts(events: Sequence[dict[str, object]]) -> str:
@@ -157,12 +159,12 @@ def test_every_event_lies_in_the_log_from_which_a_page_is_made(
     assert sum(1 for _ in run.messages(["/observer/residual"])) == SAMPLES - 1
     assert main(["report", str(path), "--out", str(tmp_path), "--quiet"]) == 0
     page = path.with_suffix(".html") if path.with_suffix(".html").exists() else next(tmp_path.rglob("*.html"))
-    assert "leak at T3" in page.read_text()
+    assert "T3.leak.size = 0.0" in page.read_text()
 
 
 def test_ctrl_c_keeps_what_was_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written(tmp_path / "rig.csv")
-    from fdi_torch.monitor.online import Monitor
+    from fdi_torch.monitor.monitor import Monitor
 
     advance = Monitor.advance
 
@@ -224,12 +226,12 @@ def test_a_window_mode_needs_a_whole_window(tmp_path: Path, capsys: pytest.Captu
     assert "a stride within it" in capsys.readouterr().err
 
 
-def test_a_window_longer_than_the_recording_is_told_and_cut(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_window_longer_than_the_recording_ends_at_its_beginning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     written(tmp_path / "rig.csv")
     window = {"lookback": "100 s", "confirm": "30 s", "longest": "5000 s", "incipient": False, "together": 1}
-    events = monitored(["--config", config(tmp_path, window=window)], capsys)
-    assert "windows may reach back 5000 s, the recording lasts 299 s" in texts(events)
-    assert "isolated" in kinds(events)
+    assert "isolated" in kinds(monitored(["--config", config(tmp_path, window=window)], capsys))
 
 
 def test_a_fault_within_the_part_taken_for_fault_free_is_suspected(
@@ -346,3 +348,70 @@ def test_a_log_that_ends_between_two_looks_is_read_once(
 
     monkeypatch.setattr(Path, "exists", ends_when_looked_at)
     assert [m.payload["h1"] for m in follow(path, {"/plant/output"}, 5.0, 0.01)] == [0.5, 0.4]
+
+
+def logged_events(path: Path) -> list[dict[str, object]]:
+    return [message.payload for message in read_run(path).messages(["/observer/alarm"])]
+
+
+@pytest.mark.parametrize("rotated", [False, True])
+def test_a_growing_file_is_followed_on_after_a_kill_to_the_same_events(
+    rotated: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed between alarm and isolation; rotated: the file then holds only what came since."""
+    whole = written(tmp_path / "all.csv")
+    expected = monitored(["--config", config(tmp_path, recording={"file": "all.csv"})], capsys)
+    lines, file = whole.read_text().splitlines(keepends=True), tmp_path / "rig.csv"
+    file.write_text("".join(lines[:225]))
+    words = ["--config", config(tmp_path), "--follow", "--idle", "0.3"]
+    with monkeypatch.context() as patch:
+
+        def killed(self: object) -> None:
+            raise KeyboardInterrupt
+
+        patch.setattr("fdi_torch.jobs.monitor.Watcher.close", killed)
+        assert main(["monitor", *words, "--json", "--quiet"]) == INTERRUPTED
+    early = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert kinds(early) == ["alarm"]
+    file.write_text(lines[0] + "".join(lines[215:] if rotated else lines[1:]))
+    late = monitored([*words, "--resume"], capsys)
+    assert early + late == expected
+    logs = [path for path in (tmp_path / "logs").glob("*.mcap") if "_2" in path.name]
+    assert [(m["t"], m["event"], m["message"]) for m in logged_events(logs[0])] == [
+        (e["time"], e["kind"], e["text"]) for e in expected
+    ]
+
+
+def test_a_run_of_another_configuration_is_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    written(tmp_path / "rig.csv")
+    assert main(["monitor", "--config", config(tmp_path), "--resume", "--quiet"]) == 2
+    assert "expected an unfinished log" in capsys.readouterr().err
+    monitored(["--config", config(tmp_path)], capsys)
+    assert main(["monitor", "--config", config(tmp_path), "--resume", "--quiet"]) == 2
+    assert "got a finished one; there is nothing to resume" in capsys.readouterr().err
+
+
+def test_a_monitors_log_is_replayed_to_the_same_events(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    written(tmp_path / "rig.csv")
+    monitored(["--config", config(tmp_path)], capsys)
+    [log] = (tmp_path / "logs").glob("*.mcap")
+    assert main(["replay", str(log), "--quiet"]) == 0
+    assert capsys.readouterr().out.startswith("bit-equal")
+    with pytest.raises(ValueError, match="a key other than the data's"):
+        run_again(read_run(log), tmp_path / "again.mcap", ["recording.file=other.csv"])
+
+
+def test_a_fault_below_its_smallest_size_is_logged_and_not_said_aloud(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path / "rig.csv")
+    plant = {**plant_mapping(load_plant("three_tank")), "matters": {"T3.leak": {"smallest": "40 %", "urgency": "high"}}}
+    assert main(["monitor", "--config", config(tmp_path, plant=plant), "--quiet"]) == 0
+    said = capsys.readouterr().out
+    assert "alarm " in said and "isolated " not in said.replace("alarm 1, isolated", "")
+    [log] = (tmp_path / "logs").glob("*.mcap")
+    assert [e["announced"] for e in logged_events(log) if e["event"] == "isolated"] == [False]
+    loud = {**plant, "matters": {"T3.leak": {"urgency": "high"}}}
+    events = monitored(["--config", config(tmp_path, plant=loud)], capsys)
+    isolated = next(event for event in events if event["kind"] == "isolated")
+    assert isolated["severity"] == "high" and "urgency: high" in str(isolated["text"])

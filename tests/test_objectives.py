@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
 from fdi_torch.estimate.objectives import Problem, Term
-from fdi_torch.estimate.refine import levenberg_marquardt
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.simulate.engine import Readings, gram_of, moments_of
 

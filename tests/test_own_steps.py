@@ -61,11 +61,11 @@ def test_levels_are_as_exact_as_asked_for(tolerance: float, truth: Tensor) -> No
     assert float(error.median()) < tolerance
 
 
-def test_a_fixed_step_as_short_as_the_shortest_is_no_better(truth: Tensor) -> None:
+def test_a_fixed_step_whose_roots_are_as_sharp_is_no_better(truth: Tensor) -> None:
     network, space = rig()
     theta, tolerance = faults(space), 1e-6
     own = CompiledEngine(network, space, experiment(tolerance)).levels(theta)
-    fixed = CompiledEngine(network, space, experiment(None, step=own_steps(tolerance).shortest)).levels(theta)
+    fixed = CompiledEngine(network, space, experiment(None, step=own_steps(tolerance).resolution)).levels(theta)
     assert float((own - truth).abs().max()) < 3.0 * float((fixed - truth).abs().max())
 
 
@@ -78,7 +78,8 @@ def test_both_engines_take_the_same_steps() -> None:
     readings, jacobian = compiled.linearise(theta)
     other = traced.linearise(theta)
     torch.testing.assert_close(readings, other[0], rtol=0, atol=1e-10)
-    torch.testing.assert_close(jacobian, other[1], rtol=1e-8, atol=1e-9 * float(jacobian.abs().max()))
+    # Slopes next to equal levels magnify a last bit of the levels some thousand times; other steps change them by 3e-3.
+    torch.testing.assert_close(jacobian, other[1], rtol=1e-7, atol=1e-7 * float(jacobian.abs().max()))
 
 
 def test_slopes_are_those_of_fine_steps() -> None:
@@ -128,31 +129,29 @@ def test_the_control_by_hand() -> None:
     n = torch.tensor
     assert own_step(n([0.0, 6.0, 7.5, 10.0]), n([4.0, 4.0, 4.0, 4.0]), n(10.0)).tolist() == [4.0, 4.0, 2.5, 10.0]
     assert own_step(n([4.0]), n([4.0]), n(10.0)).tolist() == [3.0], "two of 3 s, rather than 4 s and 2 s"
-    cases = {  # own step, error, stiffness, gone, pace -> kept, how far, pace
-        "small error": (1.0, 1e-8, 0.1, 0.0, 1.0, True, 1.0, 0.9 * (1 / (0.01 + 1e-6)) ** 0.25),
-        "large error": (1.0, 1e-4, 0.1, 0.0, 1.0, False, 0.0, 0.1),
-        "no number": (1.0, torch.nan, torch.nan, 0.0, 1.0, True, 1.0, 3.0),
-        "shortest": (0.1, 1.0, 0.1, 0.0, 0.1, True, 0.1, 0.1),
-        "there already": (1.0, 1e-4, 0.1, 10.0, 1.0, False, 10.0, 1.0),
-        "near the limit of stability": (1.0, 1e-8, 2.0, 0.0, 1.0, True, 1.0, 1.1),
-        "beyond it": (1.0, 1e-8, 4.0, 0.0, 1.0, False, 0.0, 0.55),
-        "cut short by the grid": (0.5, 4e-7, 0.1, 9.5, 2.0, True, 10.0, 2.0),
+    cases = {  # own step, error, gone, pace -> kept, how far, pace
+        "small error": (1.0, 0.01, 0.0, 1.0, True, 1.0, 0.9 * 100**0.25),
+        "none": (1.0, 0.0, 0.0, 1.0, True, 1.0, 3.0),
+        "large error": (1.0, 16.0, 0.0, 1.0, False, 0.0, 0.45),
+        "no solution": (1.0, torch.inf, 0.0, 1.0, False, 0.0, 0.1),
+        "no number": (1.0, torch.nan, 0.0, 1.0, True, 1.0, 3.0),
+        "shortest": (0.1, 1e6, 0.0, 0.1, True, 0.1, 0.1),
+        "there already": (1.0, 100.0, 10.0, 1.0, False, 10.0, 1.0),
+        "cut short by the grid": (0.5, 0.4, 9.5, 2.0, True, 10.0, 2.0),
     }
-    columns = [torch.tensor(c, dtype=torch.float64) for c in zip(*(case[:5] for case in cases.values()), strict=True)]
-    own, error, stiffness, gone, pace = columns
-    kept, after, paces = judged(own, error, stiffness, gone, pace, n(10.0), 1e-6, n(0.1))
+    columns = [torch.tensor(c, dtype=torch.float64) for c in zip(*(case[:4] for case in cases.values()), strict=True)]
+    own, error, gone, pace = columns
+    kept, after, paces = judged(own, error, gone, pace, n(10.0), 0.1)
     for i, (name, case) in enumerate(cases.items()):
-        assert (bool(kept[i]), float(after[i])) == case[5:7], name
-        assert float(paces[i]) == pytest.approx(case[7]), name
+        assert (bool(kept[i]), float(after[i])) == case[4:6], name
+        assert float(paces[i]) == pytest.approx(case[6]), name
 
 
 def test_misuse_is_named() -> None:
     network, space = rig()
-    with pytest.raises(ValueError, match="expected a positive tolerance, got 0"):
+    with pytest.raises(ValueError, match=r"expected a tolerance above the rounding of levels .*, got 0 m"):
         experiment(0.0)
-    with pytest.raises(
-        ValueError, match="expected the same steps for all lanes in the reference engine, got a tolerance"
-    ):
+    with pytest.raises(ValueError, match="expected the same steps for all lanes in the reference engine, got steps of"):
         ReferenceEngine(network, space, experiment(1e-6))
 
 
@@ -171,9 +170,10 @@ def test_a_long_recording_is_fitted_in_own_steps_alike(monkeypatch: pytest.Monke
         found, _ = refine_to_convergence(fitting, HybridSettings(), theta[None], low, high, 0.2, None)
         return found.theta[0], information_std(fitting.problem(0.05), found.theta)
 
-    expected, std = fitted()
-    assert not fitting.takes_own_steps(0.1)
-    monkeypatch.setattr("fdi_torch.estimate.fitting.MANY_STEPS", 1000)
+    with monkeypatch.context() as fixed_steps:
+        fixed_steps.setattr("fdi_torch.estimate.fitting.OWN_STEP_COST", torch.inf)
+        assert not fitting.takes_own_steps(0.1)
+        expected, std = fitted()
     assert fitting.takes_own_steps(0.1) and not fitting.takes_own_steps(1.0)
     found, own_std = fitted()
     assert float(((found - expected).abs() / std).max()) < 0.1

@@ -102,7 +102,7 @@ def test_steps_of_a_lane_s_own_scale_with_the_rig(metres: float, seconds: float)
     for m, s in ((1.0, 1.0), (metres, seconds)):
         plant, blank = experiment(m, s)
         own = OwnSteps.like(0.5 * s, plant)
-        assert own.shortest == pytest.approx(0.5 * s)
+        assert own.resolution == pytest.approx(0.5 * s)
         network = build_network(plant, placements_for(FAULTS))
         space = ParameterSpace(network.constants[name] for name in FAULTS)
         engine = TracedEngine(network, space, lay_out(blank.stretch(0, 12), plant.channels(), s, own))

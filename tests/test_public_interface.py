@@ -13,7 +13,9 @@ import fdi_torch
 
 @pytest.mark.parametrize("name", fdi_torch.__all__)
 def test_public_names_are_there(name: str) -> None:
-    assert getattr(fdi_torch, name).__name__ == name if name != "EFFECTS" else len(fdi_torch.EFFECTS) > 20
+    found = getattr(fdi_torch, name)
+    assert found.__name__.removeprefix("fdi_torch.") == name if name != "EFFECTS" else len(found) > 20
+    assert callable(found) or name == "EFFECTS"
 
 
 def test_an_unknown_name_is_refused() -> None:
@@ -24,6 +26,22 @@ def test_an_unknown_name_is_refused() -> None:
 def test_loading_the_package_does_not_load_torch() -> None:
     code = "import sys, fdi_torch; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("before", ["", "import fdi_torch.gap.answer, fdi_torch.simulate.build, fdi_torch.effects"])
+def test_a_package_with_a_function_s_name_is_both(before: str) -> None:
+    """Whichever is asked for first, the package or the function."""
+    code = f"""
+{before}
+import inspect
+from fdi_torch import effects, gap, simulate
+import fdi_torch
+import fdi_torch.gap.answer as answer
+assert "recordings" in inspect.signature(gap).parameters and fdi_torch.gap is gap
+assert len(effects()) == len(effects.EFFECTS) and fdi_torch.gap.answer is answer
+assert fdi_torch.simulate.experiment.Experiment
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_tensors_in_tensors_out() -> None:

@@ -93,7 +93,7 @@ def test_a_hose_that_fills_is_no_leak(data: Path, tmp_path: Path) -> None:
     assert 55e-6 < states["qR.pump_priming.volume"].size < 90e-6
 
 
-@pytest.mark.slow
+@pytest.mark.longest
 def test_the_valve_the_pump_and_the_offset_of_the_sensors_are_named_where_they_are(data: Path) -> None:
     plant = load_plant(REAL / "dts200_nominal.yaml")
     recordings = named_recordings(str(REAL / "dts200_runs.yaml"), plant, ROOT)

@@ -205,3 +205,47 @@ def test_a_jump_by_an_hour_asks_for_the_zone() -> None:
     check = check_recording(replace(healthy(), time=time), PLANT)
     assert [f.kind for f in check.findings] == ["clock", "gap"]
     assert "say in which zone, as in columns: {t: {zone: Europe/Berlin}}" in check.findings[0].text
+
+
+def held_at_random(hold: float, interval: float, samples: int, seed: int, levels: int = 0) -> torch.Tensor:
+    """A command that takes a new value at the end of each hold (s), sampled every `interval` s; levels: 0 for any."""
+    generator = torch.Generator().manual_seed(seed)
+    draws = torch.rand(int(samples * interval / hold) + 2, generator=generator, dtype=torch.float64)
+    values = (draws * levels).floor() / levels if levels else draws
+    clock = interval * torch.arange(samples, dtype=torch.float64) + float(torch.rand(1, generator=generator)) * hold
+    return 1e-5 + 8e-5 * values[(clock / hold).long()]
+
+
+def undersampled(command: torch.Tensor) -> bool:
+    recording = with_q1(command)
+    return "undersampled" in {finding.kind for finding in check_recording(recording, PLANT).findings}
+
+
+@pytest.mark.parametrize("levels", [0, 2, 5])
+@pytest.mark.parametrize("seed", range(10))
+def test_a_command_that_moves_faster_than_its_samples(levels: int, seed: int) -> None:
+    """Every 1 and 2 s, sampled every 3 s; and the same commands sampled ten times as fast."""
+    for hold in (1.0, 2.0):
+        assert undersampled(held_at_random(hold, 3.0, 400, seed, levels))
+        assert not undersampled(held_at_random(hold, 0.3, 400, seed, levels))
+
+
+def test_how_fast_a_command_moves_is_said() -> None:
+    channel, text = found(check_recording(with_q1(held_at_random(1.0, 3.0, 400, 0)), PLANT), "undersampled")
+    assert channel == "Q1" and "moves about as fast as it is sampled: successive samples correlate by" in text
+
+
+def test_a_sine_is_known_from_six_samples_a_period_on() -> None:
+    time = torch.arange(400, dtype=torch.float64)
+    for period, is_fast in ((2.5, True), (4.0, True), (12.0, False), (100.0, False)):
+        assert undersampled(5e-5 + 4e-5 * torch.sin(2 * torch.pi * time / period + 0.3)) is is_fast
+
+
+def test_commands_that_rarely_move_or_of_which_little_is_known_are_not_called_fast() -> None:
+    still = torch.full((400,), 5e-5, dtype=torch.float64)
+    few = still.clone()
+    few[5:] = torch.nan
+    few[1] = 6e-5
+    assert not undersampled(still) and not undersampled(few)
+    assert not undersampled(held_at_random(100.0, 1.0, 400, 0))
+    assert not undersampled(5e-5 + 0.1 * held_at_random(1.0, 3.0, 400, 0)), "too little to show in the readings"

@@ -13,8 +13,8 @@ from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.proportion import wilson
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.following import observe
+from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.noise import learn_noise
-from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.prepare import with_shapes
 from fdi_torch.monitor.rehearsal.alarms import count_false_alarms, delays, detectors
 from fdi_torch.monitor.rehearsal.naming import Kind, confusions, name, smallest_isolable

@@ -114,7 +114,7 @@ def test_an_interrupted_study_goes_on_and_says_the_same(tmp_path: Path) -> None:
     assert resumed.trials == whole.trials and resumed.summaries == whole.summaries
     logs = [[m.data for m in read_run(r.log).messages([TRIAL])] for r in (whole, resumed)]
     assert logs[0] == logs[1] and len(logs[0]) == 7
-    with pytest.raises(ValueError, match="expected an unfinished study, got a finished one"):
+    with pytest.raises(ValueError, match="expected a run that did not end, got a finished one"):
         run_study(broken, resume=True)
     with pytest.raises(ValueError, match="expected the log of this configuration, got another's"):
         run_study(quick(tmp_path / "broken", "study.trials=8"), resume=True)

@@ -35,6 +35,8 @@ def every_trial_once(results: Iterator[list[Trial]]) -> dict[int, Trial]:
 def test_killing_one_of_two_workers_changes_no_trial(plan: Plan) -> None:
     alone = every_trial_once(run_blocks(plan, plan.blocks()))
     with connected("local", workers=2) as client:
+        places = [client.scheduler.address, *client.scheduler_info()["workers"]]
+        assert len(places) == 3 and all(place.startswith("tcp://127.0.0.1:") for place in places)
 
         def with_a_murder() -> Iterator[list[Trial]]:
             for k, block in enumerate(run_with(client, plan, plan.blocks())):

@@ -11,8 +11,8 @@ import torch
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.monitor.detection import make_detector
+from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.noise import learn_noise
-from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.prepare import with_shapes
 from fdi_torch.monitor.rehearsal.runs import Course, Rig, fault_free
 from fdi_torch.monitor.samples import Samples

@@ -1,35 +1,36 @@
-"""Examine a plant and its recordings before any fit: clock, gaps, clipped, frozen or rounded channels, units, masks."""
+"""`fdi check`: what it does and prints. Its options: `options/check.py`."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
-from fdi_torch.cli.options import add_config, add_keys
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import known_parts, read_recording
-from fdi_torch.config.plant import PlantConfig, load_plant
+from fdi_torch.config.plant import load_plant
 from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.config.run import load_run
+from fdi_torch.gap.acquisition import examined
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import ChannelSummary, RecordingCheck, check_recording
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", nargs="?", help="CSV or MCAP file whose columns are named as the plant's channels")
-    parser.add_argument("--plant", metavar="NAME|FILE", help="a shipped plant such as three_tank, or a plant file")
-    add_config(parser)
-    add_keys(parser, "a plant file", PlantConfig)
+from fdi_torch.recordings.finding import Finding
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant, recordings, base = _wanted(arguments)
     checks = []
     _show_plant(plant, screen)
+    if arguments.picture:
+        from fdi_torch.report.schematic import schematic
+        from fdi_torch.report.style import save
+
+        screen.say(f"picture: {save(schematic(plant), Path(arguments.picture))}")
     for config in recordings:
         recording = read_recording(config, plant, base)
-        checks.append(check_recording(recording, plant))
+        checks.append(_checked(recording, plant))
         _show(checks[-1], screen)
         stretches = known_parts(recording, config, plant)
         if len(stretches) > 1 or len(stretches[0].recording) < len(recording):
@@ -39,15 +40,26 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     return 0
 
 
+def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
+    """What is odd about each channel; first of all what would be refused or masked."""
+    check, found = check_recording(whole, plant), [examined(plant, part) for part in whole.known_stretches()]
+    wrong = [Finding("slip", ", ".join(f.slip.channels), f.slip.text) for f in found if f.slip]
+    wrong += [
+        Finding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop}) for f in found for s in f.stuck
+    ]
+    return replace(check, findings=(*wrong, *check.findings))
+
+
 def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[RecordingConfig], Path]:
     if arguments.config is not None:
         wanted = load_run(arguments.config, arguments.set)
         if not wanted.config.recordings:
             raise ValueError("expected recordings in the run file, got a simulation; fdi simulate writes its recording")
         return wanted.plant, wanted.config.recordings, wanted.base
-    if arguments.plant is None or arguments.recording is None:
-        raise ValueError("expected a recording and --plant, or --config; fdi check --help tells more")
-    return load_plant(arguments.plant), [RecordingConfig(file=arguments.recording)], Path.cwd()
+    if arguments.plant is None:
+        raise ValueError("expected --plant, a recording and --plant, or --config; fdi check --help tells more")
+    named = [] if arguments.recording is None else [RecordingConfig(file=arguments.recording)]
+    return load_plant(arguments.plant), named, Path.cwd()
 
 
 def _show_plant(plant: PlantDescription, screen: Screen) -> None:

@@ -1,4 +1,4 @@
-"""What differs between runs: configuration, versions, data, results with their errors, convergence and residuals."""
+"""`fdi compare`: what it does and prints. Its options: `options/compare.py`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
+from fdi_torch.disk import replacing
 from fdi_torch.logbook import Comparison, compare, read_run
 from fdi_torch.report.comparison import comparison_section, in_words, result_rows
 from fdi_torch.report.material import gather
@@ -16,17 +17,11 @@ from fdi_torch.report.style import save
 MOST_TEXT = 40
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("logs", nargs="+", metavar="RUN.mcap", help="two logs or more")
-    parser.add_argument("--csv", metavar="FILE", help="also write the whole comparison as CSV")
-    parser.add_argument("--pictures", metavar="DIR", help="also write convergence and residuals as PNG and SVG")
-
-
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     compared = compare(arguments.logs)
     show(compared, screen)
     if arguments.csv:
-        with open(arguments.csv, "w", newline="", encoding="utf-8") as file:
+        with replacing(Path(arguments.csv)) as new, new.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows(compared.rows())
         screen.say(f"table: {arguments.csv}")
     if arguments.pictures:

@@ -1,4 +1,4 @@
-"""What an experiment can tell: which faults show, which can be told apart, how small they may be."""
+"""`fdi diagnosability`: what it does and prints. Its options: `options/diagnosability.py`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 
-from fdi_torch.cli.options import seconds
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.estimation import full_name
 from fdi_torch.config.loaded_recordings import read_recording
@@ -20,43 +19,6 @@ from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import time_scale
 from fdi_torch.recording import Recording
-
-EXAMPLES = """
-examples:
-  fdi diagnosability --plant three_tank --input '50 cm^3/s,50 cm^3/s'             two constant flows for 1000 s
-  fdi diagnosability --plant rig.yaml --input run.csv --noise '2 mm'              the inputs of a recording
-  fdi diagnosability --plant rig.yaml --input '20 m^3/h,50 %' --duration '1 day' --faults A.leak,link.plugging
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EXAMPLES
-    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
-    parser.add_argument("--faults", metavar="NAME,NAME", help="such as T1.leak.size; by default the usual ones")
-    parser.add_argument(
-        "--input",
-        metavar="FILE|AMOUNTS",
-        required=True,
-        help="a recording whose inputs are used, or constant inputs such as '50 cm^3/s,50 cm^3/s'",
-    )
-    parser.add_argument(
-        "--duration",
-        metavar="TIME",
-        type=seconds,
-        help="of constant inputs, such as '2 h' (1000 s on a bench, longer on slower plants)",
-    )
-    parser.add_argument(
-        "--noise",
-        metavar="AMOUNT",
-        default="1 mm",
-        help="standard deviation of every reading: of the level ('1 mm', the default), or 'h1 = 1 mm, p2 = 2 mV'",
-    )
-    parser.add_argument(
-        "--false-alarm", metavar="SHARE", type=float, default=0.001, help="of tests without a fault (0.001)"
-    )
-    parser.add_argument("--miss", metavar="SHARE", type=float, default=0.05, help="of tests with the fault (0.05)")
-    parser.add_argument("--calibrate", metavar="NAME,NAME", default="", help="constants uncertain by their tolerance")
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

@@ -9,50 +9,15 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from fdi_torch.cli import DONE
-from fdi_torch.cli.options import seconds
+from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.effects import build_network
 from fdi_torch.gap.in_turn import Trial, in_turn
-from fdi_torch.gap.prediction import START_SAMPLES
 from fdi_torch.gap.refit import Refit, refit
 from fdi_torch.gap.spread import spread
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-
-
-def add_refit_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--refit", action="store_true", help="search nothing: fit the plant's own effects and constants together"
-    )
-    parser.add_argument(
-        "--hold", metavar="NAME,...", default="", help="with --refit: leave these as they are (* is any name)"
-    )
-    parser.add_argument(
-        "--white", metavar="STD", type=float, help="with --refit: slow errors count like fast ones, of that size, SI"
-    )
-    parser.add_argument(
-        "--vary",
-        metavar="NAME,...",
-        default="",
-        help="with --refit: each recording has its own value of these; how much they differ is told (* is any name)",
-    )
-    parser.add_argument(
-        "--in-turn",
-        action="store_true",
-        help="with --refit: also free runs of every file (of every --holdout, if any) by a refit without that file",
-    )
-    parser.add_argument(
-        "--start-samples",
-        metavar="N",
-        type=int,
-        default=START_SAMPLES,
-        help=f"with --in-turn: for the start levels ({START_SAMPLES})",
-    )
-    parser.add_argument(
-        "--settle", metavar="TIME", type=seconds, help="with --in-turn: as `fdi predict` has it, in place of those"
-    )
 
 
 def run_refit(
@@ -69,7 +34,7 @@ def run_refit(
     _show(found, screen)
     _show_own(found, screen)
     if arguments.adopt:
-        Path(arguments.adopt).write_text(dump_plant(found.plant), encoding="utf-8")
+        write_adopted(arguments.plant, plant, found.plant, Path(arguments.adopt), screen)
         screen.note(f"plant file as fitted: {arguments.adopt}")
     trials: list[Trial] = []
     if arguments.in_turn:

@@ -8,8 +8,9 @@ from typing import Any
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.gap.answer import Answer, CauseName, Explanation, names
+from fdi_torch.gap.answer import UNKNOWN, Answer, CauseName, names
 from fdi_torch.gap.excitation import Excitation
+from fdi_torch.gap.verdict_words import causes_of, explanation_words, probability_words, verdict_sentence
 from fdi_torch.parameters import display_unit
 
 MOST_ROWS = 5
@@ -26,32 +27,19 @@ STAGES = {
 
 def show(answer: Answer, screen: Screen) -> None:
     """Everything but what to do next."""
-    screen.say(verdict_words(answer))
+    as_json = answer.to_dict()
+    screen.say(verdict_sentence(as_json))
     _causes(answer, screen)
-    _explanations(answer, screen)
-    rows = [[place, f"{100 * share:.1f} %"] for place, share in answer.where[:MOST_ROWS]]
-    if answer.verdict != "no_gap":
-        screen.table("where", ("place", "a free discrepancy there alone closes"), rows)
+    _explanations(as_json, screen)
+    rows = [[place, probability_words(p)] for place, p in answer.where[:MOST_ROWS] if p >= LEAST_SHOWN]
+    if rows and answer.verdict != "no_gap":
+        screen.table("where", ("place", "probability that something is wrong there"), rows)
+    _disturbances(answer.disturbances, screen)
     if answer.closure:
         _closure(answer.closure, screen)
     _constants(answer.constants, screen)
     for remark in [*answer.remarks, *_impostors(answer.impostors)]:
         screen.say(f"- {remark}")
-
-
-def verdict_words(answer: Answer) -> str:
-    """The verdict in one sentence."""
-    chance = answer.posterior[0].probability if answer.posterior else float("nan")
-    best = words(answer.posterior[0]) if answer.posterior else ""
-    if answer.verdict == "no_gap":
-        return "No gap: the plant file explains the recording within noise and tolerances."
-    if answer.verdict == "named":
-        return f"The gap comes from {best} ({percent(chance)} of all explanations weighed)."
-    if answer.verdict == "ambiguous":
-        count = len(answer.ambiguity_set)
-        return f"There is a gap that {count} explanations share at 95 %; the likeliest is {best} ({percent(chance)})."
-    place = answer.where[0][0] if answer.where else "an unknown place"
-    return f"There is a gap at {place} that no effect of the library explains; only its place and shape are known."
 
 
 def next_steps(
@@ -72,7 +60,7 @@ def next_steps(
             "next: --named-only leads past it, to the best that has a name, where several things may be wrong at once; "
             "--adopt then has something to write, and the next diagnosis tells what is left"
         )
-    if answer.verdict in ("named", "ambiguous"):
+    if any(c.effect != UNKNOWN for c in answer.causes):
         no_longer = "train and monitor no longer take the gap for a fault"
         written = f"with {adopted} as their plant, {no_longer}" if adopted else ""
         steps.append(f"next: {written or f'--adopt FILE writes the plant file with the causes; with it {no_longer}'}")
@@ -103,19 +91,6 @@ def show_plan(found: Excitation, screen: Screen) -> int:
     return DONE
 
 
-def words(explanation: Explanation) -> str:
-    if explanation.unknown_at:
-        return f"something unknown at {explanation.unknown_at}"
-    return " and ".join(f"{effect} at {place}" for effect, place in explanation.causes) or "nothing beyond tolerances"
-
-
-def percent(share: float) -> str:
-    """No more digits than tell something: 'over 99.9 %', '97.2 %'."""
-    if share >= 0.9995:
-        return "over 99.9 %"
-    return f"{100 * share:.1f} %" if share >= 0.001 else "under 0.1 %"
-
-
 def _causes(answer: Answer, screen: Screen) -> None:
     rows = []
     for cause in answer.causes:
@@ -130,10 +105,25 @@ def _causes(answer: Answer, screen: Screen) -> None:
             screen.say(f"- {_listed([(cause.effect, cause.location)])} is the same thing as {_listed(cause.same_as)}")
 
 
-def _explanations(answer: Answer, screen: Screen) -> None:
-    rows = [[words(e), percent(e.probability)] for e in answer.posterior if e.probability >= LEAST_SHOWN]
+def _disturbances(disturbances: Mapping[str, Any], screen: Screen) -> None:
+    """The random flow into each tank beside the likeliest explanation."""
+    rows = []
+    for tank, flow in disturbances.items():
+        unit, scale = display_unit(flow["unit"])
+        time = flow["correlation_time"]
+        rows.append([tank, f"{scale * flow['std']:.3g}", unit, f"{time:.3g} s" if time else "none"])
+    if rows:
+        header = ("into", "standard deviation", "unit", "correlation time")
+        screen.table("random flows, which are no fault", header, rows)
+
+
+def _explanations(answer: Mapping[str, Any], screen: Screen) -> None:
+    weighed = [(explanation_words(causes_of(e)), e["probability"]) for e in answer["posterior"]]
+    rows = [[words, probability_words(p)] for words, p in weighed if p >= LEAST_SHOWN][: MOST_ROWS + 3]
+    if answer["unexamined"] >= LEAST_SHOWN:
+        rows.append(["explanations that were not examined", probability_words(answer["unexamined"])])
     if len(rows) > 1:
-        screen.table("explanations", ("causes", "probability"), rows[: MOST_ROWS + 3])
+        screen.table("explanations", ("causes", "probability"), rows)
 
 
 def _closure(closure: Mapping[str, Any], screen: Screen) -> None:

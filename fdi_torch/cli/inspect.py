@@ -1,27 +1,17 @@
-"""What a log is about and whether it is sound; any MCAP file will do. With --topic, its messages for other tools."""
+"""`fdi inspect`: what it does and prints. Its options: `options/inspect.py`."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
+from fdi_torch.disk import named_errors
 from fdi_torch.logbook import Inspection, export, export_attachment, inspect_log, read_run
 
 MOST_RESULTS = 12
 RECORDS = ("run", "status", "data", "seeds", "git")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", metavar="RUN.mcap", help="a log, ours or any other, whole or not")
-    parser.add_argument("--topic", metavar="T", help="write the messages of this topic instead")
-    parser.add_argument("--format", choices=("csv", "ndjson", "npz"), default="csv", help="in this form (default: csv)")
-    parser.add_argument("--attachment", metavar="NAME", help="write this attachment instead, such as config.yaml")
-    parser.add_argument(
-        "--out", metavar="FILE|DIR", help="file for the messages (default: standard output), folder for an attachment"
-    )
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -41,15 +31,18 @@ def write_topic(arguments: argparse.Namespace, screen: Screen) -> None:
     """The messages of a topic, to a new file or to standard output."""
     log = read_run(arguments.log, salvage=True)
     if arguments.out is None:
-        count = export(log, arguments.topic, arguments.format, sys.stdout.buffer)
-        sys.stdout.buffer.flush()
+        with screen.stream() as stream:
+            count = export(log, arguments.topic, arguments.format, stream)
     else:
-        with open(arguments.out, "xb") as file:
-            try:
-                count = export(log, arguments.topic, arguments.format, file)
-            except OSError:
-                Path(arguments.out).unlink()
-                raise
+        path = Path(arguments.out)
+        with named_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("xb") as file:
+                try:
+                    count = export(log, arguments.topic, arguments.format, file)
+                except OSError:
+                    path.unlink()
+                    raise
     screen.note(f"{count} messages of {arguments.topic}: {arguments.out or 'standard output'}")
 
 

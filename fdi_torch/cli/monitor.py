@@ -1,4 +1,4 @@
-"""Follow a recording: alarms, which fault since when and how large, and recoveries, one line an event."""
+"""`fdi monitor`: what it does and prints. Its options: `options/monitor.py`."""
 
 from __future__ import annotations
 
@@ -6,25 +6,13 @@ import argparse
 
 import orjson
 
-from fdi_torch.cli.options import add_config, add_live, live, seconds
+from fdi_torch.cli.options import live
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.monitor import MonitorConfig, load_monitor
+from fdi_torch.config.monitor import load_monitor
 from fdi_torch.jobs.monitor import Listening, watch
-from fdi_torch.monitor.events import Event
+from fdi_torch.monitor.events import FORMAT, Event
 from fdi_torch.monitor.prepare import Prepared
 from fdi_torch.parameters import display_unit
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, MonitorConfig, required=True)
-    parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
-    parser.add_argument(
-        "--follow", action="store_true", help="the file is still being written: events as its samples come"
-    )
-    parser.add_argument(
-        "--idle", metavar="TIME", type=seconds, default=60.0, help="--follow: end after so long without a sample (60 s)"
-    )
-    add_live(parser)
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -32,7 +20,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     wanted = load_monitor(arguments.config, [*arguments.set, *folder])
     with screen.progress("following") as advance, live(arguments, wanted.name, screen) as listener:
         heard = Listening(advance, lambda e: _tell(e, screen), lambda p: _introduce(p, screen), listener)
-        done = watch(wanted, heard, arguments.follow, arguments.idle)
+        done = watch(wanted, heard, arguments.follow, arguments.idle, arguments.resume)
     slow = "" if done.spent < done.lasted else "; slower than real time"
     screen.note(f"{done.lasted:g} s of recording in {done.spent:.1f} s of work{slow}; log: {done.log}")
     if not done.events:
@@ -41,8 +29,9 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def _tell(event: Event, screen: Screen) -> None:
-    screen.say(event.line)
-    screen.line(orjson.dumps({"format": "fdi_torch.event/1", **event.to_dict()}).decode())
+    if event.announced:
+        screen.say(event.line)
+    screen.line(orjson.dumps({"format": FORMAT, **event.to_dict()}).decode())
 
 
 def _introduce(prepared: Prepared, screen: Screen) -> None:

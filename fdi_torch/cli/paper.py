@@ -1,4 +1,4 @@
-"""Make the 2020 paper's tables and figures again, ours and its numbers side by side, as one page with pictures."""
+"""`fdi paper`: what it does and prints. Its options: `options/paper.py`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,6 @@ from pathlib import Path
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.paper.page import make_page
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", default="docs/paper", help="folder for the page (default: docs/paper)")
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

@@ -1,8 +1,4 @@
-"""Run a plant file freely along recordings: of each only the first samples are used, for the start levels.
-
-What is printed is the error of the whole run, the first samples included, in each sensor's unit; with --settle, of what
-comes after that stretch. A run ends where an input becomes unknown, and begins anew where it is known again.
-"""
+"""`fdi predict`: what it does and prints. Its options: `options/predict.py`."""
 
 from __future__ import annotations
 
@@ -14,68 +10,19 @@ from typing import Any
 import torch
 
 from fdi_torch.cli import DONE
-from fdi_torch.cli.options import seconds
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.channels import missing_inputs
 from fdi_torch.config.files import find_data
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
 from fdi_torch.config.plant import load_plant
 from fdi_torch.config.recordings import RecordingConfig
-from fdi_torch.gap.prediction import START_SAMPLES, Prediction, predict
+from fdi_torch.gap.prediction import Prediction, predict
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_header
 from fdi_torch.report.free_run_figure import free_run_figure
 from fdi_torch.report.style import save
-
-EXAMPLES = """
-examples:
-  fdi predict run.csv --plant better.yaml                    one free run
-  fdi predict a.csv b.csv --plant rig.yaml --to 300          several, each for its first 300 s
-  fdi predict runs.yaml --plant rig.yaml                     stretches listed under `recordings`, as in a run file
-  fdi predict run.csv --plant better.yaml --beside rig.yaml --picture run.png
-  fdi predict run.csv --plant rig.yaml --settle 30           what varies from run to run is told by the first 30 s
-  fdi predict run.csv --plant rig.yaml --settle 60 --vary 'q?.gain'   the pumps' gains of this run too
-  fdi predict run.csv --plant rig.yaml --constant q1_cmd=0   an input that was not recorded, or '20 cm^3/s'
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EXAMPLES
-    parser.add_argument(
-        "recordings", metavar="recording", nargs="*", help="CSV or MCAP file, or a YAML file with `recordings`"
-    )
-    parser.add_argument("--recording", metavar="FILE", action="append", default=[], help="the same, as an option")
-    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
-    parser.add_argument(
-        "--start-samples", metavar="N", type=int, default=START_SAMPLES, help=f"for the start levels ({START_SAMPLES})"
-    )
-    parser.add_argument(
-        "--settle",
-        metavar="TIME",
-        type=seconds,
-        help="take what the plant file says varies from run to run, and the levels to go on from, from all of so much "
-        "of each run ('30 s'), and count errors after it",
-    )
-    parser.add_argument(
-        "--vary",
-        metavar="NAME,...",
-        default="",
-        help="constants with a tolerance that are taken from there too (* is any name)",
-    )
-    parser.add_argument("--from", metavar="TIME", dest="start", type=seconds, help="first time used of each file")
-    parser.add_argument("--to", metavar="TIME", dest="stop", type=seconds, help="last time used: 300, or '2 h'")
-    parser.add_argument("--picture", metavar="FILE", help="draw the run (PNG or SVG); of several, the last")
-    parser.add_argument("--beside", metavar="PLANT", help="another plant, drawn beside it, such as the one before")
-    parser.add_argument(
-        "--constant",
-        metavar="INPUT=VALUE",
-        action="append",
-        default=[],
-        help="an input that was not recorded, SI or with its unit",
-    )
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

@@ -1,4 +1,4 @@
-"""Save everything that is whole of a broken or unfinished log as a new one; exit code 3 where something was lost."""
+"""`fdi recover`: what it does and prints. Its options: `options/recover.py`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,6 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.logbook import recover
 
 LOST = 3
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", metavar="BROKEN.mcap", help="a damaged log, or one that was not finished (.partial)")
-    parser.add_argument("--out", metavar="FILE", help="the new log (default: NAME.recovered.mcap beside it)")
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

@@ -1,23 +1,13 @@
-"""Try a monitor out on simulated runs: false alarms, delays, faults named, estimators side by side.
-
-It is computed in pieces of seconds to minutes; Ctrl-C keeps those that are done, and --resume goes on.
-"""
+"""`fdi rehearse`: what it does and prints. Its options: `options/rehearse.py`."""
 
 from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_config, add_live, live
+from fdi_torch.cli.options import live
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.rehearsal import RehearsalConfig, load_rehearsal
+from fdi_torch.config.rehearsal import load_rehearsal
 from fdi_torch.jobs.rehearsal import Rehearsed, rehearse
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, RehearsalConfig, required=True)
-    parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
-    parser.add_argument("--resume", action="store_true", help="go on from what a stopped run left in its log")
-    add_live(parser)
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

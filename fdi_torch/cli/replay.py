@@ -1,9 +1,4 @@
-"""Run an estimation, a study or a gap diagnosis again from its log alone, and compare event by event.
-
-With --set, try another choice.
-
-Exit code 3 where an event differs by more than the tolerance.
-"""
+"""`fdi replay`: what it does and prints. Its options: `options/replay.py`."""
 
 from __future__ import annotations
 
@@ -19,32 +14,17 @@ from fdi_torch.logbook import Replay, compare, read_run, replay
 DIFFERS = 3
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", metavar="RUN.mcap", help="a log of fdi train, fdi study or fdi gap")
-    parser.add_argument(
-        "--relative", metavar="R", type=float, default=1e-9, help="tolerance of numbers (default: 1e-9)"
-    )
-    parser.add_argument(
-        "--set",
-        metavar="KEY=VALUE",
-        action="append",
-        default=[],
-        help="what if: another objective, seed, library ...; may be repeated",
-    )
-    parser.add_argument(
-        "--trial", metavar="N", type=int, action="append", default=[], help="of a study, only this; may be repeated"
-    )
-    parser.add_argument("--out", metavar="FILE", help="the new log (with --set: NAME.what_if.mcap; otherwise not kept)")
-
-
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     return what_if(arguments, screen) if arguments.set else faithful(arguments, screen)
 
 
 def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
     """The same again: every event must be the same."""
+    from fdi_torch.jobs.gap_replay import no_longer_done
     from fdi_torch.jobs.replay import comparable, run_again
 
+    for sentence in no_longer_done(read_run(arguments.log)):
+        screen.note(sentence)
     with tempfile.TemporaryDirectory() as folder, screen.progress("replay") as advance:
         target = Path(arguments.out or Path(folder) / "again.mcap")
         done = replay(
@@ -62,8 +42,11 @@ def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
     """The same data with another choice: a new log, compared with the old one."""
+    from fdi_torch.jobs.gap_replay import no_longer_done
     from fdi_torch.jobs.replay import run_again
 
+    for sentence in no_longer_done(read_run(arguments.log)):
+        screen.note(sentence)
     source = Path(arguments.log)
     target = Path(arguments.out or source.with_name(f"{source.name.removesuffix('.mcap')}.what_if.mcap"))
     with screen.progress("replay") as advance:

@@ -1,17 +1,27 @@
-"""What a command shows: results on standard output, progress and complaints on standard error."""
+"""What a command shows: results on standard output, progress and complaints on standard error.
+
+Names, units and messages come out of files that others wrote. All of them go through `_shown`: no markup is read in
+them, and what would command the terminal is spelled out.
+"""
 
 from __future__ import annotations
 
+import io
+import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import orjson
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
+
+from fdi_torch.disk import named_errors
+from fdi_torch.outside import printable, printable_json
 
 SECONDS_BETWEEN_LINES = 2.0
 ENDLESS = 1 << 16  # characters in a line of a pipe or a file
@@ -23,19 +33,43 @@ class Advance(Protocol):
     def __call__(self, share: float, text: str = "") -> None: ...
 
 
+def _shown(text: str) -> Text:
+    """The only way of text onto the terminal."""
+    return Text(printable(text))
+
+
+class _Results(Console):
+    """Standard output. Who stops reading ends the command, and is no error."""
+
+    def on_broken_pipe(self) -> None:
+        raise
+
+    def print(self, *what: Any, **how: Any) -> None:
+        with named_errors("standard output"):
+            super().print(*what, **how)
+
+
+class _Progress(Console):
+    """Standard error. The work goes on though nobody reads of its progress."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+
+
 class Screen:
     """json: results as JSON only. quiet: no progress. On a terminal progress is a bar, otherwise plain lines."""
 
     def __init__(self, json: bool = False, quiet: bool = False) -> None:
         self.json = json
         self.quiet = quiet
-        self._out = Console(width=None if sys.stdout.isatty() else ENDLESS, highlight=False, soft_wrap=True)
-        self._err = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._out = _Results(width=None if sys.stdout.isatty() else ENDLESS, highlight=False, soft_wrap=True)
+        self._err = _Progress(stderr=True, highlight=False, soft_wrap=True)
 
     def say(self, text: str = "") -> None:
         """A line of the result; not beside JSON."""
         if not self.json:
-            self._out.print(text, markup=False)
+            self._out.print(_shown(text))
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> None:
         """Rows of words and numbers, the first `left` columns flush left; not beside JSON.
@@ -49,32 +83,51 @@ class Screen:
         table = Table(box=None, pad_edge=False, header_style="bold")
         for i, name in enumerate(header):
             is_word = i < left
-            table.add_column(name, justify="left" if is_word else "right", overflow="fold", no_wrap=not is_word)
+            table.add_column(_shown(name), justify="left" if is_word else "right", overflow="fold", no_wrap=not is_word)
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*map(_shown, row))
         self._out.print(table, soft_wrap=False)
 
     def result(self, data: Any) -> None:
         """The result as JSON (dataclasses too; what is not finite becomes null), where JSON was asked for."""
         if self.json:
             options = orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_DATACLASS | orjson.OPT_SERIALIZE_NUMPY
-            sys.stdout.write(orjson.dumps(data, option=options).decode() + "\n")
-            sys.stdout.flush()
+            try:
+                text = orjson.dumps(data, option=options).decode()
+            except orjson.JSONEncodeError as error:
+                raise ValueError(
+                    f"expected results that JSON can hold, got others: {error}; is a path no UTF-8?"
+                ) from error
+            self.line(text)
 
     def line(self, text: str) -> None:
         """A line of JSON at once, for results that come one by one; only where JSON was asked for."""
         if self.json:
-            sys.stdout.write(text + "\n")
+            with named_errors("standard output"):
+                sys.stdout.write(printable_json(text) + "\n")
+                sys.stdout.flush()
+
+    @contextmanager
+    def stream(self) -> Iterator[BinaryIO]:
+        """Standard output for the bytes of a file; on a terminal only what it shows of them."""
+        with named_errors("standard output"):
+            if not sys.stdout.isatty():
+                yield sys.stdout.buffer
+                sys.stdout.buffer.flush()
+                return
+            kept = io.BytesIO()
+            yield kept
+            sys.stdout.write(printable(kept.getvalue().decode("utf-8", "replace")))
             sys.stdout.flush()
 
     def note(self, text: str) -> None:
         """A line of progress."""
         if not self.quiet:
-            self._err.print(text, markup=False)
+            self._err.print(_shown(text))
 
     def complain(self, text: str) -> None:
         """What went wrong, also where all else is quiet."""
-        self._err.print(text, markup=False)
+        self._err.print(_shown(text))
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Advance]:
@@ -83,13 +136,17 @@ class Screen:
             yield lambda share, text="": None
         elif self._err.is_terminal:
             with self._bar() as bar:
-                task = bar.add_task(title, total=1.0, text="")
-                yield lambda share, text="": bar.update(task, completed=share, text=text)
+                task = bar.add_task(printable(title), total=1.0, text="")
+                yield lambda share, text="": bar.update(task, completed=share, text=printable(text))
         else:
             yield self._lines(title)
 
     def _bar(self) -> Progress:
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            TextColumn("{task.fields[text]}", markup=False),
+        )
         return Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=self._err, transient=True)
 
     def _lines(self, title: str) -> Advance:

@@ -1,21 +1,16 @@
-"""Write the recording that `simulate:` of a run file describes: plant, inputs, faults and noise, as CSV with units."""
+"""`fdi simulate`: what it does and prints. Its options: `options/simulate.py`."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from fdi_torch.cli.options import add_config, add_run, overrides
+from fdi_torch.cli.options import overrides
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.run import RunConfig, load_run
+from fdi_torch.config.run import load_run
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.recordings.csv_files import write_csv
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, RunConfig)
-    add_run(parser)
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

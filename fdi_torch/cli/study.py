@@ -1,26 +1,15 @@
-"""Many trials of one experiment, estimated and summed up: bias, error against the Cramer-Rao bound, coverage, failures.
-
-The trials run in this process or, with --cluster, on a Dask cluster, with the same numbers.
-"""
+"""`fdi study`: what it does and prints. Its options: `options/study.py`."""
 
 from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_config, add_live, add_run, live, overrides
+from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.study import StudyFile, load_study
+from fdi_torch.config.study import load_study
 from fdi_torch.jobs.study import StudyResult, run_study
 from fdi_torch.study.isolation import Isolation
 from fdi_torch.study.summary import Ratio, Score, Summary
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, StudyFile, required=True)
-    add_run(parser)
-    add_live(parser)
-    parser.add_argument("--resume", action="store_true", help="go on from what a killed run left in its log")
-    parser.add_argument("--cluster", metavar="local|ADDRESS", help="run on Dask: local, or tcp://host:8786")
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

@@ -1,7 +1,4 @@
-"""Estimate which faults are present in a recording, how large and how surely; logged, with a picture.
-
-Without --config it runs the built-in example: the paper's Table 3 fault at an SNR of 30 dB, simulated and diagnosed.
-"""
+"""`fdi train`: what it does and prints. Its options: `options/train.py`."""
 
 from __future__ import annotations
 
@@ -10,21 +7,15 @@ import math
 from collections.abc import Sequence
 
 from fdi_torch.cli import DONE, NOT_CONVERGED
-from fdi_torch.cli.options import add_config, add_live, add_run, live, overrides
+from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.windows import show_windows
-from fdi_torch.config.run import RunConfig, load_run
+from fdi_torch.config.run import load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windows import windows_of
 from fdi_torch.parameters import display_unit
 from fdi_torch.recording import Recording
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, RunConfig)
-    add_run(parser)
-    add_live(parser)
-    parser.add_argument("--resume", action="store_true", help="go on where a killed run of the same file stopped")
+from fdi_torch.recordings.check import doubts
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -71,7 +62,8 @@ def show(done: TrainResult, screen: Screen) -> None:
 def in_words(done: TrainResult) -> list[str]:
     """What the diagnosis says, one sentence a line."""
     diagnosis, final = done.result.diagnosis, done.result.estimate
-    lines = not_counted(done.fitting.recordings)
+    recordings = done.fitting.recordings
+    lines = not_counted(recordings) + list(dict.fromkeys(s for r in recordings for s in doubts(r, done.fitting.plant)))
     if diagnosis.faults:
         found = ", ".join(f.name for f in diagnosis.present) or "every suspect is nominal as far as can be told"
         lines.append(f"{diagnosis.kind}: {found}")

@@ -1,6 +1,6 @@
 """Configuration: strict models of plant files and run files, with units; what is wrong is said in sentences."""
 
-from fdi_torch.config.loaded_recordings import LoadedRecording, load_recordings, read_recording
+from fdi_torch.config.loaded_recordings import LoadedRecording, load_recordings, read_frame, read_recording
 from fdi_torch.config.plant import build_plant, load_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.problems import ConfigError
@@ -19,5 +19,6 @@ __all__ = [
     "load_plant",
     "load_recordings",
     "load_run",
+    "read_frame",
     "read_recording",
 ]

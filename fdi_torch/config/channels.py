@@ -29,7 +29,7 @@ def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, Ch
 def _expect_keys_that_fit(place: str, name: str, column: ColumnConfig, plant: PlantDescription) -> None:
     """Raises ValueError for a key that says nothing of that channel."""
     only_clock, only_input = ("stamps", "zone", "shift", "sort"), ("held",)
-    only_channel = ("constant", "recorded", "held", "words", "quality", "good")
+    only_channel = ("constant", "recorded", "held", "words", "quality", "good", "plus")
     unfit = only_channel if name == "t" else only_clock
     if name != "t" and name not in plant.channels():
         unfit = (*unfit, *only_input)
@@ -56,7 +56,7 @@ def _channel_source(place: str, column: ColumnConfig, unit: str) -> ChannelSourc
         return ChannelSource(column.column, unit, constant)
     words = {text: _meaning(f"{place}.words.{text}", value, column.unit) for text, value in column.words.items()}
     good = tuple(str(word) for word in column.good)
-    return ChannelSource(column.column, column.unit, None, column.held, words, column.quality, good)
+    return ChannelSource(column.column, column.unit, None, column.held, words, column.quality, good, tuple(column.plus))
 
 
 def _meaning(place: str, value: Amount | None, unit: str | None) -> float:
@@ -81,10 +81,12 @@ def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant:
             )
 
 
-def unrecorded_valves(path: Path, plant: PlantDescription) -> dict[str, ChannelSource]:
-    """The valves that a CSV file lacks and the plant file says how they then stand."""
+def unrecorded_valves(
+    path: Path, plant: PlantDescription, config: FileConfig | None = None
+) -> dict[str, ChannelSource]:
+    """The valves that a table lacks and the plant file says how they then stand."""
     known = {p.valve: p.unrecorded for p in plant.pipes if p.valve and p.unrecorded is not None}
-    return {name: ChannelSource(None, "1", known[name]) for name in _lacking(path, known)}
+    return {name: ChannelSource(None, "1", known[name]) for name in _lacking(path, known, config)}
 
 
 def missing_inputs(path: Path, plant: PlantDescription) -> list[str]:
@@ -93,11 +95,11 @@ def missing_inputs(path: Path, plant: PlantDescription) -> list[str]:
     return [name for name in _lacking(path, plant.channels()) if name not in known]
 
 
-def _lacking(path: Path, names: Collection[str]) -> list[str]:
+def _lacking(path: Path, names: Collection[str], config: FileConfig | None = None) -> list[str]:
     """Those of the names that no header of a CSV file is about; of other files none."""
     if not names or is_log(path):
         return []
-    header = read_header(path)
+    header = read_header(path) if config is None else read_header(path, config.header, config.sheet)
     there = {*header, *(split[0] for column in header if (split := header_unit(column)))}
     return [name for name in names if name not in there]
 

@@ -9,13 +9,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from fdi_torch.config.plant import effect_at
+from fdi_torch.config.plant_in_code import effect_at
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
 from fdi_torch.effects import EFFECTS, all_placements, build_network, placements_for
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.names import unknown
-from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.parameters import Parameter, ParameterSpace, display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 
@@ -41,7 +41,12 @@ def _auto_or_names(value: Any) -> Any:
 
 
 def _auto_or_seconds(value: Any) -> Any:
-    return value if value == "auto" else quantity(value, "s")
+    if value == "auto":
+        return value
+    seconds = quantity(value, "s")
+    if not seconds > 0.0:
+        raise ValueError(f"expected auto or a positive time, got {value}")
+    return seconds
 
 
 def _known_settings(value: Any) -> Any:
@@ -57,8 +62,19 @@ class ObjectiveConfig(Strict):
     refine: Objective = Field("likelihood", description="what the refinement maximises")
 
 
+def _existing_method(value: Any) -> Any:
+    if value in ("lbfgs", "adam"):
+        raise ValueError(
+            f"expected lm or none, got {value}, a method that no longer exists; lm gives what it gave "
+            "(estimate.refine.method=lm), for it changed nothing"
+        )
+    return value
+
+
 class RefineConfig(Strict):
-    method: Literal["lm", "lbfgs", "adam", "none"] = Field("lm", description="Levenberg-Marquardt, L-BFGS or Adam")
+    method: Annotated[Literal["lm", "none"], BeforeValidator(_existing_method)] = Field(
+        "lm", description="Levenberg-Marquardt, or none: the search's best member as it is"
+    )
     iterations: int = Field(50, ge=1, description="at most")
 
 
@@ -175,4 +191,13 @@ def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant
             si[name] = quantity(value, constants[name].unit)
         except ValueError as error:
             raise ConfigError([f"simulate.faults.{given}: {error}"]) from error
+        low, high = constants[name].low, constants[name].high
+        if not low <= si[name] <= high:
+            unit, scale = display_unit(constants[name].unit)
+            raise ConfigError(
+                [
+                    f"simulate.faults.{given}: expected a size from {scale * low:g} to {scale * high:g} {unit}".rstrip()
+                    + f", got {scale * si[name]:g}"
+                ]
+            )
     return si

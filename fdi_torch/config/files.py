@@ -11,7 +11,8 @@ from typing import Any
 import yaml
 
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.names import nearest, unknown
+from fdi_torch.names import nearest, shortened, unknown
+from fdi_torch.outside import MOST_DIGITS, MOST_YAML_BYTES, MOST_YAML_VALUES
 
 MOST_EXTENSIONS = 8
 SHIPPED = Path(__file__).resolve().parents[1] / "configs"
@@ -22,23 +23,41 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file. Raises ConfigError where there is no file, no YAML or no mapping."""
     if not path.is_file():
         raise ConfigError([f"{path}: expected a YAML file, got none there; check the path"])
-    return parse_yaml(path.read_bytes(), str(path))
+    with path.open("rb") as file:
+        return parse_yaml(file.read(MOST_YAML_BYTES + 1), str(path))
 
 
 def parse_yaml(text: bytes, source: str) -> dict[str, Any]:
-    """The mapping in YAML text of plain values. Raises ConfigError, naming `source`, where it is none."""
-    try:
-        data = yaml.load(text.decode("utf-8"), _Loader)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        where = getattr(error, "problem_mark", None)
-        line = f"line {where.line + 1}: " if where else ""
-        problem = getattr(error, "problem", None) or str(error)
-        told = problem if problem.startswith("expected each key") else f"expected YAML, got something else: {problem}"
-        raise ConfigError([f"{source}: {line}{told}"]) from error
+    """The mapping in YAML text of plain values. Raises ConfigError, naming `source`, where it is none or too large."""
+    if len(text) > MOST_YAML_BYTES:
+        raise ConfigError([f"{source}: expected at most {MOST_YAML_BYTES} bytes of YAML, got more; split the file"])
+    data = _values(text, source)
     if not isinstance(data, dict):
         got = "nothing" if data is None else type(data).__name__
         raise ConfigError([f"{source}: expected keys and values such as plant: three_tank, got {got}"])
     return data
+
+
+def _values(text: bytes, source: str) -> Any:
+    try:
+        return yaml.load(text.decode("utf-8"), _Loader)
+    except RecursionError:
+        raise ConfigError([f"{source}: expected YAML of a few levels, got hundreds within each other"]) from None
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # numbers, dates and text that there cannot be
+        where = getattr(error, "problem_mark", None)
+        line = f"line {where.line + 1}: " if where else ""
+        problem = getattr(error, "problem", None) or str(error).partition("\n")[0]
+        told = problem if isinstance(error, _NotTakenError) else f"expected YAML, got something else: {problem}"
+        raise ConfigError([f"{source}: {line}{told}"]) from error
+
+
+def compose_yaml(text: str) -> yaml.Node:
+    """The nodes of a YAML text that was read before, with the places where they stand."""
+    loader = _Loader(text)
+    try:
+        return loader.get_single_node()
+    finally:
+        loader.dispose()
 
 
 def read_extended(path: Path, depth: int = 0) -> dict[str, Any]:
@@ -59,17 +78,65 @@ def _merged(below: Any, above: Any) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain values only. A key that stands twice is refused: the first would be lost without a word."""
+    """Plain values only, as many as `MOST_YAML_VALUES` with every alias spelled out: counted while the text is read,
+    since nine aliases of nine aliases make few bytes huge. A key that stands twice is refused: the first would be
+    lost without a word.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._spelled_out = 0
+        self._sizes: dict[int, int] = {}  # of every node, by its identity
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event = self.peek_event()
+        if getattr(event, "tag", None) is not None:
+            raise _trouble(f"expected plain values, got the tag {shortened(event.tag)}; remove it", event)
+        before = self._spelled_out
+        node = super().compose_node(parent, index)
+        if isinstance(event, yaml.AliasEvent):
+            if id(node) not in self._sizes:
+                raise _trouble(f"expected plain values, got *{event.anchor} within itself; remove it", event)
+            self._spelled_out += self._sizes[id(node)]
+        else:
+            self._spelled_out += 1
+            self._sizes[id(node)] = self._spelled_out - before
+        if self._spelled_out > MOST_YAML_VALUES:
+            raise _trouble(f"expected at most {MOST_YAML_VALUES} values, aliases spelled out, got more", event)
+        return node
+
+    def construct_scalar(self, node: Any) -> Any:
+        if node.tag in _NUMBERS and len(node.value) > MOST_DIGITS:
+            raise _trouble(f"expected a number of at most {MOST_DIGITS} digits, got {len(node.value)}", node)
+        return super().construct_scalar(node)
+
+    def construct_yaml_int(self, node: Any) -> int:
+        value: int = super().construct_yaml_int(node)
+        if not abs(value) < 2**63:
+            raise _trouble(f"expected a whole number below 2^63, got {shortened(node.value)}", node)
+        return value
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
                 if key.value in seen:
-                    told = f"expected each key once, got {key.value} twice; rename or remove one"
-                    raise yaml.constructor.ConstructorError(None, None, told, key.start_mark)
+                    told = f"expected each key once, got {shortened(key.value)} twice; rename or remove one"
+                    raise _trouble(told, key)
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+_NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+
+
+class _NotTakenError(yaml.constructor.ConstructorError):
+    """YAML as it may be, but not here."""
+
+
+def _trouble(sentence: str, where: Any) -> _NotTakenError:
+    return _NotTakenError(None, None, sentence, where.start_mark)
 
 
 def write_yaml(data: dict[str, Any]) -> str:
@@ -83,10 +150,7 @@ def with_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, 
         path, equals, text = override.partition("=")
         if not equals or not path:
             raise ConfigError([f"--set {override}: expected KEY=VALUE such as estimate.search.population=40"])
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError([f"--set {override}: expected a YAML value after '=', got {text}"]) from error
+        value = _values(text.encode("utf-8", "surrogateescape"), f"--set {override}")
         _set(changed, path.split("."), value, override)
     return changed
 
@@ -95,9 +159,11 @@ def _set(node: Any, keys: Sequence[str], value: Any, override: str) -> None:
     """Sets the value at the end of a path of keys and indices, making mappings where there are none yet."""
     for i, key in enumerate(keys):
         index: Any = key
+        place = ".".join(keys[:i])
+        if not isinstance(node, dict | list):
+            raise ConfigError([f"--set {override}: {place}: expected keys or a list there, got {node!r}; set it whole"])
         if isinstance(node, list):
-            if not key.isdigit() or int(key) >= len(node):
-                place = ".".join(keys[:i])
+            if not (key.isdecimal() and key.isascii() and len(key) < 10 and int(key) < len(node)):
                 raise ConfigError([f"--set {override}: {place}: expected an index below {len(node)}, got '{key}'"])
             index = int(key)
         if i == len(keys) - 1:
@@ -131,9 +197,14 @@ def find_data(name: str, base: Path) -> Path:
         raise ConfigError([error.problems[0] + hint]) from None
 
 
+def shipped_plants() -> dict[str, Path]:
+    """The plants that come with the package, by name."""
+    return {path.stem: path for path in sorted((SHIPPED / "plants").glob("*.yaml"))}
+
+
 def find_plant(name: str, base: Path) -> Path:
     """A plant file, or a plant that is shipped, by its name ('three_tank')."""
-    plants = {path.stem: path for path in sorted((SHIPPED / "plants").glob("*.yaml"))}
+    plants = shipped_plants()
     if name in plants:
         return plants[name]
     if Path(name).suffix in (".yaml", ".yml"):

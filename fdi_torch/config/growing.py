@@ -35,6 +35,8 @@ def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, i
         raise ConfigError([f"{config.file}: expected neither mask nor every for a file that is followed; leave them"])
     if config.also or config.tags:
         raise ConfigError([f"{config.file}: expected a file with a row an instant to follow; leave also and tags"])
+    if config.sheet or not config.header:
+        raise ConfigError([f"{config.file}: expected a CSV file with a header to follow; leave sheet and header"])
     clock = config.columns.get("t", ColumnConfig())
     if clock.zone or clock.sort:
         raise ConfigError([f"{config.file}: expected neither zone nor sort for a file that is followed; leave them"])

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
 from fdi_torch.config.estimation import names_in_full
+from fdi_torch.config.loaded_recordings import named_apart
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import told_in
 from fdi_torch.config.recordings import RecordingConfig
@@ -19,6 +20,7 @@ from fdi_torch.config.understood import understood, values_in
 from fdi_torch.monitor.prepare import GainWish
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
 
 
 class WindowConfig(Strict):
@@ -78,13 +80,16 @@ class MonitorConfig(Strict):
 
 @dataclass(frozen=True)
 class MonitorRun:
-    """A monitor file understood. base: where its paths start. text: YAML that gives the same run, plant included."""
+    """A monitor file understood. base: where its paths start. text: YAML that gives the same run, plant included.
+    given: recordings that are at hand, by what `file` calls them.
+    """
 
     config: MonitorConfig
     plant: PlantDescription
     base: Path
     source: str
     text: str
+    given: Mapping[str, Recording] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -99,10 +104,19 @@ class MonitorRun:
 def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:
     """A monitor file with some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
     data, file = values_in(path, overrides)
-    config, plant, text = understood(MonitorConfig, data, file.parent, str(file))
-    with told_in(str(file)):
+    return build_monitor(data, file.parent, str(file))
+
+
+def build_monitor(data: Mapping[str, Any], base: Path, source: str) -> MonitorRun:
+    """A monitor from a mapping as in a monitor file. `base` is where its paths start.
+
+    In place of the name of the plant or of the recording's file may stand the `Plant` or the `Recording` itself.
+    """
+    (listed, *_), given = named_apart([data.get("recording")])
+    config, plant, text = understood(MonitorConfig, {**data, "recording": listed} if given else data, base, source)
+    with told_in(source):
         config = _in_full(config, plant)
-    return MonitorRun(config, plant, file.parent, str(file), text)
+    return MonitorRun(config, plant, base, source, text, given)
 
 
 def _in_full(config: MonitorConfig, plant: PlantDescription) -> MonitorConfig:

@@ -1,33 +1,25 @@
-"""Plant files: YAML with units -> PlantDescription in SI."""
+"""Plant files: YAML with units -> `Plant` in SI."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sized
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, ValidationError
 
 from fdi_torch.config.files import find_plant, read_yaml
+from fdi_torch.config.plant_in_code import Plant, effect_parameters, settled, settled_effect, settled_tolerances
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Share, Strict, quantity
-from fdi_torch.effects import effect
-from fdi_torch.names import matching, unknown
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import COMMAND_UNITS, OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.plant.effect import Effect, fits, place_kind
-
-SENSOR_UNITS = {"1": "m", "Pa/m": "Pa", "V/m": "V", "A/m": "A", "1/m": "1"}
-"""Unit of a sensor's gain -> SI unit of its reading."""
+from fdi_torch.names import unknown
+from fdi_torch.outside import MOST_COMPONENTS
+from fdi_torch.plant.description import MOST_DISCHARGE, OUTSIDE, Matter, Pipe, PlacedEffect, Pump, Sensor, Tank
 
 
 def _start_level(value: Any) -> float | None:
     return None if value in (None, "equilibrium") else quantity(value, "m")
-
-
-MOST_DISCHARGE = 10.0  # more is no orifice's coefficient, effective or not, but per cent without their sign
 
 
 class TankConfig(Strict):
@@ -73,6 +65,11 @@ class EffectConfig(Strict):
     parameters: dict[str, Amount] = Field(default_factory=dict, description="with units, such as time_constant: 8 s")
 
 
+class MatterConfig(Strict):
+    smallest: Amount = Field(0.0, description="deviation from nominal from which on it is said aloud, with its unit")
+    urgency: str = Field("", description="a word that the events carry, such as high")
+
+
 class PlantConfig(Strict):
     name: str = ""
     gravity: Acceleration = Field(9.81, description="m/s^2")
@@ -89,153 +86,71 @@ class PlantConfig(Strict):
         default_factory=list, description="constants with a tolerance that are others in each recording; * is any name"
     )
     effects: list[EffectConfig] = Field(default_factory=list, description="what the plant is known to have")
+    matters: dict[str, MatterConfig] = Field(
+        default_factory=dict, description="faults by name, such as T1.leak, and how much they matter to a monitor"
+    )
 
 
-def load_plant(name: str | Path, base: Path | None = None) -> PlantDescription:
+def load_plant(name: str | Path, base: Path | None = None) -> Plant:
     """The plant in a file, or one that is shipped, by its name ('three_tank'). Raises ConfigError."""
     path = find_plant(str(name), base or Path.cwd())
     data = read_yaml(path)
     return build_plant({"name": path.stem, **data}, str(path))
 
 
-def build_plant(data: dict[str, Any], source: str) -> PlantDescription:
+def build_plant(data: dict[str, Any], source: str) -> Plant:
     """The plant in a mapping. Raises ConfigError, naming `source` and the field."""
     try:
         config = PlantConfig.model_validate(data)
     except ValidationError as error:
         raise explain(error, source) from None
     try:
-        return _description(config)
+        return _plant(config)
     except ValueError as error:
         raise ConfigError([f"{source}: {error}"]) from error
 
 
-def _description(config: PlantConfig) -> PlantDescription:
-    sensors = tuple(_sensor(name, sensor) for name, sensor in config.sensors.items())
-    plant = PlantDescription(
-        name=config.name,
-        tanks=tuple(Tank(name, **dict(tank)) for name, tank in config.tanks.items()),
-        pipes=tuple(Pipe(name, **dict(pipe)) for name, pipe in config.pipes.items()),
-        pumps=tuple(_pump(name, pump) for name, pump in config.pumps.items()),
-        sensors=sensors,
+def _plant(config: PlantConfig) -> Plant:
+    kinds: tuple[Sized, ...] = (config.tanks, config.pipes, config.pumps, config.sensors, config.effects)
+    parts = sum(len(kind) for kind in kinds)
+    if parts > MOST_COMPONENTS:
+        raise ValueError(f"expected at most {MOST_COMPONENTS} components and effects, got {parts}; split the plant")
+    plant = Plant(
+        tanks=[Tank(name, **dict(tank)) for name, tank in config.tanks.items()],
+        pipes=[Pipe(name, **dict(pipe)) for name, pipe in config.pipes.items()],
+        pumps=[Pump(name, **dict(pump)) for name, pump in config.pumps.items()],
+        sensors=[_sensor(name, sensor) for name, sensor in config.sensors.items()],
         gravity=config.gravity,
+        name=config.name,
     )
-    plant = replace(plant, effects=tuple(_effect(i, e, plant) for i, e in enumerate(config.effects)))
-    tolerances = _tolerances(config, plant)
-    return replace(plant, tolerances=tolerances, varying=_varying(config.varying, tolerances))
+    placed = [PlacedEffect(e.effect, e.location, e.parameters) for e in config.effects]  # type: ignore[arg-type]
+    plant = replace(plant, effects=tuple(settled_effect(i, e, plant, quantity) for i, e in enumerate(placed)))
+    tolerances = settled_tolerances(config.tolerances, plant, quantity)
+    matters = tuple(_matter(name, matter, plant) for name, matter in config.matters.items())
+    return replace(plant, tolerances=tolerances, varying=tuple(config.varying), matters=matters)
 
 
-def _pump(name: str, pump: PumpConfig) -> Pump:
-    gain, unit = _amount_in_one_of(f"pumps.{name}.gain", pump.gain, tuple(COMMAND_UNITS))
-    return Pump(name, pump.target, pump.max_flow, gain, pump.command, unit)
-
-
-def _sensor(name: str, sensor: SensorConfig) -> Sensor:
-    gain, gain_unit = _amount_in_one_of(f"sensors.{name}.gain", sensor.gain, tuple(SENSOR_UNITS))
-    unit = SENSOR_UNITS[gain_unit]
-
-    def reading(field: Literal["offset", "low", "high"]) -> float | None:
-        value = getattr(sensor, field)
-        return None if value is None else _amount(f"sensors.{name}.{field}", value, unit)
-
-    offset = reading("offset") or 0.0
-    return Sensor(name, sensor.tank, unit, gain, offset, sensor.channel, reading("low"), reading("high"))
-
-
-def _effect(index: int, config: EffectConfig, plant: PlantDescription) -> PlacedEffect:
-    place = f"effects.{index}"
+def _matter(name: str, matter: MatterConfig, plant: Plant) -> Matter:
+    """'T1.leak' stands for the leak's size."""
+    location, _, rest = name.partition(".")
+    effect, _, field = rest.partition(".")
     try:
-        known = effect_parameters(config.effect, config.location, plant)
+        parameters = effect_parameters(effect, location, plant)
     except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
-    for name in config.parameters:
-        if name not in known:
-            raise ValueError(f"{place}.parameters: {unknown(f'a parameter of {config.effect}', name, known)}")
-    values = {n: _amount(f"{place}.parameters.{n}", v, known[n].unit) for n, v in config.parameters.items()}
-    return PlacedEffect(config.effect, config.location, values)
+        raise ValueError(f"matters.{name}: {error}") from error
+    size = parameters.get(field or next(iter(parameters)))
+    if size is None:
+        raise ValueError(f"matters.{name}: {unknown('a parameter', field, parameters)}")
+    smallest = settled(f"matters.{name}.smallest", matter.smallest, size.unit, quantity)
+    if smallest < 0.0:
+        raise ValueError(f"matters.{name}.smallest: expected no negative size, got {matter.smallest}")
+    return Matter(f"{location}.{effect}.{size.name}", smallest, matter.urgency)
 
 
-def effect_parameters(name: str, location: str, plant: PlantDescription) -> dict[str, Parameter]:
-    """The parameters of an effect at a place, by their short names. Raises ValueError where it cannot be there."""
-    return {p.name: p for p in effect_at(name, location, plant).parameters(location, plant)}
-
-
-def effect_at(name: str, location: str, plant: PlantDescription) -> Effect:
-    """The effect of that name. Raises ValueError where it cannot be at that place of the plant."""
-    found = effect(name)
-    if not fits(found, plant, location):
-        there = ", ".join(place for place in plant.locations() if fits(found, plant, place)) or "none there is"
-        raise ValueError(
-            f"{location}.{name}: expected a place of kind {' or '.join(found.places)} ({there}), "
-            f"got {place_kind(plant, location)} {location}"
-        )
-    return found
-
-
-def _tolerances(config: PlantConfig, plant: PlantDescription) -> dict[str, float]:
-    """Patterns such as *.discharge_coefficient spelled out for every constant that they match; later ones win.
-
-    A pattern for parameters of effects has two dots.
-    """
-    units = absolute_units(plant)
-    known = [*_constants(config), *effect_units(plant)]
-    tolerances: dict[str, float] = {}
-    for pattern, value in config.tolerances.items():
-        place = f"tolerances.{pattern}"
-        matched = [n for n in known if fnmatchcase(n, pattern) and n.count(".") == max(pattern.count("."), 1)]
-        if not matched:
-            raise ValueError(f"{place}: {unknown('a constant', pattern, known)}")
-        for name in matched:
-            tolerances[name] = _amount(place, value, units.get(name, "1"))
-            if not tolerances[name] > 0:
-                raise ValueError(f"{place}: expected a positive tolerance such as 3 %, got {value}")
-    return tolerances
-
-
-def _varying(patterns: Sequence[str], tolerances: dict[str, float]) -> tuple[str, ...]:
-    """Raises ValueError for what matches no constant with a tolerance: how much would it vary?"""
-    try:
-        return tuple(matching("a constant with a tolerance", patterns, tolerances))
-    except ValueError as error:
-        raise ValueError(f"varying: {error}") from error
-
-
-def absolute_units(plant: PlantDescription) -> dict[str, str]:
-    """Tolerances that are no shares: of offsets, start levels and the parameters of effects, with their units."""
-    offsets = {f"{sensor.name}.offset": sensor.unit for sensor in plant.sensors}
-    return offsets | {f"{tank.name}.start_level": "m" for tank in plant.tanks} | effect_units(plant)
-
-
-def effect_units(plant: PlantDescription) -> dict[str, str]:
-    """Units of all parameters of the plant's effects, by their full names."""
-    return {
-        f"{e.location}.{e.effect}.{name}": parameter.unit
-        for e in plant.effects
-        for name, parameter in effect_parameters(e.effect, e.location, plant).items()
-    }
-
-
-def _constants(config: PlantConfig) -> list[str]:
-    fields: Sequence[tuple[dict[str, Any], tuple[str, ...]]] = (
-        (config.tanks, ("area", "height", "start_level")),
-        (config.pipes, ("area", "discharge_coefficient")),
-        (config.pumps, ("gain", "max_flow")),
-        (config.sensors, ("gain", "offset")),
-    )
-    return [f"{name}.{field}" for components, names in fields for name in components for field in names]
-
-
-def _amount_in_one_of(place: str, value: Amount, units: tuple[str, ...]) -> tuple[float, str]:
-    for unit in units:
-        try:
-            return quantity(value, unit), unit
-        except ValueError:
-            continue
-    raise ValueError(f"{place}: expected a quantity in {' or '.join(units)}, got '{value}'")
-
-
-def _amount(place: str, value: Amount, unit: str) -> float:
-    try:
-        return quantity(value, unit)
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
+def _sensor(name: str, config: SensorConfig) -> Sensor:
+    sensor = Sensor(name, config.tank, gain=config.gain, channel=config.channel)  # type: ignore[arg-type]
+    given: dict[str, Any] = {}
+    for field in ("offset", "low", "high"):
+        if (value := getattr(config, field)) is not None:
+            given[field] = settled(f"sensors.{name}.{field}", value, sensor.unit, quantity)
+    return replace(sensor, **given)

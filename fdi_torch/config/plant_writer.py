@@ -5,9 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 from fdi_torch.config.files import write_yaml
-from fdi_torch.config.plant import SENSOR_UNITS, absolute_units, effect_parameters
+from fdi_torch.config.plant_in_code import absolute_units, effect_at, effect_parameters
 from fdi_torch.parameters import parse_quantity
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import (
+    OUTSIDE,
+    READING_UNITS,
+    Matter,
+    Pipe,
+    PlacedEffect,
+    PlantDescription,
+    Pump,
+    Sensor,
+    Tank,
+)
 
 _UNITS = {
     "m": ("cm", "mm", "m", "ft", "in"),
@@ -41,7 +51,15 @@ def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
     data["tolerances"] = {name: _text(v, units.get(name, "1")) for name, v in plant.tolerances.items()}
     data["varying"] = list(plant.varying)
     data["effects"] = [_effect_mapping(placed, plant) for placed in plant.effects]
+    data["matters"] = {m.fault: _matter_mapping(m, plant) for m in plant.matters}
     return {key: value for key, value in data.items() if value}
+
+
+def _matter_mapping(matter: Matter, plant: PlantDescription) -> dict[str, Any]:
+    location, effect, field = matter.fault.split(".")
+    units = {p.name: p.unit for p in effect_at(effect, location, plant).parameters(location, plant)}
+    smallest = _text(matter.smallest, units[field]) if matter.smallest else None
+    return _given(smallest=smallest, urgency=matter.urgency or None)
 
 
 def _tank_mapping(tank: Tank) -> dict[str, Any]:
@@ -80,7 +98,7 @@ def _pump_mapping(pump: Pump) -> dict[str, Any]:
 
 
 def _sensor_mapping(sensor: Sensor) -> dict[str, Any]:
-    gain_unit = next(gain for gain, unit in SENSOR_UNITS.items() if unit == sensor.unit)
+    gain_unit = next(gain for gain, unit in READING_UNITS.items() if unit == sensor.unit)
 
     def reading(value: float | None) -> str | float | None:
         return None if value is None else _text(value, sensor.unit)

@@ -8,9 +8,10 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AllowInfNan, BeforeValidator, Field, model_validator
 
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
+from fdi_torch.outside import MOST_SAMPLES
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.stamps import expect_zone
 
@@ -54,14 +55,27 @@ def _zone(value: Any) -> Any:
     return value
 
 
+def _header(value: Any) -> Any:
+    """A column's number stands for its header, in files without one."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Header = Annotated[str, BeforeValidator(_header)]
+
+
 class ColumnConfig(Strict):
-    column: str | None = Field(
-        None, description="header of the column, its tag where rows have tags, or TOPIC:FIELD of an MCAP file"
+    column: Header | None = Field(
+        None,
+        description="header of the column, its number from 1 in a file without one, its tag where rows have tags, "
+        "or TOPIC:FIELD of an MCAP file",
+    )
+    plus: list[Header] = Field(
+        default_factory=list, description="further columns that are added to it, as of two pumps on one hose"
     )
     unit: str | None = Field(None, description="unit of its numbers, where the header does not end in it")
     constant: Amount | None = Field(None, description="the value of an input that was not recorded")
     recorded: bool = Field(True, description="false for an output that the file does not have")
-    held: Annotated[float, BeforeValidator(_held)] = Field(
+    held: Annotated[float, AllowInfNan(True), BeforeValidator(_held)] = Field(
         0.0, description="for how long an input's value stands where cells are empty: 15 s, or always (until the next)"
     )
     words: Annotated[dict[str, Amount | None], BeforeValidator(_words)] = Field(
@@ -84,7 +98,12 @@ class TagsConfig(Strict):
 
 
 class FileConfig(Strict):
-    file: str = Field(description="CSV (plain or .gz) or MCAP file; looked for here and below FDI_TORCH_DATA")
+    file: str = Field(
+        description="CSV (plain or .gz), MCAP, Parquet, Excel, MATLAB or HDF5 file; looked for here and below "
+        "FDI_TORCH_DATA"
+    )
+    header: bool = Field(True, description="false: the columns have no names but numbers, {t: {column: 1, unit: s}}")
+    sheet: str | None = Field(None, description="of an Excel workbook; by default the first")
     columns: dict[str, ColumnConfig] = Field(
         default_factory=dict, description="for channels (time is t) whose header is not name_unit"
     )
@@ -128,6 +147,9 @@ class RecordingConfig(FileConfig):
     mask: list[tuple[Moment, Moment]] = Field(
         default_factory=list, description="intervals whose readings do not count, s or stamps"
     )
-    every: int = Field(1, ge=1, description="use every n-th sample only")
+    every: int = Field(1, ge=1, le=MOST_SAMPLES, description="use every n-th sample only")
     hold: Literal["zero_order", "linear"] = Field("zero_order", description="how inputs run between samples")
+    trusted: bool = Field(
+        False, description="units, channels and clocks are as they should be, whatever they look like: never refused"
+    )
     start_levels: StartLevels = Field("free", description="free, equilibrium, or a mapping such as {T1: 50 cm}")

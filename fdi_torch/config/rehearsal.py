@@ -10,12 +10,13 @@ from typing import Annotated, Any, Literal
 import torch
 from pydantic import BeforeValidator, Field
 
+from fdi_torch.capacity import expect_room
 from fdi_torch.config.estimation import full_name
 from fdi_torch.config.monitor import WindowConfig
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.config.run import OutputConfig
-from fdi_torch.config.strict import BenchSeconds, Share, Strict, quantity
+from fdi_torch.config.strict import BenchSeconds, Decibel, Share, Strict, quantity
 from fdi_torch.config.understood import understood, values_in
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import Fitting, set_up
@@ -72,7 +73,7 @@ class RivalConfig(Strict):
     faults: list[str] = Field(min_length=1, description="random sets of them")
     sets: int = Field(200, ge=1, description="of faults")
     part: int = Field(50, ge=1, description="sets computed at once")
-    snr_db: list[float] = Field([30.0, 10.0], min_length=1, description="signal-to-noise ratios, dB")
+    snr_db: list[Decibel] = Field([30.0, 10.0], min_length=1, description="signal-to-noise ratios, dB")
     rivals: list[Literal[RIVALS]] = Field(list(RIVALS), min_length=1, description="who is compared")  # type: ignore[valid-type]
     looks: list[int] = Field([30, 60, 100, 150, 200, 300, 400, 600, 800, 1000], description="in samples")
 
@@ -125,7 +126,14 @@ def load_rehearsal(path: str | Path, overrides: Iterable[str] = ()) -> Rehearsal
 
 
 def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:
-    every, count = c.false_alarms_every, lambda seconds: int(seconds / c.sampling) + 1
+    every = c.false_alarms_every
+
+    def count(seconds: float) -> int:
+        samples = seconds / c.sampling
+        what = f"{samples:.3g} samples, one every {c.sampling:g} s for {seconds:g} s"
+        expect_room(samples, what, "simulate a shorter time, or sample more slowly")
+        return int(samples) + 1
+
     if (f := c.false_alarms) is not None:
         rigs = {name: _rig(c, plant, (), noise) for name, noise in f.noises.items()}
         yield FalseAlarmPlan(rigs, f.runs, count(f.lasts), f.calibrations, every, c.seed)
@@ -141,6 +149,7 @@ def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:
                 rig, loop, c.detector, settings, n.runs, count(n.lasts), n.onset, n.times, every, c.seed
             )  # fmt: skip
     if (r := c.rivals) is not None:
+        expect_room(float(max(r.looks)) * (1 + len(plant.sensors)), f"{max(r.looks):.3g} samples", "look earlier")
         fitting = _fitting(c, plant, r, max(r.looks) + 1)
         yield RivalPlan(fitting, r.sets, r.part, tuple(r.snr_db), tuple(r.looks), c.seed, tuple(r.rivals))
 

@@ -9,9 +9,10 @@ import torch
 from pydantic import BeforeValidator, Field
 from torch import Tensor
 
+from fdi_torch.capacity import expect_room
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recordings import StartLevels
-from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
+from fdi_torch.config.strict import Amount, Decibel, Seconds, Strict, quantity
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -41,7 +42,7 @@ def flat_names(value: Any, prefix: str = "") -> Any:
 
 
 class NoiseConfig(Strict):
-    snr_db: float | None = Field(None, description="signal-to-noise ratio of each output, dB")
+    snr_db: Decibel | None = Field(None, description="signal-to-noise ratio of each output, dB")
     definition: Literal["variance", "power"] = Field(
         "variance", description="noise against the signal's variance, or against its mean square"
     )
@@ -58,7 +59,7 @@ class SimulationConfig(Strict):
     start_levels: StartLevels = Field(
         "equilibrium", description="equilibrium (of the fault-free plant), or {T1: 50 cm}"
     )
-    faults: Annotated[dict[str, Amount], BeforeValidator(flat_names)] = Field(
+    faults: Annotated[dict[str, Amount], BeforeValidator(lambda value: flat_names(value))] = Field(
         default_factory=dict, description="values of any parameters, such as T1.leak: 0.3"
     )
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="added to every output")
@@ -70,7 +71,7 @@ def planned_recording(config: SimulationConfig, plant: PlantDescription) -> Reco
 
     Raises ConfigError for inputs that the plant lacks or misses, and for steps that are not at samples.
     """
-    time = _clock(config)
+    time = _clock(config, plant)
     units = plant.channel_units()
     for name in config.inputs:
         if name not in units:
@@ -112,7 +113,18 @@ def noise_std(config: NoiseConfig, plant: PlantDescription, clean: Tensor) -> Te
     return std
 
 
-def _clock(config: SimulationConfig) -> Tensor:
+def _expect_room_for_samples(config: SimulationConfig, plant: PlantDescription) -> None:
+    samples = config.duration / config.sample_time
+    what = f"{samples:.3g} samples, one every {config.sample_time:g} s for {config.duration:g} s"
+    columns = 1 + len(plant.channel_units()) + len(plant.sensors)
+    try:
+        expect_room(columns * samples, what, "simulate a shorter time, or sample more slowly")
+    except ValueError as error:
+        raise ConfigError([f"simulate: {error}"]) from error
+
+
+def _clock(config: SimulationConfig, plant: PlantDescription) -> Tensor:
+    _expect_room_for_samples(config, plant)
     intervals = round(config.duration / config.sample_time)
     if intervals < 1 or abs(intervals * config.sample_time - config.duration) > 1e-9 * config.duration:
         wanted = f"a multiple of sample_time ({config.sample_time:g} s)"

@@ -10,12 +10,13 @@ from pydantic.fields import FieldInfo
 from fdi_torch.config.problems import UnknownKeyError
 from fdi_torch.names import unknown
 from fdi_torch.parameters import parse_quantity
+from fdi_torch.recording import LARGEST
 
 
 class Strict(BaseModel):
     """A mapping with known keys only. Field descriptions say what each is, with its unit."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @model_validator(mode="before")
     @classmethod
@@ -42,8 +43,8 @@ def quantity(value: Any, unit: str) -> float:
         raise ValueError(
             f"expected a quantity in {unit}, got the bare number {value}; write its unit, as in '{value} {unit}'"
         )
-    if not abs(number) < float("inf"):
-        raise ValueError(f"expected a finite quantity in {unit}, got {value}")
+    if not abs(number) <= LARGEST:
+        raise ValueError(f"expected a quantity in {unit} within {LARGEST:g}, got {value}")
     return number
 
 
@@ -60,6 +61,7 @@ Length = Annotated[float, *_of("m")]
 Area = Annotated[float, *_of("m^2")]
 Flow = Annotated[float, *_of("m^3/s")]
 Seconds = Annotated[float, *_of("s")]
+Decibel = Annotated[float, Field(ge=-300, le=300)]
 _ON_A_BENCH = "the default is for tanks on a bench"
 BenchSeconds = Annotated[Seconds, _ON_A_BENCH]
 BenchSteps = Annotated[list[float], BeforeValidator(_each_in_seconds), _ON_A_BENCH]

@@ -10,19 +10,21 @@ from typing import Any, Literal
 import torch
 from pydantic import Field, ValidationError
 
+from fdi_torch.capacity import expect_room
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
 from fdi_torch.config.files import write_yaml
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.reference import keys
 from fdi_torch.config.run import Run, RunConfig, build_run
 from fdi_torch.config.simulation import planned_recording
-from fdi_torch.config.strict import BenchSeconds, BenchSteps, Share, Strict, at_pace
+from fdi_torch.config.strict import BenchSeconds, BenchSteps, Decibel, Share, Strict, at_pace
 from fdi_torch.config.understood import values_in
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting, set_up
-from fdi_torch.estimate.refine import RefineSettings
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.names import unknown
+from fdi_torch.outside import MOST_SETTINGS, MOST_TRIALS
 from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.reach import bounded
 from fdi_torch.study.plan import (
@@ -43,7 +45,7 @@ class StudyConfig(Strict):
         "simulated", description="those of simulate, or drawn evenly from the box, or every set of faulty parameters"
     )
     smallest: Share = Field(0.1, ge=0, lt=1, description="least size of a fault under modes, as a share of its range")
-    snr_db: list[float | None] = Field([None], min_length=1, description="signal-to-noise ratios, dB; null: no noise")
+    snr_db: list[Decibel | None] = Field([None], min_length=1, description="signal-to-noise ratios, dB; null: no noise")
     trials: int = Field(1000, ge=1, description="in each setting")
     block: int = Field(100, ge=1, description="trials computed at once")
     estimators: list[Estimator] = Field(
@@ -141,6 +143,22 @@ def _fitting(run: Run) -> Fitting:
 def _settings(config: StudyConfig, run: Run, fitting: Fitting) -> list[Setting]:
     """Every signal-to-noise ratio with every kind of fault asked for."""
     space, made = fitting.space, []
+    numbers = float(config.trials) * len(config.snr_db) * len(space)
+    expect_room(numbers, f"{config.trials:.3g} trials of each setting", "lower study.trials")
+    settings = float(len(config.snr_db)) * (2 ** len(space) - 1 if config.faults == "modes" else 1)
+    if not settings <= MOST_SETTINGS or not settings * config.trials <= MOST_TRIALS:
+        raise ConfigError(
+            [
+                f"{run.source}: study: expected at most {MOST_SETTINGS} settings and {MOST_TRIALS} trials in all, got "
+                f"{settings:.4g} settings of {config.trials} trials; take fewer of these, or split the study"
+            ]
+        )
+    longest = run.config.simulate.duration if run.config.simulate else 0.0
+    too_long = [step for step in (config.search_step, config.data_step, *config.steps) if step > longest]
+    if too_long:
+        raise ConfigError(
+            [f"{run.source}: study: expected steps within the {longest:g} s simulated, got {too_long[0]:g} s"]
+        )
     for snr in config.snr_db:
         noise = "no noise" if snr is None else f"SNR {snr:g} dB"
         if config.faults == "simulated":

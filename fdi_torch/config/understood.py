@@ -45,7 +45,9 @@ def understood(
 
 def plant_of(wanted: Any, base: Path, source: str) -> PlantDescription:
     """The plant of that name, in that file, or that is written there itself. Raises ConfigError."""
-    if isinstance(wanted, str):
+    if isinstance(wanted, PlantDescription):
+        return wanted
+    if isinstance(wanted, str | Path):
         return load_plant(wanted, base)
     if isinstance(wanted, dict):
         return build_plant({"name": "plant", **wanted}, f"{source}: plant")

@@ -8,7 +8,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.reach import Reach, inside
+from fdi_torch.plant.reach import Reach, inside, onsets
 
 
 class Leak(Effect):
@@ -38,7 +38,8 @@ class Leak(Effect):
         low, high = reach.levels[place]
         at_height = [{"size": 0.1, "height": height} for height in (0.5 * low, *inside((low, high), 3))]
         growing = {"size": 0.1, "onset": 0.3 * reach.duration, "ramp": 0.7 * reach.duration}
-        return [{"size": 0.1}, *at_height, {"size": 0.1, "onset": 0.5 * reach.duration}, growing]
+        opened = [{"size": 0.1, "onset": instant} for instant in onsets(reach)]
+        return [{"size": 0.1}, *at_height, *opened, growing]
 
     def inflow(self, local: Local, p: Values) -> Tensor:
         head = torch.clamp(local.level - p["height"], min=0.0)

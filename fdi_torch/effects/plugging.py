@@ -7,7 +7,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.reach import Reach, inside
+from fdi_torch.plant.reach import Reach, onsets
 
 
 class Plugging(Effect):
@@ -24,14 +24,14 @@ class Plugging(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
-            Parameter("size", "1", 0.0, -1.0, 1.0, meaning="share of the flow that is lost (b)"),
+            Parameter("size", "1", 0.0, -1.0, 1.0, meaning="share of the flow that is lost (b)", extremes=(1.0,)),
             Parameter("onset", "s", 0.0, 0.0, meaning="when it begins"),
             Parameter("ramp", "s", 0.0, 0.0, meaning="how long it takes to come in full"),
         )
 
     def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
-        onsets = [{"onset": instant} for instant in inside((0.0, reach.duration), 3)]
-        return [{"size": size} | onset for onset in [{}, *onsets] for size in (0.1, -0.1)]
+        begun = [{}, *({"onset": instant} for instant in onsets(reach))]
+        return [{"size": size} | onset for onset in begun for size in (0.1, -0.1)]
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
         return flow * (1.0 - p["size"] * local.clock.risen(p["onset"], p["ramp"]))

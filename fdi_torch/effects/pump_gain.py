@@ -32,7 +32,7 @@ class PumpGain(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
-            Parameter("factor", "1", 1.0, 0.0, 2.0, meaning="delivered over believed flow"),
+            Parameter("factor", "1", 1.0, 0.0, 2.0, meaning="delivered over believed flow", extremes=(0.0,)),
             Parameter("onset", "s", 0.0, 0.0, meaning="when it begins"),
             Parameter("ramp", "s", 0.0, 0.0, meaning="how long it takes to come in full"),
         )

@@ -20,7 +20,7 @@ class Stuck(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
-            Parameter("size", "1", 0.0, 0.0, 1.0, meaning="share of its stroke that it has lost"),
+            Parameter("size", "1", 0.0, 0.0, 1.0, meaning="share of its stroke that it has lost", extremes=(1.0,)),
             Parameter("onset", "s", 0.0, 0.0, meaning="when it gets stuck"),
         )
 

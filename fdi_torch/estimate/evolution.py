@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from fdi_torch.capacity import expect_room
 from fdi_torch.estimate.draws import problem_seeds
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.generation import State, Trial, ask, init, tell
@@ -147,6 +148,7 @@ def _begin(
     if first_guess is not None:
         first_guess = first_guess.expand(*shape, *first_guess.shape[-2:]).reshape(-1, *first_guess.shape[-2:])
     parameters = low.shape[-1]
+    _expect_room(low.shape[:-1].numel(), parameters, settings)
     state = init(low.flatten(0, -2), high.flatten(0, -2), settings, seeds.reshape(-1), first_guess)
     count, size = state.cost.shape
     finished = EvolutionResult(
@@ -159,6 +161,15 @@ def _begin(
         reason=torch.zeros_like(state.seed),
     )
     return Search(state, torch.arange(count, device=low.device), finished, shape)
+
+
+def _expect_room(problems: int, parameters: int, settings: EvolutionSettings) -> None:
+    """Members, those that have finished, the archive and the memory of what succeeded."""
+    size = settings.first_population(parameters)
+    archive = settings.archive_share * size if settings.strategy == "l-shade" else 0.0
+    numbers = (2.0 * size + archive) * (parameters + 1) + 2.0 * settings.memory
+    what = f"a search with a population of {size:.3g}, an archive of {archive:.3g} and a memory of "
+    expect_room(problems * numbers, f"{what}{settings.memory:.3g}", "make them smaller")
 
 
 def _retired(search: Search, settings: EvolutionSettings) -> Search:

@@ -48,7 +48,8 @@ class EvolutionSettings:
         _expect(0.0 <= self.factor <= 2.0, "factor (F) in [0, 2]", self.factor)
         _expect(0.0 <= self.rate <= 1.0, "rate (CR) in [0, 1]", self.rate)
         _expect(0.0 < self.best_share <= 1.0, "best_share (p) in (0, 1]", self.best_share)
-        _expect(self.archive_share >= 0.0, "archive_share of at least 0", self.archive_share)
+        _expect(0.0 <= self.archive_share < math.inf, "a finite archive_share of at least 0", self.archive_share)
+        _expect(not math.isnan(self.target), "target to be a number", self.target)
         _expect(self.parameter_tolerance >= 0.0, "parameter_tolerance of at least 0", self.parameter_tolerance)
         _expect(self.cost_tolerance >= 0.0, "cost_tolerance of at least 0", self.cost_tolerance)
 

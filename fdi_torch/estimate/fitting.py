@@ -33,8 +33,8 @@ START_SEARCH_SHARE = 0.05
 FIRST_READINGS = 5
 # An adaptive solver sees inputs that run linearly as their means over so long; in units of the plant's time scale.
 LONGEST_STEP = 1.0
-# Each takes some 50 bytes, whatever the number of lanes.
-MANY_STEPS = 1 << 20
+# One of a lane's own steps costs about as much as so many of RK4 that all lanes take alike.
+OWN_STEP_COST = 16
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,13 @@ class Fitting:
 
     def engines(self, step: float, adaptive: bool = False) -> list[Engine]:
         """An engine for each recording, in steps no longer than `step` s, or by an adaptive solver about as exact."""
+        if not step > 0.0:
+            raise ValueError(f"expected a positive integration step, got {step:g} s")
         engines = []
         for network, own, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True):
             divides = not adaptive and self._takes_own_steps(recording, network, step)
             longest = LONGEST_STEP * time_scale(self.plant) if adaptive or divides else step
-            own_steps = OwnSteps.like(step, self.plant) if divides else None
+            own_steps = _own_steps(step, recording, self.plant) if divides else None
             experiment = lay_out(recording, self.plant.channels(), longest, own_steps)
             if adaptive:
                 engines.append(adaptive_engine(network, own, experiment, step))
@@ -90,10 +92,10 @@ class Fitting:
         )
 
     def _takes_own_steps(self, recording: Recording, network: TankNetwork, step: float) -> bool:
-        """Where a table of all steps would be large, and inputs are held between samples, so that nothing is lost."""
+        """Where they cost less than fixed ones, and inputs are held between samples, so that nothing is lost."""
         steps = float(recording.time[-1] - recording.time[0]) / step
         held = recording.hold == "zero_order" and all(p.effect.stage is not Stage.COMMAND for p in network.placements)
-        return held and not self.is_slow and steps > max(MANY_STEPS, len(recording))
+        return held and not self.is_slow and steps > OWN_STEP_COST * len(recording)
 
     def problem(self, step: float, objective: Objective = "likelihood", adaptive: bool = False) -> Problem:
         """Raises ValueError where the objective is correlation and readings that count stand still."""
@@ -102,6 +104,14 @@ class Fitting:
         parts = zip(self.engines(step, adaptive), self.recordings, self.columns, strict=True)
         terms = [Term(engine, readings_of(recording, self.plant), columns) for engine, recording, columns in parts]
         return Problem(self.space, terms, objective)
+
+
+def _own_steps(step: float, recording: Recording, plant: PlantDescription) -> OwnSteps:
+    try:
+        return OwnSteps.like(step, plant)
+    except ValueError as error:
+        span = float(recording.time[-1] - recording.time[0])
+        raise ValueError(f"{span / step:.3g} integration steps of {step:g} s through {span:g} s: {error}") from error
 
 
 def set_up(

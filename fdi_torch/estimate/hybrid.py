@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,8 +12,8 @@ from torch import Tensor
 from fdi_torch.estimate.diagnosis import Diagnosis, diagnose, lasting, sample_noise
 from fdi_torch.estimate.evolution import EvolutionResult, EvolutionSettings, Search, evolve
 from fdi_torch.estimate.fitting import Fitting
+from fdi_torch.estimate.levenberg_marquardt import Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.objectives import Objective, Problem
-from fdi_torch.estimate.refine import Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.uncertainty import Estimate, make_estimate
 from fdi_torch.plant.pace import time_scale
@@ -40,11 +41,12 @@ class HybridSettings:
     search_tolerance, refine_tolerance: that error, as a share of a channel's spread over the box of parameters.
     starts: how many of the search's best, mutually distant members are refined. std_tolerance: standard errors change
     by less than this share when the step is halved. adaptive: refine by an adaptive solver instead of in fixed steps.
+    method: Levenberg-Marquardt, or none: the search's best member is the estimate.
     """
 
     objectives: tuple[Objective, Objective] = ("correlation", "likelihood")
     search: EvolutionSettings = field(default_factory=EvolutionSettings)
-    method: str = "lm"
+    method: Literal["lm", "none"] = "lm"
     refine: RefineSettings = field(default_factory=RefineSettings)
     search_step: float | None = None
     refine_step: float | None = None
@@ -88,7 +90,9 @@ def estimate_parameters(
     coarse, fine = pick_steps(fitting, settings, low, high)
     found = search(fitting.problem(coarse, settings.objectives[0]), low, high, settings, seed, on_generation, resume)
     starts = distant_members(found, low, high, settings.starts)
-    if settings.adaptive:
+    if settings.method == "none":
+        refinement = unrefined(fitting, settings, starts, low, high, fine)
+    elif settings.adaptive:
         refinement = refine_adaptively(fitting, settings, starts, low, high, coarse, on_iteration)
     else:
         refinement, fine = refine_to_convergence(fitting, settings, starts, low, high, fine, on_iteration)
@@ -232,6 +236,14 @@ def refine_adaptively(
     return refinement
 
 
+def unrefined(
+    fitting: Fitting, settings: HybridSettings, starts: Tensor, low: Tensor, high: Tensor, step: float
+) -> Refined:
+    """The first of the starts (K, P) as it is, with the cost's gradient and curvature there, in steps of `step` s."""
+    problem = fitting.problem(step, settings.objectives[1], settings.adaptive)
+    return levenberg_marquardt(problem.linearise, starts[:1], low, high, replace(settings.refine, iterations=0))
+
+
 def near_enough(settings: HybridSettings, decrease: float) -> RefineSettings:
     """Stops where the cost would still fall by `decrease`: half the square of the way left, in standard errors."""
     return replace(settings.refine, decrease_tolerance=max(settings.refine.decrease_tolerance, decrease))
@@ -240,15 +252,19 @@ def near_enough(settings: HybridSettings, decrease: float) -> RefineSettings:
 def best_of(refined: Refined) -> Refined:
     """The member (1, P) of lowest cost of a flat batch; a cost that is no number never wins."""
     cost = torch.where(torch.isfinite(refined.cost), refined.cost, torch.inf)
-    best = cost.argmin().reshape(1)
-    return Refined(**{name: None if v is None else v[best] for name, v in vars(refined).items()})  # type: ignore[arg-type]
+    return refined.member(int(cost.argmin()))
 
 
 def status_of(refinement: Refined) -> str:
-    """The status of one member; 'converged' too where only rounding kept it from going the last bit."""
+    """The status of one member; 'converged' too where only rounding kept it from going the last bit, and where no
+    refinement was wanted and none was needed.
+    """
     status = refinement.statuses()[0]
     near = float(refinement.promised[0]) < 0.5 * LEFT_TO_GO**2
-    return "converged" if status == "stalled" and near else status
+    unwanted = status == "max_iterations" and not int(refinement.iterations[0])
+    if (status == "stalled" or unwanted) and near:
+        return "converged"
+    return "not refined" if unwanted else status
 
 
 def information_std(problem: Problem, theta: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.refine import Linearisation
+from fdi_torch.estimate.levenberg_marquardt import Linearisation
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.engine import Engine, Readings
 

@@ -14,8 +14,8 @@ from fdi_torch.estimate.diagnosis import fault_flow, sample_noise
 from fdi_torch.estimate.fitting import Fitting, readings_of
 from fdi_torch.estimate.hybrid import search_box
 from fdi_torch.estimate.information import certainty
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.objectives import Problem, Term
-from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import time_scale
@@ -67,6 +67,9 @@ def noise_of(recording: Recording, plant: PlantDescription) -> Tensor:
 def cut_up(recording: Recording, length: float) -> list[Recording]:
     """Windows of `length` s side by side; each shares its last sample with the next one. A short rest is left out."""
     first, last = float(recording.time[0]), float(recording.time[-1])
+    if not (last - first) / length < len(recording):
+        at_least = f"longer than the sampling interval ({recording.interval:g} s)"
+        raise ValueError(f"{recording.source}: expected windows {at_least}, got {length:g} s; lengthen them")
     count = int((last - first) / length + 1e-9)
     return [recording.window(first + k * length, first + (k + 1) * length) for k in range(count)]
 

@@ -13,7 +13,9 @@ from fdi_torch.effects import effect
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 
-FORMAT = "fdi_torch.gap/1"
+FORMAT = "fdi_torch.gap/2"
+UNKNOWN = "unknown"  # the name of a cause that the library lacks
+CERTAIN = 0.95  # marginal probability
 OPEN_SHARE, OPEN_ERRORS = 0.2, 3.0  # of the value, and standard errors
 Verdict = Literal["no_gap", "named", "ambiguous", "unknown"]
 CauseName = tuple[str, str]
@@ -46,6 +48,11 @@ class Explanation:
     probability: float
     unknown_at: str | None = None
 
+    @property
+    def every(self) -> tuple[CauseName, ...]:
+        """The causes, and what is unknown."""
+        return (*self.causes, *(((UNKNOWN, self.unknown_at),) if self.unknown_at else ()))
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -63,6 +70,9 @@ class Answer:
     posterior: Sequence[Explanation]
     closure: Mapping[str, Any]
     noise: Mapping[str, Any]
+    unexamined: float = 0.0
+    converged: bool = True
+    disturbances: Mapping[str, Any] = field(default_factory=dict)
     shape: Mapping[str, Any] | None = None
     next_input: Mapping[str, Any] | None = None
     impostors: Mapping[str, Any] | None = None
@@ -71,6 +81,15 @@ class Answer:
     curves: Sequence[Mapping[str, Any]] = ()
     remarks: Sequence[str] = ()
     arrays: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def certain(self) -> list[CauseName]:
+        """Effects and unknowns that are there with 95 %, whatever else is."""
+        share: dict[CauseName, float] = {}
+        for e in self.posterior:
+            for cause in e.every:
+                share[cause] = share.get(cause, 0.0) + e.probability
+        return [cause for cause, probability in share.items() if probability >= CERTAIN]
 
     def to_dict(self) -> dict[str, Any]:
         answer: dict[str, Any] = {
@@ -82,7 +101,11 @@ class Answer:
             "ambiguity_set": [names(causes) for causes in self.ambiguity_set],
             "posterior": [_explanation(e) for e in self.posterior],
             "closure": dict(self.closure),
+            "unexamined": self.unexamined,
+            "certain": names(self.certain),
+            "converged": self.converged,
             "noise": dict(self.noise),
+            "disturbances": dict(self.disturbances),
             "shape": self.shape,
             "next_input": self.next_input,
             "impostors": self.impostors,
@@ -101,7 +124,8 @@ def adopted(plant: PlantDescription, answer: Answer, constants: bool = False) ->
     file says: how far they may lie off another day, the fit does not know. The causes get a tolerance, so that a later
     diagnosis refits them beside whatever else it finds.
     """
-    placed = [PlacedEffect(c.effect, c.location, {n: a.value for n, a in c.parameters.items()}) for c in answer.causes]
+    named = [c for c in answer.causes if c.effect != UNKNOWN]
+    placed = [PlacedEffect(c.effect, c.location, {n: a.value for n, a in c.parameters.items()}) for c in named]
     known = {(p.effect, p.location) for p in placed}
     effects = (*(e for e in plant.effects if (e.effect, e.location) not in known), *placed)
     if not constants:
@@ -184,5 +208,5 @@ def _cause(cause: Cause) -> dict[str, Any]:
 
 
 def _explanation(explanation: Explanation) -> dict[str, Any]:
-    shown: dict[str, Any] = {"causes": names(explanation.causes), "probability": explanation.probability}
+    shown: dict[str, Any] = {"causes": names(explanation.every), "probability": explanation.probability}
     return shown | ({"unknown_at": explanation.unknown_at} if explanation.unknown_at else {})

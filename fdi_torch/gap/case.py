@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from fdi_torch.effects import effect
+from fdi_torch.gap.acquisition import Stuck, usable, without_sensors
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.limits import told_limits
-from fdi_torch.gap.strays import Strays, strays_of, without
+from fdi_torch.gap.search import DEEPEST
+from fdi_torch.gap.strays import Stray, Strays, strays_of, without
 from fdi_torch.gap.subject import Subject, subject_of
-from fdi_torch.gap.which import DEEPEST
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.pace import time_scale
@@ -29,7 +30,7 @@ class Settings:
     """library, leave_out: as in `library_of`. step: of the simulation, s; None: as in `laid_out`.
 
     most: effects that one explanation may have. named_only: the best of what has a name, however much it leaves open:
-    a step on the way where many causes come together. cross_validate: as in `gap/stretches.py`.
+    a step on the way where many causes come together. trusted: as in `Recording`, of all of them.
     """
 
     library: tuple[str, ...] | None = None
@@ -37,7 +38,7 @@ class Settings:
     step: float | None = None
     most: int = DEEPEST
     named_only: bool = False
-    cross_validate: bool = False
+    trusted: bool = False
 
 
 PLAIN = Settings()
@@ -46,8 +47,8 @@ PLAIN = Settings()
 @dataclass(frozen=True)
 class Case:
     """library: the effects at places to search. subject: the recordings, for the plant with the limits of its sensors
-    that their values tell (`told`); held: the hold-outs. strays: what was masked in the recordings, and in the
-    hold-outs. most, named_only, cross_validate: as in `Settings`.
+    that their values tell, and sensors that are stuck (`told`), without sensors that are stuck throughout; held: the
+    hold-outs. strays: what was masked in the recordings, and in the hold-outs. most, named_only: as in `Settings`.
     """
 
     library: tuple[Placement, ...]
@@ -57,7 +58,6 @@ class Case:
     held: tuple[Subject, ...]
     most: int
     named_only: bool = False
-    cross_validate: bool = False
     strays: tuple[Sequence[Strays], Sequence[Strays]] = ((), ())
 
 
@@ -70,14 +70,25 @@ def case_of(
     for one in holdouts:
         expect_another(one, recordings)
     library = library_of(plant, settings.library, settings.leave_out)
+    longest = max(float(r.time[-1] - r.time[0]) for r in recordings)
+    if settings.step is not None and settings.step > longest:
+        raise ValueError(f"step: expected one within the {longest:g} s recorded, got {settings.step:g} s; shorten it")
+    recordings, stuck = _examined(plant, recordings, settings.trusted)
+    holdouts, _ = _examined(plant, holdouts, settings.trusted)
+    offered = {p.prefix for p in library}
+    frozen = {s.sensor.name: s for s in stuck if s.for_good and f"{s.sensor.name}.sensor_stuck" in offered}
+    plant = _with_sensors_that_read(plant, recordings, stuck)
+    library = tuple(p for p in library if p.location in plant.locations())
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     recordings, strays = _without_strays(plant, believed, recordings, settings.step)
     holdouts, strays_held = _without_strays(plant, believed, holdouts, settings.step)
     told = told_limits(plant, recordings, believed, library)
     believed += told
+    told += [Placement(effect("sensor_stuck"), n, {"size": 1.0, "onset": s.start}) for n, s in frozen.items()]
+    strays = _as_strays([s for s in stuck if s.sensor.name not in frozen]) + strays
     subject, *held = (laid_out(plant, believed, r, settings.step) for r in (recordings, *((h,) for h in holdouts)))
     apart = (strays, strays_held)
-    asked = settings.most, settings.named_only, settings.cross_validate
+    asked = settings.most, settings.named_only
     return Case(library, tuple(recordings), told, subject, tuple(held), *asked, apart)
 
 
@@ -95,6 +106,45 @@ def _without_strays(
         kept.append(replace(recording, mask=mask) if own else recording)
         found += own
     return kept, found
+
+
+def _examined(
+    plant: PlantDescription, recordings: Sequence[Recording], trusted: bool
+) -> tuple[list[Recording], list[Stuck]]:
+    """The recordings without readings of sensors that are stuck, and these. Raises ValueError for one that is not
+    what it seems."""
+    found = [usable(plant, replace(r, trusted=r.trusted or trusted)) for r in recordings]
+    return [f.recording for f in found], [s for f in found for s in f.stuck]
+
+
+def _with_sensors_that_read(
+    plant: PlantDescription, recordings: Sequence[Recording], stuck: Sequence[Stuck]
+) -> PlantDescription:
+    """The plant without sensors of which little is left beside what stood still.
+
+    Raises ValueError where no sensor is left.
+    """
+    left = {
+        s.sensor.name: sum(int(r.mask[:, r.output_names.index(s.sensor.column)].sum()) for r in recordings)
+        for s in stuck
+    }
+    silent = {name for name, count in left.items() if count < LEAST}
+    if not silent:
+        return plant
+    if len(silent) == len(plant.sensors):
+        raise ValueError(
+            f"{recordings[0].source}: expected a sensor that reads its level, got none: {', '.join(sorted(silent))} "
+            "stand still throughout; check their wiring"
+        )
+    return without_sensors(plant, silent)
+
+
+def _as_strays(stuck: Sequence[Stuck]) -> list[Strays]:
+    """Readings that stood still for a while, or of a sensor that nothing else may be said of."""
+    each: dict[str, list[Stray]] = {}
+    for s in stuck:
+        each.setdefault(s.sensor.name, []).append(Stray(slice(s.first, s.beyond), (s.start, s.stop), math.inf))
+    return [Strays(name, "", tuple(own)) for name, own in each.items()]
 
 
 def expect_another(holdout: Recording, recordings: Sequence[Recording]) -> None:

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 
 from fdi_torch.gap.closure import Model, model_of
 from fdi_torch.gap.coefficients import coefficients_of, lasting
-from fdi_torch.gap.evidence import temperature
 from fdi_torch.gap.finding import Finding
 from fdi_torch.gap.fitting import Fit
 from fdi_torch.gap.freeform import free_form
@@ -48,12 +47,11 @@ def ceiling_of(found: Finding) -> Model:
     if found.unnamed:
         return model_of(best)
     free = lasting([p for place in guilty_places(found) for p in free_form(place, plant, found.reach)])
-    heat = temperature(found.null.cost - found.search.best.cost)
-    taken: Mapping[str, float] = coefficients_of(found.fitter, best, free, found.reach, heat).by_name()
+    taken: Mapping[str, float] = coefficients_of(found.fitter, best, free, found.reach).by_name()
     return Model((*best.candidate.placements, *free), {**best.values, **taken})
 
 
 def guilty_places(found: Finding) -> list[str]:
     """Where the best explanation's causes are; the likeliest place where it has none."""
     places = list(dict.fromkeys(p.location for p in found.best.candidate.placements))
-    return places or [found.places[0].location]
+    return places or [found.posterior.places[0][0]]

@@ -22,7 +22,7 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement
 from fdi_torch.simulate.collocation import Collocation
 
-START_SAMPLES, START_ROUNDS = 120, 3
+START_SAMPLES = 120
 BLOCKS, DRAWS = 24, 400
 DEFINED = 5.0  # standard errors that a gap has to measure before a share of it means anything
 
@@ -110,9 +110,12 @@ def free_run(subject: Subject, noise: Noise, model: Model, guess: Tensor | None 
     starts = [f"{t.name}.start_level" for t in subject.plant.tanks]
     engine = Collocation(network, ParameterSpace(network.constants[n] for n in starts), subject.experiment)
     theta = engine.space.vector(fitter.first_levels()).unsqueeze(0)
-    levels = engine.settle(theta, engine.constant_guess(theta) if guess is None else guess).levels
-    theta, _, near = fitter.descend(engine, theta, levels, START_ROUNDS)
-    settled = engine.settle(theta, near.levels)
+    if guess is None:  # what all readings show leads to the model's own trajectory; it does not tell where that is
+        levels = Fitter(subject, noise).first_trajectory(engine, theta)
+    else:
+        levels = engine.settle(theta, guess).levels
+    start = fitter.descend(engine, theta, levels)
+    settled = engine.settle(start.theta, start.near.levels)
     return settled.readings[0], settled.levels
 
 

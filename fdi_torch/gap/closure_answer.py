@@ -8,7 +8,8 @@ from typing import Any
 
 from fdi_torch.gap.ceiling import FROZEN, guilty_places
 from fdi_torch.gap.closure import Closure, HeldOut, closure
-from fdi_torch.gap.finding import Finding, in_order
+from fdi_torch.gap.finding import Finding
+from fdi_torch.gap.posterior import in_order
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 

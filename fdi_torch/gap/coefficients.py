@@ -39,10 +39,9 @@ def coefficients_of(
     fit: Fit,
     free: Sequence[Placement],
     reach: Reach,
-    heat: float,
     returned: Sequence[Placement] = (),
 ) -> Coefficients:
-    """What free forms take up of what a fit leaves, and of what its causes `returned` do; heat: tempers the data.
+    """What free forms take up of what a fit leaves, and of what its causes `returned` do.
 
     The amplitude of the coefficients' normal prior is the one of most evidence.
     """
@@ -54,8 +53,8 @@ def coefficients_of(
         residual = residual + effect_columns(fitter, fit, [_as_fitted(fitter, fit, p) for p in returned]).sum(-1)
     columns, residual = _beside_starts(fitter, fit, columns, residual)
     prior = torch.tensor([o.parameters[0].std for o in options], dtype=columns.dtype)
-    spectrum, basis = torch.linalg.eigh((columns * prior).T @ (columns * prior) / heat)
-    spectrum, score = spectrum.clamp(min=0.0), basis.T @ (prior * (columns.T @ residual)) / heat
+    spectrum, basis = torch.linalg.eigh((columns * prior).T @ (columns * prior))
+    spectrum, score = spectrum.clamp(min=0.0), basis.T @ (prior * (columns.T @ residual))
     amplitude = max(AMPLITUDES, key=lambda a: _evidence(spectrum, score, a))
     weight = 1.0 / (spectrum + 1.0 / amplitude**2)
     shaped = prior.unsqueeze(1) * basis

@@ -50,7 +50,7 @@ class Curve:
         return told | ({"effect": self.effect.tolist()} if self.effect is not None else {})
 
 
-def curves_at(fitter: Fitter, fit: Fit, place: str, reach: Reach, heat: float) -> list[Curve]:
+def curves_at(fitter: Fitter, fit: Fit, place: str, reach: Reach) -> list[Curve]:
     """One curve for each variable that a place can know. fit: its causes there are given back to the free form; where
     it is a free form itself, that is shown."""
     here = tuple(p for p in fit.candidate.placements if p.location == place)
@@ -59,7 +59,7 @@ def curves_at(fitter: Fitter, fit: Fit, place: str, reach: Reach, heat: float) -
     if own:
         coefficients, effect = fitted_coefficients(fitter, fit, free), None
     else:
-        coefficients = coefficients_of(fitter, fit, free, reach, heat, returned=here)
+        coefficients = coefficients_of(fitter, fit, free, reach, returned=here)
         effect = _effect(fitter, fit, place, here) if here else None
     units = _local(fitter, fit, place, [_unit(free, name, coefficients.names) for name in coefficients.names]) / UNIT
     quantity, quantity_unit = _quantity(fitter, free, place)

@@ -34,10 +34,11 @@ class Excitation:
 
 def excitation(found: Screen, plant: PlantDescription) -> Excitation:
     """From the screen of a library beside the nuisances."""
-    strength = torch.diagonal(found.gram)
-    best = _strongest(found.options, strength)
+    pairs = found.pairs
+    strength = torch.diagonal(pairs.gram)
+    best = _strongest(pairs.options, strength)
     hidden = tuple(cause for cause, i in best.items() if float(strength[i]) < SHOWN)
-    return Excitation(hidden, _twins(plant, best, found.gram), {c: float(strength[i]) for c, i in best.items()})
+    return Excitation(hidden, _twins(plant, best, pairs.gram), {c: float(strength[i]) for c, i in best.items()})
 
 
 def _strongest(options: Sequence[Option], strength: Tensor) -> dict[CauseName, int]:

@@ -1,4 +1,8 @@
-"""Fits of one model, from many starts at once, to one recording: Levenberg-Marquardt on whole trajectories."""
+"""Fits of one model, from many starts at once, to one recording: least squares on whole trajectories.
+
+The collocation corrects a trajectory by one Newton step per evaluation. Costs of two points are therefore compared only
+where both trajectories obey the model: a point whose trajectory does not settle is refused.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +14,10 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import EFFECTS
+from fdi_torch.estimate.kalman import KalmanWhitening
+from fdi_torch.estimate.levenberg_marquardt import Competition, Linearisation, RefineSettings, levenberg_marquardt
 from fdi_torch.gap.floor import Noise, slow_excess
-from fdi_torch.gap.subject import Subject
+from fdi_torch.gap.subject import Part, Subject, between
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
@@ -19,9 +25,12 @@ from fdi_torch.plant.pace import length_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint import Joint, own_name
 
-ROUNDS = 14
-SETTLED = 0.05  # chi-square units; smaller gains decide nothing
-PATIENCE, ENOUGH = 1, 4.0  # a start is given up that gains less than a quarter of its arrears after two rounds
+# What the model still predicts to gain where a fit has converged, in units of chi-square per reading, or of one where
+# that is more: parameters a tenth of a standard error away, by the noise or by the residuals if they are larger.
+DECREMENT = 0.01
+CAP = 200  # evaluations, a guard against descents without an end
+# A start is given up that is so many chi-square units behind and gains less than a quarter of its arrears in a step.
+BEHIND, SHARE = 30.0, 0.25
 CORRECTIONS = 6  # of a trajectory that a step of the parameters moved
 FAR = 1e-3  # in units of the plant's length scale: a defect from which a correction is worth its cost
 LONG, NEARLY = 4.0, 10.0  # in the same: a shift that needs a correction, and a defect that one more makes good
@@ -31,14 +40,10 @@ Key = frozenset[tuple[str, str]]
 
 @dataclass(frozen=True)
 class Candidate:
-    """Effects at places. starts: which of their parameters are fitted, and from where ('Q1.pump_lag.time_constant').
-
-    promise: chi-square that the newest of them closes to first order.
-    """
+    """Effects at places. starts: which of their parameters are fitted, and from where ('Q1.pump_lag.time_constant')."""
 
     placements: tuple[Placement, ...] = ()
     starts: tuple[Mapping[str, float], ...] = ({},)
-    promise: float = 0.0
 
     @property
     def key(self) -> Key:
@@ -47,13 +52,17 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Fit:
-    """The best fit of a candidate: parameters by name, cost (chi-square with priors) and its neighbourhood."""
+    """The best fit of a candidate: parameters by name, cost (chi-square with priors) and its neighbourhood.
+
+    converged: whether no more than DECREMENT was left to gain. One that was given up or ran out of evaluations has not.
+    """
 
     candidate: Candidate
     space: ParameterSpace
     theta: Tensor
     cost: float
     near: Linearised
+    converged: bool
 
     @property
     def values(self) -> dict[str, float]:
@@ -68,12 +77,29 @@ class Fit:
         return self.candidate.key
 
 
-class Fitter:
-    """Fits candidates to one subject under one noise."""
+@dataclass(frozen=True)
+class Descended:
+    """Where descents ended: theta (L, P), cost (L,) in chi-square units, their neighbourhoods, converged (L,) bool."""
 
-    def __init__(self, subject: Subject, noise: Noise) -> None:
-        self.subject, self.noise = subject, noise
+    theta: Tensor
+    cost: Tensor
+    near: Linearised
+    converged: Tensor
+
+
+class Fitter:
+    """Fits candidates to one subject under one noise: of the sensors, and of random flows where there are any."""
+
+    def __init__(self, subject: Subject, noise: Noise, disturbed: KalmanWhitening | None = None) -> None:
+        self.subject, self.noise, self.disturbed = subject, noise, disturbed
         self.far = FAR * length_scale(subject.plant)
+
+    @property
+    def log_det(self) -> float:
+        """Of the variances of what `whiten` makes unit, summed over all readings."""
+        if self.disturbed:
+            return self.disturbed.log_det
+        return float((2.0 * torch.log(self.noise.innovation) * self.subject.mask.sum(dim=0)).sum())
 
     def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation | Joint:
         """The plant with the candidate's effects; its space holds the nuisances and what is free."""
@@ -95,19 +121,17 @@ class Fitter:
         self,
         candidate: Candidate,
         base: Fit | None = None,
-        rounds: int = ROUNDS,
-        target: float = -math.inf,
-        settled: float = SETTLED,
+        target: float = math.inf,
+        cap: int = CAP,
     ) -> Fit:
         """The best of the candidate's starts; nuisances and trajectory begin where `base` found them.
 
-        target: the cost to compete with; starts that come near it too slowly are given up. settled: chi-square units;
-        a start that gains less in a round is there.
+        target: the cost to compete with; starts that come near it too slowly are given up. cap: evaluations at most.
         """
         by_free: dict[tuple[str, ...], list[Mapping[str, float]]] = {}
         for start in candidate.starts:
             by_free.setdefault(tuple(sorted(start)), []).append(start)
-        fits = [self._fit(candidate, free, starts, base, rounds, target, settled) for free, starts in by_free.items()]
+        fits = [self._fit(candidate, free, starts, base, target, cap) for free, starts in by_free.items()]
         return min(fits, key=lambda f: f.cost)
 
     def _fit(
@@ -116,15 +140,17 @@ class Fitter:
         free: tuple[str, ...],
         starts: Sequence[Mapping[str, float]],
         base: Fit | None,
-        rounds: int,
         target: float,
-        settled: float,
+        cap: int,
     ) -> Fit:
         engine = self.engine(candidate, free)
         theta, levels = self._begin(engine, starts, base)
-        theta, cost, near = self.descend(engine, theta, levels, rounds, target, settled)
-        best = int(torch.nan_to_num(cost, nan=torch.inf).argmin())
-        return Fit(candidate, engine.space, theta[best], float(cost[best]), near.lanes(torch.tensor([best])))
+        found = self.descend(engine, theta, levels, target, cap)
+        best = int(torch.nan_to_num(found.cost, nan=torch.inf).argmin())
+        near = found.near.lanes(torch.tensor([best]))
+        return Fit(
+            candidate, engine.space, found.theta[best], float(found.cost[best]), near, bool(found.converged[best])
+        )
 
     def _begin(
         self, engine: Collocation | Joint, starts: Sequence[Mapping[str, float]], base: Fit | None
@@ -133,9 +159,37 @@ class Fitter:
         rows = [engine.space.vector({n: v for n, v in {**known, **s}.items() if n in engine.space}) for s in starts]
         theta = torch.stack(rows)
         if base is None:
-            guess = engine.constant_guess(theta)
-            return theta, engine.settle(theta, guess).levels
+            return theta, self.first_trajectory(engine, theta)
         return theta, base.near.levels.expand(len(starts), -1, -1)
+
+    def first_trajectory(self, engine: Collocation | Joint, theta: Tensor) -> Tensor:
+        """The model's levels (L, K+1, n) at theta (L, P), found from what the sensors show of them.
+
+        Newton's steps from levels that stay where they start miss the trajectory where levels become equal, or meet a
+        rim: its roots bend sharply there. They are the second choice, for readings that lead nowhere.
+        """
+        constant = engine.constant_guess(theta)
+        shown = torch.cat([self._shown(part) for part in self.subject.parts])
+        found = engine.settle(theta, torch.where(shown.isfinite(), shown, constant))
+        lost = (~(found.defect <= self.far)).nonzero().flatten()
+        if not len(lost):
+            return found.levels
+        second = engine.settle(theta[lost], constant[lost])
+        better = second.defect < found.defect[lost].nan_to_num(nan=torch.inf)
+        return found.levels.index_copy(0, lost[better], second.levels[better])
+
+    def _shown(self, part: Part) -> Tensor:
+        """Levels that the sensors show at the ends of the steps (K+1, n), not a number for a tank that none sees."""
+        plant, nodes = self.subject.plant, part.experiment.nodes
+        names = [t.name for t in plant.tanks]
+        shown = nodes.new_full((len(nodes), len(names)), math.nan)
+        for i, sensor in enumerate(plant.sensors):
+            tank, seen = names.index(sensor.tank), part.mask[:, i]
+            if bool(seen.any()):
+                level = (part.readings[seen, i] - sensor.offset) / sensor.gain
+                level = level.clamp(0.0, plant.tanks[tank].height)
+                shown[:, tank] = between(nodes, part.experiment.sample_times[seen], level)
+        return shown
 
     def first_levels(self) -> dict[str, float]:
         """Start levels from the mean of the first few readings."""
@@ -153,41 +207,19 @@ class Fitter:
         engine: Collocation | Joint,
         theta: Tensor,
         levels: Tensor,
-        rounds: int,
-        target: float = -math.inf,
-        settled: float = SETTLED,
-    ) -> tuple[Tensor, Tensor, Linearised]:
-        """theta (L, P), levels (L, K+1, n) -> where Levenberg-Marquardt ends, its cost (L,) and neighbourhood."""
-        low, high, scale = self.box(engine.space)
-        near = _settled(engine, theta, engine.linearise(theta, levels), self.far)
-        cost, gradient, curvature = self.normal(engine.space, theta, near, scale)
-        damping = torch.full_like(cost, 1e-3)
-        active = torch.isfinite(cost)
-        for turn in range(rounds):
-            lanes = active.nonzero().flatten()
-            if not len(lanes):
-                break
-            step = _bounded_step(gradient[lanes], curvature[lanes], damping[lanes], theta[lanes], low, high, scale)
-            moved = torch.minimum(torch.maximum(theta[lanes] + step, low), high)
-            moves = (moved - theta[lanes]).unsqueeze(1).unsqueeze(1)
-            shift = (near.slopes[lanes] * moves).sum(-1)
-            tried = _followed(engine, moved, near.levels[lanes] + shift, shift, self.far)
-            new_cost, new_gradient, new_curvature = self.normal(engine.space, moved, tried, scale)
-            # What a trajectory leaves that is not the model's, for it was not followed to its end, says nothing.
-            better = (new_cost < cost[lanes]) & (tried.defect <= near.defect[lanes].clamp(min=self.far))
-            gain = torch.where(better, cost[lanes] - new_cost, torch.zeros_like(new_cost))
-            take = lanes[better]
-            theta, cost = theta.index_copy(0, take, moved[better]), cost.index_copy(0, take, new_cost[better])
-            gradient = gradient.index_copy(0, take, new_gradient[better])
-            curvature = curvature.index_copy(0, take, new_curvature[better])
-            near = _replaced(near, take, tried.lanes(better))
-            damping[lanes] = torch.where(better, damping[lanes] * 0.2, damping[lanes] * 10.0).clamp(1e-9, 1e8)
-            rival = float(cost.min()) if len(cost) > 1 and not math.isfinite(target) else target
-            behind = cost[lanes] - rival if math.isfinite(rival) else torch.zeros_like(gain)
-            hopeless = (turn >= PATIENCE) & (ENOUGH * gain < behind) & (behind > 30.0)
-            done = (better & (gain < settled)) | (damping[lanes] > 1e4) | hopeless
-            active[lanes[done]] = False
-        return theta, cost, near
+        target: float = math.inf,
+        cap: int = CAP,
+    ) -> Descended:
+        """theta (L, P), levels (L, K+1, n) a guess of the trajectories there -> where least squares end."""
+        problem = _OnTrajectories(self, engine, levels)
+        competition = Competition(0.5 * BEHIND, SHARE, 0.5 * target)
+        # The core's cost is a negative log-likelihood, half of chi-square.
+        share = DECREMENT / max(int(self.subject.mask.sum()), 1)
+        settings = RefineSettings(cap, 0.5 * DECREMENT, share, step_tolerance=0.0, competition=competition)
+        low, high, _ = problem.box
+        found = levenberg_marquardt(problem.linearise, theta, low, high, settings, neighbourhood=problem)
+        assert isinstance(found.state, Linearised)
+        return Descended(found.theta, 2.0 * found.cost, found.state, found.converged)
 
     def normal(
         self, space: ParameterSpace, theta: Tensor, near: Linearised, scale: Tensor
@@ -202,11 +234,24 @@ class Fitter:
         curvature = j @ j.mT + torch.diag_embed((pull * scale) ** 2)
         return cost, gradient, curvature
 
+    def cost(self, fit: Fit) -> float:
+        """Chi-square of a fit under this fitter's noise, with priors."""
+        return float(self.normal(fit.space, fit.theta, fit.near, self.box(fit.space)[2])[0])
+
     def white(self, near: Linearised) -> tuple[Tensor, Tensor]:
         """Whitened residual (L, S, C) and Jacobian (L, S, C, P)."""
-        subject = self.subject
-        residual = self.noise.whiten(subject.readings - near.readings, subject.mask)
-        return residual, self.noise.whiten(near.jacobian, subject.mask)
+        residual = self.whiten(self.subject.readings - near.readings)
+        return residual, self.whiten(near.jacobian)
+
+    def whiten(self, x: Tensor) -> Tensor:
+        """x (*lanes, S, C) or (*lanes, S, C, P) -> the same in units of the noise, without its correlation."""
+        return self.disturbed(x) if self.disturbed else self.noise.whiten(x, self.subject.mask)
+
+    def priors(self, space: ParameterSpace, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Scales of the parameters (P,), and their normal priors in these: roots of the precision, and how many
+        standard deviations theta is off."""
+        scale, std = self.box(space)[2], space.std(theta)
+        return scale, (scale / std).nan_to_num(0.0), ((theta - space.nominal(theta)) / std).nan_to_num(0.0)
 
     def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]:
         """Bounds, and the scale on which each parameter varies."""
@@ -221,6 +266,49 @@ class Fitter:
             span = top - p.low
             scale.append(p.std if finite else 0.1 * (span if math.isfinite(span) else max(abs(p.nominal), 1.0)))
         return tuple(torch.tensor(x, dtype=torch.float64) for x in (low, high, scale))  # type: ignore[return-value]
+
+
+class _OnTrajectories:
+    """Half of chi-square as a problem for least squares; every point keeps its trajectory's neighbourhood."""
+
+    def __init__(self, fitter: Fitter, engine: Collocation | Joint, levels: Tensor) -> None:
+        self.fitter, self.engine, self.levels = fitter, engine, levels
+        self.box = fitter.box(engine.space)
+
+    def linearise(self, theta: Tensor, lanes: Tensor) -> Linearisation:
+        """The model at the starts theta (L, P)."""
+        near = self.engine.linearise(theta, self.levels[lanes])
+        return self._model(theta, _settled(self.engine, theta, near, self.fitter.far))
+
+    def follow(self, theta: Tensor, known: Linearisation, step: Tensor) -> Linearisation:
+        """The model at theta, a step away from what is known; its cost is infinite where no trajectory leads there."""
+        near, far = _near(known), self.fitter.far
+        shift = (near.slopes * step[:, None, None, :]).sum(-1)
+        found = _followed(self.engine, theta, near.levels + shift, shift, far)
+        model = self._model(theta, found)
+        lost = ~(found.defect <= near.defect.clamp(min=far))
+        return replace(model, cost=torch.where(lost, torch.inf, model.cost))
+
+    def bend(self, known: Linearisation, trial: Linearisation, step: Tensor) -> Tensor:
+        """J'c (L, P) for the bend c of the whitened readings along the step; priors do not bend."""
+        near = _near(known)
+        bend = _near(trial).readings - near.readings - (near.jacobian * step[:, None, None, :]).sum(-1)
+        columns = torch.cat([near.jacobian, bend.unsqueeze(-1)], dim=-1)
+        white = self.fitter.white(replace(near, jacobian=columns))[1].flatten(1, 2)
+        return (white[..., :-1] * white[..., -1:]).sum(1)
+
+    def _model(self, theta: Tensor, near: Linearised) -> Linearisation:
+        scale = self.box[2]
+        cost, descent, curvature = self.fitter.normal(self.engine.space, theta, near, scale)
+        # What nothing determines stays where it is.
+        weakest = 1e-9 * torch.diagonal(curvature, dim1=-2, dim2=-1).amax(-1, keepdim=True) + 1e-12
+        curvature = curvature + torch.diag_embed(weakest.expand_as(theta))
+        return Linearisation(0.5 * cost, -descent / scale, curvature / (scale * scale.unsqueeze(-1)), near)
+
+
+def _near(model: Linearisation) -> Linearised:
+    assert isinstance(model.state, Linearised)
+    return model.state
 
 
 def left_open(fitter: Fitter, fit: Fit) -> float:
@@ -256,7 +344,7 @@ def _settled(
         if not len(lanes):
             break
         before = near.defect
-        near = _replaced(near, lanes, engine.linearise(theta[lanes], near.levels[lanes]))
+        near = near.replaced(lanes, engine.linearise(theta[lanes], near.levels[lanes]))
         lost = lost | _no_nearer(near.defect, before, far)
     return near
 
@@ -264,30 +352,6 @@ def _settled(
 def _no_nearer(defect: Tensor, before: Tensor, far: float) -> Tensor:
     """Which lanes (L,) a correction has not brought nearer to a trajectory that they are lost from."""
     return ~((defect < LOST * far) | (defect < STALLED * before))
-
-
-def _bounded_step(
-    gradient: Tensor, curvature: Tensor, damping: Tensor, theta: Tensor, low: Tensor, high: Tensor, scale: Tensor
-) -> Tensor:
-    """The damped step; parameters that a bound stops are left out of it, once more after a first look."""
-    stuck = ((theta <= low) & (gradient < 0)) | ((theta >= high) & (gradient > 0))
-    for _ in range(2):
-        free = (~stuck).to(theta.dtype)
-        h = curvature * free.unsqueeze(-1) * free.unsqueeze(-2)
-        diagonal = torch.diagonal(h, dim1=-2, dim2=-1)
-        added = damping.unsqueeze(-1) * diagonal + (1.0 - free) + 1e-9 * diagonal.amax(-1, keepdim=True) + 1e-12
-        step = torch.linalg.solve(h + torch.diag_embed(added), (gradient * free).unsqueeze(-1)).squeeze(-1) * scale
-        step = torch.nan_to_num(step, nan=0.0, posinf=0.0, neginf=0.0)
-        # A bound that is overshot from where the parameter already lies on it holds the parameter there.
-        stuck = stuck | ((theta + step <= low) & (theta <= low)) | ((theta + step >= high) & (theta >= high))
-    return step
-
-
-def _replaced(near: Linearised, lanes: Tensor, new: Linearised) -> Linearised:
-    if len(lanes) == len(near.defect):
-        return new
-    fields = {name: getattr(near, name).index_copy(0, lanes, getattr(new, name)) for name in near.__dataclass_fields__}
-    return replace(near, **fields)
 
 
 def _in_library_order(placements: Sequence[Placement]) -> list[Placement]:

@@ -77,6 +77,15 @@ class Forcing:
             changed.append(total)
         return torch.stack(changed)
 
+    def by_rates(self, weights: Tensor) -> Tensor:
+        """The transpose of `by_inflows`: weights (tanks, M, K) of the rates -> of the inflows, the same shape."""
+        found = torch.zeros_like(weights)
+        for row, weight in zip(self._by_inflow, weights, strict=True):
+            for tank, slope in enumerate(row):
+                if slope is not None:
+                    found[tank] += slope * weight
+        return found
+
     def readings(self, placement: Placement, starts: Starts) -> Tensor:
         """How the readings change with an effect, (C, M, S) in each sensor's unit."""
         network, values, lanes = self._with(placement, starts)

@@ -25,7 +25,6 @@ from fdi_torch.plant.signals import Clock
 LOCAL_NODES, TIME_NODES = 8, 16
 HEAD_NODES = 14
 PRIOR = 0.2
-ROUNDS = 16
 NARROWEST = 1e-6  # of a grid, in units of the plant's scales
 UNIT = 0.01  # size of a coefficient at which its effect on the readings is taken
 
@@ -131,18 +130,23 @@ def free_form(
     return tuple(Placement(e, place) for e in _free_at(place, plant, reach, periods))
 
 
-def fitted_free_form(fitter: Fitter, fit: Fit, place: str, periods: Sequence[float], reach: Reach) -> Fit:
-    """The free discrepancy of one place beside what a fit has, about the moving trajectory."""
+def fitted_free_form(
+    fitter: Fitter, fit: Fit, kept: Sequence[Placement], place: str, periods: Sequence[float], reach: Reach
+) -> Fit:
+    """The free discrepancy of one place beside the effects that are kept of a fit, about the moving trajectory."""
     plant = fitter.subject.plant
     placements = free_form(place, plant, reach, periods)
     start = {f"{p.prefix}.{c.name}": 0.0 for p in placements for c in p.effect.parameters(p.location, plant)}
-    return fitter.fit(Candidate(placements, (start,)), fit, rounds=ROUNDS)
+    prefixes = {p.prefix for p in kept}
+    start |= {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] in prefixes}
+    return fitter.fit(Candidate((*kept, *placements), (start,)), fit)
 
 
 def shape_of(fit: Fit) -> dict[str, object]:
     """The discrepancy as tables against its local variables, in shares of `scale`."""
     values, tables = fit.effect_values, {}
-    for placement in fit.candidate.placements:
+    free = [p for p in fit.candidate.placements if isinstance(p.effect, _Free)]
+    for placement in free:
         effect = placement.effect
         assert isinstance(effect, _Free)
         for variable, grid in effect.nodes.items():
@@ -154,7 +158,7 @@ def shape_of(fit: Fit) -> dict[str, object]:
                 for j in range(len(effect.periods))
             ]
             tables[f"{effect.name}.period"] = {"at": list(effect.periods), "share": sizes, "scale": effect.scale}
-    return {"location": fit.candidate.placements[0].location, "tables": tables}
+    return {"location": free[0].location, "tables": tables}
 
 
 def _free_at(place: str, plant: PlantDescription, reach: Reach, periods: Sequence[float]) -> list[Effect]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.library import canonical
-from fdi_torch.gap.screening import Option, Screen
+from fdi_torch.gap.screening import Option, Pairs
 from fdi_torch.plant.description import PlantDescription
 
 DRAWS, SEED = 40, 0
@@ -24,7 +24,7 @@ PASSES = 0.02  # share of the gap left open by an impostor that a fit test would
 SEEN = 1e-6
 
 
-def simulated_impostors(found: Screen, named: CauseName, gap: float, plant: PlantDescription) -> dict[str, Any] | None:
+def simulated_impostors(found: Pairs, named: CauseName, gap: float, plant: PlantDescription) -> dict[str, Any] | None:
     """Of `draws` recordings in which another cause made a gap of this size (chi-square units), how many would have been
     given the name `named`: 'confused' with the true cause in the library, 'passed' without it, with the causes it
     passed for most often. None where no other effect can make such a gap within its range.

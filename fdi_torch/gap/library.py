@@ -36,16 +36,12 @@ STANDARD = (
     "sensor_quantization",
     "sensor_delay",
     "sensor_saturation",
+    "sensor_stuck",
     "valve_dead_zone",
     "valve_characteristic",
     "valve_authority",
     "valve_lag",
     "valve_leak",
-)
-# What one characteristic may look like: a pipe's flow by its head, a tank's cross-section by its level.
-FORMS_OF_ONE_LAW = (
-    frozenset({"laminar_flow", "flow_exponent", "outlet_drop"}),
-    frozenset({"area_taper", "internal_body"}),
 )
 
 
@@ -117,16 +113,3 @@ def twins(cause: CauseName, plant: PlantDescription) -> tuple[CauseName, ...]:
     name, place = canonical(cause, plant)
     others = [("plugging", p.name) for p in plant.pipes if canonical(("plugging", p.name), plant) == (name, place)]
     return tuple(c for c in dict.fromkeys([(name, place), *others]) if c != cause) if others else ()
-
-
-def stacked(causes: Iterable[CauseName]) -> frozenset[CauseName]:
-    """Those that stand at one place with another form of the same law: a place has one law of a kind, so that two of
-    them mean one that is neither.
-    """
-    all_of_them = frozenset(causes)
-
-    def beside(cause: CauseName) -> bool:
-        alike = [law for law in FORMS_OF_ONE_LAW if cause[0] in law]
-        return any(o != cause and o[1] == cause[1] and o[0] in law for law in alike for o in all_of_them)
-
-    return frozenset(c for c in all_of_them if beside(c))

@@ -26,7 +26,6 @@ from fdi_torch.plant.reach import reach_of
 from fdi_torch.recording import Recording
 
 FITTED, STARTS = 14, 2
-PATIENT = 40  # rounds for the recalibration, beside which all others are judged
 
 
 def one_at_a_time(
@@ -44,9 +43,9 @@ def one_at_a_time(
     null = Fitter(subject, _white(1e-2 * spread)).fit(Candidate())
     residual = torch.where(subject.mask, subject.readings - null.near.readings[0], 0.0)
     fitter = Fitter(subject, _white(residual.std(dim=0).clamp(min=1e-12)))
-    null = fitter.fit(Candidate(), null, rounds=PATIENT)
+    null = fitter.fit(Candidate(), null)
     options = options_of([p for p in found if not p.effect.rounds], fitter, reach_of(recording, plant))
-    fits = [null, *(fitter.fit(c, null) for c in _singles(screen(fitter, null, options)))]
+    fits = [null, *(fitter.fit(c, null) for c in _singles(screen(fitter, null, options, pairs=False)))]
     winner = min(fits, key=lambda fit: _bic(fitter, fit))
     return _named([(p.effect.name, p.location) for p in winner.candidate.placements])
 

@@ -30,7 +30,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
 
 START_SAMPLES = 50
-ROUNDS, CORRECTIONS, HALVINGS = 30, 80, 4
+CORRECTIONS, HALVINGS = 80, 4
 SETTLED = 1e-5  # m, on a bench
 NEARLY = 10.0  # so many times as far, and shorter steps do not help
 MOST_STEPS = 4000  # of the first try; samples may be closer, levels do not change as fast
@@ -122,7 +122,7 @@ def _run(subject: Subject, start_samples: int, counted: int) -> Prediction:
         raise ValueError(f"{source}: expected readings among the first {start_samples} samples, got none")
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     fitter = Fitter(replace(subject, mask=early), Noise(1e-2 * spread, torch.zeros_like(spread)))
-    engine, theta, levels = _by_stretch(fitter, counted) if counted else _by_samples(fitter)
+    engine, theta, levels = _by_stretch(fitter, counted) if counted else _by_samples(fitter, subject)
     run = engine.settle(theta, levels, CORRECTIONS)
     readings = run.readings[0]
     residuals = torch.where(subject.mask, subject.readings - readings, torch.zeros_like(readings))
@@ -143,15 +143,15 @@ Begun = tuple[Collocation, Tensor, Tensor]
 """The engine, parameters (1, P) and a guess of the levels (1, K+1, tanks)."""
 
 
-def _by_samples(fitter: Fitter) -> Begun:
+def _by_samples(fitter: Fitter, subject: Subject) -> Begun:
     """Start levels, and what varies, from the readings that the fitter sees."""
     plant = fitter.subject.plant
     engine = _engine(fitter, (), [*(f"{t.name}.start_level" for t in plant.tanks), *plant.varying])
     theta = torch.stack([engine.space.vector(start) for start in _starts(plant, fitter.first_levels())])
-    guess = engine.settle(theta, engine.constant_guess(theta)).levels
-    theta, cost, near = fitter.descend(engine, theta, guess, ROUNDS)
-    best = int(torch.nan_to_num(cost, nan=torch.inf).argmin())
-    return engine, theta[best : best + 1], near.levels[best : best + 1]
+    guess = Fitter(subject, fitter.noise).first_trajectory(engine, theta)
+    ends = fitter.descend(engine, theta, guess)
+    best = int(torch.nan_to_num(ends.cost, nan=torch.inf).argmin())
+    return engine, ends.theta[best : best + 1], ends.near.levels[best : best + 1]
 
 
 def _by_stretch(fitter: Fitter, samples: int) -> Begun:

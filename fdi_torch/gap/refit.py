@@ -28,7 +28,6 @@ from fdi_torch.plant.reach import reach_of_all
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.joint import own_name
 
-ROUNDS = 60
 TURNS = 3  # of the noise and the fit under it
 WIDE = 0.5  # of a range
 
@@ -88,13 +87,13 @@ def refit(
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     size = 1e-2 * spread if white is None else torch.full_like(spread, white)
     fitter = Fitter(subject, Noise(size, torch.zeros_like(spread)))
-    null = _with_a_trajectory(first_fit(fitter, Candidate(), ROUNDS), recordings)
+    null = _with_a_trajectory(first_fit(fitter, Candidate()), recordings)
     fit, base = null, null if white is None else None
     for _ in range(TURNS if white is None else 1):
         if white is None:
             fitter = Fitter(subject, estimate_noise(subject.readings - fit.near.readings[0], subject.mask))
         candidate = Candidate(tuple(free), (start,))
-        fit = base = _with_a_trajectory(first_fit(fitter, candidate, ROUNDS, base), recordings)
+        fit = base = _with_a_trajectory(first_fit(fitter, candidate, base), recordings)
         found = {n: v for n, v in fit.effect_values.items() if n in start}
         start = {n: v for n, v in found.items() if n not in _undetermined(fitter, fit)}
     own = _own(fitter, fit)

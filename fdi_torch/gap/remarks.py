@@ -18,6 +18,7 @@ from fdi_torch.gap.same_rig import other_rig
 from fdi_torch.gap.strays import Strays
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recordings.check import doubts
 
 AT_END = 1e-3  # of a parameter's range
 SHOWN_TIMES = 5  # of strays
@@ -28,7 +29,8 @@ SWINGS = 0.03  # amplitude of an oscillation worth a word, as a share of the fre
 def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
     """Of the inputs, the plant file, the parameters found, and the hold-outs."""
     subject = found.fitter.subject
-    remarks = []
+    remarks: list[str] = []
+    remarks += dict.fromkeys(s for part in subject.parts for s in doubts(part.recording, subject.plant))
     inputs = [column for part in subject.parts for column in part.recording.inputs.T]
     if all(float(torch.diff(column).abs().max()) == 0.0 for column in inputs):
         remarks.append(
@@ -39,6 +41,11 @@ def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
         remarks.append(
             "the plant file lists no tolerances, so that every constant is taken to be exact and what is a little off "
             "looks like an effect; list them under tolerances, as in P13.discharge_coefficient: 3 %"
+        )
+    if not found.best.converged:
+        remarks.append(
+            "the fit of the likeliest explanation has not converged: its sizes may be off by more than their standard "
+            "errors; a longer recording, or --library with fewer effects, may settle it"
         )
     remarks += [_astray(s) for group in found.strays for s in group]
     remarks += [*_believed_outside(subject.plant), *_at_their_ends(found), *_period(found)]

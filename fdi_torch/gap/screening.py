@@ -7,9 +7,8 @@ readings, and a regression beside the nuisances gives the chi-square that each c
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,9 +21,10 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.reach import Reach
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint import Joint, with_blanks
-from fdi_torch.simulate.scan import product, scan_in_time
+from fdi_torch.simulate.scan import scan_in_time
 
 Start = Mapping[str, float]
+AT_ONCE = 256  # options whose columns are in memory together
 
 
 @dataclass(frozen=True)
@@ -41,26 +41,15 @@ class Option:
 
 
 @dataclass(frozen=True)
-class Screen:
-    """What options would close beside a fit: with their columns C, less the nuisances' part, and what the fit leaves
-    r, score (M,) = C'r and gram (M, M) = C'C; beside its diagonal not a number where pairs were not asked for."""
+class Pairs:
+    """Of each effect at each place the start that shows most, and the one that closes most: score (M,), gram (M, M) as
+    in `Screen`."""
 
     options: tuple[Option, ...]
     score: Tensor
     gram: Tensor
 
-    @property
-    def size(self) -> Tensor:
-        """(M,): by how much the start is to be multiplied."""
-        return self.score / torch.diagonal(self.gram).clamp(min=1e-300)
-
-    @property
     def gain(self) -> Tensor:
-        """(M,): chi-square closed by each alone; 0 where only the opposite would help, or nothing is seen."""
-        strength = torch.diagonal(self.gram)
-        return torch.where((self.score > 0) & (strength > 1e-6), self.score**2 / strength.clamp(min=1e-300), 0.0)
-
-    def pair_gain(self) -> Tensor:
         """(M, M): chi-square closed by two together; 0 where one of them would have to turn round."""
         g, b = torch.diagonal(self.gram), self.score
         det = g.unsqueeze(0) * g.unsqueeze(1) - self.gram**2
@@ -68,6 +57,35 @@ class Screen:
         fine = (det > 1e-3 * g.unsqueeze(0) * g.unsqueeze(1)) & (first > 0) & (first.T > 0)
         gain = (b.unsqueeze(1) * first + b.unsqueeze(0) * first.T) / det.clamp(min=1e-300)
         return torch.where(fine, gain, 0.0)
+
+
+@dataclass(frozen=True)
+class Screen:
+    """What options would close beside a fit: with their columns C, less the nuisances' part, and what the fit leaves r,
+    score (M,) = C'r and strength (M,), the diagonal of C'C."""
+
+    options: tuple[Option, ...]
+    score: Tensor
+    strength: Tensor
+    found_pairs: Pairs | None = None
+
+    @property
+    def pairs(self) -> Pairs:
+        """Raises ValueError where they were not asked for."""
+        if self.found_pairs is None:
+            raise ValueError("expected a screen with pairs, got one without; ask `screen` for them")
+        return self.found_pairs
+
+    @property
+    def size(self) -> Tensor:
+        """(M,): by how much the start is to be multiplied."""
+        return self.score / self.strength.clamp(min=1e-300)
+
+    @property
+    def gain(self) -> Tensor:
+        """(M,): chi-square closed by each alone; 0 where only the opposite would help, or nothing is seen."""
+        strength = self.strength
+        return torch.where((self.score > 0) & (strength > 1e-6), self.score**2 / strength.clamp(min=1e-300), 0.0)
 
 
 def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Reach) -> list[Option]:
@@ -81,45 +99,62 @@ def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Reach) ->
     ]
 
 
-def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], heat: float = 1.0, pairs: bool = True) -> Screen:
-    """Columns of all options about a fit, beside its own parameters. heat, pairs: as in `against`."""
-    columns = effect_columns(fitter, fit, options)
-    return against(fitter, fit, options, columns, heat, pairs)
+def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], pairs: bool = True) -> Screen:
+    """All options about a fit, beside its own parameters with their priors. pairs: whether to say what pairs do."""
+    beside = _Beside.of(fitter, fit)
+    found = [beside.screened(options[k : k + AT_ONCE]) for k in range(0, len(options), AT_ONCE)]
+    score, strength = (torch.cat([f[k] for f in found]) if found else torch.zeros(0).double() for k in range(2))
+    whole = Screen(tuple(options), score, strength)
+    return replace(whole, found_pairs=beside.pairs(whole)) if pairs else whole
 
 
-def against(
-    fitter: Fitter, fit: Fit, options: Sequence[Option], columns: Tensor, heat: float = 1.0, pairs: bool = True
-) -> Screen:
-    """Regresses whitened columns (S, C, M) beside the fit's own parameters with their priors.
+@dataclass(frozen=True)
+class _Beside:
+    """A regression beside the parameters of a fit. left (S, C): its whitened residual without what they can do; basis
+    (S, C, P) of that."""
 
-    pairs: whether to say what pairs do together. heat: by which the data's chi-square is divided, as in the evidence;
-    what a tolerance says is no data and stays, so that an effect which relieves a constant far out of its tolerance
-    shows, however large the gap.
-    """
-    root = math.sqrt(heat)
-    residual, jacobian = (x / root for x in fitter.white(fit.near))
-    space, theta = fit.space, fit.theta
-    scale = fitter.box(space)[2]
-    pull = (scale / space.std(theta)).nan_to_num(0.0)
-    j = torch.cat([_by_column(jacobian[0] * scale), torch.diag(pull)], dim=1)
-    r = torch.cat([_by_column(residual[0].unsqueeze(-1))[0], -(theta - space.nominal(theta)) / space.std(theta)])
-    # The priors' rows of the columns are zero: no constant's tolerance speaks of an effect.
-    c = _by_column(columns)
-    seen = c.shape[1]
-    q, _ = torch.linalg.qr(torch.cat([j, 1e-6 * torch.eye(len(pull), dtype=j.dtype)], dim=1).T)
-    q = q[: len(r)]
-    shared, r = c @ q[:seen], r - q @ (q.T @ r)
-    if pairs:
-        gram = c @ c.T - shared @ shared.T
-    else:
-        alone = torch.linalg.vecdot(c, c) - torch.linalg.vecdot(shared, shared)
-        gram = torch.full((len(c), len(c)), torch.nan, dtype=c.dtype).diagonal_scatter(alone)
-    return Screen(tuple(options), c @ r[:seen] / root, gram / heat)
+    fitter: Fitter
+    fit: Fit
+    left: Tensor
+    basis: Tensor
 
+    @staticmethod
+    def of(fitter: Fitter, fit: Fit) -> _Beside:
+        residual, jacobian = (x[0] for x in fitter.white(fit.near))
+        scale, pull, off = fitter.priors(fit.space, fit.theta)
+        # The priors' rows of the columns are zero: no constant's tolerance speaks of an effect.
+        rows = torch.diag(pull), 1e-6 * torch.eye(len(pull), dtype=pull.dtype)
+        q, _ = torch.linalg.qr(torch.cat([(jacobian * scale).flatten(0, 1), *rows]))
+        r = torch.cat([residual.flatten(), -off, torch.zeros_like(off)])
+        seen = residual.numel()
+        left = (r - q @ (q.T @ r))[:seen]
+        return _Beside(fitter, fit, left.reshape(residual.shape), q[:seen].reshape(*residual.shape, -1))
 
-def _by_column(x: Tensor) -> Tensor:
-    """(S, C, M) -> (M, C S): as time lies last in memory, no copy."""
-    return x.permute(2, 1, 0).flatten(1)
+    def screened(self, options: Sequence[Option]) -> tuple[Tensor, Tensor]:
+        """Score and strength, (M,) each."""
+        columns = effect_columns(self.fitter, self.fit, options)
+        score, strength = columns.new_zeros(2, len(options)).unbind()
+        shared = columns.new_zeros(len(options), self.basis.shape[-1])
+        for c in range(columns.shape[1]):
+            own = columns[:, c].T
+            score += own @ self.left[:, c]
+            strength += torch.linalg.vecdot(own, own)
+            shared += own @ self.basis[:, c]
+        return score, strength - torch.linalg.vecdot(shared, shared)
+
+    def pairs(self, found: Screen) -> Pairs:
+        chosen: set[int] = set()
+        for value in (found.strength, found.gain):
+            best: dict[tuple[str, str], int] = {}
+            for i in torch.argsort(value, descending=True).tolist():
+                best.setdefault(found.options[i].cause, i)
+            chosen |= set(best.values())
+        kept = sorted(chosen)
+        options = tuple(found.options[i] for i in kept)
+        columns = effect_columns(self.fitter, self.fit, options).permute(1, 0, 2)
+        shared = (columns.mT @ self.basis.permute(1, 0, 2)).sum(dim=0)
+        gram = (columns.mT @ columns).sum(dim=0) - shared @ shared.T
+        return Pairs(options, found.score[kept], gram)
 
 
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:
@@ -127,7 +162,7 @@ def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tenso
     own = fitter.engine(fit.candidate, list(fit.effect_values))
     pieces = own.apart(fit.theta.unsqueeze(0), fit.near) if isinstance(own, Joint) else [(own, fit.theta, fit.near)]
     columns = with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
-    return fitter.noise.whiten(columns, fitter.subject.mask)
+    return fitter.whiten(columns)
 
 
 def _columns(
@@ -159,7 +194,7 @@ def _columns(
     if moving:
         gain, transition = near.gain.permute(0, 2, 3, 1), near.transition.permute(0, 2, 3, 1)
         still = forcing.new_zeros(1, forcing.shape[1], len(moving))
-        paths = scan_in_time(transition, product(gain, forcing), still)
+        paths = scan_in_time(transition, forcing, still, gain)
         columns[:, moving] = own.look(near.levels, theta).along(paths, [-1] * len(moving))[0]
     return columns.permute(2, 0, 1)
 

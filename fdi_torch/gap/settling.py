@@ -28,7 +28,6 @@ from fdi_torch.plant.effect import Effect, Local, Placement, Stage, Values
 
 PARTS = 8  # of the stretch
 SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)  # of what runs out of a full tank
-ROUNDS = 30
 FINEST, COARSEST = 1e-5, 1e-2  # of what a sensor reads from floor to rim: its noise lies between
 
 
@@ -70,9 +69,9 @@ def settle(stretch: Subject, starts: Sequence[Mapping[str, float]], rough: Noise
     plant, seconds = stretch.plant, float(stretch.experiment.nodes[-1])
     parts = max(1, min(PARTS, len(stretch.recording) // 2))
     fitter = Fitter(stretch, rough)
-    plain = fitter.fit(Candidate(starts=tuple(starts)), rounds=ROUNDS)
+    plain = fitter.fit(Candidate(starts=tuple(starts)))
     fitter = Fitter(stretch, _fine_noise(stretch, plain))
-    best = fitter.fit(Candidate(), plain, rounds=ROUNDS)
+    best = fitter.fit(Candidate(), plain)
     bent = {n: best.values[n] for n in plant.varying}
     believed = {n: best.space[n].nominal for n in plant.varying}
     likeliest = _surprise(fitter, best)
@@ -82,7 +81,7 @@ def settle(stretch: Subject, starts: Sequence[Mapping[str, float]], rough: Noise
         none = {f"{p.prefix}.{q.name}": 0.0 for p in placements for q in unseen.parameters(p.location, plant)}
         # What varies was bent as far as it goes where nothing flowed unseen: it also begins at what is believed.
         both = tuple(none | varying for varying in (bent, believed))
-        fit = fitter.fit(Candidate(placements, both), plain, rounds=ROUNDS)
+        fit = fitter.fit(Candidate(placements, both), plain)
         if (found := _surprise(fitter, fit)) < likeliest:
             best, likeliest = fit, found
     return Settled(best.candidate.placements, best.values)

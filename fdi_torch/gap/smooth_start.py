@@ -18,16 +18,16 @@ from fdi_torch.simulate.experiment import Experiment
 WIDENINGS = (64.0, 16.0, 4.0, 2.0)
 
 
-def first_fit(fitter: Fitter, candidate: Candidate, rounds: int, base: Fit | None = None) -> Fit:
+def first_fit(fitter: Fitter, candidate: Candidate, base: Fit | None = None) -> Fit:
     """The fit, as it is where its course of the levels is found at once."""
-    found = fitter.fit(candidate, base, rounds=rounds)
+    found = fitter.fit(candidate, base)
     if followed(found):
         return found
     for widening in WIDENINGS:
-        wide = Fitter(_drawn_smooth(fitter.subject, widening), fitter.noise).fit(candidate, base, rounds=rounds)
+        wide = Fitter(_drawn_smooth(fitter.subject, widening), fitter.noise).fit(candidate, base)
         if followed(wide):
             base = wide
-    again = fitter.fit(candidate, base, rounds=rounds) if base is not None else found
+    again = fitter.fit(candidate, base) if base is not None else found
     return again if followed(again) else found
 
 

@@ -1,13 +1,12 @@
 """Readings that stray: spikes and drop-outs, which no tank can make, told and masked before anything is searched.
 
 A level is the integral of flows, so that a reading which jumps within one sample and soon jumps back to where it was
-tells of the sensor and its wire alone. So does one that stands still to the last digit amid noise. A jump that stays is
-no stray. Both are looked for in what the believed plant leaves, which runs smoothly whatever else is wrong.
+tells of the sensor and its wire alone. A jump that stays is no stray. They are looked for in what the believed plant
+leaves, which runs smoothly whatever else is wrong. Readings that stand still are masked before (`acquisition.py`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import median
@@ -17,7 +16,6 @@ from torch import Tensor
 
 from fdi_torch.gap.fitting import Candidate, Fitter
 from fdi_torch.gap.floor import Noise
-from fdi_torch.gap.limits import LONGEST_BY_CHANCE, STILL
 from fdi_torch.gap.subject import Subject
 
 FAR = 5.0  # times what neighbouring samples usually differ by, for a jump: in white noise seven standard deviations
@@ -69,11 +67,11 @@ def strays_of(subject: Subject) -> tuple[Strays, ...]:
     """Of each sensor that has some. subject: of one recording."""
     found: dict[int, list[Stray]] = {}
     given, mask = subject.mask, subject.mask
-    for turn in range(PASSES):
+    for _ in range(PASSES):
         model, new = _believed(replace(subject, mask=mask)), mask.clone()
         for c in range(mask.shape[1]):
             far = NEARER if len(found.get(c, [])) >= EVENTS else FAR
-            own = _strays(subject, model[:, c], mask[:, c], c, far, turn == 0)
+            own = _strays(subject, model[:, c], mask[:, c], c, far)
             lost = int((~mask[:, c] & given[:, c]).sum()) + sum(s.rows.stop - s.rows.start for s in own)
             if own and lost <= MOST * int(given[:, c].sum()):
                 found.setdefault(c, []).extend(own)
@@ -107,15 +105,12 @@ def _believed(subject: Subject) -> Tensor:
     return Fitter(subject, Noise(1e-2 * size, torch.zeros_like(size))).fit(Candidate()).near.readings[0]
 
 
-def _strays(subject: Subject, model: Tensor, mask: Tensor, channel: int, far: float, first: bool) -> list[Stray]:
+def _strays(subject: Subject, model: Tensor, mask: Tensor, channel: int, far: float) -> list[Stray]:
     at = mask.nonzero().flatten()
     if len(at) < ENOUGH:
         return []
     values, believed, time = subject.readings[at, channel], model[at], subject.recording.time[at]
-    if first and (still := stood_still(values)):
-        spans = [(a, b, math.inf) for a, b in still]
-    else:
-        spans = jumps_and_returns(values - believed, torch.diff(believed).abs(), _resolution(values), far)
+    spans = jumps_and_returns(values - believed, torch.diff(believed).abs(), _resolution(values), far)
     return [
         Stray(slice(int(at[a]), int(at[b - 1]) + 1), (float(time[a]), float(time[b - 1])), jumps)
         for a, b, jumps in spans
@@ -126,22 +121,6 @@ def _resolution(values: Tensor) -> float:
     """The least distance between two values (S,) of a channel."""
     distinct = torch.unique(values)
     return float(torch.diff(distinct).min()) if len(distinct) > 1 else 0.0
-
-
-def stood_still(values: Tensor) -> list[tuple[int, int]]:
-    """Where values (S,) of one sensor repeat the last one longer than by chance, elsewhere than at an end of its range,
-    which may be where it is clipped, and not to the end, which is a sensor stuck for good: the first repeated sample,
-    and the first beyond.
-    """
-    count = len(values)
-    starts = torch.cat([torch.zeros(1, dtype=torch.int64), (torch.diff(values) != 0.0).nonzero().flatten() + 1])
-    ends = torch.cat([starts[1:], torch.tensor([count])])
-    length = ends - starts
-    inside = (values[starts] != values.max()) & (values[starts] != values.min()) & (ends < count)
-    long = length > LONGEST_BY_CHANCE
-    if int((length[~long] - 1).sum()) > STILL * count or int((length[inside] - 1).sum()) > MOST * count:
-        return []  # a rounded channel, or one at rest
-    return [(int(a) + 1, int(b)) for a, b in zip(starts[long & inside], ends[long & inside], strict=True)]
 
 
 def jumps_and_returns(x: Tensor, slope: Tensor, least: float, far: float = FAR) -> list[tuple[int, int, float]]:

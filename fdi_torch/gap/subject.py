@@ -107,3 +107,12 @@ def _part(plant: PlantDescription, recording: Recording, step: float) -> Part:
     order = [recording.output_names.index(n) for n in names]
     experiment = lay_out(recording, plant.channels(), step)
     return Part(recording, experiment, recording.outputs[:, order], recording.mask[:, order])
+
+
+def between(at: Tensor, times: Tensor, values: Tensor) -> Tensor:
+    """values (S,) at increasing times (S,), straight between them and level beyond, at times `at` (K,)."""
+    after = torch.searchsorted(times, at).clamp(max=len(times) - 1)
+    before = (after - 1).clamp(min=0)
+    span = (times[after] - times[before]).clamp(min=1e-300)
+    share = ((at - times[before]) / span).clamp(0.0, 1.0)
+    return torch.lerp(values[before], values[after], share)

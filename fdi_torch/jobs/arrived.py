@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import torch
 
 from fdi_torch.config.growing import Row
 from fdi_torch.config.monitor import MonitorRun
-from fdi_torch.monitor.continuity import GAP
-from fdi_torch.monitor.samples import Samples
+from fdi_torch.logbook import Run as Log
+from fdi_torch.logbook import series
+from fdi_torch.monitor.samples import GAP, Samples
 from fdi_torch.recording import Recording
 
 
@@ -66,3 +67,39 @@ def recording_of(rows: Sequence[Row], run: MonitorRun) -> Recording:
         hold=samples.hold,
     )
     return replace(blank, source=run.config.recording.file)
+
+
+def logged_rows(log: Log, run: MonitorRun) -> list[Row]:
+    """The samples in a monitor's log, in the order in which they came."""
+    inputs, outputs = series(log, "/plant/input"), series(log, "/plant/output")
+    count = min(len(inputs["t"]), len(outputs["t"]))  # a run may be killed between the two
+    commands = [inputs[name][:count] for name in run.plant.channels()]
+    readings = [outputs[sensor.column][:count] for sensor in run.plant.sensors]
+    times = inputs["t"][:count].tolist()
+    return [(t, [float(c[k]) for c in commands], [float(r[k]) for r in readings]) for k, t in enumerate(times)]
+
+
+def followed_on(earlier: Sequence[Row], source: Iterable[Row | str]) -> Iterator[Row | str]:
+    """A growing file from its beginning; the samples of an earlier log first, where the file no longer holds them."""
+    rows = iter(source)
+    notices: list[Row | str] = []
+    for row in rows:
+        if not isinstance(row, str):
+            break
+        notices.append(row)
+    else:
+        yield from chain(earlier, notices)
+        return
+    if _same(row, earlier[0]):
+        yield from chain(notices, [row], rows)
+        return
+    yield from chain(earlier, notices)
+    for later in chain([row], rows):
+        if isinstance(later, str) or later[0] > earlier[-1][0]:
+            yield later
+
+
+def _same(a: Row, b: Row) -> bool:
+    """Whether two rows hold the same; an unknown value equals another unknown one."""
+    first, second = ([r[0], *r[1], *r[2]] for r in (a, b))
+    return len(first) == len(second) and all(x == y or (x != x and y != y) for x, y in zip(first, second, strict=True))

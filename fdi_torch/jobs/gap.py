@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.case import PLAIN, Settings, case_of
 from fdi_torch.gap.diagnose import Tell, solved
+from fdi_torch.jobs.log_paths import STARTS_ANEW
 from fdi_torch.logbook import RunLog
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -32,12 +33,21 @@ def run_gap(
     """Diagnoses, and writes the log `path`: recordings first, then what is said on the way, then the answer."""
     recordings = (recording,) if isinstance(recording, Recording) else tuple(recording)
     every = (*recordings, *holdouts)
+    settings = replace(settings, trusted=settings.trusted or any(r.trusted for r in every))
     with one_thread():
         case = case_of(plant, recordings, holdouts, settings)
     sources = [{"path": r.source, "sha256": r.sha256} for r in every]
     config = {"settings": asdict(settings), "recordings": len(recordings)}
     text = dump_plant(plant)
-    with RunLog(path, "gap", config_text=text, config=config, data=sources, parent_run_id=parent_run_id) as log:
+    with RunLog(
+        path,
+        "gap",
+        config_text=text,
+        config=config,
+        data=sources,
+        parent_run_id=parent_run_id,
+        after_interruption=STARTS_ANEW,
+    ) as log:
         for group, each in zip(groups(len(holdouts), len(recordings)), every, strict=True):
             log_recording(log, each, group)
         log.flush()

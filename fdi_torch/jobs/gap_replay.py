@@ -9,15 +9,15 @@ from typing import Any
 
 from fdi_torch.config.logged import logged_plant
 from fdi_torch.gap.diagnose import Settings, Tell
-from fdi_torch.gap.which import DEEPEST
+from fdi_torch.gap.search import DEEPEST
 from fdi_torch.jobs.gap import groups, run_gap
 from fdi_torch.jobs.logged_recordings import recording_in
 from fdi_torch.logbook import LogError
 from fdi_torch.logbook import Run as LoggedRun
 
 LISTS, NUMBERS, YES_OR_NO = ("library", "leave_out"), ("step", "most"), {"true": True, "false": False}
-ASKED = ("named_only", "cross_validate")
-KEYS = (*LISTS, *NUMBERS, *ASKED)
+SWITCHES = ("named_only", "trusted")
+KEYS = (*LISTS, *NUMBERS, *SWITCHES)
 
 
 def gap_again(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
@@ -30,11 +30,21 @@ def gap_again(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, 
     run_gap(path, logged_plant(log), every[:together], every[together:], settings, tell, parent)
 
 
+def no_longer_done(log: LoggedRun) -> list[str]:
+    """What the logged diagnosis was asked to do that no diagnosis does any more, a sentence each."""
+    if log.metadata.get("fdi_torch.config", {}).get("settings.cross_validate") != "true":
+        return []
+    return [
+        f"{log.path}: was made with --cross-validate, an option that no longer exists; the diagnosis is done again "
+        "without it, so that another explanation may come out"
+    ]
+
+
 def settings_of(log: LoggedRun, overrides: Iterable[str] = ()) -> Settings:
     """What the diagnosis was asked, with some of it changed. Raises ValueError for a key that there is not."""
     logged = log.metadata.get("fdi_torch.config", {})
     try:
-        since_later = {"settings.most": str(DEEPEST)} | {f"settings.{key}": "false" for key in ASKED}
+        since_later = {"settings.most": str(DEEPEST), "settings.named_only": "false", "settings.trusted": "false"}
         told = {key: json.loads((since_later | logged)[f"settings.{key}"]) for key in KEYS}
     except (KeyError, ValueError) as error:
         raise LogError(f"{log.path}: expected the settings of a gap diagnosis, got none; run fdi gap again") from error
@@ -44,14 +54,14 @@ def settings_of(log: LoggedRun, overrides: Iterable[str] = ()) -> Settings:
             raise ValueError(f"--set {override}: expected one of {', '.join(KEYS)}, got {key}")
         told[key] = _given(key, value)
     library = tuple(told["library"]) if told["library"] else None
-    return Settings(library, tuple(told["leave_out"]), told["step"], told["most"], *(told[k] for k in ASKED))
+    return Settings(library, tuple(told["leave_out"]), told["step"], told["most"], told["named_only"], told["trusted"])
 
 
 def _given(key: str, value: str) -> Any:
     """The value of an override. Raises ValueError where it is of another kind."""
     if key in LISTS:
         return [name for name in value.split(",") if name]
-    if key in ASKED:
+    if key in SWITCHES:
         if value not in YES_OR_NO:
             raise ValueError(f"--set {key}={value}: expected true or false, got {value or 'nothing'}")
         return YES_OR_NO[value]

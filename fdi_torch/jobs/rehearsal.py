@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.rehearsal import Rehearsal
-from fdi_torch.jobs.log_paths import free_path
-from fdi_torch.jobs.study import carried_over, earlier
+from fdi_torch.jobs.log_paths import RESUMES
+from fdi_torch.jobs.study import carried_over, log_and_earlier
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.monitor.rehearsal.pieces import Shown
 
@@ -34,13 +34,18 @@ def rehearse(
     listener: Listener | None = None,
 ) -> Rehearsed:
     """Computes every piece that the log does not hold yet. tell(share, text) is called after each."""
-    path = Path(rehearsal.config.output.folder) / f"{rehearsal.name}.mcap"
-    before = earlier(path, rehearsal.text) if resume else None
-    path = path if resume else free_path(path.parent, rehearsal.name)
+    folder = Path(rehearsal.config.output.folder)
+    path, before = log_and_earlier(folder, rehearsal.name, rehearsal.text, resume)
     pieces = [piece for plan in rehearsal.plans for piece in plan.pieces()]
     seeds = {"seed": rehearsal.config.seed}
     with RunLog(
-        path, "rehearsal", config_text=rehearsal.text, config=rehearsal.resolved, seeds=seeds, listener=listener
+        path,
+        "rehearsal",
+        config_text=rehearsal.text,
+        config=rehearsal.resolved,
+        seeds=seeds,
+        listener=listener,
+        after_interruption=RESUMES,
     ) as log:
         known: dict[int, tuple[str, Mapping[str, Any]]] = {
             n: (done.setting, done.numbers) for n, done in carried_over(log, before).items()

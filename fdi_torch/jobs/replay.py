@@ -9,11 +9,15 @@ from typing import Any
 from fdi_torch.config.files import with_overrides
 from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.logged import logged_mapping
+from fdi_torch.config.monitor import build_monitor
 from fdi_torch.config.run import Run, build_run
 from fdi_torch.config.study import build_study
+from fdi_torch.jobs import monitor as monitor_job
 from fdi_torch.jobs import study as study_job
+from fdi_torch.jobs.arrived import logged_rows, reaching, recording_of, samples_of
 from fdi_torch.jobs.gap_replay import gap_again
 from fdi_torch.jobs.logged_recordings import recording_in
+from fdi_torch.jobs.monitor import Listening
 from fdi_torch.jobs.run_setup import fitting_of, wanted_space
 from fdi_torch.jobs.study import TRIAL, concluded, log_trials
 from fdi_torch.jobs.train import STATE, Tell, estimate_logged, log_recordings, origin_of, state_is_due
@@ -29,7 +33,7 @@ _DATA_KEYS = ("simulate", "recordings")
 def run_again(
     log: LoggedRun, path: Path, overrides: Iterable[str] = (), trials: Sequence[int] = (), tell: Tell | None = None
 ) -> Path:
-    """Does again what a log of `fdi train`, `fdi study` or `fdi gap` says, into a new log whose parent it is.
+    """Does again what a log of `fdi train`, `fdi study`, `fdi gap` or `fdi monitor` says, into a new log: its child.
 
     Returns the new log's path.
 
@@ -46,10 +50,12 @@ def run_again(
         study_again(log, path, overrides, trials, tell, parent)
     elif kind == "gap":
         gap_again(log, path, overrides, tell, parent)
+    elif kind == "monitor":
+        watch_again(log, path, overrides, tell, parent)
     elif kind == "train":
         estimate_again(log, path, overrides, tell, parent)
     else:
-        wanted = "fdi train, fdi study or fdi gap"
+        wanted = "fdi train, fdi study, fdi gap or fdi monitor"
         raise LogError(f"{log.path}: expected a log of {wanted}, got one of {kind or 'another program'}")
     return path
 
@@ -67,6 +73,23 @@ def estimate_again(log: LoggedRun, path: Path, overrides: Iterable[str], tell: T
     with RunLog(path, "train", **origin_of(run, loaded), parent_run_id=parent) as again:
         log_recordings(again, loaded, logged_truth(log))
         estimate_logged(run, fitting, again, tell)
+
+
+def watch_again(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
+    """The monitor, along the samples in the log."""
+    overrides = list(overrides)
+    _expect_no_data(overrides, ("recording",))
+    run = build_monitor(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
+    listening = Listening(tell, lambda event: None, lambda prepared: None)
+    rows = logged_rows(log, run)
+    about = log.metadata.get("fdi_torch.data", {})
+    data = [{"path": about["0.path"], "sha256": about.get("0.sha256", "")}] if "0.path" in about else []
+    with RunLog(path, "monitor", **monitor_job.origin_of(run, None) | {"data": data}, parent_run_id=parent) as again:
+        watcher = monitor_job.Watcher(run, again, listening)
+        watcher.learn(recording_of(reaching(rows, run.config.fault_free[1]) or rows, run))
+        watcher.take(samples_of(rows, run))
+        watcher.close()
+        again.result({"events": watcher.events, "faults": watcher.faults()})
 
 
 def study_again(
@@ -96,6 +119,8 @@ def comparable(trials: Sequence[int] = ()) -> Select:
     def select(messages: Iterable[Message]) -> Iterator[Message]:
         waiting: list[Message] = []
         for message in messages:
+            if message.topic == monitor_job.ALARM and message.payload.get("event") == "notice":
+                continue  # what came late, or could not be read
             if message.topic == STATE and not state_is_due(message.payload["generation"]):
                 continue
             if message.topic != TRIAL:
@@ -113,10 +138,16 @@ def comparable(trials: Sequence[int] = ()) -> Select:
 def asked_again(log: LoggedRun, overrides: Iterable[str] = ()) -> Run:
     """The run as its log describes it, with some values changed."""
     overrides = list(overrides)
-    for override in overrides:
-        if override.split("=")[0].split(".")[0] in _DATA_KEYS:
-            raise ValueError(f"--set {override}: expected a key other than the data's, got one; use fdi train")
+    _expect_no_data(overrides, _DATA_KEYS)
     return build_run(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
+
+
+def _expect_no_data(overrides: Iterable[str], keys: Sequence[str]) -> None:
+    for override in overrides:
+        if override.split("=")[0].split(".")[0] in keys:
+            raise ValueError(
+                f"--set {override}: expected a key other than the data's, got one; use fdi train or fdi monitor"
+            )
 
 
 def recorded(log: LoggedRun, run: Run) -> list[LoadedRecording]:

@@ -16,7 +16,8 @@ from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
 from fdi_torch.estimate.hybrid import HybridSettings
-from fdi_torch.estimate.refine import RefineSettings
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings
+from fdi_torch.gap.acquisition import usable
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.reach import bounded
 from fdi_torch.recording import Recording
@@ -24,10 +25,30 @@ from fdi_torch.simulate.record import clean_readings, with_noise
 
 
 def recordings_of(run: Run) -> list[LoadedRecording]:
-    """The recordings that a run file names, or the one that it asks to simulate."""
+    """The recordings that a run file names, without readings that are none, or the one that it asks to simulate."""
     if run.config.simulate is None:
-        return load_recordings(run.config.recordings, run.plant, run.base)
+        loaded = load_recordings(run.config.recordings, run.plant, run.base, run.given)
+        parts = [replace(part, recording=_readings_that_count(run, part.recording)) for part in loaded]
+        for part in parts:
+            if not bool(part.recording.mask.any()):
+                raise ConfigError([f"{part.recording.source}: expected readings, got none: all are missing or masked"])
+        return parts
     return [LoadedRecording(simulate_recording(run), run.config.simulate.start_levels)]
+
+
+def _readings_that_count(run: Run, recording: Recording) -> Recording:
+    """The recording without those of sensors that are stuck. Raises ValueError for one that is not what it seems, and
+    for a sensor that is stuck throughout where its correlation is asked for, which it has not.
+    """
+    found = usable(run.plant, recording)
+    objectives = run.config.estimate.objective.search, run.config.estimate.objective.refine
+    silent = [s for s in found.stuck if not bool(found.recording.mask[:, s.column_in(recording)].any())]
+    if silent and "correlation" in objectives:
+        raise ValueError(
+            f"{recording.source}: expected readings that vary, but {silent[0].text}; leave the sensor out of the plant "
+            "file, or use the objective 'likelihood'"
+        )
+    return found.recording
 
 
 def simulate_recording(run: Run) -> Recording:

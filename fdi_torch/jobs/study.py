@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -10,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.study import Study
-from fdi_torch.jobs.log_paths import free_path
-from fdi_torch.logbook import Listener, RunLog, read_run, unfinished
+from fdi_torch.jobs.log_paths import RESUMES, free_path, go_on_from
+from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.logbook.reader import Run as OldLog
 from fdi_torch.report.fit_figure import save
 from fdi_torch.report.study_figures import correlation_figure, error_figure
@@ -19,7 +18,8 @@ from fdi_torch.study.cluster import run_on_cluster
 from fdi_torch.study.isolation import Isolation, isolate
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 from fdi_torch.study.plan import Plan
-from fdi_torch.study.summary import Summary, summarise
+from fdi_torch.study.summary import Ratio, Summary, summarise
+from fdi_torch.tables import Shown, Table
 
 Tell = Callable[[float, str], None]
 
@@ -27,8 +27,8 @@ TRIAL = "/study/trial"
 _ENVELOPE = ("t", "trial", "group", "seed", "status")
 
 
-@dataclass(frozen=True)
-class StudyResult:
+@dataclass(frozen=True, repr=False)
+class StudyResult(Shown):
     """summaries: one a setting. isolation: where faults are drawn by mode. seconds: of this run's own trials."""
 
     summaries: tuple[Summary, ...]
@@ -38,6 +38,25 @@ class StudyResult:
     seconds: float
     log: Path
     pictures: tuple[Path, ...]
+
+    @property
+    def headline(self) -> str:
+        settings = f"{len(self.summaries)} setting{'s' if len(self.summaries) != 1 else ''}"
+        return f"{len(self.trials)} trials in {settings}"
+
+    def table(self) -> Table:
+        """A row a setting, estimator and parameter; bias and RMSE in the parameter's SI unit."""
+        names = ("setting", "estimator", "parameter", "bias", "RMSE", "RMSE / bound", "coverage")
+        rows = [
+            (s.setting, e.estimator, e.parameter, e.bias, e.rmse, _value(e.over_bound), _value(e.coverage))
+            for s in self.summaries
+            for e in s.scores
+        ]
+        return Table.of_rows(names, rows)
+
+
+def _value(ratio: Ratio | None) -> float | None:
+    return None if ratio is None else ratio.value
 
 
 def run_study(
@@ -53,10 +72,8 @@ def run_study(
     """
     tell = tell or (lambda share, text: None)
     output = study.run.config.output
-    path = Path(output.folder) / f"{study.run.name}.mcap"
-    before = earlier(path, study.text) if resume else None
-    path = path if resume else free_path(path.parent, study.run.name)
-    with RunLog(path, "study", **origin_of(study), listener=listener) as log:
+    path, before = log_and_earlier(Path(output.folder), study.run.name, study.text, resume)
+    with RunLog(path, "study", **origin_of(study), listener=listener, after_interruption=RESUMES) as log:
         trials = carried_over(log, before)
         found = len(trials)
         started = time.monotonic()
@@ -66,7 +83,7 @@ def run_study(
             tell(*progress(len(trials), found, study.plan.trials, time.monotonic() - started))
         seconds = time.monotonic() - started
         summaries, isolation = concluded(study, trials, log)
-    pictures = draw(study, trials, path)
+        pictures = draw(study, trials, path)
     return StudyResult(summaries, isolation, trials, len(trials) - found, seconds, path, pictures)
 
 
@@ -76,23 +93,13 @@ def origin_of(study: Study) -> dict[str, Any]:
     return {"config_text": study.text, "config": resolved, "seeds": {"seed": study.plan.seed}}
 
 
-def earlier(path: Path, text: str) -> OldLog | None:
-    """What a killed or interrupted run of the same configuration left, set aside; None where there is nothing.
+def log_and_earlier(folder: Path, name: str, text: str, resume: bool) -> tuple[Path, OldLog | None]:
+    """Where the log is written, and with `resume` what an unfinished run of the same configuration left, if anything.
 
-    Raises ValueError where the study is finished already, or the log is that of another configuration.
+    Raises ValueError where that run has ended, or had another configuration.
     """
-    partial = path.with_name(path.name + ".partial")
-    known = path if path.exists() else partial if partial.exists() else None
-    if known is None:
-        return None
-    old = read_run(known, salvage=True)
-    if old.config_text != text:
-        raise ValueError(f"{known}: expected the log of this configuration, got another's; run without --resume")
-    if path.exists():
-        if old.metadata.get("fdi_torch.status", {}).get("status") == "completed":
-            raise ValueError(f"{path}: expected an unfinished study, got a finished one; there is nothing to resume")
-        os.replace(path, partial)
-    return unfinished(path)
+    found = go_on_from(folder, name, text) if resume else None
+    return found or (free_path(folder, name), None)
 
 
 def carried_over(log: RunLog, before: OldLog | None) -> dict[int, Trial]:

@@ -16,8 +16,8 @@ from fdi_torch.config.run import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
-from fdi_torch.estimate.refine import Progress
-from fdi_torch.jobs.log_paths import free_path, killed_path, left_behind
+from fdi_torch.estimate.levenberg_marquardt import Progress
+from fdi_torch.jobs.log_paths import RESUMES, free_path, left_behind
 from fdi_torch.jobs.run_setup import (
     fitting_of,
     hybrid_settings,
@@ -30,14 +30,16 @@ from fdi_torch.jobs.run_setup import (
 from fdi_torch.logbook import Listener, RunLog, Trickle, as_array
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.report.fit_figure import fit_figure, save
+from fdi_torch.report.style import inline_svg
+from fdi_torch.tables import Shown, Table
 
 Tell = Callable[[float, str], None]
 STATE = "/estimator/de/population"
 GENERATION, ITERATION = "/estimator/de/generation", "/estimator/refine/iteration"
 
 
-@dataclass(frozen=True)
-class TrainResult:
+@dataclass(frozen=True, repr=False)
+class TrainResult(Shown):
     """result: the estimate and its diagnosis. truth: the simulated values by name, empty for real data."""
 
     result: HybridResult
@@ -46,12 +48,45 @@ class TrainResult:
     log: Path
     pictures: tuple[Path, ...]
 
+    @property
+    def headline(self) -> str:
+        """What the diagnosis says; a model that does not explain the recording first."""
+        diagnosis = self.result.diagnosis
+        names = ", ".join(fault.name for fault in diagnosis.present)
+        found = f"{diagnosis.kind}: {names}" if names else diagnosis.kind
+        if diagnosis.explained:
+            return found
+        ratio = diagnosis.unexplained_ratio
+        return f"the model does not explain the recording (residuals {ratio:.2g} times the noise); {found}"
+
+    def table(self) -> Table:
+        """A row a parameter, SI."""
+        final = self.result.estimate
+        low, high = final.interval()
+        columns: dict[str, Sequence[Any]] = {"parameter": final.names, "unit": final.units}
+        columns |= {"estimate": final.value.tolist(), "std error": final.std.tolist()}
+        columns |= {"95 % low": low.tolist(), "95 % high": high.tolist()}
+        columns["nominal"] = [p.nominal for p in self.fitting.space]
+        if self.truth:
+            columns["simulated"] = [self.truth.get(name) for name in final.names]
+        return Table(columns)
+
+    def picture(self) -> str:
+        """Readings and fit of the first recording, as SVG."""
+        fitted = fit_figure(self.fitting.recordings[0], self.result.predicted[0], self.headline)
+        return str(inline_svg(fitted, self.log.stem, self.headline))
+
+    def to_xarray(self, recording: int = 0) -> Any:
+        """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
+        return self.fitting.recordings[recording].compared(self.result.predicted[recording])
+
 
 def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Listener | None = None) -> TrainResult:
     """Loads or simulates, estimates, diagnoses, logs and draws what a run file asks for.
 
     tell(share, text) is called as work goes on. What was computed before an error or Ctrl-C stays readable in the log.
-    resume: goes on from the last generation that a killed run of the same file logged, and ends as it would have.
+    resume: goes on from the last generation that a killed or interrupted run of the same file logged, and ends as it
+    would have.
     listener: hears every message of the log.
     """
     tell = tell or (lambda share, text: None)
@@ -61,9 +96,8 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
     fitting = fitting_of(run, space, loaded)
     truth = simulated_truth(run)
     folder = Path(run.config.output.folder)
-    path = killed_path(folder, run.name) if resume else free_path(folder, run.name)
-    before, search = left_behind(path, run) if resume else ((), None)
-    with RunLog(path, "train", **origin_of(run, loaded), listener=listener) as log:
+    path, before, search = left_behind(folder, run) if resume else (free_path(folder, run.name), (), None)
+    with RunLog(path, "train", **origin_of(run, loaded), listener=listener, after_interruption=RESUMES) as log:
         if not log.carry_over(before):
             log_recordings(log, loaded, truth)
         result = estimate_logged(run, fitting, log, tell, search)

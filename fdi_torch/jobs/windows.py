@@ -15,7 +15,7 @@ from fdi_torch.config.run import Run
 from fdi_torch.effects import once_run
 from fdi_torch.estimate.stretches import Stretch, stretches_of
 from fdi_torch.estimate.windows import Window, cut_up, noise_of, window_of, window_step
-from fdi_torch.jobs.log_paths import free_path
+from fdi_torch.jobs.log_paths import STARTS_ANEW, free_path
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, wanted_space
 from fdi_torch.jobs.train import log_recordings, origin_of
 from fdi_torch.logbook import RunLog
@@ -46,7 +46,7 @@ def windows_of(run: Run, tell: Callable[[float, str], None] = lambda share, text
     suspects = {p.name for p in space if p.name.count(".") == 2}
     free: dict[str, StartLevel] = dict.fromkeys((t.name for t in run.plant.tanks), "free")
     path = free_path(Path(run.config.output.folder), run.name)
-    with RunLog(path, "train", **origin_of(run, loaded)) as log:
+    with RunLog(path, "train", **origin_of(run, loaded), after_interruption=STARTS_ANEW) as log:
         log_recordings(log, loaded, {})
         noise = [noise_of(part.recording, run.plant) for part in loaded]
         cuts = [(c, std) for part, std in zip(loaded, noise, strict=True) for c in cut_up(part.recording, length)]

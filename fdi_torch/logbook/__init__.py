@@ -13,7 +13,6 @@ from fdi_torch.logbook.recover import Recovery, recover
 from fdi_torch.logbook.replay import Replay, replay
 from fdi_torch.logbook.resume import last_state, set_aside, unfinished
 from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, number_at, own_signals, series
-from fdi_torch.logbook.terminate import Terminated, exit_on_sigterm
 from fdi_torch.logbook.trickle import Trickle
 from fdi_torch.logbook.writer import Listener, RunLog
 
@@ -29,14 +28,12 @@ __all__ = [
     "Run",
     "RunLog",
     "Signals",
-    "Terminated",
     "Trickle",
     "align",
     "arrays",
     "as_array",
     "compare",
     "content_hash",
-    "exit_on_sigterm",
     "export",
     "export_attachment",
     "follow",

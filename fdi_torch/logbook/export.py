@@ -39,10 +39,10 @@ def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
     content = run.attachment(name)
     target = Path(folder) / safe_name(name)
     try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists():
             raise LogError(f"{target}: exists already; choose another folder, or delete it")
-        with open(target, "xb") as file:
+        with target.open("xb") as file:
             file.write(content)
     except LogError:
         raise

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, count, repeat
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import orjson
 
+from fdi_torch.interruption import SteadyLock
 from fdi_torch.logbook.block import Block, Timed, block_of
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, as_it_is, plain
@@ -34,7 +34,7 @@ class Messages:
     """
 
     def __init__(self) -> None:
-        self._lock = threading.RLock()
+        self._lock = SteadyLock()
         self._put_off = PutOff()
         self.keep = self._put_off.keep
         self.due = False

@@ -23,7 +23,9 @@ from fdi_torch.logbook import scan
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.payload import decode
+from fdi_torch.logbook.schemas import conforming
 from fdi_torch.logbook.sink import EPOCH_NS
+from fdi_torch.outside import MOST_EXPANSION, MOST_UNPACKED
 
 # Outside chunks nothing guards these by a CRC. Our logs hold none there, so that one is another record, damaged.
 _LOOSE = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
@@ -45,11 +47,11 @@ class Message:
 
     @property
     def payload(self) -> dict[str, Any]:
-        """Its fields. Raises LogError where it is not a JSON object."""
+        """Its fields, each of the kind that its topic says. Raises LogError where it is not a JSON object."""
         if self.channel.encoding != "json":
             raise LogError(f"{self.topic}: messages in {self.channel.encoding}, only json can be read")
         try:
-            return decode(self.data)
+            return conforming(self.topic, self.channel.schema_name, decode(self.data))
         except ValueError as error:
             raise LogError(f"{self.topic}: a message is not a JSON object ({error})") from error
 
@@ -80,6 +82,7 @@ class Run:
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, Attachment] = {}
         self.damages: list[scan.Damage] = []
+        self._allowed = 0  # bytes that chunks may still unpack to
         self.data = map_file(self.path)
         self.parts = list(scan.frames(self.data))
         self.ended = scan.ends_whole(self.data)
@@ -122,6 +125,7 @@ class Run:
         """Messages, and the frames of metadata and attachments, in the order of the file."""
         self.damages = [part for part in self.parts if isinstance(part, scan.Damage)]
         directory = Directory(self._summary_records())
+        self._allowed = max(MOST_UNPACKED, MOST_EXPANSION * len(self.data))
         for place, part in enumerate(self.parts):
             if isinstance(part, scan.Damage):
                 if place < len(self.parts) - 1 and not self.salvage:
@@ -141,8 +145,12 @@ class Run:
         return record.name, record.media_type, bytes(record.data)
 
     def _part_messages(self, part: scan.Frame, directory: Directory) -> list[Message]:
+        """Of a chunk. Compressed chunks become together so much larger than the file and no more."""
         try:
-            return open_part(self.data, part, directory, self.max_chunk_bytes, require_crc=self.ours)
+            cap = min(self.max_chunk_bytes, self._allowed)
+            messages = open_part(self.data, part, directory, cap, require_crc=self.ours)
+            self._allowed -= scan.unpacked_size(self.data, part)
+            return messages
         except scan.ChunkError as error:
             damage = scan.Damage(part.start, part.end, str(error))
             self.damages.append(damage)

@@ -83,9 +83,16 @@ def ends_whole(data: Buffer) -> bool:
     return len(data) > 45 and data[-8:] == MAGIC and data[-37:-28] == _HEAD.pack(Opcode.FOOTER, 20)
 
 
+def unpacked_size(data: Buffer, frame: Frame) -> int:
+    """Bytes of the records in a chunk, as it states them, or of a record outside chunks."""
+    return (
+        int(_CHUNK.unpack_from(data, frame.start + 9)[2]) if frame.opcode == Opcode.CHUNK else frame.end - frame.start
+    )
+
+
 def chunk_body(data: Buffer, frame: Frame, cap: int = MAX_CHUNK_BYTES, require_crc: bool = False) -> bytes:
     """The records inside a chunk. Raises ChunkError: over the cap, not decompressible, CRC differs."""
-    _, _, size, crc = _CHUNK.unpack_from(data, frame.start + 9)
+    size, crc = _CHUNK.unpack_from(data, frame.start + 9)[2:]
     name_end = frame.start + 41 + _u32(data, frame.start + 37)
     compression = bytes(data[frame.start + 41 : name_end])
     if size > cap:

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Literal
 
 import orjson
+
+from fdi_torch.logbook.errors import LogError
 
 FORMAT_VERSION = "1"
 
@@ -137,10 +140,10 @@ TOPICS: dict[str, Topic] = {
     ),
     "/gap/where": Topic(
         "fdi_torch.gap_where",
-        "how much of the gap a component alone can close",
+        "how likely it is that something is wrong at a component (answers of format 1: share of the gap it can close)",
         {
             "location": ("text", "", "component"),
-            "share": ("number", "1", "of the gap"),
+            "share": ("number", "1", "probability"),
             "p_value": ("number", "1", "of no gap there"),
         },
         named=True,
@@ -152,11 +155,13 @@ TOPICS: dict[str, Topic] = {
             "verdict": ("text", "", "no_gap, named, ambiguous or unknown"),
             "p_value": ("number", "1", "of no gap"),
             "locations": ("texts", "", "where"),
-            "shares": ("numbers", "1", "of the gap, per location"),
+            "shares": ("numbers", "1", "probability, per location"),
             "causes": ("texts", "", "effect@location"),
-            "ambiguity_set": ("texts", "", "explanations that stand"),
+            "ambiguity_set": ("texts", "", "explanations that hold 95 % together"),
             "explanations": ("texts", "", "explanations compared"),
             "probabilities": ("numbers", "1", "posterior of each explanation"),
+            "unexamined": ("number", "1", "posterior of what was not examined"),
+            "certain": ("texts", "", "effect@location, there with 95 % whatever else is"),
             "answer": ("text", "", "the whole answer as JSON text"),
         },
         named=True,
@@ -200,6 +205,59 @@ def topic_definition(topic: str) -> Topic:
     if key not in TOPICS:
         raise ValueError(f"expected one of the topics {', '.join(TOPICS)}, got {topic}")
     return TOPICS[key]
+
+
+class Fields(dict[str, Any]):
+    """The fields of a message. One that is asked for by [] and is not there is said in a sentence."""
+
+    def __init__(self, topic: str, fields: Mapping[str, Any]) -> None:
+        super().__init__(fields)
+        self.topic = topic
+
+    def __missing__(self, name: str) -> Any:
+        raise LogError(f"{self.topic}: expected a field {name} in every message, got one without it")
+
+
+def conforming(topic: str, schema: str, fields: Mapping[str, Any]) -> Fields:
+    """A message without what is not of the kind that its topic says: a log is written by whoever wrote it.
+
+    Fields of the topic are of their kind, and `t` is a number; others are numbers, text or lists of these. Messages
+    of other schemas stay as they are.
+    """
+    kinds = _kinds(topic, schema)
+    if not kinds:
+        return Fields(topic, fields)
+    kept = {k: v for k, v in fields.items() if (_is_of(kinds[k], v) if k in kinds else _is_plain(v))}
+    return Fields(topic, kept)
+
+
+@lru_cache(maxsize=256)
+def _kinds(topic: str, schema: str) -> dict[str, str]:
+    """Kinds of a topic's own fields; nothing for another schema than its own."""
+    definition = TOPICS.get(f"/plant/{topic.rpartition('/')[2]}" if topic.startswith("/plant/") else topic)
+    if definition is None or definition.schema != schema:
+        return {}
+    return {"wall": "time", "t": "number"} | {name: kind for name, (kind, _, _) in definition.fields.items()}
+
+
+_PYTHON: dict[str, tuple[type, ...]] = {
+    "number": (float, int), "integer": (int,), "boolean": (bool,), "text": (str,), "time": (dict,),
+    "numbers": (float, int), "integers": (int,), "texts": (str,),
+}  # fmt: skip
+
+
+def _is_of(kind: str, value: Any) -> bool:
+    types = _PYTHON[kind]
+    if kind.endswith("s"):
+        return isinstance(value, list) and all(isinstance(item, types) for item in value)
+    return isinstance(value, types)
+
+
+def _is_plain(value: Any) -> bool:
+    if type(value) is float or type(value) is int:
+        return True
+    plain = (bool, float, int, str)
+    return isinstance(value, plain) or (isinstance(value, list) and all(isinstance(v, plain) for v in value))
 
 
 def json_schema(definition: Topic, named: Mapping[str, Kind]) -> bytes:

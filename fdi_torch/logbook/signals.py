@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import zipfile
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,8 +19,8 @@ from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.reader import Message, Run
 from fdi_torch.logbook.schemas import topic_definition
 from fdi_torch.logbook.sink import EPOCH_NS
+from fdi_torch.outside import MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION, expect_unpacked
 
-MAX_ARRAY_BYTES = 2**30
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 _BLOCK = 65536
 
@@ -102,17 +104,32 @@ def held(clock: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
     return taken
 
 
-def arrays(run: Run, name: str = "results.npz", max_bytes: int = MAX_ARRAY_BYTES) -> dict[str, np.ndarray]:
-    """Arrays of an attached .npz, of a limited size, nothing pickled."""
+def arrays(run: Run, name: str = "results.npz") -> dict[str, np.ndarray]:
+    """Arrays of an attached .npz, of a limited size, nothing pickled. What a header claims must be there."""
     content = run.attachment(name)
     try:
-        size = sum(item.file_size for item in zipfile.ZipFile(io.BytesIO(content)).infolist())
-        if size > max_bytes:
-            raise LogError(f"{run.path}: {name} unpacks to {size} bytes, more than the {max_bytes} allowed")
-        with np.load(io.BytesIO(content), allow_pickle=False) as loaded:
-            return {key: loaded[key] for key in loaded.files}
-    except (zipfile.BadZipFile, ValueError, EOFError) as error:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = [item for item in archive.infolist() if item.filename.endswith(".npy")]
+            unpacked = sum(item.file_size for item in members)
+            expect_unpacked(unpacked, len(content), name, MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION)
+            return {item.filename.removesuffix(".npy"): _array_in(archive.read(item)) for item in members}
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, NotImplementedError, RuntimeError) as error:
         raise LogError(f"{run.path}: {name} is no .npz of plain arrays ({error})") from error
+
+
+def _array_in(content: bytes) -> np.ndarray:
+    """A .npy file. Raises ValueError where its header claims other than the bytes that follow."""
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if read is None:
+        raise ValueError(f"expected version 1 or 2 of the format, got {version}")
+    shape, _, dtype = read(file)
+    claimed, there = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
+    if dtype.hasobject or claimed != there or any(size < 0 for size in shape):
+        raise ValueError(f"expected {there} bytes of {dtype}, got a header for {claimed}")
+    file.seek(0)
+    return np.load(file, allow_pickle=False)
 
 
 def field_path(text: str) -> list[str | int]:
@@ -190,7 +207,7 @@ def _own_table(run: Run, channel: Channel) -> tuple[np.ndarray, np.ndarray, np.n
     def rows() -> Iterable[Sequence[float]]:
         for row, (message, payload) in enumerate(_of(run, channel.topic)):
             uncounted.extend((row, names.index(name)) for name in payload.get("masked", ()) if name in names)
-            yield (_time(message, payload), *(float(payload.get(name, float("nan"))) for name in names))
+            yield (_time(message, payload), *(number_at(payload, name) for name in names))
 
     table = _table(rows(), len(names) + 1)
     mask = np.isfinite(table[:, 1:])

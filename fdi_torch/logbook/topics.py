@@ -150,11 +150,11 @@ class Topics(Messages):
         self.write("/diagnosis/fault", fields, t)
 
     def gap_where(self, location: str, share: float, p_value: float | None = None, **numbers: Any) -> None:
-        """How much of the gap one component alone can close."""
+        """How likely it is that something is wrong at a component. Format 1: the share of the gap that it can close."""
         self.write("/gap/where", {"location": location, "share": share, "p_value": p_value, **numbers})
 
     def gap_verdict(self, answer: Named) -> None:
-        """The diagnosis of a gap in the format `fdi_torch.gap/1`; what is numeric in its closure plots by name."""
+        """The diagnosis of a gap in the format `fdi_torch.gap/2`; what is numeric in its closure plots by name."""
         closure = {k: v for k, v in answer.get("closure", {}).items() if isinstance(v, int | float)}
         where, posterior = answer.get("where", []), answer.get("posterior", [])
         fields = {
@@ -166,6 +166,8 @@ class Topics(Messages):
             "ambiguity_set": [_explanation(causes) for causes in answer.get("ambiguity_set", [])],
             "explanations": [_explanation(item["causes"]) for item in posterior],
             "probabilities": [float(item["probability"]) for item in posterior],
+            "unexamined": answer.get("unexamined"),
+            "certain": [_cause(cause) for cause in answer.get("certain", [])],
             "answer": orjson.dumps(dict(answer), option=orjson.OPT_SERIALIZE_NUMPY).decode(),
             **closure,
         }

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.interruption import UNDISTURBED, Terminated
 from fdi_torch.logbook.block import Block, Timed
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError, log_error
@@ -30,7 +31,6 @@ from fdi_torch.logbook.provenance import environment, git_state, version_of
 from fdi_torch.logbook.reader import Message
 from fdi_torch.logbook.schemas import FORMAT_VERSION
 from fdi_torch.logbook.sink import Sink
-from fdi_torch.logbook.terminate import Terminated
 from fdi_torch.logbook.topics import Topics
 
 Listener = Callable[[Channel, int, bytes], None]
@@ -46,7 +46,8 @@ class RunLog(Topics):
     path: NAME.mcap, which must not exist. kind: the command, such as "train". config_text: the configuration exactly
     as given; config: the same, resolved, as plain nested values. seeds: name -> seed. data: one mapping an input file,
     with its "path" and "sha256". env, git: found out where not given. clock: wall time in ns. listener: hears every
-    message as it is logged.
+    message as it is logged. after_interruption: how the work goes on after Ctrl-C or SIGTERM, as a clause; the
+    exception then carries it as a note, behind where the log lies.
     Raises LogError where the file cannot be written.
     """
 
@@ -65,12 +66,14 @@ class RunLog(Topics):
         clock: Callable[[], int] = time.time_ns,
         flush_seconds: float = 0.7,
         listener: Listener | None = None,
+        after_interruption: str = "",
     ) -> None:
         super().__init__()
         self.path = Path(path)
         self.partial_path = self.path.with_name(self.path.name + ".partial")
         self.status, self.reason = "completed", ""
         self._clock, self._flush_seconds, self._listener = clock, flush_seconds, listener
+        self._after_interruption = after_interruption
         self._start_records = {
             "config": {"sha256": _sha256(config_text), **flatten(config or {})},
             "env": dict(environment() if env is None else env),
@@ -110,18 +113,29 @@ class RunLog(Topics):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stop.set()
-        self._thread.join()
-        if error is not None:
-            self.status, self.reason = _ending(error)
-        try:
-            self.settle()
-            whole = self._write_end(self._open_sink())
-        except LogError:
-            if error is None:
-                raise
-            return
-        self._publish(whole)
+        with UNDISTURBED:
+            self._stop.set()
+            self._thread.join()
+            if error is not None:
+                self.status, self.reason = _ending(error)
+            try:
+                self._end()
+            except LogError:
+                if error is None:
+                    raise
+            if self.status == "interrupted" and error is not None:
+                self._say_what_is_kept(error)
+
+    def _end(self) -> None:
+        """The log as a whole file, under its name."""
+        self.settle()
+        self._publish(self._write_end(self._open_sink()))
+
+    def _say_what_is_kept(self, error: BaseException) -> None:
+        kept = self.path if self.path.exists() else self.partial_path
+        error.add_note(f"what was computed until now is in {kept}")
+        if self._after_interruption:
+            error.add_note(self._after_interruption)
 
     def set_status(self, status: str, reason: str = "") -> None:
         """How the run ended, such as "not_converged"; "completed" where nothing is said."""
@@ -271,6 +285,8 @@ def _ending(error: BaseException) -> tuple[str, str]:
         return "interrupted", "Ctrl-C"
     if isinstance(error, Terminated):
         return "interrupted", "SIGTERM"
+    if isinstance(error, BrokenPipeError):
+        return "interrupted", "standard output was closed by its reader"
     return "failed", f"{type(error).__name__}: {error}"
 
 

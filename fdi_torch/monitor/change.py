@@ -160,8 +160,8 @@ class ChangedObserver:
         own = []
         for name in self._held:
             p = self.space.parameters[self.space.index(name)]
-            already = float(believed[self.space.index(name)]) != p.nominal
-            own.append(torch.full_like(changes.onset, LONG_AGO) if already else changes.onset)
+            already = before[:, self.space.index(name)] != p.nominal
+            own.append(torch.where(already, LONG_AGO, changes.onset))
         return torch.cat([before, changes.theta, moment, *(column.unsqueeze(1) for column in own)], dim=1)
 
 

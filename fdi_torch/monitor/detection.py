@@ -25,15 +25,22 @@ NEVER = -1
 
 @dataclass(frozen=True)
 class Detector:
-    """A statistic of white residuals (*batch, S, C) -> (*batch, S), the threshold it is held against, and its memory.
+    """A statistic of white residuals (*batch, S, C) -> (*batch, S), and the threshold it is held against.
 
-    memory: how many samples back the statistic is worth looking; further ones hardly change it.
+    follow: the same sample by sample, (S, C) and what it remembers of the samples before (None at a start) -> (S,) and
+    what it then remembers; to the last bit the same however many samples come at once.
     """
 
     chart: str
     statistic: Callable[[Tensor], Tensor]
     threshold: float
-    memory: int
+    follow: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
+
+    def shares(self, white: Tensor) -> Tensor:
+        """The share (C,) of each channel in the statistic at the last sample of white residuals (S, C)."""
+        alone = torch.eye(white.shape[-1], dtype=torch.bool).unsqueeze(1)
+        each = self.statistic(torch.where(alone, white, 0.0))[:, -1].clamp(min=0.0)
+        return each / each.sum().clamp(min=1e-300)
 
     def first_alarm(self, white: Tensor) -> Tensor:
         """Index of the first sample above the threshold, (*batch); NEVER where there is none."""
@@ -91,12 +98,13 @@ def make_detector(
     if learnt is not None:
         run_length *= more_alarms(chart, run_length, channels, drift, learnt)
     if chart == "fixed":
-        return Detector(chart, largest, fixed_threshold(run_length, channels), 1)
+        threshold = fixed_threshold(run_length, channels)
+        return Detector(chart, largest, threshold, lambda e, before: (largest(e), e[:0]))
     if chart == "cusum":
         if not drift > 0:
             raise ValueError(f"expected a positive drift of the CUSUM, got {drift}")
         threshold = cusum_threshold(run_length, channels, drift)
-        return Detector(chart, lambda e: cusum(e, drift), threshold, math.ceil(10 * threshold / drift))
+        return Detector(chart, lambda e: cusum(e, drift), threshold, lambda e, before: cusum_on(e, drift, before))
     if chart == "glr":
         lengths = window_lengths(window)
 
@@ -104,7 +112,7 @@ def make_detector(
             return glr(white, lengths)
 
         peaks = highest(statistic, channels, generator) if peaks is None else peaks
-        return Detector(chart, statistic, threshold_of(peaks, run_length), window)
+        return Detector(chart, statistic, threshold_of(peaks, run_length), lambda e, before: glr_on(e, lengths, before))
     raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
 
 
@@ -157,6 +165,30 @@ def cusum(white: Tensor, drift: float) -> Tensor:
     sums = torch.cumsum(torch.nan_to_num(torch.cat([white, -white], dim=-1) - drift, nan=0.0), dim=-2)
     lowest = torch.cummin(sums, dim=-2).values.clamp(max=0.0)
     return (sums - lowest).amax(dim=-1)
+
+
+def cusum_on(white: Tensor, drift: float, before: Tensor | None) -> tuple[Tensor, Tensor]:
+    """`cusum` of the next samples (S, C); before (2, 2 C): the sums and their minima after the last one."""
+    moves = torch.nan_to_num(torch.cat([white, -white], dim=-1) - drift, nan=0.0)
+    before = torch.zeros(2, moves.shape[-1], dtype=moves.dtype) if before is None else before
+    sums = torch.cumsum(torch.cat([before[:1], moves]), dim=0)
+    lowest = torch.cummin(torch.cat([before[1:], sums[1:]]), dim=0).values
+    return (sums - lowest)[1:].amax(dim=-1), torch.stack([sums[-1], lowest[-1]])
+
+
+def glr_on(white: Tensor, lengths: tuple[int, ...], before: Tensor | None) -> tuple[Tensor, Tensor]:
+    """`glr` of the next samples (S, C); before (N, C): the last N cumulative sums, N the longest window at most."""
+    fresh = torch.nan_to_num(white, nan=0.0)
+    before = torch.zeros(1, fresh.shape[-1], dtype=fresh.dtype) if before is None else before
+    sums = torch.cat([before[:-1], torch.cumsum(torch.cat([before[-1:], fresh]), dim=0)])
+    best, count = torch.zeros_like(fresh[:, 0]), len(fresh)
+    for n in lengths:
+        reach = min(count, len(sums) - n)
+        if reach <= 0:
+            break
+        last = sums[len(sums) - reach :]
+        best[-reach:] = torch.maximum(best[-reach:], (last - sums[-reach - n : len(sums) - n]).square().sum(-1) / n)
+    return best, sums[-(lengths[-1] + 1) :]
 
 
 def glr(white: Tensor, lengths: tuple[int, ...]) -> Tensor:

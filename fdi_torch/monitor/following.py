@@ -2,28 +2,74 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from fdi_torch.monitor.change import LONG_AGO, NEVER, ChangedObserver, Changes, Window
-from fdi_torch.monitor.continuity import joined
 from fdi_torch.monitor.hypothesis import Finding
-from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.samples import Arrived, Samples, joined
+from fdi_torch.monitor.states import Alarm
+
+# A believed fault's law may be off by so much of its own effect (a hole is not the orifice of a formula).
+OFF = 0.1
+
+
+@dataclass(frozen=True)
+class Track:
+    """The size of a fault that stands, over time. column: of the space. first, last: (s, size, std) of the first and
+    the latest estimate. strength: root mean square of what it adds to the white residuals, as far as it is known.
+    announced: when its size was last said aloud, s.
+    """
+
+    column: int
+    number: int
+    onset: float
+    first: tuple[float, float, float]
+    last: tuple[float, float, float]
+    strength: float
+    announced: float
+    adjusted: float = LONG_AGO
+
+    @property
+    def rate(self) -> float | None:
+        """Of its growth between the two, per s; None where they do not differ by three standard errors."""
+        (t0, size0, std0), (t1, size1, std1) = self.first, self.last
+        apart = t1 > t0 and abs(size1 - size0) > 3.0 * math.hypot(std0, std1)
+        return (size1 - size0) / (t1 - t0) if apart else None
 
 
 @dataclass(frozen=True)
 class Change:
-    """A change that was found: the belief before it and since when that is held (s), the finding, when the alarm came
-    and when to look again.
+    """The latest change. number: of its alarm, raised at `alarm` s. before (P,): the belief before it, held since
+    `since` s. explanations: all that hold more than a thousandth of the posterior, likeliest first; the first is what
+    the observer believes. next_look: when all of them are fitted again, s. ends: the faults that went away with it.
+    told: names of the explanations as they were said last.
     """
 
+    number: int
     before: Tensor
     since: float
-    finding: Finding
+    explanations: tuple[Finding, ...]
     alarm: float
     next_look: float
+    ends: tuple[Track, ...] = ()
+    told: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def finding(self) -> Finding:
+        """The likeliest that changes something."""
+        return self.explanations[0]
+
+
+@dataclass(frozen=True)
+class Looking:
+    """An alarm that is being confirmed: its number, and how often its cause was sought in vain."""
+
+    number: int
+    looks: int = 0
 
 
 @dataclass(frozen=True)
@@ -32,11 +78,12 @@ class MonitorState:
 
     samples: what came lately; for each, state (S, tanks + M) of the observer after it, residual and white (S, sensors),
     and effect (S, E, sensors): by how much the residual would be another without each of the effects believed in.
-    watched: how many of them the detector no longer looks at. number: samples since the observer's start. believed
-    (P,); healthy (P,): the same without a fault. blind (E, tanks + M): the states of observers without each effect.
-    reachable: no window starts before it, s. rest (sensors,): white residuals that are the believed faults' own, in
-    standard deviations of noise, where they do not explain all. alarm: one that is being looked into, s; looks: how
-    often it was, in vain. change: the latest. adjusted: since when sizes other than it says are believed in, s.
+    number: samples since the observer's start. believed (P,); healthy (P,): the same without a fault. blind
+    (E, tanks + M): the states of observers without each effect. reachable: no window starts before it, s. rest
+    (sensors,): white residuals that are the believed faults' own, in standard deviations of noise, where they do not
+    explain all. arrived: how far the clock has come. floor: no window begins before it, s, whatever is still held.
+    charted: what the detector remembers, None where it starts afresh. alarms: all so far. looking: the one that is
+    being confirmed. change: the latest. tracks: the faults that stand. learning_until: no alarm comes up to then, s.
     """
 
     samples: Samples
@@ -44,17 +91,31 @@ class MonitorState:
     residual: Tensor
     white: Tensor
     effect: Tensor
-    watched: int
     number: int
     believed: Tensor
     healthy: Tensor
     blind: Tensor
     reachable: float
     rest: Tensor
-    alarm: float | None = None
-    looks: int = 0
+    arrived: Arrived
+    floor: float = LONG_AGO
+    charted: Tensor | None = None
+    alarms: tuple[Alarm, ...] = ()
+    looking: Looking | None = None
     change: Change | None = None
-    adjusted: float = LONG_AGO
+    tracks: tuple[Track, ...] = ()
+    learning_until: float = LONG_AGO
+
+    @property
+    def adjusted(self) -> float:
+        """Since when sizes other than the latest change says are believed in, s."""
+        return max((t.adjusted for t in self.tracks), default=LONG_AGO)
+
+    def alarm(self, number: int) -> Alarm:
+        return self.alarms[number - 1]
+
+    def with_alarm(self, alarm: Alarm) -> MonitorState:
+        return replace(self, alarms=tuple(alarm if a.number == alarm.number else a for a in self.alarms))
 
     @property
     def now(self) -> float:
@@ -80,7 +141,7 @@ class MonitorState:
 
     def window(self, start: float) -> Window:
         """From the last sample before `start` on."""
-        first = self.before(start)
+        first = self.before(max(start, self.floor))
         seen = self.number - (len(self.samples) - 1 - first)
         return Window(self.samples.stretch(first, len(self.samples)), self.state[first], seen)
 
@@ -94,8 +155,9 @@ def begin(
     white, effects = observer.whitening(residual[None]), len(observer.effects)
     blind, none = state.expand(effects, -1), torch.zeros_like(residual)
     effect = none.expand(1, effects, -1)
+    now = float(first.time[0])
     return MonitorState(
-        first, state[None], residual[None], white, effect, 0, 1, believed, healthy, blind, float(first.time[0]), none
+        first, state[None], residual[None], white, effect, 1, believed, healthy, blind, now, none, Arrived(now)
     )
 
 
@@ -112,27 +174,26 @@ def believe(observer: ChangedObserver, state: MonitorState, change: Change, beli
     finding = change.finding
     window = state.window(finding.onset)
     incipient, standing = finding.hypothesis.incipient, state.standing(observer)
-    state = replace(state, believed=believed, change=change, adjusted=LONG_AGO, alarm=None, looks=0)
+    state = replace(state, believed=believed, change=change, looking=None, charted=None)
     moved = _run(observer, state, window, _alike(observer, window), change.before, finding.onset, incipient)
     left = moved.white[-len(window) :].square().nanmean(dim=0).nan_to_num().sqrt()
     if finding.fits or not moved.standing(observer):
         left = torch.zeros_like(left)
     elif set(state.standing(observer)) >= set(standing):
         left = torch.maximum(left, state.rest)  # nothing went away: what was left before may come back
-    return replace(moved, rest=left, watched=len(moved.samples))
+    return replace(moved, rest=left)
 
 
 def adjust(observer: ChangedObserver, state: MonitorState, finding: Finding) -> MonitorState:
     """The observer run again with other sizes of the faults that it believes in."""
     window, before = state.window(finding.onset), state.believed
-    moved = replace(state, believed=finding.value, adjusted=finding.onset, watched=len(state.samples))
+    moved = replace(state, believed=finding.value, charted=None)
     return _run(observer, moved, window, _alike(observer, window), before, finding.onset)
 
 
-def forget(state: MonitorState, reach: float) -> MonitorState:
-    """Without what lies more than `reach` s back, once that is a quarter of all."""
-    oldest = state.now if state.alarm is None else min(state.now, state.alarm)
-    first = min(int((state.samples.time < oldest - reach).sum()), state.watched)
+def forget(state: MonitorState) -> MonitorState:
+    """Without what no window reaches, once that is a quarter of all."""
+    first = max(int((state.samples.time < state.floor).sum()) - 1, 0)
     if first < 0.25 * len(state.samples):
         return state
     return replace(
@@ -142,8 +203,27 @@ def forget(state: MonitorState, reach: float) -> MonitorState:
         residual=state.residual[first:],
         white=state.white[first:],
         effect=state.effect[first:],
-        watched=state.watched - first,
     )
+
+
+def trusted(observer: ChangedObserver, state: MonitorState, count: int) -> Tensor:
+    """The last white residuals (count, sensors) in standard deviations of noise and of the believed faults' own
+    imperfection: e / sqrt(max(1, rest)^2 + sum (OFF f)^2), with f what each of them takes out of the residual at that
+    moment, and rest what they left in it when they were found.
+    """
+    standing = state.standing(observer)
+    if not standing:
+        return state.white[-count:]
+    known = count + observer.whitening.order
+    effects = observer.whitening.filter(state.effect[-known:, standing].movedim(1, 0))[:, -count:]
+    return state.white[-count:] / torch.sqrt(state.rest.clamp(min=1.0) ** 2 + (OFF * effects).square().sum(0))
+
+
+def strength(observer: ChangedObserver, state: MonitorState, column: int, since: float) -> float:
+    """Root mean square of what a fault that stands adds to the white residuals since a moment (s)."""
+    [effect] = [e for e, columns in enumerate(observer.effects) if column in columns]
+    count = max(int((state.samples.time > since).sum()), 1)
+    return float(observer.whitening.filter(state.effect[:, effect])[-count:].square().mean().sqrt())
 
 
 def _run(

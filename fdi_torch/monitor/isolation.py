@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.evidence import log_prior, log_volume
 from fdi_torch.estimate.information import certainty
-from fdi_torch.estimate.refine import Linearisation, RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.levenberg_marquardt import Linearisation, RefineSettings, levenberg_marquardt
 from fdi_torch.monitor.change import ChangedObserver, Changes, Window, unchanged
-from fdi_torch.monitor.hypothesis import Fault, Finding, Hypothesis
+from fdi_torch.monitor.hypothesis import NOTHING, Fault, Finding, Hypothesis, ranked
 from fdi_torch.monitor.starting import return_starts, returns, signatures, swing_start
 from fdi_torch.monitor.swinging import period_step, swings_of, told_at, with_phase_errors, within_a_turn
 
@@ -29,14 +30,16 @@ def isolate(
     incipient: bool = True,
     deepest: int = DEEPEST,
     healthy: Tensor | None = None,
-    known: Finding | None = None,
+    known: Sequence[Finding] = (),
 ) -> list[Finding]:
-    """All single changes of `faults`, then of the best ones together with another; best first.
+    """The posterior over all single changes of `faults`, the best ones together with another, and no change at all;
+    likeliest first.
 
     One change a window: faults that come together share their onset. healthy (P,): without a fault; what is believed in
-    beyond it may also go away together. known: what an earlier look at this change found, which is a start as well.
+    beyond it may also go away together. known: what earlier looks at this change found, which are starts as well.
     """
     ways = (False, True) if incipient else (False,)
+    prior = Prior(observer.space.names, len(faults) * len(ways))
     steady = [Hypothesis((f.size,), late) for late in ways for f in faults if not f.shape]
     swinging = [Hypothesis(f.columns, shape=f.shape) for f in faults if f.shape]
     singles = [*steady, *swinging]
@@ -50,10 +53,11 @@ def isolate(
     back = [] if healthy is None else returns(believed, healthy, faults)
     if healthy is not None and back:
         starts = torch.cat([starts, return_starts(observer, window, believed, healthy, back)])
-    again = [] if known is None else [known.hypothesis]
-    if known is not None:
-        starts = torch.cat([starts, _point(known)[None]])
-    found = _closest(fit(observer, window, believed, [*singles, *back, *again], starts, _misfit(base)))
+    known = [f for f in known if f.hypothesis.columns]
+    if known:
+        starts = torch.cat([starts, torch.stack([_point(f) for f in known])])
+    again = [f.hypothesis for f in known]
+    found = _closest(fit(observer, window, believed, [*singles, *back, *again], starts, _misfit(base), prior))
     for _ in range(1, deepest):
         best = found[:2]
         wider = {b.hypothesis.beside(f): b for b in best for f in faults if f.size not in b.hypothesis.columns}
@@ -64,15 +68,46 @@ def isolate(
         wider |= {b.hypothesis: b for b in best}
         kept += [b.hypothesis for b in best]
         starts = torch.stack([_point(wider[h]) for h in kept])
-        found = _closest([*found, *fit(observer, window, believed, kept, starts, _misfit(base))])
-    told = [searched(f, len(faults)) for f in found if not needless(f, believed)]
-    return doubted(told, _misfit(base))
+        found = _closest([*found, *fit(observer, window, believed, kept, starts, _misfit(base), prior)])
+    return ranked([*found, nothing(observer, window, believed, base)])
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is believed of a hypothesis before the window. names: of the space. choices: of single changes."""
+
+    names: tuple[str, ...]
+    choices: int
+
+    def __call__(self, hypothesis: Hypothesis) -> float:
+        """Log of its odds against no change. Faults that go away together do so for one reason."""
+        new = [c for c in hypothesis.sizes if c not in hypothesis.gone]
+        count = len(new) + bool(hypothesis.gone)
+        places = len({self.names[c].partition(".")[0] for c in new}) + bool(hypothesis.gone)
+        return log_prior(count, places, max(self.choices, 1))
+
+
+def nothing(observer: ChangedObserver, window: Window, believed: Tensor, base: Tensor) -> Finding:
+    """The explanation that nothing changed: an alarm by chance. base (1, S, sensors): its white innovations."""
+    limit, first = _noise_limit(observer, window), float(window.samples.time[0])
+    none = torch.zeros_like(believed)
+    count = window.readings * observer.whitening.level
+    return Finding(NOTHING, believed, none, first, 0.0, 0.0, _misfit(base), count, limit)
+
+
+def _noise_limit(observer: ChangedObserver, window: Window) -> float:
+    """Up to how large a sum of squares is noise, to four standard deviations: its own, and those of the variance that
+    was learnt from `samples` of each channel.
+    """
+    count, channels = window.readings, len(observer.network.description.sensors)
+    learnt = observer.whitening.samples * channels
+    return count * observer.whitening.level * (1.0 + 4.0 * math.sqrt(2.0 / max(count, 1) + 2.0 / learnt))
 
 
 def _closest(found: Sequence[Finding]) -> list[Finding]:
     """The best fit of each hypothesis, best first."""
     closest: dict[Hypothesis, Finding] = {}
-    for finding in sorted(found, key=lambda finding: finding.score):
+    for finding in sorted(found, key=lambda finding: -finding.evidence):
         closest.setdefault(finding.hypothesis, finding)
     return list(closest.values())
 
@@ -82,48 +117,21 @@ def _point(finding: Finding) -> Tensor:
     return torch.cat([finding.value, finding.value.new_tensor([finding.onset])])
 
 
-def needless(finding: Finding, believed: Tensor) -> bool:
-    """Whether one of several faults is, to three standard errors, what was believed (P,) of it."""
-    sizes = [c for c in finding.hypothesis.sizes if c in finding.hypothesis.free]
-    change = (finding.value - believed).abs() <= 3.0 * finding.std
-    return len(finding.hypothesis.sizes) > 1 and any(bool(change[c]) for c in sizes)
-
-
-def searched(finding: Finding, faults: int) -> Finding:
-    """Sets of several faults are many, and the best of many fits by chance: the extended BIC adds twice the logarithm
-    of their number over that of single ones (Chen & Chen 2008). What goes away together is one choice.
+def refit(
+    observer: ChangedObserver,
+    window: Window,
+    believed: Tensor,
+    findings: Sequence[Finding],
+    choices: int,
+) -> list[Finding]:
+    """The same hypotheses on another window, beside what is believed (P,), from the values found before, and their
+    posterior there. choices: of single changes, as when they were found.
     """
-    several = len(set(finding.hypothesis.sizes) - set(finding.hypothesis.gone))
-    if several < 2:
-        return finding
-    return replace(finding, score=finding.score + 2.0 * math.log(max(math.comb(faults, several) / faults, 1.0)))
-
-
-def doubted(found: Sequence[Finding], base: float) -> list[Finding]:
-    """Best first; where even the closest explanation leaves more than noise, the laws themselves are off, and what one
-    says for or against another counts for less by the share of that rest: a quasi-likelihood (McCullagh & Nelder
-    1989, ch. 9). base: the misfit without a change.
-    """
-    closest = min(found, key=lambda finding: finding.misfit)
-    if not closest.fits:
-        rest = 2.0 * closest.misfit / closest.readings
-        found = [
-            replace(
-                f,
-                std=f.std * rest**0.5,
-                onset_std=f.onset_std * rest**0.5,
-                score=f.score + 2.0 * (f.misfit - base) * (1.0 / rest - 1.0),
-            )
-            for f in found
-        ]
-    return sorted(found, key=lambda finding: finding.score)
-
-
-def refit(observer: ChangedObserver, window: Window, believed: Tensor, findings: Sequence[Finding]) -> list[Finding]:
-    """The same hypotheses on another window, beside what is believed (P,), from the values found before; best first."""
-    base = _misfit(observer.white(window, believed, unchanged(believed)))
-    starts = torch.stack([_point(f) for f in findings])
-    return doubted(fit(observer, window, believed, [f.hypothesis for f in findings], starts, base), base)
+    base = observer.white(window, believed, unchanged(believed))
+    kept = [f for f in findings if f.hypothesis.columns]
+    starts, prior = torch.stack([_point(f) for f in kept]), Prior(observer.space.names, choices)
+    found = fit(observer, window, believed, [f.hypothesis for f in kept], starts, _misfit(base), prior)
+    return ranked([*found, nothing(observer, window, believed, base)])
 
 
 def fit(
@@ -133,6 +141,7 @@ def fit(
     hypotheses: Sequence[Hypothesis],
     starts: Tensor,
     base: float,
+    prior: Prior,
 ) -> list[Finding]:
     """Sizes and onset of each hypothesis by Levenberg-Marquardt on the white innovations, all side by side.
 
@@ -164,7 +173,13 @@ def fit(
     sure = certainty(final.curvature, held=~free)
     theta = within_a_turn(told_at(refined.theta, swings, free, -middle), swings, free)
     std = with_phase_errors(sure, theta, swings, free, middle)
-    readings = window.readings
+    width = torch.cat([observer.space_width(), (last - first)[None]])
+    span, limit = SIZE_STEP * (high - low), _noise_limit(observer, window)
+    count = window.readings * observer.whitening.level
+    stopped = free & ((refined.theta <= low + span) | (refined.theta >= high - span))
+    for column, p in enumerate(observer.space):
+        for natural in (p.nominal, *p.extremes):  # an end that physics has is no limit of the fit
+            stopped[:, column] &= (refined.theta[:, column] - natural).abs() > span[:, column]
     return [
         Finding(
             hypothesis,
@@ -172,12 +187,24 @@ def fit(
             std[i, :-1],
             float(theta[i, -1]),
             float(std[i, -1]),
-            2.0 * (float(final.cost[i]) - base) + int(free[i].sum()) * math.log(readings),
+            base - float(final.cost[i]) + prior(hypothesis) + _volume(final.curvature[i], width, free[i], hypothesis),
             float(final.cost[i]),
-            readings,
+            count,
+            limit,
+            tuple(c for c in hypothesis.sizes if bool(stopped[i, c])),
         )
         for i, hypothesis in enumerate(hypotheses)
     ]
+
+
+def _volume(curvature: Tensor, width: Tensor, free: Tensor, hypothesis: Hypothesis) -> float:
+    """Log of the volume of the posterior over that of the prior, of the columns that are free.
+
+    Faults come each in its own time: that a further one shares the onset of the first costs what its own onset would.
+    """
+    chosen, further = free.nonzero().flatten(), len(set(hypothesis.sizes) - set(hypothesis.gone)) - 1
+    onset = log_volume(curvature[-1:, -1:], width[-1:])
+    return log_volume(curvature[chosen][:, chosen], width[chosen]) + max(further, 0) * onset
 
 
 def _expansion(

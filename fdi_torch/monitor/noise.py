@@ -10,9 +10,9 @@ from torch import Tensor
 
 from fdi_torch.monitor.gain import Gain, Linear, kalman_gain, linearised, riccati, start_beside_noise
 from fdi_torch.monitor.observer import Observation, Observer, bound, first_levels
-from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.samples import Samples, usual_interval
 from fdi_torch.monitor.stepper import Stepper
-from fdi_torch.monitor.whitening import Whitening, score_whitenings
+from fdi_torch.monitor.whitening import Whitening, score_whitenings, with_slow_variance
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 
@@ -27,6 +27,7 @@ class Noise:
 
     process_std (tanks,) m: how far each level wanders in a sample. reading_std (sensors,) in the readings' units.
     ratio: between the two, both as levels. whitening: the colour left in the residual. gain: of the observer for them.
+    interval: usual one between samples there, s.
     """
 
     process_std: Tensor
@@ -34,6 +35,7 @@ class Noise:
     ratio: float
     whitening: Whitening
     gain: Gain
+    interval: float = 1.0
 
 
 def learn_noise(
@@ -61,7 +63,7 @@ def learn_noise(
     coarse = min(attempt(EXPONENTS), key=lambda tried: tried.score)
     fine = attempt([coarse.exponent + offset for offset in FINE])
     best = attempt([_valley(fine)])[0]
-    return _noise(network, linear, best), best.seen
+    return replace(_noise(network, linear, best), interval=usual_interval(fault_free.time)), best.seen
 
 
 def noise_of_gain(
@@ -75,10 +77,10 @@ def noise_of_gain(
     """For an observer whose gain is given: the colour of its residual. What of it is process noise stays open (NaN)."""
     seen = Observer(network, gain, space, theta, longest_step).run(fault_free)
     settled = seen.last(max(len(fault_free) - len(gain.opening), len(fault_free) // 2))
-    whitening = score_whitenings(settled.steady_residual)[0][1]
+    whitening = with_slow_variance(score_whitenings(settled.steady_residual)[0][1], settled.steady_residual)
     unknown = network.nominal.new_full((len(network.description.tanks),), torch.nan)
     std = settled.steady_residual.square().nanmean(dim=0).sqrt()
-    return Noise(unknown, std, float("nan"), whitening, gain), seen
+    return Noise(unknown, std, float("nan"), whitening, gain, usual_interval(fault_free.time)), seen
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,8 @@ def _noise(network: TankNetwork, linear: Linear, best: _Attempt) -> Noise:
     process_std = share * (reading_std / unit).mean().expand(tanks)
     gain = _gain(network, linear, share.log10().unsqueeze(0))
     own = Gain(gain.steady[0], gain.opening[:, 0], gain.inflation[:, 0])
-    return Noise(process_std, reading_std, float(share), best.whitening, own)
+    whitening = with_slow_variance(best.whitening, best.seen.steady_residual)
+    return Noise(process_std, reading_std, float(share), whitening, own)
 
 
 def operating_point(

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network, once_run, placements_for
 from fdi_torch.estimate.fitting import StartLevels, set_up
-from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.monitor.detection import Chart, make_detector
-from fdi_torch.monitor.doubts import fault_doubts, residual_doubts
 from fdi_torch.monitor.gain import Gain, hand_gain, start_beside_noise, timed_gain
+from fdi_torch.monitor.learning import fault_doubts, learnt_words, residual_doubts
+from fdi_torch.monitor.monitor import SHAPE, Monitor, faults_of
 from fdi_torch.monitor.noise import Noise, learn_noise, noise_of_gain, operating_point
 from fdi_torch.monitor.observer import Observer
-from fdi_torch.monitor.online import SHAPE, Monitor, faults_of
-from fdi_torch.monitor.samples import Samples, take
+from fdi_torch.monitor.samples import Samples, take, usual_interval
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.parameters import ParameterSpace
@@ -29,7 +29,9 @@ from fdi_torch.recording import Recording
 
 @dataclass(frozen=True)
 class Prepared:
-    """The monitor, the values it believes in (those of calibrated constants included), and what was learnt."""
+    """The monitor, the values it believes in (those of calibrated constants included), and what was learnt. learnt: how
+    sure that is, in words. doubts: what speaks against it.
+    """
 
     monitor: Monitor
     believed: Tensor
@@ -37,6 +39,7 @@ class Prepared:
     calibrated: dict[str, float]
     radius: float
     doubts: tuple[str, ...] = ()
+    learnt: str = ""
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,8 @@ def prepare(
     the levels then. step: longest of the integration, s. ranges: of faults whose usual range does not suit.
     Raises ValueError.
     """
-    step = usual_step(plant) if step is None else step
+    # No step is longer than the usual interval between samples, which also says how sharply roots and rims are drawn.
+    step = min(usual_step(plant) if step is None else step, 1.25 * usual_interval(fault_free.time))
     watched = with_shapes(list(faults) or usual_faults(plant), plant)
     network = build_network(plant, placements_for(watched))
     running = once_run(plant, fault_free.ran)  # the fault-free part may be from the midst of the run
@@ -89,11 +93,11 @@ def prepare(
     samples = take(fault_free, plant)
     if gain is None:
         noise, seen = learn_noise(learning, samples, space, believed, longest_step=step)
-        radius = Observer(learning, noise.gain, space, believed, step).check_stable(samples, seen)
+        radius = Observer(learning, noise.gain, space, believed, step).check_stable(samples)
     else:
         wished = _wished(learning, samples, space, believed, step, gain)
         observer = Observer(learning, wished, space, believed, step)
-        radius = observer.check_stable(samples, observer.run(samples))
+        radius = observer.check_stable(samples)
         noise, seen = noise_of_gain(learning, wished, samples, space, believed, step)
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)
@@ -101,10 +105,11 @@ def prepare(
     detector = make_detector(chart, every, sampling, len(plant.sensors), generator, learnt=noise.whitening)
     monitor = Monitor(network, space, noise, detector, settings, step, watched=len(watched))
     doubts = (
-        *residual_doubts(plant, noise, detector, seen),
+        *residual_doubts(plant, noise, detector, seen, every),
         *fault_doubts(learning, space, samples, believed, step, faults_of(watched)),
     )
-    return Prepared(monitor, believed, noise, values, radius, doubts)
+    learnt = learnt_words(plant, noise, detector, every, sampling)
+    return Prepared(monitor, believed, noise, values, radius, doubts, learnt)
 
 
 def _wished(
@@ -142,11 +147,14 @@ def calibration(
 
 
 def usual_faults(plant: PlantDescription) -> list[str]:
-    """A leak of each tank, plugging of each pipe, loss of each pump's gain and bias of each sensor."""
+    """A leak of each tank, plugging of each pipe, gain and offset of each pump, and bias, gain and freezing of each
+    sensor.
+    """
     leaks = [f"{tank.name}.leak.size" for tank in plant.tanks]
     plugged = [f"{pipe.name}.plugging.size" for pipe in plant.pipes]
-    pumps = [f"{pump.name}.pump_gain.factor" for pump in plant.pumps]
-    return leaks + plugged + pumps + [f"{sensor.name}.sensor_bias.bias" for sensor in plant.sensors]
+    pumps = [f"{pump.name}.{fault}" for fault in ("pump_gain.factor", "pump_offset.offset") for pump in plant.pumps]
+    wrong = ("sensor_bias.bias", "sensor_gain.factor", "sensor_stuck.size")
+    return leaks + plugged + pumps + [f"{sensor.name}.{fault}" for fault in wrong for sensor in plant.sensors]
 
 
 def fault_free_part(recording: Recording, start: float, stop: float) -> Recording:

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 CHAIN_STATES = 400
+RAREST = 1.0 / (CHAIN_STATES * torch.finfo(torch.float64).eps)
+"""Samples to an alarm of one chart, beyond which rounding errors of the chain's equations are as large as its rate."""
 # Simulated blocks: the chance of an alarm within one is fitted over thresholds, which needs fewer draws than counting.
 BLOCKS, BLOCK, BURN_IN = 4000, 1500, 500
 
@@ -23,7 +25,7 @@ def fixed_threshold(run_length: float, channels: int) -> float:
 def cusum_run_length(threshold: float, drift: float, states: int = CHAIN_STATES) -> float:
     """Mean number of samples until max(0, g + e - drift) from g = 0 exceeds the threshold; e standard normal.
 
-    Brook & Evans (1972): g on a grid as a Markov chain.
+    Brook & Evans (1972): g on a grid as a Markov chain. Infinite where an alarm is too rare for double precision.
     """
     width = threshold / (states - 0.5)
     centres = width * torch.arange(states, dtype=torch.float64)
@@ -33,12 +35,13 @@ def cusum_run_length(threshold: float, drift: float, states: int = CHAIN_STATES)
     lower[:, 0] = 0.0
     stay = upper - lower
     ones = torch.ones(states, dtype=torch.float64)
-    return float(torch.linalg.solve(torch.eye(states, dtype=torch.float64) - stay, ones)[0])
+    lengths, singular = torch.linalg.solve_ex(torch.eye(states, dtype=torch.float64) - stay, ones)
+    return math.inf if bool(singular) else float(lengths[0])
 
 
 def cusum_threshold(run_length: float, channels: int, drift: float) -> float:
     """h of 2 C one-sided charts that alarm, taken together, once in `run_length` samples (their rates add)."""
-    _expect_rare(run_length)
+    _expect_rare(run_length, 2 * channels)
     wanted = 2.0 * channels * run_length
     low, high = 1e-3, 1.0
     while cusum_run_length(high, drift) < wanted:
@@ -82,9 +85,14 @@ def _falling_root(c0: float, c1: float, c2: float) -> float:
     return 2.0 * c0 / (-c1 + math.sqrt(inside))
 
 
-def _expect_rare(run_length: float) -> None:
+def _expect_rare(run_length: float, charts: int = 1) -> None:
     if not run_length >= 20.0:
         raise ValueError(
             f"expected a mean time between false alarms of at least 20 samples, got {run_length:g} samples; "
             "ask for fewer false alarms"
+        )
+    if not charts * run_length < RAREST:
+        raise ValueError(
+            f"expected a mean time between false alarms below {RAREST / charts:.2g} samples, above which their rate is "
+            f"lost in rounding, got {run_length:.3g} samples; ask for more false alarms"
         )

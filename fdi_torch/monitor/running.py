@@ -44,7 +44,8 @@ def run_lanes(
     first sample is read and corrected (S' = T), or is where `start` holds after its correction (S' = T - 1).
     """
     readings = samples.readings if from_first else samples.readings[..., 1:, :]
-    experiment = lay_out_samples(samples.time, samples.inputs, samples.hold, longest_step, from_first)
+    # One resolution for all stretches: what an observer sees does not depend on how many samples come at once.
+    experiment = lay_out_samples(samples.time, samples.inputs, samples.hold, longest_step, from_first, longest_step)
     kind = CompiledEngine if _compiles(network, space.names) else TracedEngine
     data = Readings(readings, torch.isfinite(readings).to(readings.dtype))
     own = theta.unsqueeze(-2) if readings.dim() > 2 else theta

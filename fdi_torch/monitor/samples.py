@@ -11,6 +11,10 @@ from torch import Tensor
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Hold, Recording
 
+GAP = 10.0  # sampling intervals without a sample before the observer starts afresh
+USUAL = 0.75
+"""Share of the intervals no longer than the usual one: where they are random, ten medians come by chance."""
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -78,3 +82,68 @@ def _columns(recording: Recording, wanted: Sequence[str], known: tuple[str, ...]
                 f"{recording.source}: expected {kind} '{name}', got {', '.join(known) or 'none'}; map the column to it"
             )
     return [known.index(name) for name in wanted]
+
+
+def usual_interval(time: Tensor) -> float:
+    """Of a clock (S,), s."""
+    steps = torch.diff(time)
+    return float(steps[steps > 0].quantile(USUAL, interpolation="lower")) if bool((steps > 0).any()) else 1.0
+
+
+@dataclass(frozen=True)
+class Arrived:
+    """How far the clock has come. last: of the last sample, s. unknown_since: since when an input is unknown, s."""
+
+    last: float
+    unknown_since: float | None = None
+
+
+def continuous(arrived: Arrived, samples: Samples, usual: float) -> tuple[list[tuple[Samples, str]], Arrived]:
+    """The new samples in stretches without a gap, a jump of the clock or unknown inputs, each with a sentence on what
+    lies before it, empty where nothing does; and how far the clock is then. A sample that repeats the last one's time
+    is left out.
+
+    usual: interval between samples, s, known beforehand: that of samples yet to come would let events depend on them.
+    """
+    known = torch.isfinite(samples.inputs).all(dim=-1)
+    stretches: list[tuple[list[int], str]] = [([], "")]
+    last, unknown_since = arrived.last, arrived.unknown_since
+    for k, time in enumerate(samples.time.tolist()):
+        if time == last:
+            continue
+        if not bool(known[k]):
+            unknown_since = time if unknown_since is None else unknown_since
+            last = time
+            continue
+        notice = _notice(last, time, usual, unknown_since)
+        if notice:
+            stretches.append(([], notice))
+        stretches[-1][0].append(k)
+        last, unknown_since = time, None
+    told = [(_chosen(samples, kept), notice) for kept, notice in stretches if kept]
+    return told, Arrived(last, unknown_since)
+
+
+def _notice(last: float, time: float, usual: float, unknown_since: float | None) -> str:
+    if time < last:
+        return f"the clock jumps back by {last - time:g} s; the observer starts afresh on the new time"
+    if unknown_since is not None:
+        return f"an input is unknown from {unknown_since:g} s to {time:g} s; the observer starts afresh"
+    if time - last > GAP * usual:
+        return f"no samples for {time - last:g} s; the observer starts afresh"
+    return ""
+
+
+def _chosen(samples: Samples, rows: Sequence[int]) -> Samples:
+    index = torch.tensor(list(rows))
+    return Samples(samples.time[index], samples.inputs[index], samples.readings[index], samples.hold)
+
+
+def joined(first: Samples, second: Samples) -> Samples:
+    """Samples of one clock, one after the other; how inputs run is as in the second."""
+    return Samples(
+        torch.cat([first.time, second.time]),
+        torch.cat([first.inputs, second.inputs]),
+        torch.cat([first.readings, second.readings]),
+        second.hold,
+    )

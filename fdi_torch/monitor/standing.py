@@ -1,46 +1,25 @@
-"""Faults that stand: followed as they change slightly, and trusted no further than their laws go."""
+"""Faults that stand: their sizes followed as they change."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from fdi_torch.monitor.change import ChangedObserver, Changes, Window, unchanged
-from fdi_torch.monitor.following import MonitorState
+from fdi_torch.monitor.following import Change, MonitorState, Track
 from fdi_torch.monitor.hypothesis import Fault, Finding
 from fdi_torch.monitor.isolation import isolate
 
-# A believed fault's law may be off by so much of its own effect (a hole is not the orifice of a formula).
-OFF = 0.1
 # A change by less than this share of the effect of the faults that stand is theirs, and no event.
 SLIGHT = 1.0 / 3.0
-# By how much another fault must explain such a change better, in units of BIC: "very strong" (Kass & Raftery 1995).
-CLEARLY = 10.0
+# By how much another fault must explain such a change better, nats: "strong" (Kass and Raftery, 1995).
+CLEARLY = 5.0
 
 
-def trusted(observer: ChangedObserver, state: MonitorState) -> Tensor:
-    """White residuals (S, sensors) in standard deviations of noise and of the believed faults' own imperfection:
-    e / sqrt(max(1, rest)^2 + sum (OFF f)^2), with f what each of them takes out of the residual at that moment, and
-    rest what they left in it when they were found.
-    """
-    standing = state.standing(observer)
-    if not standing:
-        return state.white
-    effects = observer.whitening.filter(state.effect[:, standing].movedim(1, 0))
-    return state.white / torch.sqrt(state.rest.clamp(min=1.0) ** 2 + (OFF * effects).square().sum(0))
-
-
-def held_since(state: MonitorState) -> float:
-    """Since when what is believed now is believed, s."""
-    last = state.change.finding.onset if state.change is not None else state.reachable
-    return max(state.reachable, last, state.adjusted)
-
-
-def slight_change(
-    observer: ChangedObserver, state: MonitorState, start: float, faults: Sequence[Fault]
+def changed_size(
+    observer: ChangedObserver, state: MonitorState, start: float, faults: Sequence[Fault], choices: int
 ) -> Finding | None:
     """New sizes, since `start` or later, of the faults that stand, where they change slightly and no other fault says
     more of it; None where nothing stands, or something else happens.
@@ -50,27 +29,23 @@ def slight_change(
     if not standing:
         return None
     window = state.window(start)
-    own = isolate(
+    found = isolate(
         observer, window, state.believed, standing, incipient=False, deepest=len(standing), healthy=state.healthy
-    )[0]
+    )
+    own = next(f for f in found if f.hypothesis.columns)
     near = (own.value - state.healthy).abs() <= 3.0 * own.std
     apart = (own.value - state.believed).abs() > 3.0 * own.std
-    if own.score >= 0.0 or any(bool((near & apart)[c]) for c in own.hypothesis.sizes):
-        return None  # nothing of theirs, or one of them went away
+    if own.hypothesis.gone or any(bool((near & apart)[c]) for c in own.hypothesis.sizes):
+        return None  # one of them went away
     own = replace(own, value=torch.where(near, state.believed, own.value))
     if _share(observer, window, state, own) > SLIGHT:
         return None
     others = [f for f in faults if f.size not in off]
     if others:
         best = isolate(observer, window, state.believed, others, incipient=False, deepest=1)[0]
-        if best.misfit < own.misfit and 2.0 * (own.misfit - best.misfit) / _rest(best) > CLEARLY:
+        if (own.misfit - best.misfit) / best.rest > CLEARLY:
             return None
     return own
-
-
-def _rest(finding: Finding) -> float:
-    """What it leaves, as a multiple of noise."""
-    return max(2.0 * finding.misfit / finding.readings, 1.0)
 
 
 def _share(observer: ChangedObserver, window: Window, state: MonitorState, change: Finding) -> float:
@@ -81,3 +56,41 @@ def _share(observer: ChangedObserver, window: Window, state: MonitorState, chang
     base = observer.white(window, state.believed, unchanged(state.believed))
     moved, *gone = (observer.white(window, state.believed, lanes) - base).square().sum((1, 2)).tolist()
     return (moved / sum(gone)) ** 0.5 if sum(gone) > 0.0 else float("inf")
+
+
+def tracked(
+    state: MonitorState, change: Change, sizes: Sequence[int], strength: Callable[[int], float]
+) -> MonitorState:
+    """With a track for each fault that stands after a change; sizes: the columns that say how much."""
+    found, tracks = change.finding, []
+    for column in sizes:
+        if float(state.believed[column]) == float(state.healthy[column]):
+            continue
+        earlier = next((t for t in state.tracks if t.column == column), None)
+        if column not in found.hypothesis.columns:
+            tracks += [earlier] if earlier else []
+            continue
+        now = state.now, float(state.believed[column]), float(found.std[column])
+        if earlier is not None and earlier.number == change.number:
+            start = (found.onset, float(change.before[column]), 0.0) if found.hypothesis.incipient else earlier.first
+            tracks.append(replace(earlier, onset=found.onset, first=start, last=now, strength=strength(column)))
+            continue
+        start = (found.onset, float(change.before[column]), 0.0) if found.hypothesis.incipient else now
+        tracks.append(Track(column, change.number, found.onset, start, now, strength(column), state.now))
+    return replace(state, tracks=tuple(tracks))
+
+
+def resized(state: MonitorState, finding: Finding, revise: float) -> tuple[MonitorState, list[Track]]:
+    """With the new sizes of faults that stand; which of them are due to be said aloud again: those that have stood
+    `revise` times as long as when they were last.
+    """
+    tracks, due = [], []
+    for t in state.tracks:
+        if t.column in finding.hypothesis.columns:
+            size, std = float(finding.value[t.column]), float(finding.std[t.column])
+            t = replace(t, last=(state.now, size, std), adjusted=finding.onset)
+            if state.now - t.onset >= revise * (t.announced - t.onset):
+                t = replace(t, announced=state.now)
+                due.append(t)
+        tracks.append(t)
+    return replace(state, tracks=tuple(tracks)), due

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from fdi_torch.capacity import expect_room
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
@@ -113,7 +114,11 @@ class Stepper:
 
 def substeps(begin: float, span: float, longest: float) -> list[tuple[float, float, float]]:
     """Start (s), length (s) and middle (as a share of the span) of the equal steps that fill a span."""
-    count = max(math.ceil(span / longest - 1e-9), 1)
+    needed = span / longest
+    expect_room(
+        3.0 * needed, f"{needed:.3g} integration steps of {longest:g} s through {span:g} s", "lengthen the step"
+    )
+    count = max(math.ceil(needed - 1e-9), 1)
     step = span / count
     return [(begin + i * step, step, (i + 0.5) / count) for i in range(count)]
 

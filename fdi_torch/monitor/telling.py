@@ -1,115 +1,175 @@
-"""Findings in words: what changed, by how much, since when."""
+"""From findings to events: explanations with their masses and sizes, and the text that people read."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torch import Tensor
+import torch
 
-from fdi_torch.monitor.events import Event, Kind
-from fdi_torch.monitor.following import Change
+from fdi_torch.monitor.change import ChangedObserver
+from fdi_torch.monitor.events import (
+    Event,
+    Explanation,
+    Kind,
+    Limit,
+    Size,
+    amount,
+    headline,
+    rate_words,
+    shares_words,
+)
+from fdi_torch.monitor.following import Change, MonitorState, Track
 from fdi_torch.monitor.hypothesis import Finding
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.monitor.limits import limits
+from fdi_torch.monitor.noise import Noise
+from fdi_torch.monitor.settings import MonitorSettings
+from fdi_torch.monitor.states import Alarm
 
-RIVAL = 6.0  # difference in BIC below which another explanation stands beside the best
-
-
-def tell(
-    space: ParameterSpace, change: Change, rivals: tuple[str, ...], now: float, kind: Kind, start: float
-) -> list[Event]:
-    """What is told of a change that was found at `now`: faults that went back to nominal as `recovered`, the others
-    as `kind`.
-
-    start: since when the observer runs, s; what began there may have been there before.
-    """
-    hypothesis = change.finding.hypothesis
-    back = [c for c in hypothesis.sizes if is_back(space, change, c)]
-    if len(back) == len(hypothesis.sizes):
-        return [_event(space, change, hypothesis.columns, rivals, now, "recovered", start)]
-    rest = tuple(c for c in hypothesis.columns if c not in back)
-    gone = [_event(space, change, tuple(back), (), now, "recovered", start)] if back else []
-    return [*gone, _event(space, change, rest, rivals, now, kind, start)]
+AHEAD = 4.0  # longest windows: how far the plant is run ahead
 
 
-def rivals_of(space: ParameterSpace, found: Sequence[Finding]) -> tuple[str, ...]:
-    """The names of explanations that fit nearly as well as the best, and do not merely add to it."""
-    best = found[0]
-    near = [f for f in found[1:] if f.score - best.score < RIVAL]
-    rivals = [f for f in near if not set(best.hypothesis.columns) <= set(f.hypothesis.columns)]
-    return tuple(dict.fromkeys(" + ".join(names_of(space, f)) for f in rivals))
+class Teller:
+    """Makes the events of one monitor."""
+
+    def __init__(self, observer: ChangedObserver, noise: Noise, settings: MonitorSettings, watched: int) -> None:
+        self.observer, self.space, self.noise, self.settings = observer, observer.space, noise, settings
+        self.watched, self.matters = watched, {m.fault: m for m in observer.network.description.matters}
+
+    def notice(self, state: MonitorState, text: str) -> Event:
+        return self._event(state, "notice", text)
+
+    def raised(self, state: MonitorState, alarm: Alarm) -> Event:
+        told = shares_words(alarm.shares)
+        return self._event(state, "alarm", f"the residual leaves its fault-free range: {told}", alarm)
+
+    def answered(self, state: MonitorState, change: Change, found: Sequence[Finding], kind: Kind, aloud: bool) -> Event:
+        """What explains an alarm. found: the explanations that are told, likeliest first."""
+        alarm, best = state.alarm(change.number), found[0]
+        explanations = tuple(self.explanation(f, change, state.now) for f in found)
+        text = f"{headline(explanations)}, {_since(best)}"
+        if best.onset - state.reachable <= 2.0 * max(best.onset_std, 0.5):
+            text += ", where the observer starts: it may have been there before"
+        rates = [rate_words(self.space[s.name], s.rate) for s in explanations[0].sizes if s.rate is not None]
+        text += f"; grows by {', '.join(rates)}" if rates else ""
+        if best.rest > 1.0:
+            text += "; does not explain all of the residual"
+        ahead = self._limits(state, change, found)
+        text += "".join(f"; {limit.words}" for limit in ahead[:1] if limit.chance > 0.5)
+        delay, (urgency, announced) = change.alarm - best.onset, self._severity(explanations)
+        text += f"; urgency: {urgency}" if urgency else ""
+        return self._event(
+            state, kind, text, alarm, explanations=explanations, delay=delay, limits=ahead, severity=urgency,
+            announced=announced and aloud,
+        )  # fmt: skip
+
+    def _limits(self, state: MonitorState, change: Change, found: Sequence[Finding]) -> tuple[Limit, ...]:
+        """What comes if nothing changes; the draws are those of the alarm's number."""
+        changing = [f for f in found if f.hypothesis.columns]
+        generator = torch.Generator().manual_seed(change.number)
+        horizon = AHEAD * self.settings.longest
+        return limits(self.observer, self.noise, state, change, changing, horizon, self.settings.lookback, generator)
+
+    def _severity(self, explanations: Sequence[Explanation]) -> tuple[str, bool]:
+        """The plant file's word for the likeliest explanation, and whether any of its faults is large enough to be said
+        aloud.
+        """
+        words, loud = [], []
+        for s in explanations[0].sizes:
+            matter = self.matters.get(s.name)
+            large = matter is None or abs(s.size - self.space[s.name].nominal) >= matter.smallest
+            loud.append(large)
+            words += [matter.urgency] if matter and large and matter.urgency else []
+        return ", ".join(dict.fromkeys(words)), any(loud)
+
+    def unexplained(self, state: MonitorState, number: int, found: Sequence[Finding]) -> Event:
+        explanations = tuple(self.explanation(f, None, state.now) for f in found)
+        text = f"no fault of the list explains the alarm better than chance does: {headline(explanations)}"
+        return self._event(state, "cannot tell", text, state.alarm(number), explanations=explanations)
+
+    def retired(self, state: MonitorState, alarm: Alarm, reason: str, announced: bool) -> Event:
+        return self._event(state, "retired", f"alarm {alarm.number}: {reason}", alarm, announced=announced)
+
+    def ended(
+        self,
+        state: MonitorState,
+        change: Change,
+        found: Sequence[Finding],
+        number: int,
+        names: Sequence[str],
+        observable: bool,
+    ) -> Event:
+        """Faults of one alarm that went away; or that the readings no longer show, whether they stand or not."""
+        explanations = tuple(self.explanation(f, change, state.now) for f in found)
+        text = f"{', '.join(names)}: back to nominal, {_since(found[0])}"
+        if " or " in headline(explanations):
+            text += f"; {headline(explanations)}"
+        if not observable:
+            text = (
+                f"{', '.join(names)}: the readings since {found[0].onset:.1f} s would not show whether it still stands"
+            )
+        kind: Kind = "recovered" if observable else "cannot tell"
+        delay = change.alarm - found[0].onset
+        return self._event(state, kind, text, state.alarm(number), explanations=explanations, delay=delay)
+
+    def followed(self, state: MonitorState, tracks: Sequence[Track], due: Sequence[Track]) -> list[Event]:
+        """New sizes of faults that stand; due: those that are said aloud again."""
+        return [
+            self._event(
+                state,
+                "followed",
+                f"{self._track_words(t)}, since {t.onset:.1f} s",
+                state.alarm(t.number),
+                explanations=(self._track_explanation(t),),
+                announced=t in due,
+            )
+            for t in tracks
+        ]
+
+    def summary(self, state: MonitorState, alarm: Alarm) -> Event:
+        """One line for an alarm, at the end of what is followed."""
+        own = [t for t in state.tracks if t.number == alarm.number]
+        what = "; ".join(f"{self._track_words(t)}, since {t.onset:.1f} s" for t in own) or ", ".join(alarm.faults)
+        times = f"raised {alarm.count} times, {alarm.first:g} s to {alarm.last:g} s" if alarm.count > 1 else (
+            f"raised at {alarm.first:g} s"
+        )  # fmt: skip
+        text = f"alarm {alarm.number}, {alarm.state}{': ' if what else ''}{what}; {times}"
+        explanations = tuple(self._track_explanation(t) for t in own)
+        return self._event(state, "summary", text, alarm, explanations=explanations)
+
+    def explanation(self, finding: Finding, change: Change | None, now: float) -> Explanation:
+        h, sizes = finding.hypothesis, []
+        for c in h.columns:
+            p, size, std = self.space.parameters[c], float(finding.value[c]), float(finding.std[c])
+            at_end = c in finding.at_end
+            grows = change is not None and h.incipient and c in h.sizes and now > finding.onset
+            rate = (size - float(change.before[c])) / (now - finding.onset) if grows and change else None
+            sizes.append(Size(p.name, size, std, p.unit, amount(p, size, std, at_end), at_end, rate))
+        if not sizes:
+            return Explanation(finding.mass, ())
+        gone = set(h.gone) >= set(h.sizes)
+        return Explanation(finding.mass, tuple(sizes), finding.onset, finding.onset_std, h.incipient, gone)
+
+    def _track_explanation(self, track: Track) -> Explanation:
+        p, (_, size, std) = self.space.parameters[track.column], track.last
+        told = Size(p.name, size, std, p.unit, amount(p, size, std), rate=track.rate)
+        return Explanation(1.0, (told,), track.onset, None, track.rate is not None)
+
+    def _track_words(self, track: Track) -> str:
+        p, (_, size, std) = self.space.parameters[track.column], track.last
+        grows = f", changes by {rate_words(p, track.rate)}" if track.rate is not None else ""
+        return amount(p, size, std) + grows
+
+    def _event(self, state: MonitorState, kind: Kind, text: str, alarm: Alarm | None = None, **more: object) -> Event:
+        off = (state.believed != state.healthy).nonzero().flatten().tolist()
+        believed = tuple((self.space.names[c], float(state.believed[c])) for c in off if c < self.watched)
+        if alarm is None:
+            return Event(state.now, kind, text, believed=believed)
+        return Event(
+            state.now, kind, text, alarm.number, alarm.state, shares=alarm.shares, first=alarm.first, last=alarm.last,
+            count=alarm.count, believed=believed, **more,  # type: ignore[arg-type]
+        )  # fmt: skip
 
 
-def names_of(space: ParameterSpace, finding: Finding) -> tuple[str, ...]:
-    """Parameters that a finding says have changed, by their full names."""
-    return tuple(space.names[c] for c in finding.hypothesis.columns)
-
-
-def is_nominal(space: ParameterSpace, finding: Finding, column: int) -> bool:
-    """Whether what was found is nominal, to three standard errors."""
-    return abs(float(finding.value[column]) - _nominal(space, column)) <= 3.0 * float(finding.std[column])
-
-
-def is_back(space: ParameterSpace, change: Change, column: int) -> bool:
-    """Whether what was off nominal is nominal now, and the readings tell the two apart."""
-    before, value = float(change.before[column]), float(change.finding.value[column])
-    apart = abs(before - value) > 3.0 * float(change.finding.std[column])
-    return before != _nominal(space, column) and is_nominal(space, change.finding, column) and apart
-
-
-def with_nominals(space: ParameterSpace, change: Change) -> Tensor:
-    """Values (P,) to believe in: nominal where that is within the error, unless a fault that stands is so as well."""
-    believed = change.finding.value.clone()
-    for c in change.finding.hypothesis.sizes:
-        if is_nominal(space, change.finding, c):
-            stands = float(change.before[c]) != _nominal(space, c) and not is_back(space, change, c)
-            believed[c] = change.before[c] if stands else _nominal(space, c)
-    return believed
-
-
-def _event(
-    space: ParameterSpace,
-    change: Change,
-    columns: tuple[int, ...],
-    rivals: tuple[str, ...],
-    now: float,
-    kind: Kind,
-    start: float,
-) -> Event:
-    finding, names = change.finding, tuple(space.names[c] for c in columns)
-    sizes = tuple(float(finding.value[c]) for c in columns)
-    stds = tuple(float(finding.std[c]) for c in columns)
-    units = tuple(space.parameters[c].unit for c in columns)
-    return Event(
-        now, kind, _text(finding, names, sizes, stds, units, rivals, start), names, sizes, stds, units, finding.onset,
-        finding.onset_std, finding.hypothesis.incipient, change.alarm - finding.onset, rivals,
-    )  # fmt: skip
-
-
-def _nominal(space: ParameterSpace, column: int) -> float:
-    return space.parameters[column].nominal
-
-
-def _text(
-    finding: Finding,
-    names: tuple[str, ...],
-    sizes: tuple[float, ...],
-    stds: tuple[float, ...],
-    units: tuple[str, ...],
-    rivals: tuple[str, ...],
-    start: float,
-) -> str:
-    parts = [_amount(*row) for row in zip(names, sizes, stds, units, strict=True)]
+def _since(finding: Finding) -> str:
     manner = "growing since" if finding.hypothesis.incipient else "since"
-    text = f"{', '.join(parts)}, {manner} {finding.onset:.1f} ± {finding.onset_std:.2g} s"
-    if finding.onset - start <= 2.0 * max(finding.onset_std, 0.5):
-        text += ", where the observer starts: it may have been there before"
-    if rivals:
-        text += f"; or {' or '.join(rivals)}"
-    if not finding.fits:
-        text += "; does not explain all of the residual"
-    return text
-
-
-def _amount(name: str, size: float, std: float, unit: str) -> str:
-    amount = f"{name} = {size:.4g} ± {std:.2g}" if std > 0.0 else f"{name} = {size:.4g}"
-    return amount + ("" if unit == "1" else f" {unit}")
+    return f"{manner} {finding.onset:.1f} ± {finding.onset_std:.2g} s"

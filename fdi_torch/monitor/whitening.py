@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 HIGHEST_ORDER = 8
 FEWEST_SAMPLES = 40
+BLOCKS = (10, 30, 100, 300)  # samples; a CUSUM sums over some tens, a fit over some hundreds
+FEWEST_BLOCKS, PRIOR_BLOCKS = 6, 5
 
 
 @dataclass(frozen=True)
@@ -18,7 +20,8 @@ class Whitening:
 
     mean m (C,) in the readings' units, zero where the recording shows none; coefficients A (order, C, C);
     whitener W (C, C), lower triangular. samples: how many it was estimated from. slow_error (C,): standard error of
-    ln of the standard deviation that slow sums of e have, which is 1 where the colour is known.
+    ln of the standard deviation that slow sums of e have, which is 1 where the colour is known. slow (C,): variance of
+    slow sums that the autoregression left, over that of white noise, which W makes up for: e has variance 1 / slow.
     """
 
     mean: Tensor
@@ -26,6 +29,12 @@ class Whitening:
     whitener: Tensor
     samples: int
     slow_error: Tensor
+    slow: Tensor | None = None
+
+    @property
+    def level(self) -> float:
+        """Mean square of e without a fault."""
+        return 1.0 if self.slow is None else float((1.0 / self.slow).mean())
 
     @property
     def fast_error(self) -> float:
@@ -62,6 +71,26 @@ class Whitening:
 def fit_whitening(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> Whitening:
     """From the residuals (S, C) of one fault-free recording; order and mean by the Bayesian information criterion."""
     return score_whitenings(residual, highest_order)[0][1]
+
+
+def with_slow_variance(whitening: Whitening, residual: Tensor) -> Whitening:
+    """With a whitener that allows for slow disturbances, as far as residuals (S, C) show them.
+
+    The variance of means over blocks of m samples, times m, is 1 where e is white and more where it varies slowly: what
+    an autoregression of a few samples cannot see. Of the block lengths BLOCKS the worst counts, each drawn towards 1 as
+    if PRIOR_BLOCKS blocks of white noise had been seen as well.
+    """
+    white = whitening(residual)[whitening.order :]
+    slow = torch.ones(white.shape[-1], dtype=white.dtype)
+    for length in BLOCKS:
+        count = len(white) // length
+        if count < FEWEST_BLOCKS:
+            break
+        blocks = white[: count * length].reshape(count, length, -1)
+        seen = torch.isfinite(blocks).sum(1).clamp(min=1)
+        square = (torch.nan_to_num(blocks).sum(1).square() / seen).sum(0)
+        slow = torch.maximum(slow, (square + PRIOR_BLOCKS) / (count + PRIOR_BLOCKS))
+    return replace(whitening, whitener=whitening.whitener / slow.sqrt().unsqueeze(1), slow=slow)
 
 
 def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> list[tuple[float, Whitening]]:

@@ -17,8 +17,8 @@ from fdi_torch.estimate.evolution import evolve
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.objectives import Objective, Problem, Term, spread_of
-from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
 from fdi_torch.plant.pace import time_scale
 from fdi_torch.simulate.engine import Readings
 

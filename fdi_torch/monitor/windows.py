@@ -10,12 +10,11 @@ from torch import Tensor
 
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.monitor.change import ChangedObserver
-from fdi_torch.monitor.continuity import continuous
 from fdi_torch.monitor.detection import Detector
-from fdi_torch.monitor.events import Event
+from fdi_torch.monitor.events import Event, Explanation, Kind, Size, amount
 from fdi_torch.monitor.following import MonitorState, begin, forget, observe
-from fdi_torch.monitor.online import Seen
-from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.monitor import Seen
+from fdi_torch.monitor.samples import Samples, continuous
 from fdi_torch.monitor.window_fit import ESTIMATORS, WindowData, WindowEstimate
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
@@ -52,6 +51,7 @@ class WindowMonitor:
         estimator: str,
         length: float,
         stride: float | None = None,
+        interval: float = 1.0,
     ) -> None:
         if estimator not in ESTIMATORS:
             raise ValueError(f"expected an estimator of {', '.join(ESTIMATORS)}, got '{estimator}'")
@@ -59,7 +59,7 @@ class WindowMonitor:
             raise ValueError(
                 f"expected a window longer than 0 s and a stride within it, got {length:g} s and {stride} s"
             )
-        self._observer, self.detector, self.watched = observer, detector, watched
+        self._observer, self.detector, self.watched, self._interval = observer, detector, watched, interval
         self.estimator, self.length, self.stride = estimator, length, length if stride is None else stride
 
     @property
@@ -77,9 +77,10 @@ class WindowMonitor:
     ) -> tuple[WindowState, list[Event]]:
         """As `Monitor.advance`: alarms as they come, and an estimate at the end of each window."""
         events: list[Event] = []
-        for stretch, notice in continuous(state.following.samples, samples):
+        stretches, arrived = continuous(state.following.arrived, samples, self._interval)
+        for stretch, notice in stretches:
             if notice:
-                events.append(Event(float(stretch.time[0]), "notice", notice))
+                events.append(Event(float(stretch.time[0]), "notice", notice, believed=self._off(state.believed)))
                 state = replace(self.start(stretch, state.believed), number=state.number)
                 stretch = stretch.stretch(1, len(stretch))
             while len(stretch):
@@ -88,22 +89,26 @@ class WindowMonitor:
                 state, news = self._take(state, stretch.stretch(0, count), show)
                 events += news
                 stretch = stretch.stretch(count, len(stretch))
-        return state, events
+        return replace(state, following=replace(state.following, arrived=arrived)), events
+
+    def close(self, state: WindowState) -> list[Event]:
+        """Nothing is left to be said at the end."""
+        return []
 
     def _take(
         self, state: WindowState, samples: Samples, show: Callable[[Seen], None] | None
     ) -> tuple[WindowState, list[Event]]:
         moved, count, events = observe(self._observer, state.following, samples), len(samples), []
-        first = max(moved.watched, len(moved.samples) - count - self.detector.memory)
-        statistic = self.detector.statistic(moved.white[first:])[-count:]
+        statistic, charted = self.detector.follow(moved.white[-count:], state.following.charted)
+        moved = replace(moved, charted=charted)
         if show is not None:
             show(Seen(samples.time, moved.residual[-count:], statistic))
         above = statistic > self.detector.threshold
         if not state.alarmed and bool(above.any()):
             when = float(samples.time[int(above.to(torch.int8).argmax())])
-            events.append(Event(when, "alarm", "the residual leaves its fault-free range"))
+            events.append(self._event(moved, when, "alarm", "the residual leaves its fault-free range"))
         alarmed = state.alarmed or bool(above.any())
-        state = replace(state, following=forget(moved, 2.0 * self.length), alarmed=alarmed)
+        state = replace(state, following=forget(replace(moved, floor=moved.now - 2.0 * self.length)), alarmed=alarmed)
         if moved.now < state.next_end:
             return state, events
         state, event = self._estimate(state)
@@ -121,8 +126,8 @@ class WindowMonitor:
         found = ESTIMATORS[self.estimator](WindowData(fitting, window.readings[None]), before[None], state.number)
         believed = following.believed.clone()
         believed[: self.watched] = found.value[0, : self.watched]
-        event = self._tell(found, following.now, start)
-        following = replace(following, believed=believed, healthy=believed, watched=len(following.samples))
+        event = self._tell(found, following.now, start, believed)
+        following = replace(following, believed=believed, healthy=believed, charted=None)
         return WindowState(following, state.next_end + self.stride, False, state.number + 1), event
 
     def _fitting(self, window: Samples, believed: Tensor) -> Fitting:
@@ -144,13 +149,17 @@ class WindowMonitor:
             network.nominal[network.constants.index(name)] = value
         return fitting
 
-    def _tell(self, found: WindowEstimate, now: float, start: float) -> Event:
-        parameters = self.space.parameters[: self.watched]
-        sizes, stds = (tuple(row[0, : self.watched].tolist()) for row in (found.value, found.std))
-        parts = [
-            f"{p.name} = {size:.4g}" + (f" ± {std:.2g}" if std == std else "")
-            for p, size, std in zip(parameters, sizes, stds, strict=True)
-        ]
-        text = f"{', '.join(parts)}; from {start:g} s to {now:g} s"
-        names, units = tuple(p.name for p in parameters), tuple(p.unit for p in parameters)
-        return Event(now, "estimate", text, names, sizes, stds, units)
+    def _tell(self, found: WindowEstimate, now: float, start: float, believed: Tensor) -> Event:
+        rows = zip(self.space.parameters, found.value[0].tolist(), found.std[0].tolist(), strict=False)
+        sizes = [Size(p.name, v, s, p.unit, amount(p, v, s)) for p, v, s in list(rows)[: self.watched]]
+        text = f"{', '.join(s.shown for s in sizes)}; from {start:g} s to {now:g} s"
+        return Event(
+            now, "estimate", text, explanations=(Explanation(1.0, tuple(sizes)),), believed=self._off(believed)
+        )
+
+    def _event(self, state: MonitorState, time: float, kind: Kind, text: str) -> Event:
+        return Event(time, kind, text, believed=self._off(state.believed))
+
+    def _off(self, believed: Tensor) -> tuple[tuple[str, float], ...]:
+        rows = list(zip(self.space, believed.tolist(), strict=True))[: self.watched]
+        return tuple((p.name, value) for p, value in rows if value != p.nominal)

@@ -14,7 +14,7 @@ from fdi_torch.config.simulation import NoiseConfig, noise_std
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import estimate_parameters, information_std
-from fdi_torch.estimate.refine import levenberg_marquardt
+from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, simulated_truth, wanted_space
 from fdi_torch.paper.published import PARAMETERS
 

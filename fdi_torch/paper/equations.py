@@ -38,7 +38,7 @@ EQUATIONS = (
     Equation((15,), "conventional adaptive observer: parameters integrate the residual",
              ("monitor.adaptive:adaptive_observer", "monitor.adaptive:designed_rate")),
     Equation((16,), "adaptive observer: the newest fitted parameters go back into it",
-             ("monitor.windows:WindowMonitor", "monitor.window_fit:evolution", "monitor.online:Monitor",
+             ("monitor.windows:WindowMonitor", "monitor.window_fit:evolution", "monitor.monitor:Monitor",
               "paper.online:follow")),
     Equation((17, 18), "Pearson's correlation of reading and prediction, from sums over the window",
              ("estimate.objectives:correlation_loss", "estimate.objectives:correlation_expansion")),

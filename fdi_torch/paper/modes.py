@@ -14,8 +14,8 @@ from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.estimate.evolution import evolve
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.estimate.information import certainty
+from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
 from fdi_torch.estimate.objectives import Objective, Problem, Term
-from fdi_torch.estimate.refine import levenberg_marquardt
 from fdi_torch.jobs.run_setup import hybrid_settings, simulated_truth, wanted_space
 from fdi_torch.simulate.engine import Readings
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fdi_torch.disk import write_text
 from fdi_torch.paper import tables
 from fdi_torch.paper.cases import Case, shipped_run, solve
 from fdi_torch.paper.modes import Modes, confusion, diagnose_modes, mode_name
@@ -46,8 +47,7 @@ def make_page(folder: Path, tell: Tell) -> list[Path]:
     tell(0.97, "drawing")
     pictures = draw(results, folder)
     page = folder / "README.md"
-    page.write_text(text_of(results), encoding="utf-8")
-    return [page, *pictures]
+    return [write_text(page, text_of(results)), *pictures]
 
 
 def solve_all(tell: Tell) -> Results:

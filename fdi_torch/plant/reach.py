@@ -92,6 +92,12 @@ def heads(plant: PlantDescription, pipe: str, reach: Reach) -> Range:
     return max(low - far_high, far_low - high, 0.0), max(high - far_low, far_high - low)
 
 
+def onsets(reach: Reach) -> list[float]:
+    """Moments from which a fit finds any onset between them, s: a step that is misplaced by more than its neighbours'
+    distance is no start for a fit, for what it should explain lies elsewhere."""
+    return inside((0.0, reach.duration), 9)
+
+
 def inside(reached: Range, count: int) -> list[float]:
     """`count` values evenly within a range, its ends left out."""
     low, high = reached

@@ -31,6 +31,13 @@ resolution, and the times between them differ by more than a factor of three.
 CLIPPED_SAMPLES = 5
 CLIPPED_PILE = 5.0
 """Clipped: the extreme value occurs this many times as often as its neighbour."""
+TWO_SAMPLES_A_HOLD = 0.5
+"""Correlation of successive samples of a command that is held for two of them: 1 - (sampling interval) / (hold)."""
+CERTAIN = 1.96
+"""Standard errors on one side of 97.5 % of a normal distribution."""
+NORMAL_MEDIAN = 0.6745
+"""Of the size of a standard normal number."""
+DOUBTS = ("clock", "constant", "range", "unit", "undersampled", "on change")
 COARSE_SHARE = 0.5
 """Rounded coarsely: more than this share of the readings equal the one before."""
 
@@ -78,11 +85,17 @@ def check_recording(recording: Recording, plant: PlantDescription) -> RecordingC
             *(Finding("read", "t", note) for note in recording.notes),
             *_clock_findings(time, steps, interval),
             *_unknown_inputs(recording),
+            *_undersampled_inputs(recording, plant),
             *_missing_readings(recording),
             *_reading_findings(recording),
             *against_plant(recording, plant),
         ),
     )
+
+
+def doubts(recording: Recording, plant: PlantDescription) -> list[str]:
+    """What an estimate or a verdict from a recording has to be read beside, a sentence each."""
+    return [f"{f.channel}: {f.text}" for f in check_recording(recording, plant).findings if f.kind in DOUBTS]
 
 
 def _summaries(recording: Recording) -> Iterator[ChannelSummary]:
@@ -149,6 +162,49 @@ def _unknown_inputs(recording: Recording) -> Iterator[Finding]:
             start, stop = float(recording.time[first]), float(recording.time[last])
             text = f"unknown from {start:g} s to {stop:g} s ({last - first + 1} samples): the recording is cut there"
             yield Finding("unknown", name, text, {"start": start, "stop": stop})
+
+
+def _undersampled_inputs(recording: Recording, plant: PlantDescription) -> Iterator[Finding]:
+    """Pump commands that are, at 97.5 %, held for less than two samples on average, or swing faster than six a period,
+    so strongly that the unknown flow of one interval moves the level by more than its readings scatter.
+
+    Of a command that switches at random and is held for a time h, samples at intervals d <= h correlate by 1 - d / h,
+    and those of a sine of period T by cos(2 pi d / T); 1 / sqrt(N) is the standard error over N samples that are
+    independent of each other.
+    """
+    for pump in plant.pumps:
+        areas = [tank.area for tank in plant.tanks if tank.name == pump.target]
+        if pump.channel not in recording.input_names or not areas:
+            continue
+        name, values = pump.channel, recording.inputs[:, recording.input_names.index(pump.channel)]
+        known = torch.isfinite(values[:-1]) & torch.isfinite(values[1:])
+        before, after = values[:-1][known], values[1:][known]
+        variance = float(torch.cat([before, after]).var(correction=0)) if len(before) else 0.0
+        unknown = pump.gain * variance**0.5 * recording.interval / areas[0]
+        if not unknown > _scatter(recording, plant, pump.target):
+            continue
+        share = 1.0 - float((after - before).square().mean()) / (2.0 * variance)
+        if share + CERTAIN / len(before) ** 0.5 < TWO_SAMPLES_A_HOLD:
+            text = (
+                f"moves about as fast as it is sampled: successive samples correlate by {share:.2f}, those of a "
+                f"command that is held for two samples by {TWO_SAMPLES_A_HOLD:g}. What it does between samples is not "
+                "recorded; unless it is held from each sample to the next, its flow is unknown and the error looks "
+                "like an effect of the pump: log it faster, or its mean over each interval"
+            )
+            yield Finding("undersampled", name, text, {"correlation": share, "interval": recording.interval})
+
+
+def _scatter(recording: Recording, plant: PlantDescription, tank: str) -> float:
+    """The least that readings of a tank's level scatter or step by, as a level, m; infinite where no sensor sees it."""
+    found = [torch.inf]
+    for sensor in plant.sensors:
+        if sensor.tank == tank and sensor.column in recording.output_names:
+            column = recording.output_names.index(sensor.column)
+            values = recording.outputs[recording.mask[:, column], column] / sensor.gain
+            if len(values) > 2:  # second differences of white noise of unit size are normal, with a variance of 6
+                scatter = float(torch.diff(values, n=2).abs().median()) / (NORMAL_MEDIAN * 6.0**0.5)
+                found.append(max(scatter, resolution(values)))
+    return min(found)
 
 
 def _usual_step(time: Tensor) -> float:

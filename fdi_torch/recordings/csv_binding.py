@@ -23,7 +23,7 @@ TIME_NAMES = (
 @dataclass(frozen=True)
 class Bound:
     """A channel tied to the file: position of its column (or a constant), factor into SI, SI unit, and what its cells
-    mean. stamps: its cells are time stamps.
+    mean. stamps: its cells are time stamps. plus: what is added to it.
     """
 
     name: str
@@ -34,6 +34,7 @@ class Bound:
     constant: float = float("nan")
     stamps: bool = False
     rule: Rule | None = None
+    plus: tuple[Bound, ...] = ()
 
 
 def bind_clock(path: Path, header: Sequence[str], source: ChannelSource | None) -> Bound:
@@ -62,7 +63,9 @@ def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | N
         factor = unit_factor(unit, si_unit)
     except ValueError as error:
         raise ValueError(f"{path}: column {column}: {error}") from error
-    return Bound(name, column, header.index(column), factor, si_unit, rule=_rule(path, header, name, source))
+    rule = _rule(path, header, name, source)
+    plus = tuple(bind(path, header, name, replace(source, column=each, plus=()), si_unit) for each in source.plus)
+    return Bound(name, column, header.index(column), factor, si_unit, rule=rule, plus=plus)
 
 
 def column_of(path: Path, header: Sequence[str], column: str) -> str:
@@ -125,6 +128,7 @@ def columns_of(
 
     clock: how its time stamps are written. sparse: empty cells are other than those that say that nothing was read.
     """
+    bounds = [each for bound in bounds for each in (bound, *bound.plus)]
     positions = list(dict.fromkeys(b.position for b in bounds if b.position is not None))
     rules = {b.position: b.rule for b in bounds if b.position is not None and b.rule is not None}
     stamps = next((b.position for b in bounds if b.stamps), None)

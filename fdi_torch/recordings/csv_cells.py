@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.recordings.csv_text import Heading
+from fdi_torch.recordings.csv_text import Heading, rows_of
 from fdi_torch.recordings.stamps import seconds_of
 
 BAD = float("inf")
@@ -81,7 +80,7 @@ def parse_carefully(lines: list[str], columns: Columns, above: int) -> np.ndarra
 
 def _rows(lines: list[str], columns: Columns, above: int) -> Iterator[list[float]]:
     names, delimiter = columns.heading.names, columns.heading.delimiter
-    for number, cells in enumerate(csv.reader(lines, delimiter=delimiter), start=above + 1):
+    for number, cells in rows_of(columns.path, lines, delimiter, above):
         if not any(cell.strip() for cell in cells):
             continue
         if len(cells) != len(names):

@@ -1,4 +1,5 @@
-"""Recordings from CSV files (plain or .gz), read in blocks of lines: a long file costs its numbers and little more.
+"""Recordings from CSV files (plain or .gz), and from other tables as if they were, read in blocks of lines: a long file
+costs its numbers and little more.
 
 A header of the form name_unit (`t_s`, `Q1_cm3_s`, `h1_cm`) or name [unit] tells all; other headers are mapped by
 `ChannelSource`. Empty and non-finite cells are allowed in channels (a missing reading, an unknown command), never in
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -17,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from fdi_torch.disk import replacing
 from fdi_torch.parameters import header_unit, unit_factor
 from fdi_torch.recording import Hold, Recording
 from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of
@@ -93,7 +96,9 @@ def read_csv_files(
 def _shared_out(files: Sequence[FileSource], names: Sequence[str]) -> list[list[str]]:
     """Which channels are taken from which file; what none has, from the first, which says so."""
     shares: list[list[str]] = [[] for _ in files]
-    headers = [_named_in(read_header(file.path)) if len(files) > 1 else set() for file in files]
+    headers = [
+        _named_in(read_header(file.path, file.header, file.sheet)) if len(files) > 1 else set() for file in files
+    ]
     for name in names:
         said = [k for k, file in enumerate(files) if name in file.columns]
         there = [k for k, header in enumerate(headers) if name in header]
@@ -112,8 +117,8 @@ def _read(file: FileSource, names: Sequence[str]) -> Read:
 def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
     """A file with a row an instant: one sheet."""
     path, given = file.path, file.columns.get("t")
-    with open_csv(path) as handle:
-        heading, lines = heading_of(path, handle)
+    with open_csv(path, file.sheet) as handle:
+        heading, lines = heading_of(path, handle, file.header)
         clock = bind_clock(path, heading.names, given)
         bounds = [bind(path, heading.names, name, file.columns.get(name)) for name in names]
         sparse = any(file.columns[name].held > 0.0 for name in names if name in file.columns)
@@ -174,10 +179,10 @@ def _sha256(paths: Sequence[Path]) -> str:
     return each[0] if len(each) == 1 else hashlib.sha256("".join(each).encode()).hexdigest()
 
 
-def read_header(path: Path) -> tuple[str, ...]:
-    """The column names of a CSV file."""
-    with open_csv(path) as handle:
-        return heading_of(path, handle)[0].names
+def read_header(path: Path, header: bool = True, sheet: str | None = None) -> tuple[str, ...]:
+    """The column names of a table, as `FileSource` says how it is laid out."""
+    with open_csv(path, sheet) as handle:
+        return heading_of(path, handle, header)[0].names
 
 
 def _read_table(lines: Iterator[str], columns: Columns) -> tuple[np.ndarray, list[str]]:
@@ -208,7 +213,7 @@ def _blocks(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
     try:
         while block := list(islice(lines, LINES_PER_BLOCK)):
             yield block
-    except (UnicodeDecodeError, EOFError, gzip.BadGzipFile) as error:
+    except (UnicodeDecodeError, EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{path}: expected a whole CSV file, got one that is cut off or damaged: {error}") from error
 
 
@@ -239,26 +244,37 @@ def channels_in_si(table: np.ndarray, columns: Columns, bounds: Sequence[Bound])
     """The bound channels in SI as (rows, channels)."""
     channels = np.empty((len(table), len(bounds)))
     for i, bound in enumerate(bounds):
-        source = bound.constant if bound.position is None else table[:, columns.positions.index(bound.position)]
-        channels[:, i] = source * np.float64(bound.factor)
+        channels[:, i] = _numbers(table, columns, bound)
+        for further in bound.plus:
+            channels[:, i] += _numbers(table, columns, further)
     return channels
+
+
+def _numbers(table: np.ndarray, columns: Columns, bound: Bound) -> np.ndarray:
+    source = bound.constant if bound.position is None else table[:, columns.positions.index(bound.position)]
+    return np.asarray(source * np.float64(bound.factor))
 
 
 def write_csv(recording: Recording, path: Path) -> Path:
     """The recording as CSV whose headers need no mapping: t_s, Q1_cm3_s, h1_cm ... Masked readings are left empty."""
     units = [_FILE_UNITS.get(unit, unit) for unit in (*recording.input_units, *recording.output_units)]
-    names = (*recording.input_names, *recording.output_names)
     si_units = (*recording.input_units, *recording.output_units)
     factors = [unit_factor(si, unit) for si, unit in zip(si_units, units, strict=True)]
     readings = torch.where(recording.mask, recording.outputs, torch.nan)
     table = torch.cat([recording.inputs, readings], dim=1).numpy() * np.asarray(factors)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8", newline="") as handle:
-        handle.write(",".join(["t_s", *(f"{n}_{u}" for n, u in zip(names, units, strict=True))]) + "\n")
+    with replacing(path) as new, new.open("w", encoding="utf-8", newline="") as handle:
+        inputs = dict(zip(recording.input_names, recording.input_units, strict=True))
+        handle.write(header_of(inputs, dict(zip(recording.output_names, recording.output_units, strict=True))) + "\n")
         for t, row in zip(recording.time.tolist(), table, strict=True):
             cells = ("" if np.isnan(value) else f"{value:.12g}" for value in row.tolist())
             handle.write(f"{t:.12g}," + ",".join(cells) + "\n")
     return path
+
+
+def header_of(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> str:
+    """A header that needs no mapping, from channels' names and SI units: t_s,Q1_cm3_s,h1_cm."""
+    named = (*inputs.items(), *outputs.items())
+    return ",".join(["t_s", *(f"{name}_{_FILE_UNITS.get(unit, unit)}" for name, unit in named)])
 
 
 _FILE_UNITS = {"m": "cm", "m^3/s": "cm3_s", "Pa": "mbar", "A": "mA", "1/s": "Hz", "1": "pct"}

@@ -14,6 +14,7 @@ from fdi_torch.recordings.csv_files import channels_in_si, from_first
 from fdi_torch.recordings.csv_text import heading_of, open_csv
 from fdi_torch.recordings.sheets import held
 from fdi_torch.recordings.source import ChannelSource
+from fdi_torch.recordings.tables import TableText
 
 
 class GrowingCsv:
@@ -32,6 +33,8 @@ class GrowingCsv:
         mapping = mapping or {}
         self.path = path
         with open_csv(path) as handle:
+            if isinstance(handle, TableText):
+                raise ValueError(f"{path}: expected a CSV or MCAP file that is followed, got a table of another format")
             heading, _ = heading_of(path, handle)
             self._encoding = handle.encoding
         if self._encoding == "utf-16":

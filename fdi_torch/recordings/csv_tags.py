@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ import numpy as np
 from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_binding import Bound, bind_clock, column_of, rule_of
 from fdi_torch.recordings.csv_cells import number_in, ruled
-from fdi_torch.recordings.csv_text import heading_of, open_csv
+from fdi_torch.recordings.csv_text import heading_of, open_csv, rows_of
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource
 from fdi_torch.recordings.stamps import stamp_reader
 
@@ -40,7 +39,10 @@ def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagge
     wanted = {source.column or name: name for name, source in sources.items()}
     rows = {name: _Rows() for name in names}
     seen: set[str] = set()
-    with open_csv(path) as handle:
+    for channel, source in sources.items():
+        if source.plus:
+            raise ValueError(f"{path}: columns.{channel}.plus: expected no such key where rows have tags; leave it out")
+    with open_csv(path, file.sheet) as handle:
         heading, lines = heading_of(path, handle)
         given = file.columns.get("t")
         clock = bind_clock(path, heading.names, given)
@@ -49,7 +51,7 @@ def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagge
         quality = None if tags.quality is None else heading.names.index(column_of(path, heading.names, tags.quality))
         rules = {name: rule_of(source, quality) for name, source in sources.items()}
         read = stamp_reader(given.stamps, given.zone) if isinstance(given, ClockSource) else stamp_reader(None, None)
-        for number, cells in enumerate(csv.reader(lines, delimiter=heading.delimiter), start=heading.lines + 1):
+        for number, cells in rows_of(path, lines, heading.delimiter, heading.lines):
             if len(cells) != len(heading.names):
                 if not any(cell.strip() for cell in cells):
                     continue

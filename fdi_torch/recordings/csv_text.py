@@ -5,20 +5,21 @@ from __future__ import annotations
 import codecs
 import csv
 import gzip
+import io
+import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
+from fdi_torch.outside import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, expect_unpacked
 from fdi_torch.parameters import header_unit, si_unit_of
+from fdi_torch.recordings.tables import TableText, format_of, table_text
 
 _SNIFFED = 1 << 16
 _FOREIGN = {
-    b"PK\x03\x04": "a zip archive or an Excel workbook; save the sheet as CSV",
-    b"PAR1": "a Parquet file; write it as CSV",
-    b"\x89HDF": "an HDF5 or MATLAB file; write its channels as CSV",
-    b"MATLAB 5.0": "a MATLAB file; write its channels as CSV",
+    b"ARROW1": "a Feather file; write it as Parquet",
     b"\x89MCAP": "an MCAP file; let its name end in .mcap",
 }
 
@@ -32,14 +33,66 @@ class Heading:
     lines: int
 
 
-def open_csv(path: Path) -> TextIO:
-    """UTF-8 or UTF-16, or else what Western European Windows writes. Raises ValueError for what is no text."""
+def open_csv(path: Path, sheet: str | None = None) -> TextIO | TableText:
+    """UTF-8 or UTF-16, or else what Western European Windows writes; or a table of another format as such text.
+
+    sheet: of an Excel workbook. Raises ValueError for what is neither.
+    """
     if not path.is_file():
         raise ValueError(f"{path}: expected a CSV file, got none there; check the path")
-    encoding = _encoding(path, _beginning(path))
+    beginning = _beginning(path)
+    if known := format_of(beginning):
+        return table_text(path, known, sheet)
+    if sheet is not None:
+        raise ValueError(f"{path}: sheet: expected this key of an Excel workbook only, got a CSV file; leave it out")
+    encoding = _encoding(path, beginning)
     if path.suffix == ".gz":
-        return gzip.open(path, "rt", encoding=encoding, newline="")
+        return io.TextIOWrapper(io.BufferedReader(_Unpacked(path)), encoding=encoding, newline="")
     return path.open(encoding=encoding, newline="")
+
+
+class _Unpacked(io.RawIOBase):
+    """The bytes of a .gz file, as many as it may have."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._packed, self._count = path, path.stat().st_size, 0
+        self._file = gzip.open(path)  # noqa: SIM115, closed with this
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        found = self._file.read(len(buffer))
+        buffer[: len(found)] = found
+        self._count += len(found)
+        expect_unpacked(self._count, self._packed, str(self._path), MOST_UNPACKED, MOST_EXPANSION)
+        return len(found)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+def rows_of(path: Path, lines: Iterable[str], delimiter: str, above: int = 0) -> Iterator[tuple[int, list[str]]]:
+    """The cells of each line, with the number of its row; `above`: rows of the file before these."""
+    rows = csv.reader(lines, delimiter=delimiter)
+    number = above
+    try:
+        for number, cells in enumerate(rows, start=above + 1):
+            yield number, cells
+    except csv.Error as error:
+        raise ValueError(
+            f"{path}: row {number + 1}: expected cells of a CSV file, got something else: {error}"
+        ) from None
+
+
+def _short_lines(path: Path, lines: Iterable[str]) -> Iterator[str]:
+    for number, line in enumerate(lines, start=1):
+        if len(line) > MOST_LINE:
+            raise ValueError(
+                f"{path}: row {number}: expected at most {MOST_LINE} characters in a line, got more; is it a CSV file?"
+            )
+        yield line
 
 
 def _beginning(path: Path) -> bytes:
@@ -48,14 +101,14 @@ def _beginning(path: Path) -> bytes:
             return raw.read(_SNIFFED)
     except EOFError:
         return b""  # cut off; which the reader says
-    except gzip.BadGzipFile as error:
+    except (gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{path}: expected a CSV file (plain or .gz), got something else: {error}") from error
 
 
 def _encoding(path: Path, start: bytes) -> str:
     for magic, what in _FOREIGN.items():
         if start.startswith(magic):
-            raise ValueError(f"{path}: expected a CSV or MCAP file, got {what}")
+            raise ValueError(f"{path}: expected a CSV, MCAP, Parquet, Excel, MATLAB or HDF5 file, got {what}")
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     if b"\0" in start:
@@ -67,30 +120,43 @@ def _encoding(path: Path, start: bytes) -> str:
     return "utf-8-sig"
 
 
-def heading_of(path: Path, lines: Iterable[str]) -> tuple[Heading, Iterator[str]]:
+def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[Heading, Iterator[str]]:
     """The heading, and the lines below it. Lines that start with # may stand above, and Excel's `sep=;`; a row of units
-    may stand below names without units.
+    may stand below names without units. Without a header, columns are named by their numbers: 1, 2 ...
     """
-    rest, delimiter = iter(lines), ""
+    rest, delimiter = _short_lines(path, lines), getattr(lines, "delimiter", "")
     for number, line in enumerate(rest, start=1):
         if line.lower().startswith("sep=") and len(line.strip()) == 5:
             delimiter = line[4]
         elif line.strip() and not line.startswith("#"):
-            names = _cells(line, delimiter or max(",;\t", key=line.count))
+            delimiter = delimiter or _delimiter(line, header)
+            names = _cells(path, line, delimiter, number - 1)
+            if not header:
+                numbers = tuple(str(k + 1) for k in range(len(names)))
+                return Heading(numbers, delimiter, number - 1), chain([line], rest)
             if len(names) < 2:
                 raise ValueError(
                     f"{path}: row {number}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got "
                     f"'{line.strip()[:60]}'; put # before what stands above the header, and part columns by commas"
                 )
-            return _with_units(names, delimiter or max(",;\t", key=line.count), number, rest)
+            return _with_units(path, names, delimiter, number, rest)
     raise ValueError(f"{path}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got an empty file")
 
 
-def _with_units(names: list[str], delimiter: str, number: int, rest: Iterator[str]) -> tuple[Heading, Iterator[str]]:
+def _delimiter(line: str, header: bool) -> str:
+    """What parts the columns. In a row of numbers a comma beside tabs or semicolons is a decimal one."""
+    if header:
+        return max(",;\t", key=line.count)
+    return next((each for each in "\t;" if each in line), ",")
+
+
+def _with_units(
+    path: Path, names: list[str], delimiter: str, number: int, rest: Iterator[str]
+) -> tuple[Heading, Iterator[str]]:
     below = next(rest, None)
     if below is None:
         return Heading(tuple(names), delimiter, number), rest
-    units = _cells(below, delimiter)
+    units = _cells(path, below, delimiter, number)
     bare = len(units) == len(names) and all(
         not unit or not header_unit(n) for n, unit in zip(names, units, strict=True)
     )
@@ -100,8 +166,8 @@ def _with_units(names: list[str], delimiter: str, number: int, rest: Iterator[st
     return Heading(tuple(names), delimiter, number), chain([below], rest)
 
 
-def _cells(line: str, delimiter: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+def _cells(path: Path, line: str, delimiter: str, above: int) -> list[str]:
+    return [cell.strip() for _, cells in rows_of(path, [line], delimiter, above) for cell in cells]
 
 
 def _is_unit(text: str) -> bool:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Finding:
-    """kind: read, clock, gap, constant, clipped, frozen, quantised, range, unit, missing, on change or unknown.
+    """kind: read, clock, gap, constant, clipped, frozen, quantised, range, unit, missing, on change,
+    undersampled, unknown, stuck or slip.
 
     values: SI, by name.
     """

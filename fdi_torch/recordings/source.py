@@ -19,7 +19,7 @@ class ChannelSource:
     where None). constant: the value (SI, in `unit`) of a channel that the file does not hold; NaN where it was never
     recorded. held: how long an input's value stands where cells after it are empty, s. words: what a cell with that
     text means, in `unit`; NaN: nothing was read. quality: header of the column that tells whether the value counts;
-    good: the words by which it does.
+    good: the words by which it does. plus: headers of further columns whose values are added to it.
     """
 
     column: str | None = None
@@ -29,6 +29,7 @@ class ChannelSource:
     words: Mapping[str, float] = field(default_factory=dict)
     quality: str | None = None
     good: tuple[str, ...] = ()
+    plus: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,16 @@ class TagRows:
 
 @dataclass(frozen=True)
 class FileSource:
-    """A file, what its columns are to channels (time is `t`), and how its rows are laid out (None: one an
-    instant)."""
+    """A file, what its columns are to channels (time is `t`), and how its rows are laid out (None: one an instant).
+
+    header: whether its first row has the columns' names; else they are numbered from 1. sheet: of an Excel workbook.
+    """
 
     path: Path
     columns: Mapping[str, ChannelSource] = field(default_factory=dict)
     tags: TagRows | None = None
+    header: bool = True
+    sheet: str | None = None
 
 
 class Reader(Protocol):

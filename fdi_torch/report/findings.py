@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fdi_torch.effects import effect
+from fdi_torch.gap.verdict_words import cause_words
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import fits
 from fdi_torch.report.material import Material
@@ -35,8 +36,8 @@ class Finding:
 
     @property
     def words(self) -> str:
-        """'leak at T1'."""
-        return f"{self.effect.replace('_', ' ')} at {self.location}"
+        """'leak at T1', 'something unknown at Q1'."""
+        return cause_words({"effect": self.effect, "location": self.location}).replace("_", " ")
 
     @property
     def sized(self) -> str:

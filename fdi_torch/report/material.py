@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import orjson
 
+from fdi_torch.gap.verdict_words import FORMAT_1
 from fdi_torch.logbook import Inspection, LogError, Run, Signals, arrays, inspect_log, own_signals, series
 from fdi_torch.plant.description import PlantDescription
 
@@ -117,6 +118,13 @@ class Material:
             self.trouble.append("/gap/verdict: the answer is no JSON object")
             return {}
         return found
+
+    @property
+    def meaning_of_shares(self) -> str:
+        """What the number beside each place of a gap diagnosis is; in format 1 of its answer it was another one."""
+        if self.answer.get("format") == FORMAT_1:
+            return "share of the gap that a free discrepancy there alone closes"
+        return "probability that something is wrong there"
 
 
 def gather(run: Run, plant: PlantDescription | None = None) -> Material:

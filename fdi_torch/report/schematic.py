@@ -29,7 +29,7 @@ Point = tuple[float, float]
 @dataclass(frozen=True)
 class Overlay:
     """What is drawn on the rig. levels: tank -> m. marks: location -> words on a guilty component. heat: location ->
-    share of the gap, 0 to 1, as strength of colour."""
+    how sure it is that something is wrong there, 0 to 1, as strength of colour."""
 
     levels: Mapping[str, float] = field(default_factory=dict)
     marks: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -240,7 +240,7 @@ class _Drawing:
 
 
 def strength(share: float) -> float:
-    """How strong a share of the gap is coloured: much stronger for what closes all than for what closes most."""
+    """Opacity of a place by how sure it is (0 to 1): much stronger for what is certain than for what is likely."""
     return 0.5 * share**3
 
 

@@ -18,6 +18,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from fdi_torch.disk import replacing
+
 # What was read is grey, what a model says is blue, what deviates is orange, a second model or the truth is green
 # (after Okabe & Ito 2008, darkened until text in them has a contrast of 4.5 on white).
 INK, SOFT, FAINT = "#1f2933", "#67727e", "#d3d9e0"
@@ -105,10 +107,9 @@ def label_lines(axes: Axes, columns: int = 4) -> None:
 
 def save(figure: Figure, path: Path) -> Path:
     """Writes the picture as PNG or SVG, by the path's ending; equal figures give equal files."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
-    with styled():
-        figure.savefig(path, dpi=160, metadata=metadata)
+    with styled(), replacing(path) as new:
+        figure.savefig(new, dpi=160, metadata=metadata)
     return path
 
 

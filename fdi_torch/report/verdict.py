@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.report.findings import Finding, fault_at, findings
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
@@ -15,7 +16,7 @@ KINDS = {
     "monitor": "Monitoring",
     "study": "Study",
     "gap": "Sim-to-real gap",
-    "challenge": "Withheld check",
+    "challenge": "Blind benchmark",
     "rehearsal": "A monitor tried out",
 }
 
@@ -26,7 +27,15 @@ def kind_words(material: Material) -> str:
 
 def headline(material: Material) -> str:
     """The verdict; how the run ended where it has none."""
-    said = (gap_words, lambda m: fault_words(findings(m)), alarm_words, challenge_words, rehearsal_words, study_words)
+    said = (
+        gap_words,
+        monitor_words,
+        lambda m: fault_words(findings(m)),
+        alarm_words,
+        benchmark_words,
+        rehearsal_words,
+        study_words,
+    )
     for words in (of(material) for of in (*said, windows_words)):
         if words:
             return words
@@ -43,16 +52,22 @@ def fault_words(found: list[Finding]) -> str:
 
 
 def gap_words(material: Material) -> str:
-    answer = material.answer
-    causes = _listed([finding.sized for finding in findings(material)])
-    places = _listed([str(place["location"]) for place in answer.get("where", [])[:1]])
-    standing = len(answer.get("ambiguity_set", []))
-    return {
-        "no_gap": "No gap beyond noise and tolerances",
-        "named": f"The gap comes from {causes}",
-        "ambiguous": f"A gap that {standing} explanations share; the best is {causes}",
-        "unknown": f"A gap at {places or 'an unknown place'} that no known effect explains",
-    }.get(str(answer.get("verdict", "")), "")
+    """The terminal's sentence, with the sizes of what is named."""
+    sized = _listed([finding.sized for finding in findings(material)])
+    return verdict_sentence(material.answer, sized).removesuffix(".")
+
+
+def monitor_words(material: Material) -> str:
+    """What is open of each alarm, with every explanation above 5 %, as the last event about it says."""
+    if material.kind != "monitor":
+        return ""
+    last = {m["alarm"]: m for m in material.of("/observer/alarm") if m.get("alarm") and m.get("headline")}
+    states = {m["alarm"]: str(m.get("state", "")) for m in material.of("/observer/alarm") if m.get("alarm")}
+    told = [f"{m['headline']} ({states[n]})" for n, m in last.items() if states[n] not in ("recovered", "retired")]
+    ended = [f"{m['headline']}" for n, m in last.items() if states[n] == "recovered"]
+    parts = [_listed(told)] if told else []
+    parts += [f"recovered: {_listed(ended)}"] if ended else []
+    return "; ".join(parts)
 
 
 def alarm_words(material: Material) -> str:
@@ -66,7 +81,7 @@ def alarm_words(material: Material) -> str:
     return f"{len(alarms)} alarm{'s' if len(alarms) > 1 else ''}, {first}{': ' + channels if channels else ''}"
 
 
-def challenge_words(material: Material) -> str:
+def benchmark_words(material: Material) -> str:
     answers = [m for m in material.of("/study/trial") if m.get("by") == "fdi"] if material.kind == "challenge" else []
     if not answers:
         return ""

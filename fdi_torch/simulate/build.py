@@ -1,4 +1,8 @@
-"""Compiles a source into a library once and keeps it in a cache that all processes of this machine share."""
+"""Compiles a source into a library once and keeps it in a cache that all processes of this user share.
+
+A cached library is code that will run. The folder therefore belongs to this user alone (mode 0700), a library's name
+holds the hash of its content, and owner, mode and hash are checked before it is loaded. One that fails is built anew.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,10 @@ import importlib.util
 import os
 import platform
 import shutil
+import stat
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -19,8 +25,8 @@ _FLAGS = (
 )  # fmt: skip
 
 
-class BuildError(RuntimeError):
-    """The machine has no C++ compiler, or it did not take the source."""
+class BuildError(OSError):
+    """The machine has no C++ compiler, it did not take the source, or there is no folder to build in."""
 
 
 Command = tuple[str, ...]
@@ -47,56 +53,119 @@ def warm_up() -> None:
 
 
 def cache_folder() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "fdi_torch"
+    """$XDG_CACHE_HOME/fdi_torch or ~/.cache/fdi_torch; without a home, a folder of this user among temporary files."""
+    if os.environ.get("XDG_CACHE_HOME"):
+        return Path(os.environ["XDG_CACHE_HOME"]) / "fdi_torch"
+    try:
+        return Path.home() / ".cache" / "fdi_torch"
+    except RuntimeError:
+        return Path(tempfile.gettempdir()) / f"fdi_torch_{os.geteuid()}"
 
 
 def is_cached(source: str) -> bool:
     """Whether the source has been compiled on this machine before."""
     compiler = find_compiler()
-    return compiler is not None and _library(compiler, source).exists()
+    try:
+        return compiler is not None and _cached(_own_folder(), _key(compiler, source)) is not None
+    except BuildError:
+        return False
 
 
-def load_library(source: str) -> ctypes.CDLL:
-    """The compiled source, from the cache if it is there. Raises BuildError."""
+def load_library(source: str, *functions: str) -> ctypes.CDLL:
+    """The compiled source, from the cache if it is there whole. functions: what it has to have. Raises BuildError."""
     compiler = find_compiler()
     if compiler is None:
         raise BuildError(
             "expected a C++ compiler, got none on the PATH; install g++, or fdi_torch[compiler], or set CXX"
         )
-    library = _library(compiler, source)
-    if not library.exists():
-        _compile(compiler, source, library)
-    return ctypes.CDLL(str(library))
+    folder, key = _own_folder(), _key(compiler, source)
+    cached = _cached(folder, key)
+    if cached is not None:
+        try:
+            return _opened(cached, functions)
+        except BuildError:
+            cached.unlink(missing_ok=True)
+    return _opened(_compile(compiler, source, folder, key), functions)
 
 
-def _library(compiler: Command, source: str) -> Path:
+def _key(compiler: Command, source: str) -> str:
     key = "\0".join([source, *_FLAGS, _identity(compiler), _processor()])
-    return cache_folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.so"
+    return hashlib.sha256(key.encode()).hexdigest()[:24]
 
 
-def _compile(compiler: Command, source: str, library: Path) -> None:
+def _own_folder() -> Path:
+    """The cache's folder, made where it is not there. Raises BuildError where others could write to it."""
+    folder = cache_folder()
     try:
-        library.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-            code, built = Path(folder) / "kernel.cpp", Path(folder) / "kernel.so"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+            raise BuildError(
+                f"{folder}: expected a folder of this user's own for compiled plants, got one of another user or a "
+                "link; remove it, or set XDG_CACHE_HOME"
+            )
+        if stat.S_IMODE(found.st_mode) != 0o700:
+            folder.chmod(0o700)
+    except BuildError:
+        raise
+    except OSError as error:
+        raise BuildError(f"expected to write to {folder}, got {error}; set XDG_CACHE_HOME") from error
+    return folder
+
+
+def _cached(folder: Path, key: str) -> Path | None:
+    """A library of that key that is this user's and whole; those that are not are removed."""
+    for library in sorted(folder.glob(f"{key}_*.so")):
+        if _is_sound(library):
+            return library
+        library.unlink(missing_ok=True)
+    return None
+
+
+def _is_sound(library: Path) -> bool:
+    found = library.lstat()
+    own = stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o022
+    return own and library.stem.rpartition("_")[2] == _content_hash(library)
+
+
+def _content_hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _opened(library: Path, functions: Sequence[str]) -> ctypes.CDLL:
+    try:
+        opened = ctypes.CDLL(str(library))
+        for name in functions:
+            getattr(opened, name)
+    except (OSError, AttributeError) as error:
+        raise BuildError(f"expected a library with {', '.join(functions)}, got {error}; try another CXX") from error
+    return opened
+
+
+def _compile(compiler: Command, source: str, folder: Path, key: str) -> Path:
+    """Builds the library, and returns where it lies."""
+    try:
+        with tempfile.TemporaryDirectory(dir=folder) as place:
+            code, built = Path(place) / "kernel.cpp", Path(place) / "kernel.so"
             code.write_text(source, encoding="utf-8")
             done = subprocess.run(
                 [*compiler, *_FLAGS, str(code), "-o", str(built)], capture_output=True, text=True, check=False
             )
-            if done.returncode:
-                raise BuildError(
-                    f"expected {' '.join(compiler)} to compile the plant, got: {done.stderr.strip()[:2000]}"
-                )
-            built.replace(library)  # atomic: other processes see all of it or nothing
+            if not done.returncode:
+                built.chmod(0o700)
+                library = folder / f"{key}_{_content_hash(built)}.so"
+                built.replace(library)  # atomic: other processes see all of it or nothing
+                return library
     except OSError as error:
-        raise BuildError(f"expected to write to {library.parent}, got {error}; set XDG_CACHE_HOME") from error
+        raise BuildError(f"expected to write to {folder}, got {error}; set XDG_CACHE_HOME") from error
+    raise BuildError(f"expected {' '.join(compiler)} to compile the plant, got: {done.stderr.strip()[:2000]}")
 
 
 @lru_cache(maxsize=8)
 def _identity(compiler: Command) -> str:
-    stat = os.stat(compiler[0])
-    return f"{os.path.realpath(compiler[0])} {stat.st_size} {stat.st_mtime_ns}"
+    found = os.stat(compiler[0])
+    return f"{os.path.realpath(compiler[0])} {found.st_size} {found.st_mtime_ns}"
 
 
 @lru_cache(maxsize=1)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from fdi_torch.capacity import expect_room
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.pace import length_scale
@@ -51,8 +52,15 @@ class Linearised:
     defect: Tensor
 
     def lanes(self, which: Tensor) -> Linearised:
-        """Some of the lanes."""
+        """Some of the lanes, by place or by choice."""
         return Linearised(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+
+    def replaced(self, which: Tensor, new: Linearised) -> Linearised:
+        """The same with the lanes at places `which` as `new` has them, in this order."""
+        if len(which) == len(self.defect):
+            return new
+        names = self.__dataclass_fields__
+        return Linearised(*(getattr(self, n).index_copy(0, which, getattr(new, n)) for n in names))
 
 
 class Collocation:
@@ -73,6 +81,9 @@ class Collocation:
 
     def linearise(self, theta: Tensor, levels: Tensor) -> Linearised:
         """theta (L, P), levels (L, K+1, tanks) a guess of the trajectory -> one Newton step further, with slopes."""
+        lanes, nodes, tanks = levels.shape
+        what = f"{lanes} trajectories of {nodes:.3g} steps with {len(self.space)} sensitivities each"
+        expect_room(float(levels.numel()) * (tanks + len(self.space)), what, "choose a longer step")
         path = levels.movedim(1, 2).contiguous()
         middle = 0.5 * (path[..., :-1] + path[..., 1:])
         values = self.network.bind(self.space, theta.unsqueeze(-2))

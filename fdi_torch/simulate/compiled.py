@@ -9,14 +9,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fdi_torch.capacity import expect_room
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.build import is_cached, load_library
 from fdi_torch.simulate.emit import emit
 from fdi_torch.simulate.engine import Readings, expect_problems
 from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
 from fdi_torch.simulate.injection import Injection, expect_injectable
-from fdi_torch.simulate.program import build_program
+from fdi_torch.simulate.program import Program, build_program
 
 _INTEGERS = (
     "lanes", "lanes_per_problem", "steps", "samples", "signal_samples", "mode", "threads", "gain_stride", "out_bytes",
@@ -27,23 +29,39 @@ _ARRAYS = (
     "sample_intervals", "sample_shares", "signal_times", "signal_integral", "signal_slopes", "values", "weights",
     "centres", "memory", "gains", "start", "start_memory", "out", "jacobian",
 )  # fmt: skip
+_OWN_STEPS = ("tolerance", "slope_tolerance", "shortest")
 _MODES = {"levels": 0, "readings": 1, "moments": 2, "linearise": 3, "gram": 4, "observe": 5}
 _REALS = {torch.float64: "double", torch.float32: "float"}
 VALUE_LANES, TANGENT_LANES = 32, 16
+# Up to so many tanks a step is unrolled, which makes it faster and takes a compiler longer.
+MOST_UNROLLED = 6
+
+
+class _Python(ctypes.Structure):
+    """`struct Python` of kernel.hpp."""
+
+    _fields_ = [(name, ctypes.c_void_p) for name in ("release", "take", "signals")]
 
 
 class _Job(ctypes.Structure):
     """`struct Job` of kernel.hpp."""
 
     _fields_ = [(n, ctypes.c_int64) for n in _INTEGERS]
-    _fields_ += [("tolerance", ctypes.c_double)] + [(n, ctypes.c_void_p) for n in _ARRAYS]
+    _fields_ += [(n, ctypes.c_double) for n in _OWN_STEPS] + [(n, ctypes.c_void_p) for n in _ARRAYS]
+    _fields_ += [("python", ctypes.POINTER(_Python))]
+
+
+_API = ("PyEval_SaveThread", "PyEval_RestoreThread", "PyErr_CheckSignals")
+_PYTHON = _Python(*(ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p) for name in _API))
+_RUN = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)  # called with Python's lock, which the loop lets go of while it runs
 
 
 class CompiledEngine:
     """Readings of many parameter vectors at once, by the same fixed-step RK4 as the reference engine.
 
     Compiles at the first use of each kind (values, sensitivities; float64, float32 as theta is) and at most once a
-    machine. Raises BuildError where there is no compiler. Threads: as many as torch is set to.
+    machine. Raises BuildError where there is no compiler, and what a signal's handler raises while a loop runs.
+    Threads: as many as torch is set to.
     """
 
     name = "compiled"
@@ -52,37 +70,44 @@ class CompiledEngine:
         self.network, self.space, self.experiment, self.why = network, space, experiment, why
         shares = experiment.sample_share
         inner = bool(((shares > 0) & (shares < 1)).any())
-        self._form = experiment.tolerance is not None, inner
+        self._form = experiment.own is not None, inner
         self._tables: dict[torch.dtype, dict[str, Tensor]] = {}
 
     def levels(self, theta: Tensor) -> Tensor:
+        expect_no_gradient(self, theta, "levels")
         out = self._empty(theta, len(self.network.description.tanks))
         self._run("levels", theta, out)
         return out
 
     def readings(self, theta: Tensor) -> Tensor:
+        if is_differentiated(theta):
+            return readings_with_gradient(self, theta)
         out = self._empty(theta, self._sensors)
         self._run("readings", theta, out)
         return out
 
     def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        expect_no_gradient(self, theta, "linearise")
         out = self._empty(theta, self._sensors)
         jacobian = self._empty(theta, self._sensors, len(self.space))
         self._run("linearise", theta, out, jacobian)
         return out, jacobian
 
     def moments(self, theta: Tensor, data: Readings) -> Tensor:
+        expect_no_gradient(self, theta, "moments")
         out = theta.new_empty(*theta.shape[:-1], self._sensors, 3)
         self._run("moments", theta, out, data=data)
         return out
 
     def gram(self, theta: Tensor, data: Readings) -> Tensor:
+        expect_no_gradient(self, theta, "gram")
         width = len(self.space) + 3
         out = theta.new_empty(*theta.shape[:-1], self._sensors, width, width)
         self._run("gram", theta, out, data=data)
         return out
 
     def observe(self, theta: Tensor, data: Readings, injection: Injection) -> Tensor:
+        expect_no_gradient(self, theta, "observe")
         memory = self.network.command_memory() + self.network.reading_memory()
         out = self._empty(theta, len(self.network.description.tanks) + memory + self._sensors)
         expect_injectable(self.experiment, injection, memory)
@@ -102,7 +127,11 @@ class CompiledEngine:
         return len(self.network.description.sensors)
 
     def _empty(self, theta: Tensor, *width: int) -> Tensor:
-        return theta.new_empty(*theta.shape[:-1], len(self.experiment.sample_times), *width)
+        shape = (*theta.shape[:-1], len(self.experiment.sample_times), *width)
+        lanes, samples = theta.shape[:-1].numel(), len(self.experiment.sample_times)
+        what = f"{lanes:.3g} simulations of {samples:.3g} samples"
+        expect_room(float(torch.Size(shape).numel()), what, "ask for fewer at once")
+        return theta.new_empty(shape)
 
     def _run(
         self,
@@ -141,7 +170,9 @@ class CompiledEngine:
             "jacobian_bytes": 0 if jacobian is None else jacobian.nbytes,
         }
         pointers = {name: None if a is None else a.data_ptr() for name, a in arrays.items()}
-        run(ctypes.byref(_Job(**sizes, tolerance=self.experiment.tolerance or 0.0, **pointers)))
+        own = self.experiment.own
+        control = {} if own is None else {name: getattr(own, name) for name in _OWN_STEPS}
+        run(ctypes.byref(_Job(**sizes, **control, **pointers, python=ctypes.pointer(_PYTHON))))
 
     def _lanes(self, theta: Tensor) -> Tensor:
         if theta.dtype not in _REALS or theta.device.type != "cpu":
@@ -194,8 +225,13 @@ class CompiledEngine:
 
 @lru_cache(maxsize=128)
 def _source(network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool, inner: bool, real: str) -> str:
-    lanes = TANGENT_LANES if tangent else VALUE_LANES
-    return emit(build_program(network, names, tangent, within), inner, real, lanes)
+    # Lanes with steps of their own wait for each other, so that no more of them go together than a register holds.
+    lanes = "VECTOR" if within else TANGENT_LANES if tangent else VALUE_LANES
+    return emit(_program(network, names, tangent, within), inner, real, lanes)
+
+
+def _program(network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool) -> Program:
+    return build_program(network, names, tangent, within, len(network.description.tanks) <= MOST_UNROLLED)
 
 
 @lru_cache(maxsize=128)
@@ -203,7 +239,6 @@ def _kernel(
     network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool, inner: bool, real: str
 ) -> tuple[Any, Tensor]:
     """The compiled function, and the numbers of the equations that it is handed."""
-    run = load_library(_source(network, names, tangent, within, inner, real)).run
-    run.restype, run.argtypes = None, [ctypes.c_void_p]
-    lifted = build_program(network, names, tangent, within).graph.lifted
+    run = _RUN(("run", load_library(_source(network, names, tangent, within, inner, real), "run")))
+    lifted = _program(network, names, tangent, within).graph.lifted
     return run, torch.tensor(lifted or [0.0], dtype=torch.float64)

@@ -7,9 +7,12 @@ a step for all lanes; the rest stands in loops over the vectors of a block, in t
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from itertools import accumulate
 from pathlib import Path
 
 from fdi_torch.simulate.expression import Varies
+from fdi_torch.simulate.implicit import DIAGONAL, ERROR, NEWTON_ROUNDING, NEWTON_ROUNDS, NEWTON_SHARE, STAGES
+from fdi_torch.simulate.own_steps import LONGER, SHORTER
 from fdi_torch.simulate.program import Program
 from fdi_torch.simulate.section import Output, Place, Row, Section
 from fdi_torch.simulate.statements import Statements, stored
@@ -30,7 +33,7 @@ VECTOR float sinf(float); VECTOR float cosf(float);
 """
 
 
-def emit(program: Program, inner_samples: bool, real: str, lanes: int) -> str:
+def emit(program: Program, inner_samples: bool, real: str, lanes: int | str) -> str:
     """The source. real: 'double' or 'float'. inner_samples: whether samples lie within steps. lanes: in a block."""
     writer = _Writer(program, inner_samples)
     sections = writer.sections()
@@ -39,6 +42,7 @@ def emit(program: Program, inner_samples: bool, real: str, lanes: int) -> str:
         "LANES": lanes,
         "TANGENT": int(program.tangent),
         "WITHIN": int(program.within),
+        "UNROLLED": int(program.unrolled),
         "INNER_SAMPLES": int(inner_samples),
         "COLUMNS": columns,
         "WIDTH": columns + 3,
@@ -62,6 +66,8 @@ def emit(program: Program, inner_samples: bool, real: str, lanes: int) -> str:
         _table("LATE_CHANNEL", [program.channels[i] for i in program.late_actuators]),
         _table("LATE_SENSOR", program.late_sensors),
         _table("SENSOR_TANK", program.sensor_tanks),
+        *([] if program.unrolled else _law_tables(program)),
+        *(_implicit_tables(program) if program.within else []),
         primitives(real),
     ]
     skeleton = _SKELETON.read_text(encoding="utf-8").replace("//@SECTIONS@", sections)
@@ -74,6 +80,50 @@ def primitives(real: str) -> str:
     head = ["#include <cmath>", _VECTORS, f"typedef {real} real;"]
     head += [f"#define REAL_BITS {bits}", f"#define LIBRARY(name) name{suffix}"]
     return "\n".join([*head, _PRIMITIVES.read_text(encoding="utf-8")])
+
+
+def _law_tables(program: Program) -> list[str]:
+    """Which tank's rate has a slope by which level."""
+    return [
+        f"#define SLOPES_BY_LEVEL {len(program.pattern)}",
+        _table("SLOPE_ROW", [row for row, _ in program.pattern]),
+        _table("SLOPE_COLUMN", [column for _, column in program.pattern]),
+    ]
+
+
+def _implicit_tables(program: Program) -> list[str]:
+    """The method of `implicit.py` and the work of its elimination."""
+    work = program.elimination
+    ends = list(accumulate(len(updates) for updates in work.updates))
+    beyond = list(accumulate(len(row) for row in work.above))
+    weights = [(*row, DIAGONAL) for row in STAGES]
+    counts = {"STAGES": len(STAGES), "ENTRIES": len(work.entries), "ELIMINATIONS": len(work.rows)}
+    counts |= {"NEWTON_ROUNDS": NEWTON_ROUNDS}
+    return [
+        *(f"#define {name} {value}" for name, value in counts.items()),
+        f"#define DIAGONAL {DIAGONAL!r}",
+        f"#define NEWTON_SHARE {NEWTON_SHARE!r}",
+        f"#define NEWTON_ROUNDING {NEWTON_ROUNDING!r}",
+        f"#define LONGER {LONGER!r}",
+        f"#define SHORTER {SHORTER!r}",
+        f"static const double STAGE[STAGES][STAGES + 1] = {{{', '.join(_braced(row) for row in weights)}}};",
+        f"static const double STEP_ERROR[STAGES + 1] = {_braced(ERROR)};",
+        _table("GIVEN", work.given),
+        _table("ENTRY_ROW", [row for row, _ in work.entries]),
+        _table("ENTRY_COLUMN", [column for _, column in work.entries]),
+        _table("PIVOT", work.order),
+        _table("MULTIPLIER", [entry for entry, _ in work.rows]),
+        _table("MULTIPLIED", [pivot for _, pivot in work.rows]),
+        _table("CHANGES_UNTIL", ends),
+        _table("CHANGED", [changed for updates in work.updates for changed, _ in updates]),
+        _table("CHANGED_BY", [beyond for updates in work.updates for _, beyond in updates]),
+        _table("BEYOND_UNTIL", beyond),
+        _table("BEYOND", [entry for row in work.above for entry, _ in row]),
+    ]
+
+
+def _braced(values: Sequence[float]) -> str:
+    return f"{{{', '.join(map(repr, values))}}}"
 
 
 def _table(name: str, values: Sequence[int]) -> str:
@@ -94,15 +144,16 @@ class _Writer:
 
     def sections(self) -> str:
         p = self.program
-        first = p.stages[0] if p.within else p.act + p.stages[0]
-        texts = [
-            self._section("settle_commands", [p.settle_commands]),
-            *([self._section("act", [p.act])] if p.within else []),
-            self._section("step", [first, *p.stages[1:-1], p.stages[-1] + p.advance]),
+        texts = [self._section("settle_commands", [p.settle_commands])]
+        if not p.unrolled:
+            texts += [self._section("act", [p.act]), self._section("rates", [p.law])]
+        else:
+            texts.append(self._section("step", [p.act + p.stages[0], *p.stages[1:-1], p.stages[-1] + p.advance]))
+        texts += [
             self._section("settle_readings", [p.settle_readings]),
             self._section("read", [p.read]),
         ]
-        if self.inner_samples:
+        if self.inner_samples and p.unrolled:
             texts.append(self._section("end", [p.end]))
         texts.insert(0, self._prepare())
         return "\n".join(texts)

@@ -67,7 +67,7 @@ class Engine(Protocol):
     why: str  # a plain sentence on why this engine was chosen
 
     def readings(self, theta: Tensor) -> Tensor:
-        """theta (*batch, P) -> readings (*batch, S, C) in SI."""
+        """theta (*batch, P) -> readings (*batch, S, C) in SI; with their gradient where theta requires it."""
         ...
 
     def levels(self, theta: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from fdi_torch.capacity import expect_room
 from fdi_torch.plant.signals import CumulativeSignal
 from fdi_torch.recording import Hold, Recording
 from fdi_torch.simulate.own_steps import OwnSteps
@@ -22,9 +23,8 @@ class Experiment:
     nodes (K+1,) s: the ends of the integration steps, which hit every switch of a held input they can.
     inputs (K, channels): each channel's exact mean over each step. signal: the same for any delayed interval.
     sample_times (S,) s; sample k lies at share `sample_share` (0..1] of step `sample_step` (the first at 0 of step 0).
-    resolution: the time below which roots and rims are drawn smooth, s; the longest step, or with
-    a tolerance the shortest of a lane's own.
-    tolerance: None, or m: each lane divides the steps by itself (`OwnSteps`).
+    resolution: the time below which roots and rims are drawn smooth, s; the longest step, or that of `own`.
+    own: None, or how each lane divides the steps by itself.
     """
 
     nodes: Tensor
@@ -34,7 +34,7 @@ class Experiment:
     sample_step: Tensor
     sample_share: Tensor
     resolution: Tensor
-    tolerance: float | None = None
+    own: OwnSteps | None = None
 
     @property
     def steps(self) -> Tensor:
@@ -90,8 +90,8 @@ def lay_out(recording: Recording, channels: tuple[str, ...], step: float, own: O
         sample_times=time,
         sample_step=index,
         sample_share=share,
-        resolution=steps.max() if own is None else steps.new_tensor(own.shortest),
-        tolerance=None if own is None else own.tolerance,
+        resolution=steps.max() if own is None else steps.new_tensor(own.resolution),
+        own=own,
     )
 
 
@@ -113,7 +113,11 @@ def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float, every: boo
         anchors = time[:1]
     ends = torch.cat([time[:1], anchors, time[-1:]]).unique()
     gaps = torch.diff(ends)
-    counts = torch.ceil(gaps / step - 1e-9).clamp(min=1).to(torch.int64)
+    needed = torch.ceil(gaps / step - 1e-9).clamp(min=1)
+    total = float(needed.sum())
+    what = f"{total:.3g} integration steps of {step:g} s through {span:g} s"
+    expect_room((2 + inputs.shape[1]) * total, what, "choose a longer step")
+    counts = needed.to(torch.int64)
     after = torch.cumsum(counts, 0)
     nodes = torch.empty(int(after[-1]) + 1, dtype=time.dtype, device=time.device)
     nodes[-1] = ends[-1]

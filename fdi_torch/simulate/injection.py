@@ -38,15 +38,17 @@ class Injection:
         }
 
 
-def lay_out_samples(time: Tensor, inputs: Tensor, hold: Hold, step: float, from_first: bool = True) -> Experiment:
+def lay_out_samples(
+    time: Tensor, inputs: Tensor, hold: Hold, step: float, from_first: bool = True, resolution: float | None = None
+) -> Experiment:
     """Every sample at the end of a step no longer than `step` (s), on the clock of `time` (S,); inputs (S, channels).
 
     from_first: whether the first sample is one to be read, or only where the run begins. A single sample is read and
-    nothing else.
+    nothing else. resolution: how sharply roots and rims are drawn, s; by default by the longest of the steps.
     """
     if len(time) == 1:
         time, inputs = torch.cat([time, time + step]), inputs.expand(2, -1)
-        beyond = lay_out_samples(time, inputs, "zero_order", step)
+        beyond = lay_out_samples(time, inputs, "zero_order", step, resolution=resolution)
         return replace(
             beyond, sample_times=time[:1], sample_step=beyond.sample_step[:1], sample_share=beyond.sample_share[:1]
         )
@@ -73,7 +75,7 @@ def lay_out_samples(time: Tensor, inputs: Tensor, hold: Hold, step: float, from_
         sample_times=time if from_first else time[1:],
         sample_step=steps,
         sample_share=shares,
-        resolution=torch.diff(nodes).max(),
+        resolution=torch.diff(nodes).max() if resolution is None else nodes.new_tensor(resolution),
     )
 
 

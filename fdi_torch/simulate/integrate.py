@@ -18,6 +18,7 @@ from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.forward_mode import Everywhere, beside, directions, value_and_slope, with_slope
+from fdi_torch.simulate.gradient import expect_no_gradient
 
 
 class ReferenceEngine:
@@ -43,8 +44,8 @@ class ReferenceEngine:
         why: str = "",
         every_node: bool = True,
     ) -> None:
-        if experiment.tolerance is not None:
-            raise ValueError("expected the same steps for all lanes in the reference engine, got a tolerance")
+        if experiment.own is not None:
+            raise ValueError("expected the same steps for all lanes in the reference engine, got steps of their own")
         self.network, self.space, self.experiment, self.why = network, space, experiment, why
         self.method, self.rtol, self.atol, self.every_node = method, rtol, atol, every_node
 
@@ -69,6 +70,7 @@ class ReferenceEngine:
 
         Levels and their slopes are integrated side by side; torch differentiates each operation of the right-hand side.
         """
+        expect_no_gradient(self, theta, "linearise")
         lanes = theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
         parts = [self._run_with_slopes(p) for p in ([lanes] if self.method == "rk4" else lanes.split(1))]
         readings, slopes = (torch.cat(each, dim=1) for each in zip(*parts, strict=True))
@@ -120,7 +122,7 @@ class ReferenceEngine:
         clocks = [self._clock(begin, step) for begin, step in zip(e.nodes[:-1].unbind(), e.steps.unbind(), strict=True)]
 
         def rates(t: Tensor, state: Tensor) -> Tensor:
-            k = min(max(bisect_right(edges, float(t)) - 1, 0), len(edges) - 2)
+            k = min(max(bisect_right(edges, float(t.detach())) - 1, 0), len(edges) - 2)
             if slopes is None:
                 return self.network(state, held[k], clocks[k], values)
             with self.arithmetic:

@@ -4,7 +4,11 @@
 // lanes and becomes vector instructions. No lane reads another's numbers, and every block is full (a last, short one
 // repeats its last lane), so a trajectory does not depend on its neighbours, their number, or the threads.
 #include <atomic>
+#include <chrono>
+#include <condition_variable>
+#include <limits>
 #include <memory>
+#include <mutex>
 #include <thread>
 #include <vector>
 #if defined(__linux__)
@@ -17,10 +21,17 @@
 enum Mode { LEVELS, READINGS, MOMENTS, LINEARISE, GRAM, OBSERVE };
 enum { MEMORY = COMMAND_MEMORY + READING_MEMORY, STATE = TANKS + MEMORY };
 
+// How the calling thread lets Python's other threads run, and whether a signal's handler has raised an exception.
+struct Python {
+    void *(*release)();
+    void (*take)(void *);
+    int (*signals)();
+};
+
 struct Job {
     int64_t lanes, lanes_per_problem, steps, samples, signal_samples, mode, threads, gain_stride;
     int64_t out_bytes, jacobian_bytes;
-    double tolerance;                                        // of a lane's own step, m
+    double tolerance, slope_tolerance, shortest;             // of a lane's own steps: m, a share, s
     const real *theta, *nominal, *lifted, *resolution;
     const real *starts, *spans, *means;                      // (K), (K), (K, CHANNELS)
     const int64_t *first_sample;                             // (K + 1): step k holds samples first[k] .. first[k + 1]
@@ -29,7 +40,34 @@ struct Job {
     const real *values, *weights, *centres, *memory;         // (problems, S, SENSORS) twice, (problems, SENSORS) twice
     const real *gains, *start, *start_memory;                // (lanes or 1, S, TANKS, SENSORS), (lanes, TANKS), (lanes, MEMORY)
     real *out, *jacobian;
+    const Python *python;
 };
+
+static constexpr std::chrono::milliseconds INTERVAL(50);
+
+// Whether all threads are to stop: the one that was called looks now and then whether it was interrupted.
+struct Watch {
+    explicit Watch(const Python *python) : python(python), state(python->release()) {}
+    ~Watch() { python->take(state); }
+
+    void look() {
+        const auto now = std::chrono::steady_clock::now();
+        if (now < next) return;
+        next = now + INTERVAL;
+        python->take(state);
+        if (python->signals()) stop = true;
+        state = python->release();
+    }
+
+    std::atomic<bool> stop{false};
+    const Python *python;
+    void *state;
+    std::chrono::steady_clock::time_point next = std::chrono::steady_clock::now();
+};
+
+#if !UNROLLED && !WITHIN
+#define STAGES 3  // besides the first
+#endif
 
 using Lane = real[LANES];
 
@@ -44,8 +82,18 @@ struct Block {
     Lane value, weight, centre;
     Lane squares[SENSORS][3];
 #if WITHIN
-    Lane part[2], pace, gone;                                // each lane's own step: its clock, its length, how far it is
-    Lane error[TANKS], stiffness[1];
+    Lane part[2], pace, gone, failed;                        // each lane's own step: its clock, its length, how far it is
+    Lane base[TANKS], move[TANKS], error[TANKS];
+    Lane factor[ENTRIES], inverse[TANKS];                    // of 1 - g df/dh
+#if TANGENT
+    Lane d_error[COLUMNS][TANKS], d_size[COLUMNS];
+#endif
+#endif
+#if !UNROLLED
+    Lane slope[TANKS], by_level[SOME(SLOPES_BY_LEVEL)], stage[STAGES + 1][TANKS];
+#if TANGENT
+    Lane d_slope[COLUMNS][TANKS], d_stage[STAGES + 1][COLUMNS][TANKS];
+#endif
 #endif
 #if TANGENT
     Lane row[SOME(ROWS)][COLUMNS];                           // what theta alone does to each output
@@ -59,7 +107,9 @@ struct Block {
     real uniform[SOME(UNIFORM_CONSTANTS)], span[SOME(SPANS)];    // span: the steps' lengths that `steady` is of
     int64_t end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
     int64_t problem[LANES];
-    bool one_problem;
+    bool one_problem, looks;
+    int turns;
+    Watch *watch;
     const real *nominal, *lifted;
     real resolution;
     std::vector<real> history, d_history;                    // (LATE_SENSORS, S, LANES), (COLUMNS, LATE_SENSORS, S, LANES)
@@ -224,6 +274,11 @@ static void add_gram(const Job &job, Block &b, int64_t s) {
 }
 #endif
 
+static bool is_interrupted(Block &b) {
+    if (b.looks && ++b.turns % 64 == 0) b.watch->look();
+    return b.watch->stop.load(std::memory_order_relaxed);
+}
+
 struct Rows {  // where the lanes of a block stand in the results
     int64_t first, count;
 };
@@ -318,6 +373,12 @@ static void load(const Job &job, Block &b, const Rows &rows) {
     std::memset(b.squares, 0, sizeof b.squares);
 #if WITHIN
     EACH_LANE b.pace[l] = INFINITY;
+#if TANGENT
+    std::memset(b.d_size, 0, sizeof b.d_size);
+#endif
+#endif
+#if !UNROLLED && TANGENT
+    std::memset(b.d_slope, 0, sizeof b.d_slope);
 #endif
 #if TANGENT
     std::memset(b.d_level, 0, sizeof b.d_level);
@@ -352,6 +413,62 @@ static bool has_inner_sample(const Job &job, int64_t k) {
     return false;
 }
 
+#if !UNROLLED
+// The rates at the levels, and how they move, as those of stage s.
+static void take_rates(Block &b, const real *clock, const real *channel, int s) {
+    rates(b, clock, channel);
+    std::memcpy(b.stage[s], b.slope, sizeof b.slope);
+#if TANGENT
+    for (int p = 0; p < COLUMNS; ++p) {
+        std::memcpy(b.d_stage[s][p], b.d_slope[p], sizeof b.d_slope[p]);
+        for (int e = 0; e < SLOPES_BY_LEVEL; ++e)
+            EACH_VECTOR AT(b.d_stage[s][p][SLOPE_ROW[e]]) += AT(b.by_level[e]) * AT(b.d_level[p][SLOPE_COLUMN[e]]);
+    }
+#endif
+}
+#endif
+
+#if !UNROLLED && !WITHIN
+// The levels of stage s of RK4 by the 3/8 rule, or for s = 4 those after the step; in the order of runge_kutta.py.
+static inline void move_on(Lane *level, const Lane *before, Lane *k, int stride, real step, int s) {
+    const real third = real(1.0 / 3.0);
+    for (int i = 0; i < TANKS; ++i) EACH_LANE {
+        const real k1 = k[i][l], k2 = k[stride + i][l], k3 = k[2 * stride + i][l], k4 = k[3 * stride + i][l];
+        const real change = s == 1 ? k1 * step * third
+                            : s == 2 ? (k2 - k1 * third) * step
+                            : s == 3 ? (k1 - k2 + k3) * step
+                                     : (k1 + (k2 + k3) * 3 + k4) * step * real(0.125);
+        level[i][l] = before[i][l] + change;
+    }
+}
+
+static void step(Block &b, const real *clock, const real *channel) {
+    act(b, clock, channel);
+    remember_levels(b);
+    for (int s = 0; s < 4; ++s) {
+        take_rates(b, clock, channel, s);
+        move_on(b.level, b.before, b.stage[0], TANKS, clock[1], s + 1);
+#if TANGENT
+        for (int p = 0; p < COLUMNS; ++p)
+            move_on(b.d_level[p], b.d_before[p], b.d_stage[0][p], TANKS * COLUMNS, clock[1], s + 1);
+#endif
+    }
+}
+
+// The slopes at both ends of the step that was taken, for samples within it.
+static void end(Block &b, const real *clock, const real *channel) {
+    std::memcpy(b.slope_left, b.stage[0], sizeof b.slope_left);
+#if TANGENT
+    std::memcpy(b.d_slope_left, b.d_stage[0], sizeof b.d_slope_left);
+#endif
+    take_rates(b, clock, channel, 0);
+    std::memcpy(b.slope_right, b.stage[0], sizeof b.slope_right);
+#if TANGENT
+    std::memcpy(b.d_slope_right, b.d_stage[0], sizeof b.d_slope_right);
+#endif
+}
+#endif
+
 #if WITHIN
 // As `own_step` in own_steps.py. Returns whether any lane is on its way.
 static bool set_out(Block &b, real start, real span) {
@@ -366,30 +483,164 @@ static bool set_out(Block &b, real start, real span) {
     return open;
 }
 
-static const real STABLE = 2.6, CALM = 2.2;
+// 1 - g df/dh, eliminated. The work is that of `Elimination` in elimination.py.
+static void eliminate(Block &b) {
+    EACH_VECTOR {
+        const Vec g = real(DIAGONAL) * AT(b.part[1]);
+        for (int e = 0; e < ENTRIES; ++e) {
+            const Vec slope = GIVEN[e] < 0 ? Vec{} : Vec(AT(b.by_level[GIVEN[e]]));
+            AT(b.factor[e]) = real(ENTRY_ROW[e] == ENTRY_COLUMN[e]) - g * slope;
+        }
+        for (int n = 0, r = 0, u = 0; n < TANKS; ++n) {
+            const Vec inverse = real(1) / AT(b.factor[PIVOT[n]]);
+            AT(b.inverse[PIVOT[n]]) = inverse;
+            for (; r < ELIMINATIONS && MULTIPLIED[r] == PIVOT[n]; ++r) {
+                const Vec multiplier = AT(b.factor[MULTIPLIER[r]]) * inverse;
+                AT(b.factor[MULTIPLIER[r]]) = multiplier;
+                for (; u < CHANGES_UNTIL[r]; ++u) AT(b.factor[CHANGED[u]]) -= multiplier * AT(b.factor[CHANGED_BY[u]]);
+            }
+        }
+    }
+}
+
+static void solve(Block &b, Lane *x) {
+    EACH_VECTOR {
+        for (int r = 0; r < ELIMINATIONS; ++r)
+            AT(x[ENTRY_ROW[MULTIPLIER[r]]]) -= AT(b.factor[MULTIPLIER[r]]) * AT(x[MULTIPLIED[r]]);
+        for (int n = TANKS - 1; n >= 0; --n) {
+            Vec sum = AT(x[PIVOT[n]]);
+            for (int u = n ? BEYOND_UNTIL[n - 1] : 0; u < BEYOND_UNTIL[n]; ++u)
+                sum -= AT(b.factor[BEYOND[u]]) * AT(x[ENTRY_COLUMN[BEYOND[u]]]);
+            AT(x[PIVOT[n]]) = sum * AT(b.inverse[PIVOT[n]]);
+        }
+    }
+}
+
+// The first `count` slopes, weighted and summed.
+static inline Vec weighted(const double *weight, Lane *first, int stride, int count, int l) {
+    Vec sum = real(weight[0]) * AT(first[0]);
+    for (int j = 1; j < count; ++j) sum += real(weight[j]) * AT(first[j * stride]);
+    return sum;
+}
+
+// By how much a step may be wrong.
+static inline void error_of(Block &b, Lane out, Lane *first, int stride) {
+    EACH_VECTOR AT(out) = FABS(AT(b.part[1]) * weighted(STEP_ERROR, first, stride, STAGES + 1, l));
+}
+
+// Levels at base + g f(levels), each lane by as many rounds of Newton's method as it needs.
+static void solve_stage(const Job &job, Block &b, const real *clock, const real *channel) {
+    const real enough = NEWTON_SHARE * job.tolerance;
+    Lane active, before;
+    EACH_LANE {
+        active[l] = 1;
+        before[l] = 0;
+    }
+    for (int round = 0, open = 1; round < NEWTON_ROUNDS && open; ++round) {
+        rates(b, clock, channel);
+        eliminate(b);
+        for (int i = 0; i < TANKS; ++i) EACH_VECTOR {
+            const Vec g = real(DIAGONAL) * AT(b.part[1]);
+            AT(b.move[i]) = AT(b.base[i]) + g * AT(b.slope[i]) - AT(b.level[i]);
+        }
+        solve(b, b.move);
+        Lane size, rounding;
+        EACH_LANE size[l] = rounding[l] = 0;
+        for (int i = 0; i < TANKS; ++i) EACH_LANE {
+            const real move = std::fabs(b.move[i][l]);
+            size[l] = move > size[l] ? move : size[l];
+            b.level[i][l] += active[l] != 0 ? b.move[i][l] : 0;
+            const real level = NEWTON_ROUNDING * std::numeric_limits<real>::epsilon() * std::fabs(b.level[i][l]);
+            rounding[l] = level > rounding[l] ? level : rounding[l];
+        }
+        open = 0;
+        EACH_LANE {
+            const bool far = size[l] > enough && size[l] > rounding[l] && !(size[l] * size[l] <= enough * before[l]);
+            active[l] = active[l] != 0 && far ? 1 : 0;
+            before[l] = size[l];
+            open += active[l] != 0;
+        }
+    }
+    EACH_LANE b.failed[l] = active[l] != 0 ? 1 : b.failed[l];
+}
+
+// As `ImplicitStep` in implicit.py.
+static void step(const Job &job, Block &b, const real *clock, const real *channel) {
+    EACH_LANE b.failed[l] = 0;
+    take_rates(b, clock, channel, 0);
+    for (int s = 1; s <= STAGES; ++s) {
+        for (int i = 0; i < TANKS; ++i) EACH_VECTOR {
+            const Vec own = AT(b.part[1]);
+            AT(b.base[i]) = AT(b.before[i]) + own * weighted(STAGE[s - 1], &b.stage[0][i], TANKS, s, l);
+            AT(b.level[i]) = AT(b.base[i]) + real(DIAGONAL) * own * AT(b.stage[s - 1][i]);
+        }
+        solve_stage(job, b, clock, channel);
+        for (int i = 0; i < TANKS; ++i) EACH_VECTOR
+            AT(b.stage[s][i]) = (AT(b.level[i]) - AT(b.base[i])) / (real(DIAGONAL) * AT(b.part[1]));
+#if TANGENT
+        rates(b, clock, channel);
+        eliminate(b);
+        for (int p = 0; p < COLUMNS; ++p) {
+            for (int i = 0; i < TANKS; ++i) EACH_VECTOR {
+                const Vec own = AT(b.part[1]);
+                const Vec rest = AT(b.d_before[p][i])
+                                 + own * weighted(STAGE[s - 1], &b.d_stage[0][p][i], TANKS * COLUMNS, s, l);
+                AT(b.base[i]) = rest;
+                AT(b.d_level[p][i]) = rest + real(DIAGONAL) * own * AT(b.d_slope[p][i]);
+            }
+            solve(b, b.d_level[p]);
+            for (int i = 0; i < TANKS; ++i) EACH_VECTOR
+                AT(b.d_stage[s][p][i]) = (AT(b.d_level[p][i]) - AT(b.base[i])) / (real(DIAGONAL) * AT(b.part[1]));
+        }
+#endif
+    }
+    for (int i = 0; i < TANKS; ++i) {
+        error_of(b, b.error[i], &b.stage[0][i], TANKS);
+#if TANGENT
+        for (int p = 0; p < COLUMNS; ++p) error_of(b, b.d_error[p][i], &b.d_stage[0][p][i], TANKS * COLUMNS);
+#endif
+    }
+}
 
 // As `judged` in own_steps.py. Levels of no number are kept as they are.
 static void keep_or_undo(const Job &job, Block &b, real span) {
-    const real tolerance = job.tolerance, shortest = b.resolution;
-    Lane kept;
+    const real tolerance = job.tolerance, shortest = job.shortest;
+    Lane kept, error;
     EACH_LANE {
-        real error = 0;
-        for (int i = 0; i < TANKS; ++i) error = std::fabs(b.error[i][l]) > error ? std::fabs(b.error[i][l]) : error;
-        const real own = b.part[1][l], pace = b.pace[l], stiffness = b.stiffness[0][l];
-        const real ratio = tolerance / (error + tolerance * real(1e-6)), cut = std::sqrt(ratio);
-        const real longer = real(0.9) * std::sqrt(cut), shorter = cut < real(0.05) ? real(0.05) : real(0.9) * cut;
-        const bool is_open = b.gone[l] < span, small = ratio >= 1 && !(own * stiffness > STABLE);
-        const real reach = own * (small ? (longer < 3 ? longer : 3) : shorter), stable = CALM / stiffness;
-        const real wanted = small && own < pace && reach < pace ? pace : reach, next = stable < wanted ? stable : wanted;
+        real largest = 0;
+        for (int i = 0; i < TANKS; ++i) largest = b.error[i][l] > largest ? b.error[i][l] : largest;
+        error[l] = b.failed[l] != 0 ? INFINITY : largest / tolerance;
+    }
+#if TANGENT
+    Lane size[COLUMNS];
+    for (int p = 0; p < COLUMNS; ++p) EACH_LANE {
+        real wrong = 0;
+        size[p][l] = b.d_size[p][l];
+        for (int i = 0; i < TANKS; ++i) {
+            wrong = b.d_error[p][i][l] > wrong ? b.d_error[p][i][l] : wrong;
+            size[p][l] = std::fabs(b.d_level[p][i][l]) > size[p][l] ? std::fabs(b.d_level[p][i][l]) : size[p][l];
+        }
+        const real share = wrong > 0 ? wrong / (real(job.slope_tolerance) * size[p][l]) : 0;
+        error[l] = share > error[l] ? share : error[l];
+    }
+#endif
+    EACH_LANE {
+        const real own = b.part[1][l], pace = b.pace[l];
+        const real cut = std::sqrt(std::sqrt(error[l])) / real(0.9), least = 1 / real(LONGER), most = 1 / real(SHORTER);
+        const real reach = own / (cut < least ? least : cut > most ? most : cut);
+        const bool is_open = b.gone[l] < span, small = !(error[l] > 1);
+        const real next = small && own < pace && reach < pace ? pace : reach;
         kept[l] = is_open && (small || own <= shortest) ? 1 : 0;
         b.pace[l] = !is_open ? pace : next < shortest ? shortest : next;
         b.gone[l] = kept[l] == 0 ? b.gone[l] : span - b.gone[l] <= own ? span : b.gone[l] + own;
     }
     for (int i = 0; i < TANKS; ++i) EACH_LANE b.level[i][l] = kept[l] != 0 ? b.level[i][l] : b.before[i][l];
 #if TANGENT
-    for (int p = 0; p < COLUMNS; ++p)
+    for (int p = 0; p < COLUMNS; ++p) {
+        EACH_LANE b.d_size[p][l] = kept[l] != 0 ? size[p][l] : b.d_size[p][l];
         for (int i = 0; i < TANKS; ++i)
             EACH_LANE b.d_level[p][i][l] = kept[l] != 0 ? b.d_level[p][i][l] : b.d_before[p][i][l];
+    }
 #endif
 }
 
@@ -397,9 +648,9 @@ static void keep_or_undo(const Job &job, Block &b, real span) {
 static void step_within(const Job &job, Block &b, const real *clock, const real *channel) {
     act(b, clock, channel);
     EACH_LANE b.gone[l] = 0;
-    while (set_out(b, clock[0], clock[1])) {
+    while (!is_interrupted(b) && set_out(b, clock[0], clock[1])) {
         remember_levels(b);
-        step(b, clock, channel);
+        step(job, b, clock, channel);
         keep_or_undo(job, b, clock[1]);
     }
 }
@@ -410,6 +661,7 @@ static void run_block(const Job &job, Block &b, const Rows &rows) {
     prepare(b, nullptr, nullptr);
     begin_with(b.level, job.start, TANKS, 0, TANKS, rows);
     for (int64_t k = 0; k < job.steps; ++k) {
+        if (is_interrupted(b)) return;
         const real clock[2] = {job.starts[k], job.spans[k]};
         const real *channel = job.means + k * CHANNELS;
         int64_t s = job.first_sample[k];
@@ -443,16 +695,18 @@ static void run_block(const Job &job, Block &b, const Rows &rows) {
     finish(job, b, rows);
 }
 
-static void work(const Job &job, std::atomic<int64_t> &next) {
+static void work(const Job &job, std::atomic<int64_t> &next, Watch &watch, bool calls) {
     std::unique_ptr<Block> b(new Block());
     b->nominal = job.nominal;
     b->lifted = job.lifted;
     b->resolution = *job.resolution;
+    b->watch = &watch;
+    b->looks = calls;
     b->history.resize(LATE_SENSORS * job.samples * LANES);
 #if TANGENT
     b->d_history.resize(COLUMNS * LATE_SENSORS * job.samples * LANES);
 #endif
-    for (int64_t first; (first = LANES * next++) < job.lanes;)
+    for (int64_t first; !watch.stop && (first = LANES * next++) < job.lanes;)
         run_block(job, *b, {first, job.lanes - first < LANES ? job.lanes - first : LANES});
 }
 
@@ -465,14 +719,29 @@ static void prefer_large_pages(void *from, int64_t bytes) {
 #endif
 }
 
+// Called with Python's lock held. Where it was interrupted an exception is set, and the results are of no use.
 extern "C" void run(const Job *job) {
+    Watch watch(job->python);
     prefer_large_pages(job->out, job->out_bytes);
     prefer_large_pages(job->jacobian, job->jacobian_bytes);
     std::atomic<int64_t> next(0);
     const int64_t blocks = (job->lanes + LANES - 1) / LANES;
     const int64_t threads = job->threads < blocks ? job->threads : blocks;
+    std::mutex mutex;
+    std::condition_variable ended;
+    int64_t at_work = threads - 1;
     std::vector<std::thread> others;
-    for (int64_t i = 1; i < threads; ++i) others.emplace_back([&] { work(*job, next); });
-    work(*job, next);
+    for (int64_t i = 1; i < threads; ++i)
+        others.emplace_back([&] {
+            work(*job, next, watch, false);
+            std::lock_guard<std::mutex> lock(mutex);
+            --at_work;
+            ended.notify_one();
+        });
+    work(*job, next, watch, true);
+    {
+        std::unique_lock<std::mutex> lock(mutex);
+        while (!ended.wait_for(lock, INTERVAL, [&] { return at_work <= 0; })) watch.look();
+    }
     for (auto &other : others) other.join();
 }

@@ -13,31 +13,49 @@ from torch import Tensor
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import length_scale, time_scale
 
-# RK4 is stable on the real axis down to -2.785; a step is kept below the one and chosen for the other.
-STABLE, CALM = 2.6, 2.2
 # A step over a root's kink is wrong by step^1.5, and so is a root drawn smooth for that step: by 1 m for one so long,
 # in units of the plant's time and length scales. From the largest error of fixed steps over random faults of three
 # tanks.
 STEP_FOR_ONE_METRE = 2000.0
+# The steps that cross the kink of a root, as a share of the one that it is drawn smooth for, are about as exact.
+CROSSING = 0.25
+# Errors of that many steps add up before the tanks have forgotten them.
+ADDED_UP = 100.0
+LONGER, SHORTER = 3.0, 0.1  # how much the next step may differ from the one before
 
 
 @dataclass(frozen=True)
 class OwnSteps:
     """How exactly lanes divide the time by themselves.
 
-    tolerance, m: of a level's error over a step; at 1e-6 m and less, over random faults of three tanks, the largest
-    error of a whole simulation was 1.5 to 2 times this. shortest, s: the shortest step that a lane may take.
+    tolerance, m: of a level's error over a step. resolution, s: roots and rims are drawn smooth for so long a step.
+    shortest, s: the shortest step that a lane may take.
+    slope_tolerance: of the error of a level's slope by a parameter over a step, as a share of that parameter's largest
+    slope so far. A root's kink costs levels step^1.5 and slopes step^0.5, so that it is the cube root of the levels'.
     """
 
     tolerance: float
+    resolution: float
     shortest: float
+    slope_tolerance: float
 
     @classmethod
-    def within(cls, tolerance: float, plant: PlantDescription) -> OwnSteps:
-        """Steps for a tolerance (m). Raises ValueError unless it is positive."""
-        if not tolerance > 0:
-            raise ValueError(f"expected a positive tolerance, got {tolerance} m")
-        return cls(tolerance, _step_of_unit_error(plant) * (tolerance / length_scale(plant)) ** (2.0 / 3.0))
+    def within(cls, tolerance: float, plant: PlantDescription, resolution: float | None = None) -> OwnSteps:
+        """Steps for a tolerance (m) of the whole simulation. Roots are as sharp as that asks for, or `resolution` (s).
+
+        Raises ValueError where a step's share of the tolerance is not above the rounding of the plant's levels.
+        """
+        scale, rounding = length_scale(plant), ADDED_UP * torch.finfo(torch.float64).eps
+        if not tolerance > rounding * scale:
+            raise ValueError(
+                f"expected a tolerance above the rounding of levels ({rounding * scale:.2g} m after {ADDED_UP:g} "
+                f"steps), got {tolerance:.2g} m; ask for steps of "
+                f"{_step_of_unit_error(plant) * rounding ** (2.0 / 3.0):.2g} s or longer"
+            )
+        share = tolerance / scale
+        as_sharp = _step_of_unit_error(plant) * share ** (2.0 / 3.0)
+        slope_tolerance = (share / ADDED_UP) ** (1.0 / 3.0)
+        return cls(tolerance / ADDED_UP, resolution or as_sharp, CROSSING * as_sharp, slope_tolerance)
 
     @classmethod
     def like(cls, step: float, plant: PlantDescription) -> OwnSteps:
@@ -60,33 +78,22 @@ def own_step(gone: Tensor, pace: Tensor, span: Tensor) -> Tensor:
 
 
 def judged(
-    own: Tensor,
-    error: Tensor,
-    stiffness: Tensor,
-    gone: Tensor,
-    pace: Tensor,
-    span: Tensor,
-    tolerance: float,
-    shortest: Tensor,
+    own: Tensor, error: Tensor, gone: Tensor, pace: Tensor, span: Tensor, shortest: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Which lanes keep the step they took (L,), how far they have come and their pace from here on, s.
 
-    A step is kept where its error (m) is small and it is stable beside the stiffness (1/s), or where it is as short as
-    they come. The next one's length follows from the error, which grows with step^3, or at a root's kink with
-    step^1.5, and from the stiffness: the error alone would let steps waver about the limit of stability, where levels
-    at rest stay as they are and their slopes grow.
+    error: as a share of what is tolerated; infinite where a step has no solution. A step is kept where it is at most 1,
+    or where the step is as short as they come. The next one's length follows from the error, which grows with step^4.
+    An error of no number says nothing: levels of no number are kept as they are.
     """
-    ratio = tolerance / (torch.nan_to_num(error, nan=0.0) + tolerance * 1e-6)
-    cut = torch.sqrt(ratio)
-    longer, shorter = torch.clamp(0.9 * torch.sqrt(cut), max=3.0), torch.where(cut < 0.05, 0.05, 0.9 * cut)
-    is_open, small = gone < span, (ratio >= 1.0) & ~(own * stiffness > STABLE)
-    reach, stable = own * torch.where(small, longer, shorter), CALM / stiffness
-    wanted = torch.where(small & (own < pace) & (reach < pace), pace, reach)
-    following = torch.where(stable < wanted, stable, wanted)
+    cut = torch.sqrt(torch.sqrt(torch.nan_to_num(error, nan=0.0))) / 0.9
+    reach = own / torch.clamp(cut, 1.0 / LONGER, 1.0 / SHORTER)
+    is_open, small = gone < span, ~(error > 1.0)
+    following = torch.where(small & (own < pace) & (reach < pace), pace, reach)
     kept = is_open & (small | (own <= shortest))
     after = torch.where(span - gone <= own, span, gone + own)
     return (
         kept,
         torch.where(kept, after, gone),
-        torch.where(is_open, torch.where(following < shortest, shortest, following), pace),
+        torch.where(is_open, torch.clamp(following, min=shortest), pace),
     )

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
+from fdi_torch.simulate.elimination import Elimination, eliminate
 from fdi_torch.simulate.expression import Graph, Varies
 from fdi_torch.simulate.runge_kutta import Stages, moved
 from fdi_torch.simulate.section import Output, Place, Row, Section
@@ -25,16 +26,19 @@ class Program:
     """The sections; each is a tuple of outputs.
 
     prepare: level (at t = 0), command_delay, reading_delay. settle_commands, settle_readings: the memories at first.
-    within: each lane takes steps of its own within those of the grid; `stages` and `advance` are of such a step, with
-    an `error` for each level and the `stiffness` at its start, after `act`.
     act: action, next_command_memory. stages: stage k's levels and then its rates ('slope'), four of each in turn.
     advance: level. end: slope at the end of the step. read: reading, next_reading_memory.
+    within: each lane takes steps of its own within those of the grid, see `implicit.py`.
+    unrolled: whether there are stages, advance and end, in which what a step has in common is worked out once. If not,
+    there is the law, written once however many stages a step has: the rates ('slope') with what theta and the actions
+    alone do to them, and their slopes by the levels ('by_level'), an output for each (tank, tank) of `pattern`.
     late_actuators, late_sensors: index of those that can be late, in the order of the delays.
     """
 
     graph: Graph
     tangent: bool
     within: bool
+    unrolled: bool
     columns: int
     tanks: int
     actuators: int
@@ -51,24 +55,38 @@ class Program:
     stages: tuple[Section, ...]
     advance: Section
     end: Section
+    law: Section
+    pattern: tuple[tuple[int, int], ...]
     settle_readings: Section
     read: Section
 
     @cached_property
     def step(self) -> Section:
-        """All that a step of the grid computes, in order; one within it, without what the actuators do."""
-        return (() if self.within else self.act) + tuple(o for stage in self.stages for o in stage) + self.advance
+        """All that a step of the grid computes, in order, where all lanes take the same one."""
+        return self.act + tuple(o for stage in self.stages for o in stage) + self.advance
+
+    @cached_property
+    def elimination(self) -> Elimination:
+        """How to solve for the levels of an implicit step."""
+        return eliminate(self.tanks, self.pattern)
 
 
 @lru_cache(maxsize=64)
-def build_program(network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool = False) -> Program:
-    """The program of a plant whose parameters `names` are columns of theta; `tangent`: with its Jacobian."""
-    return _Builder(network, names, tangent, within).program()
+def build_program(
+    network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool = False, unrolled: bool = True
+) -> Program:
+    """The program of a plant whose parameters `names` are columns of theta; `tangent`: with its Jacobian.
+
+    Steps of the lanes' own are never unrolled.
+    """
+    return _Builder(network, names, tangent, within, unrolled and not within).program()
 
 
 class _Builder:
-    def __init__(self, network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool) -> None:
-        self.network, self.tangent, self.within = network, tangent, within
+    def __init__(
+        self, network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool, unrolled: bool
+    ) -> None:
+        self.network, self.tangent, self.within, self.unrolled = network, tangent, within, unrolled
         self.graph = Graph()
         self.tracer = Tracer(self.graph)
         self.theta = [self.graph.input("theta", i, Varies.LANE) for i in range(len(names))]
@@ -93,12 +111,14 @@ class _Builder:
         network = self.network
         prepare, late_actuators, late_sensors = self._prepare()
         settle_commands, act = self._commands(late_actuators)
-        stages, advance, end = self._rates(act)
+        stages, advance, end = self._rates(act) if self.unrolled else ((), (), ())
+        law, pattern = ((), ()) if self.unrolled else self._law(act)
         settle_readings, read = self._readings()
         return Program(
             graph=self.graph,
             tangent=self.tangent,
             within=self.within,
+            unrolled=self.unrolled,
             columns=len(self.theta),
             tanks=len(network.description.tanks),
             actuators=len(network.actuators()),
@@ -115,6 +135,8 @@ class _Builder:
             stages=stages,
             advance=advance,
             end=end,
+            law=law,
+            pattern=pattern,
             settle_readings=settle_readings,
             read=read,
         )
@@ -156,26 +178,37 @@ class _Builder:
 
     def _rates(self, act: Section) -> tuple[tuple[Section, ...], Section, Section]:
         """The stages of a step, the levels after it, and the slopes there."""
-        graph, network, tensor = self.graph, self.network, self.tracer.tensor
+        graph = self.graph
         actions = [o.node for o in act if o.place[0] == "action"]
         held = [
-            graph.input("action", a, Varies.BOTH if self.within or graph.nodes[n].varies & Varies.LANE else Varies.STEP)
+            graph.input("action", a, Varies.BOTH if graph.nodes[n].varies & Varies.LANE else Varies.STEP)
             for a, n in enumerate(actions)
         ]
-        clock = self._own_clock() if self.within else self.clock
-        levels = self._inputs("level", len(network.description.tanks))
-        with self.tracer:
-            rates = network.rates([tensor(h) for h in levels], [tensor(a) for a in held], clock, self.values)
+        levels = self._inputs("level", len(self.network.description.tanks))
         moving: dict[int, Place] = {n: ("level", i) for i, n in enumerate(levels)}
         moving |= {held[o.place[1]]: o.place for o in act if o.place[0] == "action" and o.row}
-        law = self._outputs("slope_right", [self.tracer.node(r) for r in rates], moving)
-        if self.within:
-            own = Stages(graph, law, levels, self.tracer.node(clock.step), {})
-            stages, advance = own.write()
-            return (stages[0] + own.stiffness(), *stages[1:]), advance + own.errors(), ()
+        law = self._outputs("slope_right", self._network_rates(levels, held, self.clock), moving)
         stages, advance = Stages(graph, law, levels, self.span[1], dict(zip(held, actions, strict=True))).write()
         uniform = {h: a for h, a in zip(held, actions, strict=True) if not graph.nodes[a].varies & Varies.LANE}
         return stages, advance, tuple(moved(graph, law, uniform, {}))
+
+    def _law(self, act: Section) -> tuple[Section, tuple[tuple[int, int], ...]]:
+        """The rates, their slopes by the levels, and which tank's rate has one by which level."""
+        levels = self._inputs("level", len(self.network.description.tanks))
+        held = self._inputs("action", len(self.network.actuators()))
+        rates = self._network_rates(levels, held, self._own_clock() if self.within else self.clock)
+        moving = {held[o.place[1]]: o.place for o in act if o.place[0] == "action" and o.row}
+        tank = {n: i for i, n in enumerate(levels)}
+        slopes = self.graph.partials(rates, levels) if self.within or self.tangent else []
+        by_level = {(i, tank[n]): slope for i, row in enumerate(slopes) for n, slope in row.items()}
+        jacobian = [Output(("by_level", e), slope) for e, slope in enumerate(by_level.values())]
+        return (*self._outputs("slope", rates, moving), *jacobian), tuple(by_level)
+
+    def _network_rates(self, levels: list[int], held: list[int], clock: Clock) -> list[int]:
+        tensor = self.tracer.tensor
+        with self.tracer:
+            rates = self.network.rates([tensor(h) for h in levels], [tensor(a) for a in held], clock, self.values)
+        return [self.tracer.node(r) for r in rates]
 
     def _own_clock(self) -> Clock:
         """That of a lane's own step."""

@@ -1,5 +1,5 @@
 // Linear recurrences in time, lane by lane: time is the last dimension in memory, and a few of its steps are turned
-// into a block that lies close together, worked through, and turned back.
+// into a block that lies close together, worked through, and turned back. Compiled for one number of TANKS.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -20,6 +20,22 @@ inline void scatter(const double* block, int64_t count, int64_t stride, int64_t 
     for (int64_t r = 0; r < count; ++r) {
         double* row = rows + r * stride + first;
         for (int64_t t = 0; t < length; ++t) row[t] = block[t * count + r];
+    }
+}
+
+// to (N, W) += A from, of `from` the rows that are not all zero.
+template <int N, int W>
+inline void add_product(const double* __restrict a, const double* __restrict from, const bool* __restrict on,
+                        double* __restrict to) {
+    for (int i = 0; i < N; ++i) {
+        double total[W];
+        for (int c = 0; c < W; ++c) total[c] = to[i * W + c];
+        for (int j = 0; j < N; ++j) {
+            if (!on[j]) continue;
+            const double value = a[i * N + j];
+            for (int c = 0; c < W; ++c) total[c] += value * from[j * W + c];
+        }
+        for (int c = 0; c < W; ++c) to[i * W + c] = total[c];
     }
 }
 
@@ -62,26 +78,68 @@ inline void invert(Steps* m, Steps* inverse) {
     }
 }
 
-// x_{k+1} = A_k x_k + b_k: a (lanes, N, N, steps), b (lanes, N, columns, steps), first (lanes, N, columns)
-// -> x (lanes, N, columns, steps + 1).
+// A linear recurrence of one lane, as in `scan`, for W columns from `from` on, of which the last may not be there.
+template <int N, int W>
+void scan_columns(int64_t steps, int64_t columns, int64_t from, const double* a, const double* gain, const double* b,
+                  const double* first, double* x) {
+    const int64_t width = std::min<int64_t>(W, columns - from);
+    std::vector<double> along(2 * BLOCK * N * N), forcing(BLOCK * N * W), path((BLOCK + 1) * N * W);
+    double* gains = along.data() + BLOCK * N * N;
+    bool all[N], on[N];
+    std::fill(all, all + N, true);
+    for (int i = 0; i < N; ++i)
+        for (int64_t c = 0; c < width; ++c) {
+            const int64_t row = i * columns + from + c;
+            x[row * (steps + 1)] = path[i * W + c] = first[row];
+        }
+    for (int64_t k = 0; k < steps; k += BLOCK) {
+        const int64_t length = std::min(BLOCK, steps - k);
+        gather(a, N * N, steps, k, length, along.data());
+        if (gain) gather(gain, N * N, steps, k, length, gains);
+        for (int i = 0; i < N; ++i) {
+            on[i] = false;
+            for (int64_t c = 0; c < width; ++c) {
+                const double* row = b + (i * columns + from + c) * steps + k;
+                for (int64_t t = 0; t < length; ++t) {
+                    forcing[(t * N + i) * W + c] = row[t];
+                    on[i] |= row[t] != 0.0;
+                }
+            }
+        }
+        for (int64_t t = 0; t < length; ++t) {
+            double *now = &path[t * N * W], *next = now + N * W;
+            const double* pushed = &forcing[t * N * W];
+            if (gain) {
+                std::fill(next, next + N * W, 0.0);
+                add_product<N, W>(gains + t * N * N, pushed, on, next);
+            } else {
+                std::copy(pushed, pushed + N * W, next);
+            }
+            add_product<N, W>(&along[t * N * N], now, all, next);
+        }
+        for (int i = 0; i < N; ++i)
+            for (int64_t c = 0; c < width; ++c) {
+                double* row = x + (i * columns + from + c) * (steps + 1) + k + 1;
+                for (int64_t t = 0; t < length; ++t) row[t] = path[((t + 1) * N + i) * W + c];
+            }
+        std::copy(&path[length * N * W], &path[(length + 1) * N * W], path.begin());
+    }
+}
+
+// x_{k+1} = A_k x_k + G_k b_k: a, gain (lanes, N, N, steps), gain null for the unit matrix; b (lanes, N, columns, steps),
+// first (lanes, N, columns) -> x (lanes, N, columns, steps + 1).
 template <int N>
-void scan(int64_t lanes, int64_t steps, int64_t columns, const double* a, const double* b, const double* first,
-          double* x) {
-    const int64_t wide = N * columns;
-    std::vector<double> forcing(BLOCK * wide), path((BLOCK + 1) * wide), along(BLOCK * N * N);
+void scan(int64_t lanes, int64_t steps, int64_t columns, const double* a, const double* gain, const double* b,
+          const double* first, double* x) {
     for (int64_t lane = 0; lane < lanes; ++lane) {
-        const double *own_a = a + lane * N * N * steps, *own_b = b + lane * wide * steps;
-        double* own_x = x + lane * wide * (steps + 1);
-        std::copy(first + lane * wide, first + (lane + 1) * wide, path.begin());
-        scatter(path.data(), wide, steps + 1, 0, 1, own_x);
-        for (int64_t k = 0; k < steps; k += BLOCK) {
-            const int64_t length = std::min(BLOCK, steps - k);
-            gather(own_a, N * N, steps, k, length, along.data());
-            gather(own_b, wide, steps, k, length, forcing.data());
-            for (int64_t t = 0; t < length; ++t)
-                step<N>(&along[t * N * N], &path[t * wide], &forcing[t * wide], columns, &path[(t + 1) * wide]);
-            scatter(&path[wide], wide, steps + 1, k + 1, length, own_x);
-            std::copy(&path[length * wide], &path[length * wide] + wide, path.begin());
+        const int64_t square = lane * N * N * steps, wide = lane * N * columns;
+        const double *own_a = a + square, *own_gain = gain ? gain + square : nullptr, *own_b = b + wide * steps;
+        double* own_x = x + wide * (steps + 1);
+        for (int64_t from = 0; from < columns;) {
+            const int64_t left = columns - from;
+            auto* run = left > 4 ? scan_columns<N, 16> : left > 1 ? scan_columns<N, 4> : scan_columns<N, 1>;
+            run(steps, columns, from, own_a, own_gain, own_b, first + wide, own_x);
+            from += left > 4 ? 16 : left > 1 ? 4 : 1;
         }
     }
 }
@@ -174,23 +232,15 @@ void midpoint(int64_t lanes, int64_t steps, int64_t columns, const double* span,
 }
 }  // namespace
 
-#define EACH(DO) DO(1) DO(2) DO(3) DO(4) DO(5) DO(6)
-#define SCAN(N) \
-    case N: scan<N>(lanes, steps, columns, a, b, first, x); break;
-#define MIDPOINT(N) \
-    case N: \
-        midpoint<N>(lanes, steps, columns, span, path, rates, by_level, by_theta, start, start_slopes, levels, slopes, \
-                    transition, gain, defect); \
-        break;
-
-extern "C" void scan_in_time(int64_t n, int64_t lanes, int64_t steps, int64_t columns, const double* a,
+extern "C" void scan_in_time(int64_t lanes, int64_t steps, int64_t columns, const double* a, const double* gain,
                              const double* b, const double* first, double* x) {
-    switch (n) { EACH(SCAN) }
+    scan<TANKS>(lanes, steps, columns, a, gain, b, first, x);
 }
 
-extern "C" void midpoint_step(int64_t n, int64_t lanes, int64_t steps, int64_t columns, const double* span,
-                              const double* path, const double* rates, const double* by_level, const double* by_theta,
-                              const double* start, const double* start_slopes, double* levels, double* slopes,
-                              double* transition, double* gain, double* defect) {
-    switch (n) { EACH(MIDPOINT) }
+extern "C" void midpoint_step(int64_t lanes, int64_t steps, int64_t columns, const double* span, const double* path,
+                              const double* rates, const double* by_level, const double* by_theta, const double* start,
+                              const double* start_slopes, double* levels, double* slopes, double* transition,
+                              double* gain, double* defect) {
+    midpoint<TANKS>(lanes, steps, columns, span, path, rates, by_level, by_theta, start, start_slopes, levels, slopes,
+                    transition, gain, defect);
 }

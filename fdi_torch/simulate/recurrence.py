@@ -1,12 +1,14 @@
 """The recurrences of `scan.py` and `midpoint.py` as compiled loops: one walk through time instead of many operations.
 
-Compiled at the first use and once a machine, for any plant of up to MOST tanks. None where there is no compiler, or
-for tensors that loops over numbers cannot take: torch does the same then, many times slower.
+Compiled at the first use and once a machine for each number of tanks, up to MOST: the loops keep matrices of all steps
+of a block on the stack. None where there is no compiler, or for tensors that loops over numbers cannot take: torch does
+the same then, many times slower.
 """
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,17 +17,17 @@ from torch import Tensor
 
 from fdi_torch.simulate.build import BuildError, load_library
 
-MOST = 6
+MOST = 32
 _SOURCE = Path(__file__).with_name("recurrence.hpp")
 
 
-def scanned(a: Tensor, b: Tensor, first: Tensor) -> Tensor | None:
-    """x_{k+1} = A_k x_k + b_k: a (L, n, n, K), b (L, n, m, K), first (L, n, m) -> x (L, n, m, K+1)."""
-    if not _plain(a, b, first):
+def scanned(a: Tensor, b: Tensor, first: Tensor, gain: Tensor | None = None) -> Tensor | None:
+    """x_{k+1} = A_k x_k + G_k b_k: a and gain (L, n, n, K), b (L, n, m, K), first (L, n, m) -> x (L, n, m, K+1)."""
+    if not _plain(a, b, first, *(() if gain is None else (gain,))):
         return None
     lanes, n, columns, steps = b.shape
     x = b.new_empty(lanes, n, columns, steps + 1)
-    return x if _run("scan_in_time", b.shape, [a, b, first], [x]) else None
+    return x if _run("scan_in_time", b.shape, [a, gain, b, first], [x]) else None
 
 
 def midpoint_step(
@@ -46,21 +48,22 @@ def _plain(*given: Tensor) -> bool:
     return not any(t.requires_grad or t.dtype is not torch.float64 or t.device.type != "cpu" for t in given)
 
 
-def _run(name: str, shape: torch.Size, given: list[Tensor], made: list[Tensor]) -> bool:
+def _run(name: str, shape: torch.Size, given: Sequence[Tensor | None], made: Sequence[Tensor]) -> bool:
     """Runs one of the loops. shape: (L, n, columns, K). given: is read as it lies there; made: is written."""
     lanes, n, columns, steps = shape
-    library = _library() if n <= MOST else None
+    library = _library(n) if n <= MOST else None
     if library is None:
         return False
-    held = [t.contiguous() for t in given]
-    pointers = [ctypes.c_void_p(t.data_ptr()) for t in (*held, *made)]
-    getattr(library, name)(*(ctypes.c_int64(x) for x in (n, lanes, steps, columns)), *pointers)
+    held = [None if t is None else t.contiguous() for t in given]
+    pointers = [ctypes.c_void_p(None if t is None else t.data_ptr()) for t in (*held, *made)]
+    getattr(library, name)(*(ctypes.c_int64(x) for x in (lanes, steps, columns)), *pointers)
     return True
 
 
-@lru_cache(maxsize=1)
-def _library() -> ctypes.CDLL | None:
+@lru_cache
+def _library(tanks: int) -> ctypes.CDLL | None:
     try:
-        return load_library(_SOURCE.read_text(encoding="utf-8"))
+        source = f"#define TANKS {tanks}\n" + _SOURCE.read_text(encoding="utf-8")
+        return load_library(source, "scan_in_time", "midpoint_step")
     except BuildError:
         return None

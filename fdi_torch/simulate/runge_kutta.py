@@ -22,7 +22,6 @@ class Stages:
     ) -> None:
         self.graph, self.law, self.levels, self.step, self.replaced = graph, law, levels, step, replaced
         self.stages: list[Section] = []
-        self.rates: list[list[int]] = []
         self.tangent = any(o.row for o in law)
         self.third, self.eighth = graph.number(1.0 / 3.0), graph.literal(0.125)
 
@@ -46,27 +45,6 @@ class Stages:
         advance = tuple(Output(("next_level", i), n, self._follows(i, parts)) for i, n in enumerate(after))
         return tuple(self.stages), advance
 
-    def errors(self) -> Section:
-        """By how much a step of second order with the same rates, (k2 + k3) / 2, ends elsewhere, m: of order step^3.
-
-        More than this step is wrong by; where a root has a kink within the step, as much as it is wrong by.
-        """
-        k1, k2, k3, k4 = self.rates
-        bend = self._each("sub", self._each("add", k1, k4), self._each("add", k2, k3))
-        eighth_step = self.graph.apply("mul", self.step, self.eighth)
-        return tuple(Output(("error", i), n) for i, n in enumerate(self._each("mul", bend, [eighth_step] * len(bend))))
-
-    def stiffness(self) -> Section:
-        """The fastest rate at which the levels could come to rest where the step begins, 1/s.
-
-        Not more than the largest sum of the sizes of a row of the Jacobian (Gershgorin 1931).
-        """
-        graph, fastest = self.graph, self.graph.literal(0.0)
-        for slopes in graph.partials([o.node for o in self.law], self.levels):
-            row = graph.total(graph.apply("abs", slope) for slope in slopes.values())
-            fastest = fastest if row is None else graph.apply("maximum", fastest, row)
-        return (Output(("stiffness", 0), fastest),)
-
     def _slopes(self, at: list[int], slopes: Slopes) -> list[int]:
         """The rates at some levels, which follow from earlier slopes."""
         stage = len(self.stages)
@@ -76,8 +54,7 @@ class Stages:
         rates = [Output((f"slope{stage + 1}", o.place[1]), o.node, o.row) for o in found]
         self.graph.closed |= {o.node for o in rates}
         self.stages.append((*reached, *rates))
-        self.rates.append([o.node for o in rates])
-        return self.rates[-1]
+        return [o.node for o in rates]
 
     def _follows(self, i: int, slopes: Slopes) -> Row:
         """How a level within the step changes: as the one at its start, and by factor x earlier slopes."""

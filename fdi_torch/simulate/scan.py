@@ -19,16 +19,20 @@ def linear_scan(transition: Tensor, forcing: Tensor, first: Tensor) -> Tensor:
     return scan_in_time(a, b, first).permute(0, 3, 1, 2)
 
 
-def scan_in_time(a: Tensor, b: Tensor, first: Tensor) -> Tensor:
+def scan_in_time(a: Tensor, b: Tensor, first: Tensor, gain: Tensor | None = None) -> Tensor:
     """The same with time last: a (L, n, n, K), b (L, n, m, K), first (L, n, m) -> (L, n, m, K+1).
+
+    gain: G (L, n, n, K), where it is G_k b_k that is added.
 
     All blocks run side by side from zero, with the product of their A; the starts of the blocks are such a
     recurrence again, and then every x follows.
     """
     m, count = b.shape[2], b.shape[-1]
     a = a.expand(b.shape[0], *a.shape[1:])
-    if (compiled := scanned(a, b, first)) is not None:
+    if (compiled := scanned(a, b, first, gain)) is not None:
         return compiled
+    if gain is not None:
+        b = product(gain, b)
     if count <= LENGTH:
         return torch.stack(_one_by_one(a, b, first), dim=-1)
     blocks = -(-count // LENGTH)
@@ -37,9 +41,9 @@ def scan_in_time(a: Tensor, b: Tensor, first: Tensor) -> Tensor:
     start = scan_in_time(ends[:, :, m:], ends[:, :, :m], first)
     x = b.new_empty(*b.shape[:-1], blocks * LENGTH + 1)
     x[..., 0] = first
-    steps = x[..., 1:].unflatten(-1, (blocks, LENGTH)).unbind(-1)
-    for step, y in zip(steps, inner, strict=True):
-        step.copy_(product(y[:, :, m:], start).add_(y[:, :, :m]))
+    steps = x[..., 1:].unflatten(-1, (blocks, LENGTH))
+    for k, y in enumerate(inner):
+        steps[..., k] = product(y[:, :, m:], start).add_(y[:, :, :m])
     return x[..., : count + 1]
 
 

@@ -5,7 +5,7 @@ Slower than the compiled engine and faster than differentiating through torchdif
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -14,6 +14,8 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
+from fdi_torch.simulate.implicit import ImplicitStep
 from fdi_torch.simulate.injection import Injection, expect_injectable
 from fdi_torch.simulate.integrate import hermite
 from fdi_torch.simulate.interpreter import Change, Interpreter
@@ -30,26 +32,33 @@ class TracedEngine:
         self.network, self.space, self.experiment, self.why = network, space, experiment, why
 
     def levels(self, theta: Tensor) -> Tensor:
+        expect_no_gradient(self, theta, "levels")
         return self._simulate(theta, tangent=False, levels=True)[0]
 
     def readings(self, theta: Tensor) -> Tensor:
+        if is_differentiated(theta):
+            return readings_with_gradient(self, theta)
         return self._simulate(theta, tangent=False)[0]
 
     def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        expect_no_gradient(self, theta, "linearise")
         readings, jacobian = self._simulate(theta, tangent=True)
         assert jacobian is not None
         return readings, jacobian
 
     def moments(self, theta: Tensor, data: Readings) -> Tensor:
+        expect_no_gradient(self, theta, "moments")
         expect_problems(theta, data)
         return moments_of(self.readings(theta), data)
 
     def gram(self, theta: Tensor, data: Readings) -> Tensor:
+        expect_no_gradient(self, theta, "gram")
         expect_problems(theta, data)
         return gram_of(*self.linearise(theta), data)
 
     def observe(self, theta: Tensor, data: Readings, injection: Injection) -> Tensor:
-        program = build_program(self.network, self.space.names, False, self.experiment.tolerance is not None)
+        expect_no_gradient(self, theta, "observe")
+        program = build_program(self.network, self.space.names, False, self.experiment.own is not None)
         expect_injectable(self.experiment, injection, program.command_memory + program.reading_memory)
         lanes = theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
         run = _Run(program, self.network, self.experiment, lanes, injection)
@@ -58,7 +67,7 @@ class TracedEngine:
         return torch.stack(rows, dim=1).reshape(*theta.shape[:-1], len(rows), -1)
 
     def _simulate(self, theta: Tensor, tangent: bool, levels: bool = False) -> tuple[Tensor, Tensor | None]:
-        program = build_program(self.network, self.space.names, tangent, self.experiment.tolerance is not None)
+        program = build_program(self.network, self.space.names, tangent, self.experiment.own is not None)
         run = _Run(
             program, self.network, self.experiment, theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
         )
@@ -88,7 +97,9 @@ class _Run:
         interpreter = Interpreter(program, lanes, network.nominal, self.resolution)
         self.state, self.compute, self.full = interpreter.state, interpreter.run, interpreter.full
         self.history: list[list[tuple[Tensor, Change]]] = []
+        self.implicit = ImplicitStep(program, self.state, self.compute, self.full)
         self.pace = lanes.new_full((len(lanes),), torch.inf)
+        self.size = lanes.new_zeros(lanes.shape[::-1])
 
     def samples(self) -> Iterator[int]:
         """Runs; at each sample's turn the state holds 'sample' levels and the sample's number is handed out."""
@@ -157,7 +168,7 @@ class _Run:
     def _step(self, k: int) -> None:
         """A step of the grid: at once, or each lane in as many of its own as it needs."""
         e, p, values = self.experiment, self.program, self.state.values
-        if e.tolerance is None:
+        if e.own is None:
             return self.compute(p.step)
         self.compute(p.act)
         start, span = values["clock", 0], values["clock", 1]
@@ -166,12 +177,27 @@ class _Run:
             own = own_step(gone, self.pace, span)
             values["part", 0], values["part", 1] = start + gone, own
             before = self._levels()
-            self.compute(p.step)
-            error = torch.stack([values["error", i].expand_as(own).abs() for i in range(p.tanks)]).amax(dim=0)
-            stiffness = values["stiffness", 0]
-            kept, gone, self.pace = judged(own, error, stiffness, gone, self.pace, span, e.tolerance, self.resolution)
+            error, wrong = self.implicit.take(own, e.own.tolerance)
+            size = self._largest_slopes(wrong)
+            kept, gone, self.pace = judged(own, self._worst(error, wrong, size), gone, self.pace, span, e.own.shortest)
+            self.size = torch.where(kept, size, self.size)
             rows = zip(self._levels(), before, strict=True)
             self.state.put("level", [self._either(kept, now, then) for now, then in rows])
+
+    def _largest_slopes(self, wrong: Sequence[Tensor]) -> Tensor:
+        """Of the levels by each parameter so far, (P, L)."""
+        if not wrong:
+            return self.size
+        return torch.maximum(self.size, torch.stack([self.full(d).abs() for _, d in self._levels()]).amax(dim=0))
+
+    def _worst(self, error: Tensor, wrong: Sequence[Tensor], size: Tensor) -> Tensor:
+        """The larger of a step's two errors, each as a share of what is tolerated, (L,)."""
+        if not wrong or not len(size):
+            return error
+        assert self.experiment.own is not None
+        largest = torch.stack(list(wrong)).amax(dim=0)
+        share = torch.where(largest > 0.0, largest / (self.experiment.own.slope_tolerance * size), 0.0)
+        return torch.fmax(error, torch.nan_to_num(share, nan=0.0).amax(dim=0))
 
     def _either(self, yes: Tensor, x: tuple[Tensor, Change], y: tuple[Tensor, Change]) -> tuple[Tensor, Change]:
         level = torch.where(yes, x[0], y[0])

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R")
 LOCAL = "local"
+LOOPBACK = "127.0.0.1"  # where a local cluster listens, and nobody else can reach it
 # A block may lose its worker this often before the study gives up.
 LOST_WORKERS = 20
 
@@ -59,7 +60,10 @@ def each_on(client: Client, work: Callable[[T], R], items: Iterable[T]) -> Itera
 
 @contextmanager
 def connected(address: str, workers: int | None = None) -> Iterator[Client]:
-    """A scheduler at an address, or so many worker processes here. Raises ValueError without Dask or a scheduler."""
+    """A scheduler at an address, or so many worker processes here. Raises ValueError without Dask or a scheduler.
+
+    A scheduler is trusted: it and its workers send objects that are unpickled here.
+    """
     try:
         import dask
         from distributed import Client, LocalCluster
@@ -68,7 +72,7 @@ def connected(address: str, workers: int | None = None) -> Iterator[Client]:
     dask.config.set({"distributed.scheduler.allowed-failures": LOST_WORKERS})
     if address == LOCAL:
         with (
-            LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
+            LocalCluster(n_workers=workers, threads_per_worker=1, host=LOOPBACK, dashboard_address=None) as cluster,
             Client(cluster) as client,
         ):
             yield client

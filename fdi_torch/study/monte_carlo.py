@@ -12,8 +12,8 @@ from fdi_torch.estimate.diagnosis import UNEXPLAINED_RATIO, sample_noise
 from fdi_torch.estimate.evolution import evolve
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.objectives import OBJECTIVES, Objective, Problem, Term, spread_of
-from fdi_torch.estimate.refine import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.refined import CONVERGED, STATUSES, Refined
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.study.plan import Block, Plan
@@ -109,7 +109,7 @@ class Fits:
         best = starts
         for engine in self.engines:
             refined = self._refine(engine, best, self.low, self.high, lanes=lanes)
-            chosen = _best(refined)
+            chosen = refined.best()
             best = chosen.theta[:, None]
         return chosen
 
@@ -131,7 +131,8 @@ class Fits:
         settings = self.method.refine
         if objective == "correlation":
             settings = replace(settings, decrease_tolerance=CORRELATION_TOLERANCE)
-        return _best(self._refine(self.engines[-1], theta[:, None], -everywhere, everywhere, objective, settings))
+        refined = self._refine(self.engines[-1], theta[:, None], -everywhere, everywhere, objective, settings)
+        return refined.best()
 
     def standard_errors(self, fit: Refined) -> Tensor:
         """(B, P): from the curvature of the likelihood at the estimate; 0 where a bound holds it."""
@@ -191,13 +192,6 @@ def distant(population: Tensor, cost: Tensor, width: Tensor, count: int) -> Tens
         next_best = population[torch.arange(len(population)), place]
         taken.append(torch.where(fits.any(-1)[:, None], next_best, taken[0]))
     return torch.stack(taken, dim=1)
-
-
-def _best(refined: Refined) -> Refined:
-    """The member of lowest cost of each trial: (B, K, ...) -> (B, ...)."""
-    cost = torch.where(torch.isfinite(refined.cost), refined.cost, torch.inf)
-    rows, best = torch.arange(len(cost)), cost.argmin(-1)
-    return Refined(**{name: v[rows, best] for name, v in vars(refined).items()})
 
 
 def is_converged(status: str) -> bool:

@@ -17,8 +17,8 @@ from torch import Tensor
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.estimate.objectives import Objective
-from fdi_torch.estimate.refine import RefineSettings
 from fdi_torch.parameters import ParameterSpace
 
 Estimator = Literal["free", "boxed", "correlation", "linearised", "search"]

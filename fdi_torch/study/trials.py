@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from fdi_torch.capacity import expect_room
 from fdi_torch.estimate.batch_algebra import apply
 from fdi_torch.estimate.information import Certainty, certainty
 from fdi_torch.simulate.engine import Engine, Readings
@@ -30,6 +31,9 @@ class Trials:
 def make_trials(plan: Plan, block: Block) -> Trials:
     """Noise-free readings at fine steps, and each trial's own noise."""
     setting = plan.settings[block.setting]
+    readings = sum(part.outputs.numel() for part in plan.fitting.recordings)
+    trials = block.last - block.first
+    expect_room(3.0 * trials * readings, f"{trials:.3g} trials at once of {readings:.3g} readings", "lower study.block")
     truth = setting.faults[block.first : block.last]
     clean = _clean(plan.fitting.engines(plan.method.data_step)[0], truth)
     if setting.snr_db is None:

@@ -107,7 +107,7 @@ def test_what_a_command_wrote_in_other_ways_means_what_it_meant() -> None:
 def test_every_kind_of_log_that_is_written_has_a_golden_one() -> None:
     """The kinds as the code names them, where it opens a log."""
     jobs = "".join(path.read_text() for path in sorted((TESTS.parent / "fdi_torch/jobs").glob("*.py")))
-    kinds = re.findall(r'RunLog\(\s*path, "(\w+)"', jobs)
+    kinds = re.findall(r'RunLog\(\s*path,\s*"(\w+)"', jobs)
     assert jobs.count("RunLog(") == len(kinds) and set(kinds) == {kind for kind, *_ in COMMANDS}
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from example_logs import FIXED
 
+from fdi_torch.interruption import Terminated
 from fdi_torch.logbook import LogError, RunLog, read_run
-from fdi_torch.logbook.terminate import Terminated
 
 
 @pytest.mark.parametrize(
@@ -143,8 +143,9 @@ def test_a_full_disk_ends_the_log_not_the_process(tmp_path: Path) -> None:
 
 WRITER = """
 import sys, time
-from fdi_torch.logbook import RunLog, exit_on_sigterm
-exit_on_sigterm()
+from fdi_torch.interruption import catch_signals
+from fdi_torch.logbook import RunLog
+catch_signals()
 with RunLog(sys.argv[1] + "/a.mcap", "train") as log:
     number = 0
     while True:

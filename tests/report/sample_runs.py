@@ -157,6 +157,26 @@ GAP_ANSWER: dict[str, Any] = {
     ],
 }
 
+_ODD, _LEAK = {"effect": "unknown", "location": "Q1"}, {"effect": "leak", "location": "T1"}
+GAP_ANSWER_2: dict[str, Any] = GAP_ANSWER | {
+    "format": "fdi_torch.gap/2",
+    "verdict": "unknown",
+    "causes": [{**_LEAK, "parameters": {"size": {"value": 0.2, "std": 0.01, "unit": "1"}}}, _ODD | {"parameters": {}}],
+    "ambiguity_set": [],
+    "posterior": [
+        {"causes": [_LEAK, _ODD], "probability": 0.9, "unknown_at": "Q1"},
+        {"causes": [_LEAK, {"effect": "unknown", "location": "T1"}], "probability": 0.07, "unknown_at": "T1"},
+        {"causes": [_LEAK], "probability": 0.01},
+    ],
+    "unexamined": 0.02,
+    "certain": [_LEAK],
+    "disturbances": {
+        "T1": {"std": 2.5e-6, "unit": "m^3/s", "correlation_time": 15.0},
+        "T2": {"std": 1e-8, "unit": "m^3/s", "correlation_time": 0.0},
+    },
+    "impostors": None,
+}
+
 
 def write_monitor(path: Path) -> Path:
     """Residuals with thresholds, an alarm and its isolation."""

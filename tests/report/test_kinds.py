@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from sample_runs import (
     GAP_ANSWER,
+    GAP_ANSWER_2,
     NASTY,
     material_of,
     write_challenge,
@@ -46,7 +48,7 @@ def names(made: RunReport) -> set[str]:
 def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> None:
     made = report(write_gap, tmp_path)
     text = page([made])
-    assert headline(made.material) == "The gap comes from pump lag at Q1 (8.10 ± 0.20 s)"
+    assert headline(made.material) == "The gap comes from pump lag at Q1 (8.10 ± 0.20 s), probability 90.0 %"
     assert titles(made)[:10] == [
         "The rig",
         "What causes it",
@@ -76,9 +78,24 @@ def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"verdict": "no_gap", "causes": []}, "No gap beyond noise and tolerances"),
-        ({"verdict": "ambiguous"}, "A gap that 2 explanations share; the best is pump lag at Q1 (8.10 ± 0.20 s)"),
-        ({"verdict": "unknown", "causes": []}, "A gap at Q1 that no known effect explains"),
+        (
+            {"verdict": "no_gap", "causes": []},
+            "No gap: the plant file explains the recording within noise and tolerances",
+        ),
+        (
+            {"verdict": "ambiguous"},
+            "There is a gap that 2 explanations share at 95 %; the likeliest is pump lag at Q1 (8.10 ± 0.20 s)"
+            ", probability 90.0 %",
+        ),
+        (
+            {"verdict": "unknown", "causes": [], "posterior": [{"causes": [], "probability": 0.9, "unknown_at": "Q1"}]},
+            "The gap comes from something unknown at Q1, probability 90.0 %; no effect of the library has the law that "
+            "is there",
+        ),
+        (
+            {"verdict": "unknown", "causes": [], "posterior": [{"causes": [], "probability": 1.0}]},
+            "Readings of Q1 jump or stand still as no tank makes them; beyond them the plant file holds",
+        ),
     ],
 )
 def test_every_verdict_has_its_words(changes: dict[str, Any], words: str, tmp_path: Path) -> None:
@@ -87,6 +104,34 @@ def test_every_verdict_has_its_words(changes: dict[str, Any], words: str, tmp_pa
     made = report_of(material_of(tmp_path / "run.mcap"))
     assert headline(made.material) == words
     assert "is undefined: it is too small against its own standard error" in page([made])
+
+
+def test_a_page_of_the_second_format_shows_what_the_first_could_not_say(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "run.mcap", "gap", env={}, git={}) as log:
+        for place in GAP_ANSWER_2["where"]:
+            log.gap_where(place["location"], place["share"])
+        log.gap_verdict(GAP_ANSWER_2)
+    material = material_of(tmp_path / "run.mcap", load_plant("three_tank"))
+    text = page([report_of(material)])
+    assert headline(material) == (
+        "The gap comes from leak at T1 (size 0.200 ± 0.010) and something unknown at Q1, probability 90.0 %; no effect "
+        "of the library has the law that is there"
+    )
+    assert "Whichever explanation is true, there is with 95 %: leak at T1." in text
+    assert "Probability that something is wrong there." in text and "share of the gap" not in text
+    assert "leak at T1 and something unknown at T1" in text and "not examined" in text
+    assert "<td>2.5</td><td>cm³/s</td><td>15 s</td>" in re.sub(r"<td[^>]*>", "<td>", text)
+    assert "cannot be shown" not in text
+    (message,) = material.of("/gap/verdict")
+    assert (message["unexamined"], message["certain"]) == (0.02, ["leak@T1"])
+    assert message["explanations"][0] == "leak@T1 + unknown@Q1"
+
+
+def test_a_page_of_the_first_format_says_what_its_shares_are(tmp_path: Path) -> None:
+    text = page([report(write_gap, tmp_path)])
+    assert "Share of the gap that a free discrepancy there alone closes." in text
+    assert "something is wrong there" not in text and "Random flows" not in text
+    assert "something unknown at Q1" in text, "which the first format says in a field of its own"
 
 
 def test_noise_is_seen_through_a_moving_signal() -> None:

@@ -1,3 +1,4 @@
-"""Where the gap lies, no library asked: followed.py the trajectory that the readings tell, forms.py and columns.py what
-a discrepancy of each component may look like, sparse.py how few of these forms do, suspects.py the components in order.
+"""Where the gap lies, without the library: forms.py and components.py say what a discrepancy of each component may look
+like, survey.py what that does to the readings, sparse.py how few of the forms are needed, localization.py how likely
+each place is.
 """

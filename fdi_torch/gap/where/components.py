@@ -14,8 +14,8 @@ from torch import Tensor
 
 from fdi_torch.gap.forcing import Forcing
 from fdi_torch.gap.where.forms import (
-    MORE_STROKES,
-    STROKES,
+    LAGS,
+    RAMPS,
     bends,
     jerks,
     jumps,
@@ -36,26 +36,23 @@ SLOW = (100.0, 300.0)  # s, of a chamber beside a tank
 
 
 class Ends:
-    """The least and the greatest value of each signal in all recordings.
+    """The least and the greatest value of each signal in all recordings, and forms between them."""
 
-    closely: whether forms are to lie close together, and what switches or is slow is asked about as well.
-    """
-
-    def __init__(self, seen: Sequence[Signals], closely: bool = False) -> None:
-        self.seen, self.closely = seen, closely
+    def __init__(self, seen: Sequence[Signals]) -> None:
+        self.seen = seen
 
     def __call__(self, name: str) -> tuple[float, float]:
         low, high = min(float(s[name].min()) for s in self.seen), max(float(s[name].max()) for s in self.seen)
         return low, max(high, low + 1e-9 * (max(abs(low), abs(high)) or 1.0))
 
     def bends(self, s: Signals, name: str, count: int) -> list[Tensor]:
-        return bends(s[name], self(name), 2 * count if self.closely else count)
+        return bends(s[name], self(name), 2 * count)
 
     def jumps(self, s: Signals, name: str, count: int) -> list[Tensor]:
-        return jumps(s[name], self(name), 3 * count if self.closely else count)
+        return jumps(s[name], self(name), 3 * count)
 
     def relays(self, s: Signals, name: str) -> list[tuple[float, Tensor]]:
-        return relays(s[name], self(name), RELAYS) if self.closely else []
+        return relays(s[name], self(name), RELAYS)
 
 
 Forms = Callable[[Signals, Tensor, Ends], list[Tensor]]  # signals (K,), steps (K,) s -> (K,) each
@@ -89,18 +86,11 @@ def component_at(place: str, plant: PlantDescription) -> Component:
     return _pipe(found, plant)
 
 
-def balance_of(place: str, plant: PlantDescription) -> str | None:
-    """The tank whose balance alone a place has a part in: itself, its pump's, its outlet's; None of what joins two."""
-    if place_kind(plant, place) in ("tank_pair", "sensor"):
-        return None
-    component = component_at(place, plant)
-    ends = {component.source, component.target} - {OUTSIDE}
-    return ends.pop() if len(ends) == 1 else None
-
-
 def of_reading(s: Signals, step: Tensor, ends: Ends, pace: float) -> list[Tensor]:
     """Forms of a sensor's discrepancy; step: between samples, s; pace: of the plant."""
     own = [*ends.bends(s, "reading", 12), s["reading"] * s["time"] / ends("time")[1]]
+    lag = lagged(s["reading"], step, pace * LAGS[0]) - s["reading"]
+    own += [lag * (s["time"] / ends("time")[1] - j / RAMPS).clamp(min=0.0) for j in range(RAMPS)]  # a clock that drifts
     return [*own, *memories(s["reading"], step, pace), *sticks(s["reading"], ends("reading"))]
 
 
@@ -113,9 +103,8 @@ def _pump(pump: Pump, plant: PlantDescription) -> Component:
     def flows(s: Signals, step: Tensor, ends: Ends) -> list[Tensor]:
         own = [*ends.bends(s, "command", 9), *memories(s["flow"], step, pace)]
         own += [s["flow"] * b for b in ends.bends(s, "level", 6)]
-        own += slews(s["flow"], step, ends("flow"), pace, MORE_STROKES if ends.closely else STROKES)
-        if ends.closely:
-            own += jerks(s["flow"], ends("flow"))
+        own += slews(s["flow"], step, ends("flow"), pace)
+        own += jerks(s["flow"], ends("flow"))
         return [*own, *sticks(s["flow"], ends("flow")), *tirings(s["flow"], step, ends("flow"), pace)]
 
     return Component(signals, flows, "flow", OUTSIDE, pump.target)
@@ -170,8 +159,7 @@ def _tank(place: str, plant: PlantDescription) -> Component:
         for low, on in ends.relays(s, "level"):  # a draw, an orifice at the floor, and one that low
             own += [on, on * _root(s["level"]), on * _root((s["level"] - low).clamp(min=0.0))]
         # No short lags: how the level lags behind itself is its own rate, which is all that there is to explain.
-        if ends.closely:
-            own += [lagged(s["level"], step, pace * tau) - s["level"] for tau in SLOW]
+        own += [lagged(s["level"], step, pace * tau) - s["level"] for tau in SLOW]
         return [*own, *sticks(s["level"], ends("level"))]
 
     def areas(s: Signals, step: Tensor, ends: Ends) -> list[Tensor]:

@@ -20,8 +20,7 @@ LAGS = (3.0, 10.0, 30.0, 100.0, 300.0)  # s
 FADES = (10.0, 40.0, 160.0)  # s, of what a step up, or a step down, leaves behind
 BANDS = (0.03, 0.08, 0.16, 0.3)  # of the signal's range, within which it sticks
 JERKS = (0.1, 0.2, 0.3, 0.4)  # of the signal's range
-STROKES = (8.0, 25.0, 80.0)  # s, through the signal's range
-MORE_STROKES = (8.0, 20.0, 40.0, 80.0, 160.0, 320.0)
+STROKES = (8.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # s, through the signal's range
 HEATS = (150.0, 500.0)  # s, over which its own recent past weakens (or strengthens) a flow
 RAMPS = 12  # in time, evenly
 
@@ -52,11 +51,9 @@ def sticks(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
     return list((stuck(x, band) - x).unbind())
 
 
-def slews(
-    x: Tensor, step: Tensor, ends: tuple[float, float], pace: float, strokes: Sequence[float] = STROKES
-) -> list[Tensor]:
+def slews(x: Tensor, step: Tensor, ends: tuple[float, float], pace: float) -> list[Tensor]:
     """How x differs from what follows it no faster than through its range in some time."""
-    return [slewed(x, step, (ends[1] - ends[0]) / (pace * time)) - x for time in strokes]
+    return [slewed(x, step, (ends[1] - ends[0]) / (pace * time)) - x for time in STROKES]
 
 
 def jerks(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:

@@ -8,11 +8,10 @@ from torch import Tensor
 FINER = 4  # times finer than the recording's own frequencies
 SURROUNDINGS = 15  # of the recording's own frequencies, to each side
 CYCLES = 8  # that a line has to go through
-STANDS_OUT = 30.0  # times the median of its surroundings; chance alone makes 10 of some thousand frequencies
 
 
-def spectral_line(white: Tensor, spacing: float, stands_out: float = STANDS_OUT) -> float | None:
-    """The period (s) of what stands out of its surroundings in the spectrum of a residual (S, C), if anything does."""
+def spectral_line(white: Tensor, spacing: float) -> float | None:
+    """The period (s) of what stands out most of its surroundings in the spectrum of a residual (S, C)."""
     samples = len(white)
     taper = torch.hann_window(samples, periodic=False, dtype=white.dtype).unsqueeze(-1)
     power = (torch.fft.rfft(white * taper, n=FINER * samples, dim=0).abs() ** 2).sum(dim=-1)
@@ -24,4 +23,4 @@ def spectral_line(white: Tensor, spacing: float, stands_out: float = STANDS_OUT)
     ratio = power / median.repeat_interleave(FINER)[: len(power)]
     ratio[: CYCLES * FINER] = 0.0
     peak = int(ratio.argmax())
-    return FINER * samples * spacing / peak if float(ratio[peak]) > stands_out else None
+    return FINER * samples * spacing / peak if peak else None

@@ -2,9 +2,9 @@
 
 Coefficients c ~ N(0, 1/a_j) with a variance each, found by their evidence (MacKay, 1992; Tipping, 2001, "Sparse
 Bayesian learning"): what is not needed goes to nothing and costs nothing. For a residual r with columns C, C'C = G,
-C'r = b and noise of variance T,
+C'r = b and noise of unit variance,
 
-    log E = b'S b / (2 T^2) + log det(S) / 2 + sum log(a) / 2,   S = (G / T + diag(a))^-1.
+    log E = b'S b / 2 + log det(S) / 2 + sum log(a) / 2,   S = (G + diag(a))^-1.
 """
 
 from __future__ import annotations
@@ -23,48 +23,49 @@ RIDGES = tuple(10.0**k for k in range(-8, 2))  # shares of the diagonal
 
 @dataclass(frozen=True)
 class Sparse:
-    """Of B problems: log evidence (B,) against no coefficients at all, closes (B,), chi-square units, and how many
-    coefficients they need (B,)."""
+    """Of B problems: log evidence (B,) against no coefficients at all, closes (B,), chi-square units, how many
+    coefficients they need (B,), and their posterior means (B, M)."""
 
     evidence: Tensor
     closes: Tensor
     needs: Tensor
+    mean: Tensor
 
 
-def sparse(gram: Tensor, score: Tensor, heat: float, rounds: int) -> Sparse:
-    """gram (B, M, M), score (B, M); heat: the variance T."""
+def sparse(gram: Tensor, score: Tensor, rounds: int) -> Sparse:
+    """gram (B, M, M), score (B, M)."""
     size = torch.diagonal(gram, dim1=-2, dim2=-1).clamp(min=0.0)
     live, size = size > SEEN, torch.sqrt(size.clamp(min=1e-12))
-    unit = gram / size.unsqueeze(-1) / size.unsqueeze(-2)
-    told, aim = unit / heat, score / size / heat
-    first = score.shape[-1] / (aim * heat).abs().amax(dim=-1, keepdim=True).clamp(min=1e-9) ** 2
-    precision = torch.where(live, first.expand_as(aim), HIGH)
+    unit, aim = gram / size.unsqueeze(-1) / size.unsqueeze(-2), score / size
+    first = score.shape[-1] / aim.abs().amax(dim=-1, keepdim=True).clamp(min=1e-9) ** 2
+    precision, kept = torch.where(live, first.expand_as(aim), HIGH), None
     for turn in range(rounds):
         if turn == FIRST_ROUNDS:
-            told, aim, unit, live, precision = _needed(told, aim, unit, live, precision)
-        mean, used, _ = _posterior(told, aim, precision)
+            unit, aim, live, precision, kept = _needed(unit, aim, live, precision)
+        mean, used, _ = _posterior(unit, aim, precision)
         found = used / (mean * mean).clamp(min=1e-30)
         precision = torch.where(live, found.clamp(LOW, HIGH), HIGH)
-    mean, used, half_log_det = _posterior(told, aim, precision)
+    mean, used, half_log_det = _posterior(unit, aim, precision)
     evidence = 0.5 * (aim * mean).sum(-1) - half_log_det + 0.5 * torch.log(precision).sum(-1) - used.sum(-1)
     fitted = (mean.unsqueeze(-2) @ unit @ mean.unsqueeze(-1)).flatten()
-    return Sparse(evidence, 2.0 * heat * (aim * mean).sum(-1) - fitted, used.sum(-1))
+    whole = mean if kept is None else torch.zeros_like(score).scatter(-1, kept, mean)
+    return Sparse(evidence, 2.0 * (aim * mean).sum(-1) - fitted, used.sum(-1), whole / size)
 
 
-def _needed(told: Tensor, aim: Tensor, unit: Tensor, live: Tensor, precision: Tensor) -> tuple[Tensor, ...]:
-    """The same problems without the columns that all but vanished, as many in each as the largest needs."""
-    _, used, _ = _posterior(told, aim, precision)
+def _needed(unit: Tensor, aim: Tensor, live: Tensor, precision: Tensor) -> tuple[Tensor, ...]:
+    """The same problems without the columns that all but vanished, as many in each as the largest needs, and which."""
+    _, used, _ = _posterior(unit, aim, precision)
     count = max(int((used > VANISHED).sum(-1).max()), 1)
     kept = used.topk(count, dim=-1).indices
     rows, columns = kept.unsqueeze(-1), kept.unsqueeze(-2)
     each = torch.arange(len(kept))[:, None, None]
-    told, unit = told[each, rows, columns], unit[each, rows, columns]
-    return told, aim.gather(-1, kept), unit, live.gather(-1, kept), precision.gather(-1, kept)
+    return unit[each, rows, columns], aim.gather(-1, kept), live.gather(-1, kept), precision.gather(-1, kept), kept
 
 
-def _posterior(told: Tensor, aim: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean (B, M), how far each coefficient is told (B, M), and half the log determinant of the curvature (B,)."""
-    root = _root(told + torch.diag_embed(precision + 1e-9))
+def _posterior(unit: Tensor, aim: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean (B, M), the share of each coefficient that the data determine (B, M), and half the log determinant of the
+    curvature (B,)."""
+    root = _root(unit + torch.diag_embed(precision + 1e-9))
     covariance = torch.cholesky_inverse(root)
     mean = (covariance @ aim.unsqueeze(-1)).squeeze(-1)
     used = (1.0 - precision * torch.diagonal(covariance, dim1=-2, dim2=-1)).clamp(1e-12, 1.0)

@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from fdi_torch.gap.disturbances import smoothed_levels
 from fdi_torch.gap.fitting import Fit, Fitter
 from fdi_torch.gap.forcing import Forcing
+from fdi_torch.gap.subject import between
 from fdi_torch.gap.where.components import Component, Ends, Signals, component_at, of_reading
-from fdi_torch.gap.where.followed import between, followed
 from fdi_torch.gap.where.forms import courses
 from fdi_torch.plant.description import OUTSIDE, Sensor
 from fdi_torch.plant.pace import time_scale
@@ -24,28 +25,45 @@ from fdi_torch.simulate.joint import Joint, with_blanks
 from fdi_torch.simulate.scan import product, scan_in_time
 
 MOST_ROWS = 1000  # of a channel; more samples are taken together, for no form is as fast
-SAMPLES_A_STEP, FEWER = 25, 9  # of a course in time, at least; where one looks closely
+SAMPLES_A_STEP = 9  # of a course in time, at least
 
 
 @dataclass(frozen=True)
 class Regression:
-    """gram (M, M) = C'C and score (M,) = C'r of a component's columns C beside what the readings r hold against the
-    model without them; unexplained = r'r, of which noise makes up `noise`."""
+    """gram (M, M) = C'C and score (M,) = C'r of a component's columns C beside the residual r of the model without
+    them, under the noise of a fitter."""
 
     gram: Tensor
     score: Tensor
-    unexplained: float
-    noise: float
 
 
 @dataclass(frozen=True)
-class _Piece:
-    """One recording, about levels (1, K+1, tanks)."""
+class Discrepancy:
+    """What a component's forms do to the readings, columns (S, C, M), about a trajectory."""
+
+    columns: Tensor
+    near: Linearised
+
+
+@dataclass(frozen=True)
+class Forms:
+    """Of one component along one recording: flows (M, K) m^3/s, courses in time (M', K), and, of a tank, changes of its
+    level's rate (M'', K) m/s or None."""
+
+    flows: Tensor
+    in_time: Tensor
+    areas: Tensor | None
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One recording, about levels (1, K+1, tanks). rows: its samples among all."""
 
     engine: Collocation
     theta: Tensor
     near: Linearised
     along: Forcing
+    rows: slice
 
     @property
     def middle(self) -> Tensor:
@@ -56,91 +74,107 @@ class _Piece:
         """What changes (tanks, M, K) of the rates do to the readings, (S, C, M)."""
         gain, transition = self.near.gain.permute(0, 2, 3, 1), self.near.transition.permute(0, 2, 3, 1)
         still = rates.new_zeros(1, *rates.shape[:2])
-        paths = scan_in_time(transition, product(gain, rates.unsqueeze(0)), still)
+        paths = scan_in_time(transition, rates.unsqueeze(0), still, gain)
         return self.engine.look(self.near.levels, self.theta).along(paths, [-1] * rates.shape[1])[0].permute(2, 0, 1)
+
+    def seen_from(self, weights: Tensor) -> Tensor:
+        """The transpose of `seen`: weights (S, C, M) of the readings -> of the rates, (tanks, M, K)."""
+        tanks, columns = self.near.gain.shape[-1], weights.shape[-1]
+        paths = weights.new_zeros(1, tanks, columns, self.near.levels.shape[1], requires_grad=True)
+        readings = self.engine.look(self.near.levels, self.theta).along(paths, [-1] * columns)
+        (by_path,) = torch.autograd.grad(readings, paths, weights.permute(1, 2, 0).unsqueeze(0))
+        back, gain = self.near.transition.permute(0, 3, 2, 1).flip(-1), self.near.gain.permute(0, 3, 2, 1)
+        by_level = scan_in_time(back, by_path[..., :-1].flip(-1), by_path[..., -1]).flip(-1)
+        return product(gain, by_level[..., 1:])[0]
 
 
 class Survey:
     """The regressions of all components of a subject, beside the constants of a fit.
 
-    periods: of waves, s. steps: in time, over all recordings. closely: with forms that lie close together.
+    periods: of waves, s. steps: in time, over all recordings.
     """
 
-    def __init__(self, fitter: Fitter, fit: Fit, periods: Sequence[float], steps: int, closely: bool = False) -> None:
-        self.closely = closely
+    def __init__(self, fitter: Fitter, fit: Fit, periods: Sequence[float], steps: int) -> None:
         self.fitter, self.fit, self.periods = fitter, fit, tuple(periods)
         self.engine = fitter.engine(fit.candidate, list(fit.effect_values))
-        self.theta, self.levels = fit.theta.unsqueeze(0), followed(fitter.subject, fit)
+        self.theta, self.levels = fit.theta.unsqueeze(0), smoothed_levels(fitter, fit)
         self.near = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.near, levels=self.levels))
         parts, samples = len(self.pieces), len(fitter.subject.readings)
-        self.steps = max(min(steps, samples // (FEWER if closely else SAMPLES_A_STEP)) // parts, 2)
+        self.steps = max(min(steps, samples // SAMPLES_A_STEP) // parts, 2)
 
-    def of(self, place: str) -> Regression:
+    def of(self, place: str) -> Discrepancy:
         plant = self.fitter.subject.plant
         sensors = [s.name for s in plant.sensors]
         if place in sensors:
             return self._of_sensor(sensors.index(place), plant.sensors[sensors.index(place)])
-        return self._regressed(self._columns(component_at(place, plant)), self.near)
+        return Discrepancy(self._columns(component_at(place, plant)), self.near)
 
-    def _pieces(self, near: Linearised) -> list[_Piece]:
+    def _pieces(self, near: Linearised) -> list[Piece]:
         whole = self.engine
         parts = whole.apart(self.theta, near) if isinstance(whole, Joint) else [(whole, self.theta, near)]
         found = []
-        for engine, theta, own in parts:
+        for rows, (engine, theta, own) in zip(self.fitter.subject.rows, parts, strict=True):
             values = engine.network.bind(engine.space, theta.unsqueeze(-2))
             present = [p.prefix for p in engine.network.placements]
             path = own.levels[0].T.contiguous()
-            found.append(_Piece(engine, theta, own, Forcing(engine.network, present, values, path, engine.experiment)))
+            along = Forcing(engine.network, present, values, path, engine.experiment)
+            found.append(Piece(engine, theta, own, along, rows))
+        return found
+
+    def forms(self, component: Component) -> list[Forms]:
+        """Of a component along each recording."""
+        seen = [
+            {n: x.reshape(-1).expand(len(p.middle)) for n, x in component.signals(p.along).items()} for p in self.pieces
+        ]
+        ends, found = Ends(seen), []
+        for piece, s in zip(self.pieces, seen, strict=True):
+            step = piece.engine.experiment.steps
+            in_time = [s[component.in_time] * c for c in self._courses(piece.middle, piece)]
+            areas = torch.stack(component.areas(s, step, ends)) if component.areas else None
+            found.append(Forms(torch.stack(component.flows(s, step, ends)), torch.stack(in_time), areas))
         return found
 
     def _columns(self, component: Component) -> Tensor:
         """(S, C, M), not whitened."""
-        seen = [
-            {n: x.reshape(-1).expand(len(p.middle)) for n, x in component.signals(p.along).items()} for p in self.pieces
-        ]
-        ends = Ends(seen, self.closely)
         shared: list[Tensor] = []
         own: list[Tensor] = []
-        for piece, s in zip(self.pieces, seen, strict=True):
-            step = piece.engine.experiment.steps
-            in_time = [s[component.in_time] * c for c in self._courses(piece.middle, piece)]
-            changes = [self._moved(piece, component, torch.stack(f)) for f in (component.flows(s, step, ends), in_time)]
-            if component.areas:
-                areas = torch.stack(component.areas(s, step, ends))
-                tank = self._tank(component.target)
-                rates = areas.new_zeros(len(changes[0]), *areas.shape).index_copy_(0, tank, areas.unsqueeze(0))
+        for piece, forms in zip(self.pieces, self.forms(component), strict=True):
+            changes = [self._moved(piece, component, flows) for flows in (forms.flows, forms.in_time)]
+            if forms.areas is not None:
+                rates = forms.areas.new_zeros(len(changes[0]), *forms.areas.shape)
+                rates[self.tank(component.target)] = forms.areas
                 changes.insert(0, rates)
             columns = piece.seen(torch.cat(changes, dim=1))
-            shared.append(columns[..., : -len(in_time)])
-            own.append(columns[..., -len(in_time) :])
+            shared.append(columns[..., : -len(forms.in_time)])
+            own.append(columns[..., -len(forms.in_time) :])
         return _side_by_side(shared, own)
 
-    def _moved(self, piece: _Piece, component: Component, flows: Tensor) -> Tensor:
+    def _moved(self, piece: Piece, component: Component, flows: Tensor) -> Tensor:
         """Flows (M, K) from one end to the other -> how the rates change, (tanks, M, K)."""
         inflows: list[Tensor | None] = [None] * len(self.fitter.subject.plant.tanks)
         for end, sign in ((component.source, -1.0), (component.target, 1.0)):
             if end != OUTSIDE:
-                inflows[int(self._tank(end))] = sign * flows
+                inflows[self.tank(end)] = sign * flows
         return piece.along.by_inflows(inflows, len(flows))
 
-    def _courses(self, time: Tensor, piece: _Piece) -> list[Tensor]:
+    def _courses(self, time: Tensor, piece: Piece) -> list[Tensor]:
         return courses(time, float(piece.engine.experiment.nodes[-1]), self.periods, self.steps)
 
-    def _tank(self, name: str) -> Tensor:
-        return torch.tensor([[t.name for t in self.fitter.subject.plant.tanks].index(name)])
+    def tank(self, name: str) -> int:
+        return [t.name for t in self.fitter.subject.plant.tanks].index(name)
 
-    def _of_sensor(self, channel: int, sensor: Sensor) -> Regression:
+    def _of_sensor(self, channel: int, sensor: Sensor) -> Discrepancy:
         """About what the model makes of the sensor's tank while the others are as they were read."""
-        levels = self.engine.driven(self.theta, self.levels, int(self._tank(sensor.tank)))
+        levels = self.engine.driven(self.theta, self.levels, self.tank(sensor.tank))
         seen: list[Signals] = []
         first = 0
         for piece in self.pieces:
             nodes, times = piece.engine.experiment.nodes, piece.engine.experiment.sample_times
-            own = levels[0, first : first + len(nodes), int(self._tank(sensor.tank))]
+            own = levels[0, first : first + len(nodes), self.tank(sensor.tank)]
             seen.append({"reading": sensor.gain * between(times, nodes, own) + sensor.offset, "time": times})
             first += len(nodes)
-        ends = Ends(seen, self.closely)
+        ends = Ends(seen)
         shared: list[Tensor] = []
         own_columns: list[Tensor] = []
         pace = time_scale(self.fitter.subject.plant)
@@ -151,25 +185,24 @@ class Survey:
                 column = levels.new_zeros(len(step), self.fitter.subject.readings.shape[1], len(forms))
                 column[:, channel] = torch.stack(forms, dim=1)
                 into.append(column)
-        return self._regressed(_side_by_side(shared, own_columns), self.engine.linearise(self.theta, levels))
+        return Discrepancy(_side_by_side(shared, own_columns), self.engine.linearise(self.theta, levels))
 
-    def _regressed(self, columns: Tensor, near: Linearised) -> Regression:
-        """columns (S, C, M) beside what can be done with the constants."""
-        space, theta, mask = self.fit.space, self.fit.theta, self.fitter.subject.mask
-        residual, jacobian = self.fitter.white(near)
-        scale = self.fitter.box(space)[2]
-        pull = (scale / space.std(theta)).nan_to_num(0.0)
-        off = ((theta - space.nominal(theta)) / space.std(theta)).nan_to_num(0.0)
-        each = max(len(mask) // MOST_ROWS, 1)
-        c = _together(self.fitter.noise.whiten(columns, mask), each).flatten(0, 1)
-        r = _together(residual[0], each).flatten()
-        j = _together(jacobian[0] * scale, each).flatten(0, 1)
-        basis, _ = torch.linalg.qr(torch.cat([j, torch.diag(pull + 1e-9)]))
-        left = torch.cat([r, -off])
-        left = left - basis @ (basis.T @ left)
-        shared = basis[: len(r)].T @ c
-        noise = float(mask[: len(mask) // each * each].sum()) / each
-        return Regression(c.T @ c - shared.T @ shared, c.T @ left[: len(r)], float(left @ left), noise)
+
+def regressed(fitter: Fitter, fit: Fit, found: Discrepancy) -> Regression:
+    """The columns of a discrepancy beside what the parameters of a fit can do."""
+    space, theta = fit.space, fit.theta
+    residual, jacobian = fitter.white(found.near)
+    scale, pull, off = fitter.priors(space, theta)
+    each = max(len(residual[0]) // MOST_ROWS, 1)
+    c = _together(fitter.whiten(found.columns), each).flatten(0, 1)
+    r = _together(residual[0], each).flatten()
+    j = _together(jacobian[0] * scale, each).flatten(0, 1)
+    basis, _ = torch.linalg.qr(torch.cat([j, torch.diag(pull + 1e-9)]))
+    left = torch.cat([torch.cat([c, r.unsqueeze(1)], dim=1), c.new_zeros(len(pull), c.shape[1] + 1)])
+    left[len(r) :, -1] = -off
+    left -= basis @ (basis.T @ left)
+    both = left.T @ left
+    return Regression(both[:-1, :-1], both[:-1, -1])
 
 
 def _side_by_side(shared: Sequence[Tensor], own: Sequence[Tensor]) -> Tensor:

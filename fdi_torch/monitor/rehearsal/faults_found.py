@@ -11,8 +11,8 @@ import torch
 
 from fdi_torch.estimate.proportion import wilson
 from fdi_torch.monitor.detection import CHARTS, Detector
+from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.noise import Noise, learn_noise
-from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.rehearsal.alarms import delays, detectors
 from fdi_torch.monitor.rehearsal.naming import confusions, name
 from fdi_torch.monitor.rehearsal.pieces import Numbers, Piece, Shown, quantiles, seeded

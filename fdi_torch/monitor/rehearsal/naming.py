@@ -13,7 +13,7 @@ from torch import Tensor
 from fdi_torch.monitor.change import ChangedObserver, Changes, Window, unchanged
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import Fault
-from fdi_torch.monitor.online import SHAPE, Monitor
+from fdi_torch.monitor.monitor import SHAPE, Monitor
 from fdi_torch.monitor.samples import Samples
 
 # Rates for which a size is isolable: of calling it where it is not, and of missing it.
@@ -106,7 +106,7 @@ def _said(events: Sequence[Event], onset: float) -> Named:
     after = [t for t in alarms if t >= onset]
     told = [e for e in events if e.faults and e.time >= onset]
     first, last = (_sizes(told[0]), _sizes(told[-1])) if told else ((), ())
-    return Named(after[0] if after else None, first, last, bool(told) and told[-1].incipient, len(alarms) - len(after))
+    return Named(after[0] if after else None, first, last, bool(told) and told[-1].growing, len(alarms) - len(after))
 
 
 def _sizes(event: Event) -> tuple[str, ...]:

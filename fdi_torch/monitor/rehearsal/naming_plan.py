@@ -13,8 +13,8 @@ from torch import Tensor
 from fdi_torch.estimate.proportion import wilson
 from fdi_torch.monitor.detection import Chart, make_detector
 from fdi_torch.monitor.following import observe
+from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.noise import Noise, learn_noise
-from fdi_torch.monitor.online import Monitor
 from fdi_torch.monitor.rehearsal.naming import Kind, confusions, name, smallest_isolable
 from fdi_torch.monitor.rehearsal.pieces import Numbers, Piece, Shown, quantiles, seeded
 from fdi_torch.monitor.rehearsal.runs import Controller, Course, LevelControl, Rig, fault_free

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from fdi_torch.capacity import expect_room
 from fdi_torch.monitor.changing import ONSET, RAMP, ChangingNetwork
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import PlantState, Stepper, usual_step
@@ -65,6 +66,8 @@ class Rig:
     def run(self, course: Course, samples: int, generator: torch.Generator) -> Samples:
         """Readings (R, samples, sensors); inputs (R, samples, channels) where they are controlled."""
         runs, like = len(course.theta), self.levels
+        what = f"{runs:.3g} runs of {samples:.3g} samples"
+        expect_room(float(runs) * samples * len(self.reading_std), what, "simulate fewer or shorter ones")
         moment = [course.onset.unsqueeze(1), course.ramp.unsqueeze(1)]
         theta = torch.cat([course.theta, *moment, *[course.onset.unsqueeze(1)] * len(self._onsets)], dim=1)
         values = self.changing.bind(self._columns, theta)

@@ -2,9 +2,9 @@
 
 from fdi_torch.report.section import Maker
 from fdi_torch.report.sections.before_after import holdout_section, profile_section
-from fdi_torch.report.sections.challenge import confusion_section, misses_section, scores_section
+from fdi_torch.report.sections.blind_benchmark import confusion_section, misses_section, scores_section
 from fdi_torch.report.sections.estimate import estimate_section, posterior_section
-from fdi_torch.report.sections.gap import causes_section, where_section
+from fdi_torch.report.sections.gap import causes_section, disturbances_section, where_section
 from fdi_torch.report.sections.gap_closure import closure_section, constants_section
 from fdi_torch.report.sections.gap_curves import curves_section, shape_section
 from fdi_torch.report.sections.gap_next import limits_section, next_input_section
@@ -22,6 +22,7 @@ SECTIONS: tuple[Maker, ...] = (
     rig_section,
     causes_section,
     where_section,
+    disturbances_section,
     curves_section,
     shape_section,
     closure_section,

@@ -7,6 +7,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from fdi_torch.gap.verdict_words import causes_of
+from fdi_torch.gap.verdict_words import explanation_words as in_words
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.loose import as_float
 from fdi_torch.report.material import Material
@@ -16,10 +18,11 @@ from fdi_torch.report.section import Picture, Section
 
 MOST_BARS = 10
 LEAST_SHOWN = 1e-4  # of a probability
+CONTENT = 0.95  # of the explanations that an answer calls plausible
 
 
 def where_section(material: Material) -> Section | None:
-    """How much of the gap each component alone can close, library-free."""
+    """How likely it is that something is wrong at each component, its law not asked for."""
     where = {str(m["location"]): m for m in material.of("/gap/where")}
     where |= {str(place["location"]): place for place in material.answer.get("where", [])}
     ranked = sorted(where.items(), key=lambda item: -float(item[1]["share"]))[:MOST_BARS]
@@ -28,16 +31,18 @@ def where_section(material: Material) -> Section | None:
     shares = [100.0 * float(place["share"]) for _, place in ranked]
     texts = [f"{share:.3g} %{_chance(place)}" for share, (_, place) in zip(shares, ranked, strict=True)]
     guilty = {str(cause["location"]) for cause in material.answer.get("causes", [])}
-    guilty |= {str(e["unknown_at"]) for e in material.answer.get("posterior", [])[:1] if e.get("unknown_at")}
+    for item in material.answer.get("posterior", [])[:1]:
+        guilty |= {str(cause["location"]) for cause in causes_of(item)}
     names = [name for name, _ in ranked]
-    figure = bar_panel("Where", "share of the gap, %", names, shares, texts, [name in guilty for name in names])
+    meaning = material.meaning_of_shares
+    figure = bar_panel("Where", f"{meaning}, %", names, shares, texts, [name in guilty for name in names])
     _up_to_all(figure)
-    words = "What a free-form discrepancy at one component alone can close. Orange: where the causes are."
+    words = f"{meaning[:1].upper()}{meaning[1:]}. Orange: where the likeliest explanation has its causes."
     return Section("Where the gap lies", [words, [Picture("gap_where", figure)]])
 
 
 def causes_section(material: Material) -> Section | None:
-    """The best explanation with its parameters, and what else stands."""
+    """The best explanation with its parameters, and the others with their probabilities."""
     answer = material.answer
     if not answer:
         return None
@@ -45,21 +50,64 @@ def causes_section(material: Material) -> Section | None:
     rows = [row for cause in answer.get("causes", []) for row in _cause_rows(cause)]
     blocks: list[Any] = [table(header, rows, left=3)] if rows else []
     blocks += _twins(answer.get("causes", []))
-    standing = [explanation_words(causes) for causes in answer.get("ambiguity_set", [])]
-    if len(standing) > 1:
-        blocks += ["These explanations stand at 95 %:", tag("ul", *(tag("li", words) for words in standing))]
-    weighed = [item for item in answer.get("posterior", []) if as_float(item.get("probability")) >= LEAST_SHOWN]
-    posterior = weighed[:MOST_BARS]
-    if posterior:
-        names = [_weighed(item) for item in posterior]
-        chances = [100.0 * float(item["probability"]) for item in posterior]
-        texts = [f"{chance:.3g} %" for chance in chances]
-        kept = [name in standing or bool(item.get("unknown_at")) for name, item in zip(names, posterior, strict=True)]
-        figure = bar_panel("Explanations", "probability, %", names, chances, texts, kept)
-        _up_to_all(figure)
-        blocks.append([Picture("gap_posterior", figure, "Orange: together they hold 95 %." if standing else "")])
+    certain = answer.get("certain") or []
+    if certain and answer.get("verdict") != "named":
+        blocks.append(f"Whichever explanation is true, there is with 95 %: {explanation_words(certain)}.")
+    plausible = [explanation_words(causes) for causes in answer.get("ambiguity_set") or _content(answer)]
+    if len(plausible) > 1:
+        blocks += ["These explanations hold 95 % together:", tag("ul", *(tag("li", words) for words in plausible))]
+    blocks += _posterior(answer)
     blocks += [tag("ul", *(tag("li", str(remark)) for remark in answer["remarks"]))] if answer.get("remarks") else []
     return Section("What causes it", blocks) if blocks else None
+
+
+def disturbances_section(material: Material) -> Section | None:
+    """The random flows into the tanks beside the likeliest explanation."""
+    flows = material.answer.get("disturbances")
+    rows = [_flow_row(tank, flow) for tank, flow in flows.items()] if isinstance(flows, dict) else []
+    if not rows:
+        return None
+    words = (
+        "Random flows into each tank that the recording shows beside the likeliest explanation: waves, pulsation, "
+        "splashing. They are no fault."
+    )
+    header = ("into", "standard deviation", "unit", "correlation time")
+    return Section("Random flows", [words, table(header, rows)])
+
+
+def _flow_row(tank: str, flow: Any) -> list[str]:
+    flow = flow if isinstance(flow, dict) else {}
+    unit, scale = shown_unit(str(flow.get("unit", "")))
+    time = as_float(flow.get("correlation_time"))
+    return [tank, number(scale * as_float(flow.get("std")), 3), unit, f"{number(time, 3)} s" if time else "none"]
+
+
+def _content(answer: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
+    """The fewest explanations that hold 95 % together, by their probabilities."""
+    held, kept = 0.0, []
+    for item in answer.get("posterior", []):
+        if held >= CONTENT:
+            break
+        held += as_float(item.get("probability"))
+        kept.append(causes_of(item))
+    return kept
+
+
+def _posterior(answer: Mapping[str, Any]) -> list[Any]:
+    """Bars of the explanations' probabilities, and of what was not examined."""
+    weighed = [item for item in answer.get("posterior", []) if as_float(item.get("probability")) >= LEAST_SHOWN]
+    names = [explanation_words(causes_of(item)) for item in weighed[:MOST_BARS]]
+    chances = [as_float(item["probability"]) for item in weighed[:MOST_BARS]]
+    within = [k < len(_content(answer)) for k in range(len(chances))]
+    if as_float(answer.get("unexamined")) >= LEAST_SHOWN:
+        names, chances, within = [*names, "not examined"], [*chances, as_float(answer["unexamined"])], [*within, False]
+    if not names:
+        return []
+    percents = [100.0 * chance for chance in chances]
+    texts = [f"{percent:.3g} %" for percent in percents]
+    figure = bar_panel("Explanations", "probability, %", names, percents, texts, within)
+    _up_to_all(figure)
+    return [[Picture("gap_posterior", figure, "Orange: together they hold 95 %.")]]
 
 
 def _up_to_all(figure: Figure) -> None:
@@ -90,8 +138,5 @@ def _twins(causes: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def explanation_words(causes: Sequence[Mapping[str, Any]]) -> str:
-    return " + ".join(f"{c['effect']} at {c['location']}".replace("_", " ") for c in causes) or "no gap"
-
-
-def _weighed(item: Mapping[str, Any]) -> str:
-    return f"unknown at {item['unknown_at']}" if item.get("unknown_at") else explanation_words(item["causes"])
+    """'leak at T1 and something unknown at Q1'."""
+    return in_words(causes).replace("_", " ")

@@ -15,14 +15,14 @@ from fdi_torch.report.section import Picture, Section
 
 
 def rig_section(material: Material) -> Section | None:
-    """The schematic: last levels read, what was found where, the gap's share as strength of colour."""
+    """The schematic: last levels read, what was found where, how sure a place is as strength of colour."""
     plant = material.plant
     if plant is None:
         return None
     overlay = Overlay(last_levels(material, plant), marks_of(material), heat_of(material))
     parts = ["Levels are the last ones read."] if overlay.levels else []
     parts += ["Orange: what was found."] if overlay.marks else []
-    parts += ["Strength of colour: share of the gap that this component alone can close."] if overlay.heat else []
+    parts += [f"Strength of colour: {material.meaning_of_shares}."] if overlay.heat else []
     caption = " ".join([f"{plant.name}, not to scale.", *parts])
     return Section("The rig", [[Picture("rig", schematic(plant, overlay), caption, wide=True)]])
 
@@ -55,7 +55,7 @@ def marks_of(material: Material) -> dict[str, list[str]]:
 
 
 def heat_of(material: Material) -> dict[str, float]:
-    """Location -> share of the gap."""
+    """Location -> its number between 0 and 1, see `Material.meaning_of_shares`."""
     where = {str(message["location"]): float(message["share"]) for message in material.of("/gap/where")}
     where |= {str(place["location"]): float(place["share"]) for place in material.answer.get("where", [])}
     return {location: min(max(share, 0.0), 1.0) for location, share in where.items() if math.isfinite(share)}

@@ -1,0 +1,239 @@
+"""Under which conditions a case is recorded: inputs, start levels, calibration constants, noise, disturbances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdi_torch.blind.control import LevelControl, draw_control
+from fdi_torch.blind.deviation import Array
+from fdi_torch.blind.disturbances import Disturbance
+from fdi_torch.blind.inputs import (
+    DECIMALS,
+    FACTORS,
+    channel_limits,
+    command_unit,
+    commanded,
+    drawn,
+    in_print,
+    with_standstills,
+)
+from fdi_torch.blind.plants import Rig
+from fdi_torch.blind.scaling import SAME, Scales, on_bench
+from fdi_torch.blind.sensor_noise import WHITE, NoiseCorrelation, draw_correlation
+from fdi_torch.blind.simulator import Drive, HiddenRigs, Ran, simulate
+from fdi_torch.plant.description import PlantDescription
+
+RECORDED, HELD_OUT = 3601, 2401
+COARSE = 0.25
+WIDEST = 2.5
+"""Standard deviations that a constant is off at most."""
+_LEAST = 0.2
+_MOST_TRIALS = 12
+LOW, HIGH = 0.13, 0.8
+FULL, LEAST = 0.5, 0.02
+NOISE = 1 / 35
+"""Of the mean level at rest, as in the three tanks: readings are then noisy by 0.14, 0.29 or 0.57 % of it."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """commands: recording and hold-out, (T, C) in the header's unit. signal: of the recording, by name.
+
+    starts (2, N) m. built: the rig's true constants. noise (S,): standard deviation of each sensor's readings, m;
+    errors: those of both parts, (T, S) m. control, disturbances (T, N) m^3/s: of both parts, where there are any;
+    disturbance: how the latter were drawn.
+    """
+
+    rig: Rig
+    commands: tuple[Array, Array]
+    signal: str
+    starts: Array
+    built: PlantDescription
+    noise: Array
+    correlation: NoiseCorrelation
+    errors: tuple[Array, ...] = ()
+    control: tuple[LevelControl, ...] = ()
+    disturbance: Disturbance | None = None
+    disturbances: tuple[Array, ...] = ()
+
+    def drive(self, part: int, disturbed: bool) -> Drive:
+        """What the recording (0) or the hold-out (1) is driven with."""
+        asked, control = asked_of_pumps(self.built, self.commands[part]), self.control[part] if self.control else None
+        error = None
+        if control is not None:
+            tanks = [t.name for t in self.rig.plant.tanks]
+            read = [tanks.index(s.tank) for s in self.rig.plant.sensors]
+            error = self.errors[part][:, read.index(control.tank)]
+        disturbance = self.disturbances[part] if disturbed and self.disturbances else None
+        return Drive(asked, self.starts[part], disturbance, control, error)
+
+
+def as_built(plant: PlantDescription, rng: np.random.Generator) -> PlantDescription:
+    """The rig as it was built, constants drawn within their tolerances: x (1 + s z), an offset x + s z, z standard
+    normal and clipped.
+    """
+    off: dict[str, dict[str, float]] = {}
+    for constant, tolerance in plant.tolerances.items():
+        name, _, field = constant.rpartition(".")
+        z = float(np.clip(rng.normal(), -WIDEST, WIDEST))
+        believed = float(getattr(plant.component(name), field))
+        drawn = believed + tolerance * z if field == "offset" else believed * max(1 + tolerance * z, _LEAST)
+        off.setdefault(name, {})[field] = drawn
+    return replace(
+        plant,
+        tanks=tuple(replace(t, **off.get(t.name, {})) for t in plant.tanks),  # type: ignore[arg-type]
+        pipes=tuple(replace(p, **off.get(p.name, {})) for p in plant.pipes),  # type: ignore[arg-type]
+        pumps=tuple(replace(p, **off.get(p.name, {})) for p in plant.pumps),  # type: ignore[arg-type]
+        sensors=tuple(replace(s, **off.get(s.name, {})) for s in plant.sensors),  # type: ignore[arg-type]
+    )
+
+
+def draw_conditions(
+    rig: Rig, rng: np.random.Generator, inputs: str, coloured: float, rest: Array, resting: str | None = None
+) -> Conditions:
+    """inputs: 'rich', 'poor' (in the recording) or 'steps'. coloured: chance of correlated noise.
+
+    rest (N,): the rig's levels without any effect at middling inputs, m. resting: a channel that often stands still.
+    """
+    plant = rig.plant
+    if resting:
+        name, commands = "with_standstills", [with_standstills(rig, rng, n, resting) for n in (RECORDED, HELD_OUT)]
+    else:
+        signal = drawn(rng, inputs)
+        name, commands = signal.__name__, [commanded(rig, rng, RECORDED, signal), commanded(rig, rng, HELD_OUT)]
+    heights = np.array([t.height for t in plant.tanks])
+    starts = np.minimum(rest * rng.uniform(0.75, 1.25, size=(2, len(rest))), 0.85 * heights)
+    built = as_built(plant, rng)
+    noise = float(rng.choice([0.05, 0.1, 0.2])) * rig.noise_unit * rng.uniform(0.7, 1.4, size=len(plant.sensors))
+    correlation = draw_correlation(rng) if rng.random() < coloured else WHITE
+    return Conditions(rig, (commands[0], commands[1]), name, starts, built, noise, correlation)
+
+
+def asked_of_pumps(plant: PlantDescription, commands: Array) -> Array:
+    """(T, C) in the header's unit -> (T, M) m^3/s, within each pump's range."""
+    channels = plant.channels()
+    flows = [p.gain * FACTORS[command_unit(p)] * commands[:, channels.index(p.channel)] for p in plant.pumps]
+    return np.stack([np.clip(q, 0.0, p.max_flow) for p, q in zip(plant.pumps, flows, strict=True)], axis=1)
+
+
+def commands_of_pumps(plant: PlantDescription, asked: Array) -> Array:
+    """(T, M) m^3/s -> (T, C) in the header's unit: each channel by its first pump."""
+    first = {p.channel: i for i, p in reversed(list(enumerate(plant.pumps)))}
+    pumps = [plant.pumps[first[channel]] for channel in plant.channels()]
+    units = [(first[p.channel], p.gain * FACTORS[command_unit(p)], DECIMALS[command_unit(p)]) for p in pumps]
+    return np.stack([np.round(asked[:, i] / factor, decimals) for i, factor, decimals in units], axis=1)
+
+
+def levels_at_rest(rig: Rig) -> Array:
+    """(N,) m: where the rig without any effect comes to rest at middling inputs."""
+    if rig.rest is not None:
+        return np.array(rig.rest)
+    middle = in_print(rig, np.tile(channel_limits(rig).mean(axis=1), (4001, 1)))
+    start = np.array([0.4 * t.height for t in rig.plant.tanks])
+    (ran,) = simulate(HiddenRigs([rig.plant], [()]), [Drive(asked_of_pumps(rig.plant, middle), start)], COARSE)
+    return ran.levels[-1]
+
+
+def nominal_runs(conditions: Sequence[Conditions], part: int, disturbed: bool = False) -> list[Ran]:
+    """Each recording (0) or hold-out (1) as the rig without any effect would run, coarsely."""
+    if not conditions:
+        return []
+    rigs = HiddenRigs([c.built for c in conditions], [()] * len(conditions))
+    return simulate(rigs, [c.drive(part, disturbed) for c in conditions], COARSE)
+
+
+def kept_within(conditions: Sequence[Conditions]) -> list[Conditions]:
+    """Changes the inputs of those whose rig without any effect comes near its rim, or its floor where that counts.
+
+    Inputs are turned down (up) where levels are too high (low) alone, else drawn together about their mean.
+    Raises ValueError where that does not help.
+    """
+    kept, todo = list(conditions), list(range(len(conditions)))
+    for _ in range(_MOST_TRIALS):
+        runs = [nominal_runs([kept[i] for i in todo], part) for part in (0, 1)]
+        outside = []
+        for i, *both in zip(todo, *runs, strict=True):
+            c = kept[i]
+            heights = np.array([t.height for t in c.rig.plant.tanks])
+            shares = np.concatenate([ran.levels for ran in both]) / heights
+            low, high = c.rig.lowest > shares.min(), c.rig.highest < shares.max()
+            if low or high:
+                outside.append(i)
+                kept[i] = replace(c, commands=tuple(_moved(c.rig, u, low, high) for u in c.commands))
+        todo = outside
+        if not todo:
+            return kept
+    name = kept[todo[0]].rig.plant.name
+    raise ValueError(f"rig {name}: expected inputs that keep it below its rim, got overflow; lower input_high")
+
+
+def _moved(rig: Rig, commands: Array, low: bool, high: bool) -> Array:
+    if not low:
+        return in_print(rig, 0.85 * commands)
+    middle = commands.mean(axis=0)
+    return in_print(rig, middle + 0.85 * (commands - middle) if high else 0.9 * commands + 0.1 * commands.max(axis=0))
+
+
+def controlled(c: Conditions, rng: np.random.Generator, runs: Sequence[Ran]) -> Conditions:
+    """With a level control on one pump. runs: the rig without any effect in open loop, recording and hold-out."""
+    limits, channels = channel_limits(c.rig), c.rig.plant.channels()
+    flows = np.array([p.gain * FACTORS[command_unit(p)] for p in c.rig.plant.pumps])
+    quanta = np.array([10.0 ** -DECIMALS[command_unit(p)] for p in c.rig.plant.pumps])
+    rows = limits[[channels.index(p.channel) for p in c.rig.plant.pumps]] * flows[:, None]
+    control = draw_control(rng, c.rig.plant, [ran.levels for ran in runs], rows, flows * quanta)
+    return replace(c, control=control)
+
+
+def disturbed(
+    conditions: Sequence[Conditions], disturbances: Sequence[Disturbance], generators: Sequence[np.random.Generator]
+) -> list[Conditions]:
+    """With random flows into each tank, scaled such that the levels that are read move by `ratio` times the noise.
+
+    The scale comes from two coarse runs: levels move nearly in proportion.
+    """
+    drawn = [
+        tuple(d.values(rng, len(u)) for u in c.commands)
+        for c, d, rng in zip(conditions, disturbances, generators, strict=True)
+    ]
+    still = nominal_runs(conditions, 0)
+    scales = [0.02 * float(asked_of_pumps(c.built, c.commands[0]).mean()) for c in conditions]
+    for trial in range(3):
+        out = [
+            replace(c, disturbance=d, disturbances=tuple(scale * values for values in own))
+            for c, d, own, scale in zip(conditions, disturbances, drawn, scales, strict=True)
+        ]
+        if trial < 2:
+            moved = nominal_runs(out, 0, disturbed=True)
+            ratios = [moved_by(c, a.levels, b.levels) for c, a, b in zip(out, moved, still, strict=True)]
+            scales = [s * d.ratio / r for s, d, r in zip(scales, disturbances, ratios, strict=True)]
+    return out
+
+
+def moved_by(c: Conditions, levels: Array, others: Array) -> float:
+    """Root mean square of what the levels that are read differ by, each in units of its sensor's noise."""
+    tanks = [t.name for t in c.rig.plant.tanks]
+    read = [tanks.index(s.tank) for s in c.rig.plant.sensors]
+    return float(np.sqrt(np.mean(((levels - others)[:, read] / c.noise) ** 2)))
+
+
+def exercised(plant: PlantDescription, scales: Scales = SAME) -> Rig:
+    """A rig that only its plant file describes, with the widest inputs, in steps of a tenth, at whose middle no tank
+    rests above half its height.
+
+    scales: how much larger and slower it is than a rig on a bench. Cases are made there and recorded at the
+    plant's own size and pace: a water tower's recording lasts for days.
+
+    Raises ValueError for valves, for a rig without pumps or sensors, and where every input overfills it.
+    """
+    rig = Rig(on_bench(plant, scales), LOW, HIGH, full_size=plant, scales=scales)
+    while ((rest := levels_at_rest(rig)) > [FULL * t.height for t in rig.plant.tanks]).any():
+        rig = replace(rig, input_low=0.9 * rig.input_low, input_high=0.9 * rig.input_high)
+        if rig.input_high < LEAST:
+            raise ValueError(
+                f"plant {plant.name}: expected inputs at which no tank rests above half its height, got none above "
+                f"{100 * LEAST:.0f} % of max_flow; check that every tank drains"
+            )
+    return replace(rig, noise_unit=NOISE * float(rest.mean()))

@@ -1,0 +1,195 @@
+"""How each effect of the diagnosis' vocabulary is drawn at a hidden rig: law, numbers and usual strength.
+
+Sizes are shares of what the sound rig does under this recording's inputs; a draw is f(s, place) -> Deviation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from fdi_torch.blind.deviation import Deviation
+from fdi_torch.blind.nominal_run import NominalRun
+from fdi_torch.plant.description import Tank
+
+Draw = Callable[[NominalRun, str], Deviation]
+
+
+def pump_gain(s: NominalRun, at: str) -> Deviation:
+    return Deviation("pump_gain", at, "scaled", {"gain": 1 + s.either(0.08, 0.20)})
+
+
+def pump_dead_zone(s: NominalRun, at: str) -> Deviation:
+    zone = s.size(0.06, 0.13) * s.pump(at)[1]
+    law = s.one_of("threshold", "soft_threshold")
+    return Deviation("pump_dead_zone", at, law, {"zone": zone} | ({"knee": 0.15 * zone} if "soft" in law else {}))
+
+
+def pump_saturation(s: NominalRun, at: str) -> Deviation:
+    low, high = s.pump(at)
+    limit = high - s.size(0.28, 0.5) * (high - low)
+    return Deviation("pump_saturation", at, s.one_of("hard_limit", "rounded_limit"), {"limit": limit})
+
+
+def pump_lag(s: NominalRun, at: str) -> Deviation:
+    return Deviation("pump_lag", at, s.one_of("slow", "slow_in_two_poles"), {"tau": s.size(7, 25)})
+
+
+def pump_delay(s: NominalRun, at: str) -> Deviation:
+    return Deviation("pump_delay", at, s.one_of("late", "late_and_smeared", "late_and_slow"), {"delay": s.size(5, 15)})
+
+
+def pump_back_pressure(s: NominalRun, at: str) -> Deviation:
+    loss, high = s.size(0.1, 0.22), s.tank(s.tank_of(at), 0.98)
+    law = s.one_of("shut_off_head", "falling", "drooping")
+    share = {"shut_off_head": 1 - (1 - loss) ** 2, "falling": loss, "drooping": loss**0.5}[law]
+    return Deviation("pump_back_pressure", at, law, {"head": high / share})
+
+
+def laminar_flow(s: NominalRun, at: str) -> Deviation:
+    """The size is the share of flow lost at the middling head, f = 1 - size, solved for the law's own head."""
+    law = s.one_of("viscous_and_inertial", "reynolds_blend", "sharp_transition")
+    kept = 1 - s.size(0.07, 0.22)
+    if law == "sharp_transition":
+        return Deviation("laminar_flow", at, law, {"head": s.head(at, 0.1 + 2 * (1 - kept))})
+    ratio = (1 / kept - kept) ** 2 if law == "viscous_and_inertial" else np.arctanh(kept) ** -2
+    return Deviation("laminar_flow", at, law, {"head": float(ratio) * s.head(at, 0.5)})
+
+
+def flow_exponent(s: NominalRun, at: str) -> Deviation:
+    numbers = {"power": 0.5 + s.either(0.07, 0.16), "reference": s.uniform(0.6, 1.6) * s.head(at, 0.5)}
+    return Deviation("flow_exponent", at, "other_power", numbers)
+
+
+def outlet_drop(s: NominalRun, at: str) -> Deviation:
+    share = s.either(0.08, 0.18)
+    drop = share * s.head(at, 0.5) if share > 0 else share * s.head(at, 0.05)
+    return Deviation("outlet_drop", at, "down_pipe", {"drop": drop})
+
+
+def coefficient_drift(s: NominalRun, at: str) -> Deviation:
+    law = s.one_of("drifting_evenly", "drifting_to_rest", "drifting_as_sine", "drifting_unevenly")
+    return Deviation("coefficient_drift", at, law, {"change": s.either(0.1, 0.25), "span": s.seconds})
+
+
+def plugging(s: NominalRun, at: str) -> Deviation:
+    """From the start on where strong, else from some time on: a small one from the start is within tolerance."""
+    sudden = s.strength < 0.5 or s.rng.random() < 0.5
+    onset = s.uniform(0.12, 0.5) * s.seconds if sudden else -1e9
+    return Deviation(
+        "plugging", at, "narrowed", {"loss": s.either(0.14, 0.28), "onset": onset, "ramp": s.uniform(1.0, 40.0)}
+    )
+
+
+def cross_flow(s: NominalRun, at: str) -> Deviation:
+    first, second = at.split("-")
+    numbers = {"conductance": s.size(0.08, 0.25) * s.conductance_at(first)}
+    law = s.one_of("slot", "window")
+    numbers["viscous" if law == "slot" else "height"] = 1e-3 if law == "slot" else 0.3 * s.tank(first, 0.05)
+    return Deviation("cross_flow", at, law, numbers, other=second)
+
+
+def leak(s: NominalRun, at: str) -> Deviation:
+    conductance = s.size(0.08, 0.25) * s.conductance_at(at)
+    if s.rng.random() < 0.5:
+        return Deviation("leak", at, "floor_hole", {"conductance": conductance})
+    height = s.uniform(0.1, 0.6) * s.tank(at, 0.5)
+    numbers = {"conductance": 1.4 * conductance, "height": height, "bore": s.uniform(0.01, 0.06) * s.span(at)}
+    return Deviation("leak", at, "hole", numbers)
+
+
+def unmetered_flow(s: NominalRun, at: str) -> Deviation:
+    begin = s.uniform(0.08, 0.35) * s.seconds
+    end = begin + s.uniform(0.2, 0.5) * s.seconds
+    draw = s.either(0.07, 0.16) * float(np.max(s.asked))
+    return Deviation(
+        "unmetered_flow", at, "tapped", {"draw": draw, "begin": begin, "end": end, "ramp": s.uniform(1.0, 20.0)}
+    )
+
+
+def area_taper(s: NominalRun, at: str) -> Deviation:
+    """The cross-section believed in was measured at the floor, or is that at half height."""
+    slope = ((1 + s.either(0.15, 0.4)) ** 0.5 - 1) / s.tank(at, 0.98)
+    tank = s.plant.component(at)
+    half = 0.5 * tank.height if isinstance(tank, Tank) and s.rng.random() < 0.5 else 0.0
+    return Deviation("area_taper", at, s.one_of("cone", "wedge"), {"slope": slope, "reference": half})
+
+
+def internal_body(s: NominalRun, at: str) -> Deviation:
+    numbers = {"low": s.tank(at, s.uniform(0.05, 0.3)), "high": s.tank(at, s.uniform(0.7, 0.95))}
+    law = s.one_of("block", "barrel", "heap")
+    numbers |= {"share": s.size(0.2, 0.45)} | ({"chamfer": s.uniform(0.05, 0.2)} if law == "block" else {})
+    return Deviation("internal_body", at, law, numbers)
+
+
+def overflow(s: NominalRun, at: str) -> Deviation:
+    law = s.one_of("rectangular_weir", "notched_weir", "brim")
+    deep = {"rectangular_weir": 0.05, "notched_weir": 0.12, "brim": 0.02}[law]
+    crest = s.tank(at, 0.98) - s.size(0.25, 0.5) * s.span(at)
+    numbers = {"crest": crest, "depth": deep * s.span(at), "flow": float(np.max(s.asked))}
+    others = [t.name for t in s.plant.tanks if t.name != at]
+    into = others[int(s.rng.integers(len(others)))] if others and s.rng.random() < 0.25 else None
+    return Deviation("overflow", at, law, numbers, other=into)
+
+
+def sensor_bias(s: NominalRun, at: str) -> Deviation:
+    return Deviation("sensor_bias", at, "offset", {"offset": s.either(0.04, 0.1) * s.span(s.tank_of(at))})
+
+
+def sensor_gain(s: NominalRun, at: str) -> Deviation:
+    return Deviation("sensor_gain", at, "stretched", {"gain": 1 + s.either(0.05, 0.12)})
+
+
+def sensor_lag(s: NominalRun, at: str) -> Deviation:
+    return Deviation("sensor_lag", at, s.one_of("damped", "damped_twice"), {"tau": s.size(10, 35)})
+
+
+def sensor_drift(s: NominalRun, at: str) -> Deviation:
+    rate = s.either(0.06, 0.15) * s.span(s.tank_of(at)) / s.seconds
+    return Deviation("sensor_drift", at, "creeping", {"rate": rate})
+
+
+def sensor_quantization(s: NominalRun, at: str) -> Deviation:
+    return Deviation("sensor_quantization", at, "rounded", {"step": s.size(0.03, 0.08) * s.span(s.tank_of(at))})
+
+
+def sensor_delay(s: NominalRun, at: str) -> Deviation:
+    return Deviation("sensor_delay", at, "late_reading", {"delay": s.size(6, 18)})
+
+
+def sensor_saturation(s: NominalRun, at: str) -> Deviation:
+    tank = s.tank_of(at)
+    ceiling = s.tank(tank, 0.98) - s.size(0.25, 0.5) * s.span(tank)
+    return Deviation("sensor_saturation", at, s.one_of("clipped", "clipped_reading"), {"ceiling": ceiling})
+
+
+NAMED: dict[str, Draw] = {
+    draw.__name__: draw
+    for draw in (
+        pump_gain,
+        pump_dead_zone,
+        pump_saturation,
+        pump_lag,
+        pump_delay,
+        pump_back_pressure,
+        laminar_flow,
+        flow_exponent,
+        outlet_drop,
+        coefficient_drift,
+        plugging,
+        cross_flow,
+        leak,
+        unmetered_flow,
+        area_taper,
+        internal_body,
+        overflow,
+        sensor_bias,
+        sensor_gain,
+        sensor_lag,
+        sensor_drift,
+        sensor_quantization,
+        sensor_delay,
+        sensor_saturation,
+    )
+}

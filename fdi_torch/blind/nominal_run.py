@@ -1,0 +1,86 @@
+"""What a cause is drawn against: how the sound rig moves under these inputs, so that thresholds are crossed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdi_torch.blind.deviation import Array
+from fdi_torch.blind.simulator import conductance
+from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
+
+
+@dataclass(frozen=True)
+class NominalRun:
+    """One case's sound rig.
+
+    plant: as built. levels (T, N) m and asked (T, M) m^3/s of the recording; seconds: its length.
+    strength: 1 usual, 0.2 weak. rng: this case's own.
+    """
+
+    plant: PlantDescription
+    levels: Array
+    asked: Array
+    strength: float
+    rng: np.random.Generator
+
+    @property
+    def seconds(self) -> float:
+        return float(len(self.levels) - 1)
+
+    def uniform(self, low: float, high: float) -> float:
+        return float(self.rng.uniform(low, high))
+
+    def size(self, low: float, high: float) -> float:
+        """A size in its usual range, times the strength asked for."""
+        return self.strength * self.uniform(low, high)
+
+    def either(self, low: float, high: float) -> float:
+        """A size of either sign."""
+        return self.size(low, high) * (1.0 if self.rng.random() < 0.5 else -1.0)
+
+    def one_of(self, *laws: str) -> str:
+        return laws[int(self.rng.integers(len(laws)))]
+
+    def pump(self, name: str) -> tuple[float, float]:
+        """Lowest and highest flow asked of the pump, m^3/s."""
+        column = self.asked[:, [p.name for p in self.plant.pumps].index(name)]
+        return float(column.min()), float(column.max())
+
+    def tank(self, name: str, share: float) -> float:
+        """The level that the tank stays below for this share of the time, m."""
+        column = self.levels[:, [t.name for t in self.plant.tanks].index(name)]
+        return float(np.quantile(column, share))
+
+    def span(self, tank: str) -> float:
+        """Levels between which the tank moves, m."""
+        return self.tank(tank, 0.98) - self.tank(tank, 0.02)
+
+    def tank_of(self, location: str) -> str:
+        """The tank a pump feeds, a sensor reads or a pipe drains."""
+        component = self.plant.component(location)
+        if isinstance(component, Pump):
+            return component.target
+        if isinstance(component, Pipe):
+            return component.source
+        return component.tank if isinstance(component, Sensor) else component.name
+
+    def head(self, pipe: str, share: float) -> float:
+        """The driving head that the pipe stays below for this share of the time, m."""
+        tanks = [t.name for t in self.plant.tanks]
+        p = next(p for p in self.plant.pipes if p.name == pipe)
+        head = self.levels[:, tanks.index(p.source)] - p.elevation
+        if not p.is_outlet:
+            head = head - (self.levels[:, tanks.index(p.target)] - p.elevation)
+        return float(np.quantile(np.abs(head), share))
+
+    def conductance_of(self, pipe: str) -> float:
+        return float(conductance(self.plant)[[p.name for p in self.plant.pipes].index(pipe)])
+
+    def conductance_at(self, tank: str) -> float:
+        """That of the pipe a leak of this tank is compared with."""
+        component = self.plant.component(tank)
+        reference = component.leak_reference if isinstance(component, Tank) else None
+        touching = [p.name for p in self.plant.pipes if tank in (p.source, p.target)]
+        return self.conductance_of(reference or touching[0])

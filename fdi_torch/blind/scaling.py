@@ -1,0 +1,82 @@
+"""A rig of any size and speed as one on a bench, where the benchmark's seconds, litres and centimetres are usual ones.
+
+Lengths are measured in units of `length` m, times of `time` s, areas of `area` m^2: A dh/dt = q and
+q = C_d a sqrt(2 g h) keep their form if flows are measured in area x length / time and bores a in
+area x sqrt(length) / time. All are powers of ten, so that what is round in print stays round.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from fdi_torch.plant.description import PlantDescription, Pump, Sensor
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What one second, metre and square metre of the bench are at the rig, s, m and m^2."""
+
+    time: float = 1.0
+    length: float = 1.0
+    area: float = 1.0
+
+    @property
+    def flow(self) -> float:
+        return self.area * self.length / self.time
+
+    @property
+    def bore(self) -> float:
+        return self.area * math.sqrt(self.length) / self.time
+
+    def command(self, pump: Pump) -> float:
+        """What a pump's command of 1 on the bench is at the rig: more where commands are flows, else the same."""
+        return self.flow if pump.gain_unit == "1" else 1.0
+
+    def as_dict(self) -> dict[str, float]:
+        return {"time_s": self.time, "length_m": self.length, "area_m2": self.area}
+
+
+SAME = Scales()
+
+
+def decimals(on_bench: int, scale: float) -> int:
+    """Decimals in print that tell as much as `on_bench` decimals do on the bench."""
+    return max(on_bench - round(math.log10(scale)), 0)
+
+
+def on_bench(plant: PlantDescription, scales: Scales) -> PlantDescription:
+    """The dynamically similar plant on the bench; readings in volts and the like stay the same."""
+    return replace(
+        plant,
+        tanks=tuple(
+            replace(
+                t,
+                area=t.area / scales.area,
+                height=t.height / scales.length,
+                start_level=None if t.start_level is None else t.start_level / scales.length,
+            )
+            for t in plant.tanks
+        ),
+        pipes=tuple(replace(p, area=p.area / scales.bore, elevation=p.elevation / scales.length) for p in plant.pipes),
+        pumps=tuple(
+            replace(p, max_flow=p.max_flow / scales.flow, gain=p.gain / scales.flow * scales.command(p))
+            for p in plant.pumps
+        ),
+        sensors=tuple(_sensor(s, scales) for s in plant.sensors),
+        tolerances={name: t / _unit_of(plant, name, scales) for name, t in plant.tolerances.items()},
+    )
+
+
+def _sensor(sensor: Sensor, scales: Scales) -> Sensor:
+    if sensor.unit != "m":
+        return replace(sensor, gain=sensor.gain * scales.length)
+    low, high = (None if end is None else end / scales.length for end in (sensor.low, sensor.high))
+    return replace(sensor, offset=sensor.offset / scales.length, low=low, high=high)
+
+
+def _unit_of(plant: PlantDescription, constant: str, scales: Scales) -> float:
+    """An offset's tolerance is in the reading's unit, all others are shares."""
+    name, _, field = constant.rpartition(".")
+    sensor = next((s for s in plant.sensors if s.name == name), None)
+    return scales.length if field == "offset" and sensor is not None and sensor.unit == "m" else 1.0

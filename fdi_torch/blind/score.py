@@ -1,0 +1,204 @@
+"""Scores diagnoses against the opened key: detection, name, place, answer set, confident errors, closure, utility."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from fdi_torch.blind.conditions import HELD_OUT
+from fdi_torch.blind.kinds import KINDS
+from fdi_torch.blind.places import Cause, canonical, effect_places
+from fdi_torch.blind.sizes import size_errors
+from fdi_torch.blind.statistics import clopper_pearson, mean_interval, median_interval
+from fdi_torch.parameters import unit_factor
+from fdi_torch.plant.description import OUTSIDE, PlantDescription
+
+Answer = Mapping[str, Any]
+Row = dict[str, Any]
+SHARES = (
+    "right",
+    "place",
+    "in_set",
+    "cause_beside",
+    "named_wrong",
+    "detected",
+    "missed",
+    "false_alarm",
+    "closed_within",
+    "crash",
+)
+MEANS = ("utility", "set_size", "sec")
+MEDIANS = ("closed_error", "sec")
+
+
+def utility(answer: Collection[Cause], truth: Collection[Cause], pairs: int) -> float:
+    """DXC'09 utility of a set of causes w for the truth v of f pairs (Feldman et al., 2010).
+
+    1 - n (N + 1) / (f (n + 1)) - m (M + 1) / (f (m + 1)), n = |w - v|, N = |w|, m = |v - w|, M = f - N.
+    """
+    w, v = set(answer), set(truth)
+    n, m = len(w - v), len(v - w)
+    return 1 - n * (len(w) + 1) / (pairs * (n + 1)) - m * (pairs - len(w) + 1) / (pairs * (m + 1))
+
+
+def expected_utility(answer: Answer, sets: Sequence[list[Cause]], truth: list[Cause], plant: PlantDescription) -> float:
+    """Utility weighted by the posterior; where there is none, each member of the answer set counts the same."""
+    post = [(_causes(x["causes"], plant), float(x["probability"])) for x in answer.get("posterior") or []]
+    post = post or [(s, 1.0) for s in sets or [[]]]
+    weight, pairs = sum(w for _, w in post) or 1.0, len(effect_places(plant))
+    return sum(w * utility(_with_names(s), truth, pairs) for s, w in post) / weight
+
+
+def _with_names(causes: Sequence[Cause]) -> list[Cause]:
+    """Less what has none: an unknown is no effect-place pair."""
+    return [cause for cause in causes if cause[0] != "unknown"]
+
+
+def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> Row:
+    """One row of scores. truth: a line of the key, with its kind and causes."""
+    kind, true = truth["kind"], _causes(truth["causes"], plant)
+    causes = _causes(answer.get("causes"), plant)
+    sets = [_causes(s, plant) for s in answer.get("ambiguity_set") or []] or ([causes] if causes else [])
+    verdict, denied = answer.get("verdict"), kind == "left_out"
+    row: Row = {
+        "kind": kind,
+        "truth": true,
+        "effect": truth["causes"][0].get("really", true[0][0]) if true else "none",
+        "verdict": verdict,
+        "causes": causes,
+        "set_size": len(sets),
+        "crash": verdict == "crash",
+        **_stated(kind, true, answer, plant),
+        "utility": expected_utility(answer, sets, [] if denied else _with_names(true), plant),
+    }
+    if not true:
+        alarm = verdict != "no_gap"
+        return row | {"right": not alarm, "false_alarm": alarm, "named_wrong": verdict == "named"}
+    row |= {"detected": verdict not in ("no_gap", "crash")} | judge_closure(truth, answer, plant)
+    unseen = [("unknown", true[0][1])] if denied else [cause for cause in true if cause[0] == "unknown"]
+    if unseen:
+        where = [w["location"] for w in answer.get("where") or []]
+        return row | _judge_unseen(unseen[0], [] if denied else _with_names(true), causes, sets, verdict, where)
+    row |= {"z": size_errors(truth, answer.get("causes") or (), plant)} if verdict in ("named", "ambiguous") else {}
+    if kind == "messy":
+        return row | _judge_messy(true[0], causes, verdict)
+    of_outlets = [[("leak", p.source)] for p in plant.pipes if p.target == OUTSIDE]
+    tolerated = verdict == "no_gap" and true in of_outlets and not KINDS[kind].shows
+    row |= _judge_named(true, causes, sets, verdict, tolerated)
+    return row | ({"right": row["in_set"]} if kind == "dsingle" else {})
+
+
+def _stated(kind: str, true: list[Cause], answer: Answer, plant: PlantDescription) -> Row:
+    """The probability that the best explanation was given, and whether it is the true one."""
+    best = max(answer.get("posterior") or [], key=lambda x: float(x["probability"]), default=None)
+    if best is None:
+        return {}
+    causes = _causes(best["causes"], plant)
+    if best.get("unknown_at"):  # as the first format says it
+        causes.append(("unknown", best["unknown_at"]))
+    expected = [("unknown", true[0][1])] if kind == "left_out" else true
+    if kind == "messy":
+        right = true[0] in causes and _with_names(causes) == causes
+    else:
+        right = sorted(causes) == sorted(expected)
+    return {"stated": float(best["probability"]), "stated_right": right}
+
+
+def _judge_unseen(
+    unseen: Cause, named: list[Cause], causes: list[Cause], sets: list[list[Cause]], verdict: Any, where: list[str]
+) -> Row:
+    """A law that no library holds, at its place; named: causes beside it, all of which have to be there for
+    `cause_beside`.
+    """
+    at_place = where[:1] == [unseen[1]] or unseen in causes
+    row = {"right": verdict == "unknown" and at_place, "place": at_place, "named_wrong": verdict == "named"}
+    if not named:
+        return row
+    whole = sorted([*named, unseen])
+    return row | {
+        "cause_beside": row["right"] and _with_names(causes) == named,
+        "in_set": any(sorted(s) == whole for s in sets),
+    }
+
+
+def _judge_messy(full: Cause, causes: list[Cause], verdict: Any) -> Row:
+    """The full effect is to be named; the faint ones may be."""
+    return {
+        "right": full in causes,
+        "place": any(place == full[1] for _, place in causes),
+        "named_wrong": verdict == "named" and full not in causes,
+    }
+
+
+def _judge_named(true: list[Cause], causes: list[Cause], sets: list[list[Cause]], verdict: Any, tolerated: bool) -> Row:
+    """tolerated: the cause is a change of an outlet that may lie within its tolerance, and no gap was reported."""
+    named = sorted(causes) == sorted(true)
+    return {
+        "right": (named and verdict in ("named", "ambiguous")) or tolerated,
+        "in_set": any(sorted(s) == sorted(true) for s in sets) or tolerated,
+        "place": sorted(p for _, p in causes) == sorted(p for _, p in true) or tolerated,
+        "named_wrong": verdict == "named" and not named,
+        "missed": verdict == "no_gap",
+    }
+
+
+def judge_closure(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> Row:
+    """How far `closed` is from 1 - (a^2 - f^2)/(r^2 - f^2) with the true noise f of the hold-out.
+
+    Defined where the gap r^2 - f^2 left by recalibration is over five of its standard errors. The answer is in the
+    unit of the first sensor, the key in metres of level.
+    """
+    closure = answer.get("closure") or {}
+    if truth.get("disturbance"):  # the floor is then no longer the sensors' noise
+        return {}
+    if not truth.get("noise_rms_m") or any(closure.get(k) is None for k in ("recalibrated", "augmented")):
+        return {}
+    sensor = plant.sensors[0]
+    metres = unit_factor(closure.get("unit", "cm"), sensor.unit) / sensor.gain
+    floor = truth["noise_rms_m"]["holdout"]
+    square = math.fsum(f * f for f in floor) / len(floor)
+    left, gap = ((closure[k] * metres) ** 2 - square for k in ("augmented", "recalibrated"))
+    error = square * math.sqrt(2 / (HELD_OUT * len(floor)) * truth.get("repeats", 1.0))
+    if gap < 5 * error:
+        return {}
+    if closure.get("closed") is None:
+        return {"closed_within": False}
+    off = abs(closure["closed"] - (1 - left / gap))
+    return {"closed_error": off, "closed_within": off <= 0.03}
+
+
+def _causes(listed: Any, plant: PlantDescription) -> list[Cause]:
+    return [canonical((c["effect"], c["location"]), plant) for c in listed or []]
+
+
+def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """Scores by stratum and over all: shares with exact 95 % intervals, means with normal ones."""
+    strata = {kind: own for kind in KINDS if (own := [r for r in rows if r["kind"] == kind])}
+    return {name: _stratum(of) for name, of in (*strata.items(), ("all", list(rows)))}
+
+
+def by_effect(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """The same for each effect that is the only cause of its case; those without a name go by their law."""
+    lone = [r for r in rows if len(r["truth"]) == 1]
+    return {e: _stratum([r for r in lone if r["effect"] == e]) for e in sorted({r["effect"] for r in lone})}
+
+
+def _stratum(rows: Sequence[Row]) -> dict[str, Any]:
+    out: dict[str, Any] = {"cases": len(rows)}
+    for name in SHARES:
+        hits = [bool(r[name]) for r in rows if name in r]
+        if hits:
+            low, high = clopper_pearson(sum(hits), len(hits))
+            out[name] = {"of": len(hits), "hits": sum(hits), "share": sum(hits) / len(hits), "ci95": [low, high]}
+    for name in MEANS:
+        values = [float(r[name]) for r in rows if r.get(name) is not None]
+        if values:
+            mean, low, high = mean_interval(values)
+            out[name] = {"of": len(values), "mean": mean, "ci95": [low, high]}
+    for name in MEDIANS:
+        values = [float(r[name]) for r in rows if r.get(name) is not None]
+        if values:
+            median, low, high = median_interval(values)
+            out[f"median_{name}"] = {"of": len(values), "median": median, "ci95": [low, high]}
+    return out

@@ -1,0 +1,117 @@
+"""Sizes of named causes against the truth, where a law of the hidden rigs has a number that is the same quantity as a
+parameter of the diagnosis' effect: z = (value - truth) / standard error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from fdi_torch.blind.scaling import Scales
+from fdi_torch.blind.simulator import conductance
+from fdi_torch.blind.statistics import clopper_pearson, root_mean_square_interval
+from fdi_torch.parameters import unit_factor
+from fdi_torch.plant.description import PlantDescription, Pump, Sensor
+
+NORMAL_95 = 1.96
+
+Quantity = tuple[str, str, Callable[[Mapping[str, float], PlantDescription, str, Scales], float]]
+"""Name of a parameter, its SI unit, and its true value by a law's numbers, plant, place and scales of the rig."""
+
+
+def _number(parameter: str, unit: str, value: Callable[[Mapping[str, float]], float]) -> Quantity:
+    """A number that only has to be brought from the bench to the rig's own size and pace."""
+
+    def at_the_rig(numbers: Mapping[str, float], plant: PlantDescription, at: str, scales: Scales) -> float:
+        factors = {"s": scales.time, "1/s": 1 / scales.time, "m": scales.length, "m/s": scales.length / scales.time}
+        return value(numbers) * (factors | {"m^3/s": scales.flow, "m^2": scales.area, "1": 1.0})[unit]
+
+    return parameter, unit, at_the_rig
+
+
+def _reading(parameter: str, unit: str, number: str) -> Quantity:
+    """A number in the unit of a level; NaN at a sensor that reads in another unit, or with an offset of its own."""
+    name, _, level = _number(parameter, unit, lambda n: n[number])
+
+    def at_the_rig(numbers: Mapping[str, float], plant: PlantDescription, at: str, scales: Scales) -> float:
+        sensor = plant.component(at)
+        assert isinstance(sensor, Sensor)
+        plain = sensor.unit == "m" and sensor.gain == 1 and sensor.offset == 0
+        return level(numbers, plant, at, scales) if plain else math.nan
+
+    return name, unit, at_the_rig
+
+
+def _dead_zone(numbers: Mapping[str, float], plant: PlantDescription, at: str, scales: Scales) -> float:
+    pump = plant.component(at)
+    assert isinstance(pump, Pump)
+    return numbers["zone"] * scales.flow if pump.gain_unit == "1" else math.nan
+
+
+def _leak(numbers: Mapping[str, float], plant: PlantDescription, at: str, scales: Scales) -> float:
+    """As a share of the nominal capacity of the tank's reference pipe."""
+    pipes = [p.name for p in plant.pipes]
+    reference = next((t.leak_reference for t in plant.tanks if t.name == at), None)
+    first = next((p.name for p in plant.pipes if at in (p.source, p.target)), pipes[0])
+    return numbers["conductance"] * scales.bore / float(conductance(plant)[pipes.index(reference or first)])
+
+
+SAME: dict[tuple[str, str], Quantity] = {
+    ("pump_gain", "scaled"): _number("factor", "1", lambda n: n["gain"]),
+    ("pump_dead_zone", "threshold"): ("dead_zone", "m^3/s", _dead_zone),
+    ("pump_saturation", "hard_limit"): _number("limit", "m^3/s", lambda n: n["limit"]),
+    ("pump_lag", "slow"): _number("time_constant", "s", lambda n: n["tau"]),
+    ("pump_delay", "late"): _number("delay", "s", lambda n: n["delay"]),
+    ("flow_exponent", "other_power"): _number("excess", "1", lambda n: n["power"] - 0.5),
+    ("outlet_drop", "down_pipe"): _number("drop", "m", lambda n: n["drop"]),
+    ("coefficient_drift", "drifting_evenly"): _number("rate", "1/s", lambda n: n["change"] / n["span"]),
+    ("plugging", "narrowed"): _number("size", "1", lambda n: n["loss"]),
+    ("leak", "floor_hole"): ("size", "1", _leak),
+    ("unmetered_flow", "tapped"): _number("flow", "m^3/s", lambda n: -n["draw"]),
+    ("sensor_bias", "offset"): _reading("bias", "m", "offset"),
+    ("sensor_gain", "stretched"): _number("factor", "1", lambda n: n["gain"]),
+    ("sensor_lag", "damped"): _number("time_constant", "s", lambda n: n["tau"]),
+    ("sensor_drift", "creeping"): _reading("rate", "m/s", "rate"),
+    ("sensor_quantization", "rounded"): _reading("step", "m", "step"),
+    ("sensor_delay", "late_reading"): _number("delay", "s", lambda n: n["delay"]),
+    ("sensor_saturation", "clipped"): _reading("limit", "m", "ceiling"),
+    ("sensor_saturation", "clipped_reading"): _reading("limit", "m", "ceiling"),
+}
+
+
+def size_errors(truth: Mapping[str, Any], causes: Iterable[Mapping[str, Any]], plant: PlantDescription) -> list[str]:
+    """'effect z' for each cause that is true, told with a standard error, and has a number of the same quantity."""
+    units = truth.get("scales") or {}
+    scales = Scales(units.get("time_s", 1.0), units.get("length_m", 1.0), units.get("area_m2", 1.0))
+    true = {(c["effect"], c["location"]) for c in truth["causes"]}
+    found = []
+    for cause in causes:
+        for d in truth.get("deviations", ()):
+            here = (d["effect"], d["location"])
+            if here not in true or here != (cause["effect"], cause["location"]) or (d["effect"], d["law"]) not in SAME:
+                continue
+            name, unit, value = SAME[d["effect"], d["law"]]
+            amount = (cause.get("parameters") or {}).get(name) or {}
+            expected = value(d["numbers"], plant, d["location"], scales)
+            if amount.get("std") and math.isfinite(expected):
+                factor = unit_factor(amount.get("unit") or "1", unit)
+                found.append(f"{d['effect']} {(factor * amount['value'] - expected) / (factor * amount['std']):.4g}")
+    return found
+
+
+def sizes(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """By effect and over all: root mean square of z with its interval, and the share within 1.96 standard errors."""
+    by: dict[str, list[float]] = {}
+    for row in rows:
+        for effect, z in (text.split() for text in row.get("z") or ()):
+            for name in (effect, "all"):
+                by.setdefault(name, []).append(float(z))
+    return {name: _scores(by[name]) for name in [*sorted(by.keys() - {"all"}), *(["all"] if by else [])]}
+
+
+def _scores(z: list[float]) -> dict[str, Any]:
+    rms, *ends = root_mean_square_interval(z)
+    within = sum(abs(v) <= NORMAL_95 for v in z)
+    share = {"of": len(z), "hits": within, "share": within / len(z), "ci95": clopper_pearson(within, len(z))}
+    return {"rms": {"of": len(z), "mean": rms, "ci95": ends}, "within": share}

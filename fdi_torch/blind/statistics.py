@@ -1,0 +1,58 @@
+"""Intervals for shares, means and medians, and the F test."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from scipy import stats
+
+
+def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Exact interval for a share of k in n (Clopper and Pearson, 1934); (0, 1) for n = 0."""
+    if n == 0:
+        return 0.0, 1.0
+    low, high = stats.binomtest(k, n).proportion_ci(confidence, "exact")
+    return float(low), float(high)
+
+
+def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Median and the order statistics that hold it in 95 % of samples of any distribution; NaN where there are few."""
+    ranked, n = sorted(values), len(values)
+    if not ranked:
+        return math.nan, math.nan, math.nan
+    median = 0.5 * (ranked[(n - 1) // 2] + ranked[n // 2])
+    outside = [k for k in range(1, n // 2 + 1) if stats.binom.cdf(k - 1, n, 0.5) <= 0.025]
+    if not outside:
+        return median, math.nan, math.nan
+    return median, ranked[outside[-1] - 1], ranked[n - outside[-1]]
+
+
+def mean_interval(values: Sequence[float], z: float = 1.96) -> tuple[float, float, float]:
+    """Mean and its normal 95 % interval; NaN where there are no values, no width where there is one."""
+    if not values:
+        return math.nan, math.nan, math.nan
+    mean = math.fsum(values) / len(values)
+    if len(values) == 1:
+        return mean, math.nan, math.nan
+    std = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
+    half = z * std / math.sqrt(len(values))
+    return mean, mean - half, mean + half
+
+
+def root_mean_square_interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Root mean square of normal values of mean 0, and its 95 % interval by chi-square."""
+    n = len(values)
+    if n == 0:
+        return math.nan, math.nan, math.nan
+    square = math.fsum(v * v for v in values)
+    low, high = (math.sqrt(square / float(stats.chi2.ppf(p, n))) for p in (0.975, 0.025))
+    return math.sqrt(square / n), low, high
+
+
+def f_test(explained: float, residual: float, parameters: int, samples: float) -> float:
+    """p-value of `parameters` columns that lower the sum of squares by `explained` to `residual`."""
+    freedom = samples - parameters
+    if freedom <= 0 or residual <= 0:
+        return 1.0
+    return float(stats.f.sf(explained / parameters / (residual / freedom), parameters, freedom))

@@ -1,0 +1,25 @@
+"""--adopt: a plant file with what was found in it, and what is different from the one before."""
+
+from __future__ import annotations
+
+from difflib import unified_diff
+from pathlib import Path
+
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.files import find_plant
+from fdi_torch.config.plant_patch import patched_plant
+from fdi_torch.disk import write_text
+from fdi_torch.plant.description import PlantDescription
+
+
+def write_adopted(name: str, before: PlantDescription, after: PlantDescription, target: Path, screen: Screen) -> None:
+    """Writes the plant of that name (a file, or shipped), read as `before`, as `after` has it, and tells the lines that
+    are different.
+    """
+    text = find_plant(name, Path.cwd()).read_text(encoding="utf-8")
+    changed, kept = patched_plant(text, before, after)
+    write_text(target, changed)
+    if not kept:
+        screen.note(f"{target}: written anew, without the comments of {name}: components share values in it")
+    for line in unified_diff(text.splitlines(), changed.splitlines(), name, str(target), lineterm="", n=1):
+        screen.say(line)

@@ -1,0 +1,69 @@
+"""`fdi effects`: what it does and prints. Its options: `options/effects.py`."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import Any
+
+from fdi_torch.cli import DONE
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.plant import load_plant
+from fdi_torch.effects.catalogue import Entry, effects
+from fdi_torch.parameters import Parameter, display_unit
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    catalogue = effects(load_plant(arguments.plant) if arguments.plant else None)
+    entries = [catalogue[name] for name in arguments.names] or list(catalogue.entries)
+    if arguments.names:
+        for entry in entries:
+            _show(entry, bool(arguments.plant), screen)
+    else:
+        rows = [[e.name, ", ".join(e.at if arguments.plant else e.kinds), e.meaning] for e in entries]
+        screen.table(
+            catalogue.headline, ("effect", "at" if arguments.plant else "sits at a", "what it is"), rows, left=3
+        )
+        screen.say("fdi effects NAME tells its equation, parameters and units, and how to write it")
+    screen.result({"format": "fdi_torch.effects/1", "effects": [_as_json(entry) for entry in entries]})
+    return DONE
+
+
+def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
+    screen.say(f"{entry.name}: {entry.meaning}")
+    screen.say(f"  sits at a {' or '.join(entry.kinds)}" + (f": {', '.join(entry.at)}" if of_plant else ""))
+    screen.say(f"  acts {entry.begins}")
+    screen.table("", ("parameter", "unit", "nominal", "range", "meaning"), [_row(p) for p in entry.parameters], left=5)
+    screen.say(f"  in simulate.faults:     {entry.in_a_run_file}")
+    screen.say(f"  in estimate.parameters: {entry.at[0]}.{entry.name}")
+    screen.say(f"  in a plant's effects:   {entry.in_a_plant_file}")
+    if entry.mistaken_for:
+        screen.say(f"  easily mistaken for: {', '.join(entry.mistaken_for)}")
+    for line in entry.law.splitlines():
+        screen.say(f"  | {line}".rstrip())
+    screen.say()
+
+
+def _row(parameter: Parameter) -> list[str]:
+    unit, scale = display_unit(parameter.unit)
+    low, high = (f"{scale * v:.4g}" if math.isfinite(v) else "" for v in (parameter.low, parameter.high))
+    ends = f"{low} to {high}" if low and high else f"from {low}" if low else f"to {high}" if high else "any"
+    return [parameter.name, unit or "1", f"{scale * parameter.nominal:.4g}", ends, parameter.meaning]
+
+
+def _as_json(entry: Entry) -> dict[str, Any]:
+    parameters = [
+        {"name": p.name, "unit": p.unit, "nominal": p.nominal, "low": p.low, "high": p.high, "meaning": p.meaning}
+        for p in entry.parameters
+    ]
+    return {
+        "effect": entry.name,
+        "meaning": entry.meaning,
+        "law": entry.law,
+        "stage": entry.stage,
+        "kinds": list(entry.kinds),
+        "at": list(entry.at),
+        "begins": entry.begins,
+        "parameters": parameters,
+        "mistaken_for": list(entry.mistaken_for),
+    }

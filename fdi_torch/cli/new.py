@@ -1,0 +1,33 @@
+"""`fdi new`: what it does and prints. Its options: `options/new.py`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from fdi_torch.cli import DONE
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.plant import load_plant
+from fdi_torch.config.templates import template
+from fdi_torch.disk import named_errors
+
+NEXT = {
+    "plant": "fdi check --plant {}",
+    "run": "fdi train --config {}",
+    "monitor": "fdi monitor --config {}",
+    "study": "fdi study --config {}",
+}
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    path = Path(arguments.out or f"{arguments.kind}.yaml")
+    if path.suffix not in (".yaml", ".yml"):
+        raise ValueError(f"--out: expected a file that ends in .yaml, got {path}; rename it")
+    text = template(arguments.kind, load_plant(arguments.plant), arguments.plant, path.stem)
+    if path.exists():
+        raise ValueError(f"{path}: expected a new file, got one that is there; name another by --out")
+    with named_errors(path), path.open("x", encoding="utf-8") as file:
+        file.write(text)
+    screen.say(f"{path}; next: {NEXT[arguments.kind].format(path)}")
+    screen.result({"format": "fdi_torch.new/1", "file": str(path), "kind": arguments.kind})
+    return DONE

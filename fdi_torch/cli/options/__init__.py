@@ -1,0 +1,117 @@
+"""The options of each command: one module a command here, and below what several commands have in one form.
+
+A command's module has its description (the docstring), EXAMPLES and `add_arguments(parser)`. None of them imports
+torch, so that help is shown at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fdi_torch.cli.screen import Screen
+    from fdi_torch.logbook import Listener
+
+LIVE = "127.0.0.1:8765"
+
+
+class ShowKeys(argparse.Action):
+    """Prints what may stand in a file, and ends. models: as 'module:Model', imported when they are asked for."""
+
+    def __init__(self, models: Sequence[str], **settings: Any) -> None:
+        super().__init__(nargs=0, **settings)
+        self.models = models
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from fdi_torch.config.reference import config_reference
+
+        for model in self.models:
+            module, name = model.split(":")
+            sys.stdout.write(config_reference(getattr(import_module(module), name)) + "\n")
+        parser.exit()
+
+
+def add_keys(parser: argparse.ArgumentParser, what: str, *models: str) -> None:
+    """--keys of a file, by its models as 'module:Model'."""
+    told = f"print every key of {what} with its default and meaning, and end"
+    parser.add_argument("--keys", action=ShowKeys, models=models, help=told)
+
+
+def add_config(parser: argparse.ArgumentParser, *models: str, required: bool = False) -> None:
+    """models: of what may stand in the file, as 'module:Model'."""
+    parser.add_argument("--config", metavar="FILE", required=required, help="run file (YAML)")
+    if models:
+        add_keys(parser, "such a file", *models)
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="change one value of it, as in --set estimate.search.population=40; may be repeated",
+    )
+
+
+def seconds(text: str) -> float:
+    """A time on the command line: '90 s', '1.5 h', or a bare number of seconds."""
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    from fdi_torch.units import UnitError, in_unit, number_and_unit
+
+    try:
+        return in_unit(*number_and_unit(text), "s")
+    except UnitError:
+        raise argparse.ArgumentTypeError(f"expected a time such as 90 or '1.5 h', got '{text}'") from None
+
+
+def add_run(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", metavar="DIR", help="folder for what is written (default: logs)")
+    parser.add_argument("--device", metavar="cpu|cuda", help="where tensors live")
+    parser.add_argument("--seed", metavar="N", type=int, help="of everything drawn at random")
+
+
+def overrides(arguments: argparse.Namespace) -> list[str]:
+    """--set, and the short forms of what it can set, last ones winning."""
+    short = {"output.folder": "out", "device": "device", "seed": "seed"}
+    given = [(key, getattr(arguments, name, None)) for key, name in short.items()]
+    return [*arguments.set, *(f"{key}={value}" for key, value in given if value is not None)]
+
+
+def add_live(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--live",
+        metavar="[HOST:]PORT",
+        nargs="?",
+        const=LIVE,
+        help=f"serve the running job to Foxglove or Lichtblick (alone: {LIVE}, which only this machine "
+        "reaches; 0.0.0.0:PORT lets the whole network read, without a password; needs the extra live)",
+    )
+
+
+def who_may_read(host: str) -> str:
+    """The server asks nobody for a password."""
+    if host.strip("[]") in ("127.0.0.1", "::1", "localhost"):
+        return "who works on this machine may read it, nobody else"
+    return "whoever reaches this machine may read it, without a password"
+
+
+@contextmanager
+def live(arguments: argparse.Namespace, name: str, screen: Screen) -> Iterator[Listener | None]:
+    """What --live asks for: a server that hears the log, whose address is told; None without --live."""
+    if arguments.live is None:
+        yield None
+        return
+    from fdi_torch.logbook import serve
+
+    host, _, port = arguments.live.rpartition(":")
+    if not (port.isdigit() and int(port) < 2**16):
+        raise ValueError(f"--live: expected [HOST:]PORT such as {LIVE}, got {arguments.live}")
+    with serve(name, host or LIVE.partition(":")[0], int(port)) as server:
+        screen.note(f"live: {server.address} ({who_may_read(host or LIVE.partition(':')[0])})")
+        yield server

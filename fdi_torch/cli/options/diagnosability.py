@@ -1,0 +1,42 @@
+"""What an experiment can tell: which faults show, which can be told apart, how small they may be."""
+
+from __future__ import annotations
+
+import argparse
+
+from fdi_torch.cli.options import seconds
+
+EXAMPLES = """
+examples:
+  fdi diagnosability --plant three_tank --input '50 cm^3/s,50 cm^3/s'             two constant flows for 1000 s
+  fdi diagnosability --plant rig.yaml --input run.csv --noise '2 mm'              the inputs of a recording
+  fdi diagnosability --plant rig.yaml --input '20 m^3/h,50 %' --duration '1 day' --faults A.leak,link.plugging
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
+    parser.add_argument("--faults", metavar="NAME,NAME", help="such as T1.leak.size; by default the usual ones")
+    parser.add_argument(
+        "--input",
+        metavar="FILE|AMOUNTS",
+        required=True,
+        help="a recording whose inputs are used, or constant inputs such as '50 cm^3/s,50 cm^3/s'",
+    )
+    parser.add_argument(
+        "--duration",
+        metavar="TIME",
+        type=seconds,
+        help="of constant inputs, such as '2 h' (1000 s on a bench, longer on slower plants)",
+    )
+    parser.add_argument(
+        "--noise",
+        metavar="AMOUNT",
+        default="1 mm",
+        help="standard deviation of every reading: of the level ('1 mm', the default), or 'h1 = 1 mm, p2 = 2 mV'",
+    )
+    parser.add_argument(
+        "--false-alarm", metavar="SHARE", type=float, default=0.001, help="of tests without a fault (0.001)"
+    )
+    parser.add_argument("--miss", metavar="SHARE", type=float, default=0.05, help="of tests with the fault (0.05)")
+    parser.add_argument("--calibrate", metavar="NAME,NAME", default="", help="constants uncertain by their tolerance")

@@ -1,0 +1,35 @@
+"""Run an estimation, a study, a gap diagnosis or a monitor again from its log alone, and compare event by event.
+
+With --set, try another choice.
+
+Exit code 3 where an event differs by more than the tolerance.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+EXAMPLES = """
+examples:
+  fdi replay logs/own.mcap                         the same again, compared
+  fdi replay logs/own.mcap --set seed=7            another seed
+  fdi replay logs/study.mcap --trial 12            one trial of a study
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", metavar="RUN.mcap", help="a log of fdi train, study, gap or monitor")
+    parser.add_argument(
+        "--relative", metavar="R", type=float, default=1e-9, help="tolerance of numbers (default: 1e-9)"
+    )
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="what if: another objective, seed, library ...; may be repeated",
+    )
+    parser.add_argument(
+        "--trial", metavar="N", type=int, action="append", default=[], help="of a study, only this; may be repeated"
+    )
+    parser.add_argument("--out", metavar="FILE", help="the new log (with --set: NAME.what_if.mcap; otherwise not kept)")

@@ -1,0 +1,25 @@
+"""Estimate which faults are present in a recording, how large and how surely; logged, with a picture.
+
+Without --config it runs the built-in example: the paper's Table 3 fault at an SNR of 30 dB, simulated and diagnosed.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from fdi_torch.cli.options import add_config, add_live, add_run
+
+EXAMPLES = """
+examples:
+  fdi train                                        the built-in example: simulated, then diagnosed
+  fdi train --config own.yaml                      a recording of your own
+  fdi train --config own.yaml --set estimate.search.population=40 --seed 3
+  fdi train --config own.yaml --resume             go on where it was stopped
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_config(parser, "fdi_torch.config.run:RunConfig")
+    add_run(parser)
+    add_live(parser)
+    parser.add_argument("--resume", action="store_true", help="go on where a killed run of the same file stopped")

@@ -1,0 +1,181 @@
+"""A plant file changed where the plant has changed: comments, order, wildcards and units stay as they are written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from typing import Any
+
+import yaml
+
+from fdi_torch.config.files import compose_yaml, parse_yaml
+from fdi_torch.config.plant import build_plant
+from fdi_torch.config.plant_writer import dump_plant, plant_mapping
+from fdi_torch.config.problems import ConfigError
+from fdi_torch.plant.description import PlacedEffect, PlantDescription
+from fdi_torch.units import UnitError, in_unit, number_and_unit
+
+DIGITS = 7
+"""Of a number that is written: a ten-millionth of it, far below any standard error."""
+_SAME = 1e-6  # relative, of numbers written with so many digits
+_PARTS = ("tanks", "pipes", "pumps", "sensors")
+Path = tuple[str | int, ...]
+
+
+def patched_plant(text: str, before: PlantDescription, after: PlantDescription) -> tuple[str, bool]:
+    """The text of a plant file with what is different in `after`, and whether the rest of it could be kept.
+
+    text: the file that `before` was read from. Numbers are written in the unit that stands there, to `DIGITS` digits.
+    Where the changes cannot be told apart in the text (anchors that several components share), it is written anew.
+    """
+    edits = _Edits(text)
+    for path, value in _changes(before, after):
+        edits.set(path, value)
+    for placed in _new_effects(before, after):
+        edits.append(("effects",), _rounded(placed, after))
+    changed = edits.applied()
+    try:
+        kept = _equal(build_plant({"name": after.name, **parse_yaml(changed.encode(), "patched")}, "patched"), after)
+    except ConfigError:
+        kept = False
+    return (changed, True) if kept else (dump_plant(after), False)
+
+
+def _changes(before: PlantDescription, after: PlantDescription) -> Iterator[tuple[Path, str | float]]:
+    """Path and new value of every constant, effect's parameter and tolerance that is not what it was."""
+    old, new = plant_mapping(before), plant_mapping(after)
+    for part in _PARTS:
+        for name, fields in new.get(part, {}).items():
+            for field, value in fields.items():
+                if old[part][name].get(field) != value:
+                    yield (part, name, field), value
+    places = {(e.effect, e.location): k for k, e in enumerate(before.effects)}
+    for k, placed in enumerate(after.effects):
+        place = places.get((placed.effect, placed.location))
+        if place is not None:
+            for name, value in new["effects"][k]["parameters"].items():
+                if old["effects"][place]["parameters"].get(name) != value:
+                    yield ("effects", place, "parameters", name), value
+    for name, value in new.get("tolerances", {}).items():
+        if old.get("tolerances", {}).get(name) != value:
+            yield ("tolerances", name), value
+
+
+def _new_effects(before: PlantDescription, after: PlantDescription) -> list[PlacedEffect]:
+    known = {(e.effect, e.location) for e in before.effects}
+    return [e for e in after.effects if (e.effect, e.location) not in known]
+
+
+def _rounded(placed: PlacedEffect, plant: PlantDescription) -> dict[str, Any]:
+    """As a plant file has it."""
+    mapping: dict[str, Any] = plant_mapping(plant)["effects"][plant.effects.index(placed)]
+    return mapping | {"parameters": {n: _in_unit_of(v, None) for n, v in mapping["parameters"].items()}}
+
+
+class _Edits:
+    """Changes of a YAML text, found by the places that its parser tells of each value."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text if text.endswith("\n") or not text else f"{text}\n"
+        self._root = compose_yaml(self._text)
+        self._replaced: list[tuple[int, int, str]] = []
+        self._added: dict[Path, list[str]] = {}
+
+    def set(self, path: Path, value: str | float) -> None:
+        """Writes a value in the unit of the one there, or adds the key to the mapping that it belongs in."""
+        node = self._at(path)
+        if isinstance(node, yaml.ScalarNode):
+            quote = node.style if node.style in ("'", '"') else ""
+            new = f"{quote}{_in_unit_of(value, node.value)}{quote}"
+            self._replaced.append((node.start_mark.index, node.end_mark.index, new))
+        else:
+            self._added.setdefault(path[:-1], []).append(_flow({path[-1]: _in_unit_of(value, None)})[1:-1])
+
+    def append(self, path: Path, item: Mapping[str, Any]) -> None:
+        """Adds an item to a list."""
+        self._added.setdefault(path, []).append(_flow(dict(item)))
+
+    def applied(self) -> str:
+        """The text with all of them, from its end to its beginning, so that places stay true."""
+        edits = [*self._replaced, *(self._inserted(path, items) for path, items in self._added.items())]
+        text = self._text
+        for start, end, new in sorted(edits, reverse=True):
+            text = text[:start] + new + text[end:]
+        return text
+
+    def _at(self, path: Path) -> Any:
+        """The node there; None where there is none."""
+        node: Any = self._root
+        for step in path:
+            if isinstance(node, yaml.SequenceNode) and isinstance(step, int):
+                node = node.value[step]
+            elif isinstance(node, yaml.MappingNode):
+                node = next((value for key, value in node.value if key.value == step), None)
+            else:
+                return None
+        return node
+
+    def _inserted(self, path: Path, items: list[str]) -> tuple[int, int, str]:
+        """Where and how the items are added to the collection at that path."""
+        node = self._at(path)
+        is_list = path == ("effects",)
+        if node is None or isinstance(node, yaml.ScalarNode):  # it is not in the file yet
+            whole = f"[{', '.join(items)}]" if is_list else f"{{{', '.join(items)}}}"
+            if len(path) == 1 and not self._root.flow_style:
+                lines = "".join(f"  - {item}\n" if is_list else f"  {item}\n" for item in items)
+                return len(self._text), len(self._text), f"\n{path[0]}:\n{lines}"
+            return self._inserted(path[:-1], [f"{path[-1]}: {whole}"])
+        if node.flow_style:
+            end = node.end_mark.index - 1
+            return end, end, (", " if node.value else "") + ", ".join(items)
+        first = node.value[0] if is_list else node.value[0][0]
+        column = node.start_mark.column if is_list else first.start_mark.column
+        end = self._text.index("\n", _end(node))
+        return end, end, "".join(f"\n{' ' * column}{'- ' if is_list else ''}{item}" for item in items)
+
+
+def _end(node: Any) -> int:
+    """Where what a block holds ends; its own mark lies behind the comments and empty lines that follow."""
+    while isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
+        last = node.value[-1]
+        node = last[1] if isinstance(node, yaml.MappingNode) else last
+    return int(node.end_mark.index)
+
+
+def _flow(value: Any) -> str:
+    """On one line."""
+    return str(yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6)).strip()
+
+
+def _in_unit_of(value: str | float, written: str | None) -> Any:
+    """A quantity to `DIGITS` digits, in the unit of what is written there; a bare number remains one."""
+    number, unit = number_and_unit(str(value))
+    if written is not None:
+        try:
+            _, wanted = number_and_unit(written)
+            number, unit = in_unit(number, unit, wanted), wanted
+        except UnitError:
+            pass  # a word such as equilibrium stands there
+    short = f"{number:.{DIGITS}g}"
+    return float(short) if unit == "1" else f"{short} {unit}"
+
+
+def _equal(one: PlantDescription, other: PlantDescription) -> bool:
+    """The same plant, numbers as good as equal, its effects in any order."""
+    return _alike(_plain(one), _plain(other))
+
+
+def _plain(plant: PlantDescription) -> dict[str, Any]:
+    plain = asdict(plant)
+    return plain | {"effects": sorted(plain["effects"], key=lambda e: (e["effect"], e["location"]))}
+
+
+def _alike(one: Any, other: Any) -> bool:
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_alike(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(_alike, one, other))
+    if isinstance(one, float | int) and isinstance(other, float | int):
+        return math.isclose(one, other, rel_tol=_SAME, abs_tol=1e-15)
+    return bool(one == other)

@@ -1,0 +1,75 @@
+"""Files that are written as a whole or not at all, and what goes wrong with the disk, as one sentence."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+_CAUSES = {
+    errno.ENOSPC: "the disk is full; free some space",
+    errno.EDQUOT: "the disk quota is used up; free some space",
+    errno.EFBIG: "the limit on file size is reached; raise it (ulimit -f)",
+    errno.EACCES: "the folder or file may not be written or read; choose another or change its permissions",
+    errno.EPERM: "the folder or file may not be written or read; choose another or change its permissions",
+    errno.EROFS: "the file system is read-only; choose another folder",
+    errno.ENOENT: "there is no such file or folder, and none can be made there; check the path",
+    errno.EEXIST: "a part of the path is a file, not a folder; choose another folder",
+    errno.ENOTDIR: "a part of the path is a file, not a folder; choose another folder",
+    errno.EISDIR: "it is a folder; name a file",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+    errno.EIO: "the device reports an input/output error; use another disk",
+}
+
+
+class DiskError(OSError):
+    """A file cannot be written. Its text is one sentence that names the file and what to do."""
+
+
+def sentence(place: Path | str, error: OSError) -> str:
+    """What the operating system's error on a file means."""
+    if error.errno == errno.EEXIST and Path(place).is_file():
+        return f"{place}: it exists already; choose another name, or delete it"
+    return f"{place}: {_CAUSES.get(error.errno or 0, (error.strerror or str(error)).lower())}"
+
+
+@contextmanager
+def named_errors(place: Path | str) -> Iterator[None]:
+    """An error of the operating system inside names the file; it often does not where a write fails."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        if error.errno is None:  # a sentence already
+            raise
+        raise DiskError(sentence(place, error)) from error
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """The path to write a new version of a file at; it takes the file's place where the block ends without an error.
+
+    Folders are made. A device, such as /dev/stdout, is written at once. Raises DiskError.
+    """
+    with named_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and not path.is_file():
+            yield path
+            return
+        target = path.resolve()
+        new = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+        try:
+            yield new
+            os.replace(new, target)
+        finally:
+            new.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """A text file (UTF-8), whole or not at all; what UTF-8 cannot hold becomes a question mark. Raises DiskError."""
+    with replacing(path) as new:
+        new.write_text(text, encoding="utf-8", errors="replace")
+    return path

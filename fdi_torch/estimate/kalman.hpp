@@ -1,0 +1,327 @@
+// Kalman filter of levels x, of the random flows w that move them, and of correlated noise v of the sensors:
+//
+//     x_{s+1} = A_s x_s + B_s w_s,   y_s = H_s x_s + v_s + e_s,   e ~ N(0, diag R)
+//
+// where w and v decay by factors `keep` and take shocks of variance q; wherever a sample is marked fresh, the whole
+// state z = (x, w, v) begins anew with variance diag P0. Compiled for TANKS (of x and w), CHANNELS (of y) and LAYERS of
+// noise on each channel, none to several: v has LAYERS * CHANNELS. Matrices are dense, row by row.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <initializer_list>
+#include <vector>
+
+namespace {
+constexpr int n = TANKS, C = CHANNELS, decaying = n + LAYERS * C, d = n + decaying;
+
+struct Model {
+    const double *a, *b, *h;     // (S, n, n), (S, n, n), (S, C, n)
+    const double *keep, *q, *r;  // (decaying), (decaying), (C)
+    const double* p0;            // (d)
+    const uint8_t *seen, *fresh; // (S, C), (S)
+};
+
+// to (A, W) += m (A, B) x (B, W)
+template <int A, int B, int W>
+inline void add_product(const double* __restrict m, const double* __restrict x, double* __restrict to) {
+    for (int i = 0; i < A; ++i) {
+        double row[W];
+        for (int k = 0; k < W; ++k) row[k] = to[i * W + k];
+        for (int j = 0; j < B; ++j) {
+            const double v = m[i * B + j];
+            for (int k = 0; k < W; ++k) row[k] += v * x[j * W + k];
+        }
+        for (int k = 0; k < W; ++k) to[i * W + k] = row[k];
+    }
+}
+
+// to (B, W) += m (A, B)' x (A, W)
+template <int A, int B, int W>
+inline void add_product_of_transposed(const double* __restrict m, const double* __restrict x, double* __restrict to) {
+    for (int j = 0; j < B; ++j) {
+        double row[W];
+        for (int k = 0; k < W; ++k) row[k] = to[j * W + k];
+        for (int i = 0; i < A; ++i) {
+            const double v = m[i * B + j];
+            for (int k = 0; k < W; ++k) row[k] += v * x[i * W + k];
+        }
+        for (int k = 0; k < W; ++k) to[j * W + k] = row[k];
+    }
+}
+
+template <int A, int B>
+inline void transpose(const double* __restrict x, double* __restrict to) {
+    for (int i = 0; i < A; ++i)
+        for (int j = 0; j < B; ++j) to[j * A + i] = x[i * B + j];
+}
+
+// to = F z, of z (d, W)
+template <int W>
+inline void forward(const Model& m, int64_t t, const double* __restrict z, double* __restrict to) {
+    std::fill(to, to + n * W, 0.0);
+    add_product<n, n, W>(m.a + t * n * n, z, to);
+    add_product<n, n, W>(m.b + t * n * n, z + n * W, to);
+    for (int i = 0; i < decaying; ++i)
+        for (int k = 0; k < W; ++k) to[(n + i) * W + k] = m.keep[i] * z[(n + i) * W + k];
+}
+
+// to = F' z, of z (d, W)
+template <int W>
+inline void backward(const Model& m, int64_t t, const double* __restrict z, double* __restrict to) {
+    std::fill(to, to + n * W, 0.0);
+    add_product_of_transposed<n, n, W>(m.a + t * n * n, z, to);
+    for (int i = 0; i < decaying; ++i)
+        for (int k = 0; k < W; ++k) to[(n + i) * W + k] = m.keep[i] * z[(n + i) * W + k];
+    add_product_of_transposed<n, n, W>(m.b + t * n * n, z, to + n * W);
+}
+
+// to (C, W) = H z, of z (d, W); nothing of what is not seen
+template <int W>
+inline void look(const Model& m, int64_t t, const double* __restrict z, double* __restrict to) {
+    std::fill(to, to + C * W, 0.0);
+    add_product<C, n, W>(m.h + t * C * n, z, to);
+    for (int i = 0; i < LAYERS * C; ++i)
+        for (int k = 0; k < W; ++k) to[i % C * W + k] += z[(2 * n + i) * W + k];
+    for (int c = 0; c < C; ++c)
+        if (!m.seen[t * C + c]) std::fill(to + c * W, to + (c + 1) * W, 0.0);
+}
+
+// to (d, W) = H' x, of x (C, W), which is zero where nothing is seen
+template <int W>
+inline void look_back(const Model& m, int64_t t, const double* __restrict x, double* __restrict to) {
+    std::fill(to, to + 2 * n * W, 0.0);
+    add_product_of_transposed<C, n, W>(m.h + t * C * n, x, to);
+    for (int i = 0; i < LAYERS * C; ++i) std::copy(x + i % C * W, x + (i % C + 1) * W, to + (2 * n + i) * W);
+}
+
+// Inverse of the lower Cholesky factor of s (C, C); false where s is not positive definite.
+inline bool inverse_factor(const double* s, double* inverse, double* log_det) {
+    double l[C * C] = {};
+    for (int i = 0; i < C; ++i)
+        for (int j = 0; j <= i; ++j) {
+            double total = s[i * C + j];
+            for (int k = 0; k < j; ++k) total -= l[i * C + k] * l[j * C + k];
+            if (i == j) {
+                if (!(total > 0.0)) return false;
+                l[i * C + i] = std::sqrt(total);
+                *log_det += std::log(total);
+            } else {
+                l[i * C + j] = total / l[j * C + j];
+            }
+        }
+    std::fill(inverse, inverse + C * C, 0.0);
+    for (int j = 0; j < C; ++j) {
+        inverse[j * C + j] = 1.0 / l[j * C + j];
+        for (int i = j + 1; i < C; ++i) {
+            double total = 0.0;
+            for (int k = j; k < i; ++k) total -= l[i * C + k] * inverse[k * C + j];
+            inverse[i * C + j] = total / l[i * C + i];
+        }
+    }
+    return true;
+}
+
+// W columns of y from `first` on, of which the last may not be there.
+template <int W>
+void whiten(const Model& m, int64_t samples, int64_t columns, int64_t first, const double* gain, const double* white,
+            const double* y, double* out) {
+    double z[d * W], moved[d * W], nu[C * W], scaled[C * W];
+    const int64_t width = std::min<int64_t>(W, columns - first);
+    for (int64_t t = 0; t < samples; ++t) {
+        if (m.fresh[t]) std::fill(z, z + d * W, 0.0);
+        look<W>(m, t, z, nu);
+        for (int c = 0; c < C; ++c) {
+            const double* row = y + (t * C + c) * columns + first;
+            const bool on = m.seen[t * C + c];
+            if (width == W)
+                for (int k = 0; k < W; ++k) nu[c * W + k] = on ? row[k] - nu[c * W + k] : 0.0;
+            else
+                for (int64_t k = 0; k < W; ++k) nu[c * W + k] = on && k < width ? row[k] - nu[c * W + k] : 0.0;
+        }
+        std::fill(scaled, scaled + C * W, 0.0);
+        add_product<C, C, W>(white + t * C * C, nu, scaled);
+        for (int c = 0; c < C; ++c)
+            std::copy(scaled + c * W, scaled + c * W + width, out + (t * C + c) * columns + first);
+        if (t + 1 == samples || m.fresh[t + 1]) continue;
+        add_product<d, C, W>(gain + t * d * C, nu, z);
+        forward<W>(m, t, z, moved);
+        std::copy(moved, moved + d * W, z);
+    }
+}
+
+// The transpose of `whiten`: W columns of v -> what each reading adds to the products of v with its innovations.
+template <int W>
+void whiten_back(const Model& m, int64_t samples, int64_t columns, int64_t first, const double* gain,
+                 const double* white, const double* v, double* out) {
+    double z[d * W], moved[d * W], nu[C * W], own[C * W];
+    const int64_t width = std::min<int64_t>(W, columns - first);
+    for (int64_t t = samples - 1; t >= 0; --t) {
+        if (t + 1 == samples || m.fresh[t + 1])
+            std::fill(moved, moved + d * W, 0.0);
+        else
+            backward<W>(m, t, z, moved);
+        for (int c = 0; c < C; ++c)
+            for (int64_t k = 0; k < W; ++k)
+                own[c * W + k] = k < width ? v[(t * C + c) * columns + first + k] : 0.0;
+        std::fill(nu, nu + C * W, 0.0);
+        add_product_of_transposed<C, C, W>(white + t * C * C, own, nu);
+        add_product_of_transposed<d, C, W>(gain + t * d * C, moved, nu);
+        for (int c = 0; c < C; ++c) {
+            if (!m.seen[t * C + c]) std::fill(nu + c * W, nu + (c + 1) * W, 0.0);
+            std::copy(nu + c * W, nu + c * W + width, out + (t * C + c) * columns + first);
+        }
+        look_back<W>(m, t, nu, z);
+        for (int i = 0; i < d * W; ++i) z[i] = moved[i] - z[i];
+    }
+}
+
+using Walk = void (*)(const Model&, int64_t, int64_t, int64_t, const double*, const double*, const double*, double*);
+
+// Columns side by side, as many at a time as there are left.
+void in_tiles(Walk wide, Walk narrow, Walk single, const Model& m, int64_t samples, int64_t columns,
+              const double* gain, const double* white, const double* x, double* out) {
+    for (int64_t first = 0; first < columns;) {
+        const int64_t left = columns - first;
+        (left > 8 ? wide : left > 1 ? narrow : single)(m, samples, columns, first, gain, white, x, out);
+        first += left > 8 ? 32 : left > 1 ? 8 : 1;
+    }
+}
+}  // namespace
+
+extern "C" {
+// -> gain (S, d, C), white (S, C, C): the inverse factor of the innovation's variance. Returns its log determinant,
+// summed over what was seen, or not a number where a variance is not positive.
+double kalman_gains(int64_t samples, const Model* model, double* gain, double* white) {
+    const Model& m = *model;
+    std::vector<double> space(3 * d * d + 2 * d * C);
+    double *p = space.data(), *half = p + d * d, *next = half + d * d, *cross = next + d * d, *shown = cross + d * C;
+    double s[C * C], weight[C * C], log_det = 0.0;
+    for (int64_t t = 0; t < samples; ++t) {
+        const uint8_t* on = m.seen + t * C;
+        if (m.fresh[t]) {
+            std::fill(p, p + d * d, 0.0);
+            for (int i = 0; i < d; ++i) p[i * d + i] = m.p0[i];
+        }
+        look<d>(m, t, p, shown);
+        transpose<C, d>(shown, cross);
+        look<C>(m, t, cross, s);
+        for (int c = 0; c < C; ++c) s[c * C + c] += on[c] ? m.r[c] : 1.0;
+        double* own = white + t * C * C;
+        if (!inverse_factor(s, own, &log_det)) return std::nan("");
+        std::fill(weight, weight + C * C, 0.0);
+        add_product_of_transposed<C, C, C>(own, own, weight);
+        for (int c = 0; c < C; ++c)
+            if (!on[c]) own[c * C + c] = 0.0;
+        double* k = gain + t * d * C;
+        std::fill(k, k + d * C, 0.0);
+        add_product<d, C, C>(cross, weight, k);
+        if (t + 1 == samples) break;
+        std::fill(next, next + d * d, 0.0);
+        add_product<d, C, d>(k, shown, next);
+        for (int i = 0; i < d * d; ++i) p[i] -= next[i];
+        forward<d>(m, t, p, half);
+        transpose<d, d>(half, p);
+        forward<d>(m, t, p, next);  // F (F P)', as P is symmetric
+        for (int i = 0; i < d; ++i)
+            for (int j = 0; j < d; ++j) p[i * d + j] = 0.5 * (next[i * d + j] + next[j * d + i]);
+        for (int i = 0; i < decaying; ++i) p[(n + i) * (d + 1)] += m.q[i];
+    }
+    return log_det;
+}
+
+// y (S, C, M) -> innovations of unit variance (S, C, M), column by column.
+void kalman_innovations(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
+                        const double* y, double* out) {
+    in_tiles(whiten<32>, whiten<8>, whiten<1>, *model, samples, columns, gain, white, y, out);
+}
+
+// The transpose of the same.
+void kalman_transposed(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
+                       const double* v, double* out) {
+    in_tiles(whiten_back<32>, whiten_back<8>, whiten_back<1>, *model, samples, columns, gain, white, v, out);
+}
+
+// Slopes of the log-likelihood of innovations nu (S, C), of unit variance, by the variances: by_q (decaying), by_r (C),
+// by_p0 (d), and the same without the innovations, with the sign turned: n_q, n_r, n_p0, so that a variance times twice
+// its n is how many readings determine it; shocks (S, d): the smoothed state where a recording begins, and the smoothed shock that leads to every
+// other sample (the disturbance smoother: Durbin and Koopman, 2012, sections 4.5 and 7.3.3).
+void kalman_score(int64_t samples, const Model* model, const double* gain, const double* white, const double* nu,
+                  double* by_q, double* by_r, double* by_p0, double* n_q, double* n_r, double* n_p0,
+                  double* shocks) {
+    const Model& m = *model;
+    std::vector<double> space(3 * d * d + 4 * d * C);
+    double *big = space.data(), *half = big + d * d, *turned = half + d * d, *inner = turned + d * d;
+    double *inner_t = inner + d * C, *wide = inner_t + d * C, *cross = wide + d * C;
+    double r[d] = {}, back[d], u[C], spread[C * C];
+    for (double* sum : {by_q, n_q}) std::fill(sum, sum + decaying, 0.0);
+    for (double* sum : {by_r, n_r}) std::fill(sum, sum + C, 0.0);
+    for (double* sum : {by_p0, n_p0}) std::fill(sum, sum + d, 0.0);
+    for (int64_t t = samples - 1; t >= 0; --t) {
+        const double *k = gain + t * d * C, *w = white + t * C * C;
+        if (t + 1 == samples || m.fresh[t + 1]) {
+            std::fill(r, r + d, 0.0);
+            std::fill(big, big + d * d, 0.0);
+        } else {
+            for (int i = 0; i < decaying; ++i) {
+                by_q[i] += 0.5 * (r[n + i] * r[n + i] - big[(n + i) * (d + 1)]);
+                n_q[i] += 0.5 * big[(n + i) * (d + 1)];
+            }
+            backward<1>(m, t, r, back);
+            std::copy(back, back + d, r);
+            backward<d>(m, t, big, half);
+            transpose<d, d>(half, turned);
+            backward<d>(m, t, turned, big);  // F' N F
+        }
+        // u = S^-1 nu - K' F' r, and S^-1 + K' F' N F K.
+        std::fill(inner, inner + d * C, 0.0);
+        add_product<d, d, C>(big, k, inner);
+        std::fill(spread, spread + C * C, 0.0);
+        add_product_of_transposed<d, C, C>(k, inner, spread);
+        add_product_of_transposed<C, C, C>(w, w, spread);
+        std::fill(u, u + C, 0.0);
+        add_product_of_transposed<C, C, 1>(w, nu + t * C, u);
+        for (int c = 0; c < C; ++c) {
+            for (int i = 0; i < d; ++i) u[c] -= k[i * C + c] * r[i];
+            if (m.seen[t * C + c]) {
+                by_r[c] += 0.5 * (u[c] * u[c] - spread[c * C + c]);
+                n_r[c] += 0.5 * spread[c * C + c];
+            } else {
+                u[c] = 0.0;
+            }
+        }
+        look_back<1>(m, t, u, back);
+        for (int i = 0; i < d; ++i) r[i] += back[i];
+        // N + Z + Z' with Z = H' (T H / 2 - (F'NF K)'), T the spread: (I - K H)' F'NF (I - K H) + H' S^-1 H.
+        for (int c = 0; c < C; ++c)
+            for (int e = 0; e < C; ++e)
+                if (!m.seen[t * C + c] || !m.seen[t * C + e]) spread[c * C + e] = 0.0;
+        look_back<C>(m, t, spread, cross);
+        transpose<d, C>(cross, wide);
+        transpose<d, C>(inner, inner_t);
+        for (int c = 0; c < C; ++c)
+            for (int i = 0; i < d; ++i)
+                wide[c * d + i] = m.seen[t * C + c] ? 0.5 * wide[c * d + i] - inner_t[c * d + i] : 0.0;
+        look_back<d>(m, t, wide, half);
+        for (int i = 0; i < d; ++i)
+            for (int j = 0; j < d; ++j) big[i * d + j] += half[i * d + j] + half[j * d + i];
+        for (int i = 0; i < d; ++i) {
+            const double shock = m.fresh[t] ? m.p0[i] : i < n ? 0.0 : m.q[i - n];
+            shocks[t * d + i] = shock * r[i];
+            if (m.fresh[t]) {
+                by_p0[i] += 0.5 * (r[i] * r[i] - big[i * (d + 1)]);
+                n_p0[i] += 0.5 * big[i * (d + 1)];
+            }
+        }
+    }
+}
+
+// shocks (S, d) -> smoothed levels x (S, n).
+void kalman_levels(int64_t samples, const Model* model, const double* shocks, double* levels) {
+    double z[d] = {}, moved[d] = {};
+    for (int64_t t = 0; t < samples; ++t) {
+        for (int i = 0; i < d; ++i) z[i] = (model->fresh[t] ? 0.0 : moved[i]) + shocks[t * d + i];
+        std::copy(z, z + n, levels + t * n);
+        forward<1>(*model, t, z, moved);
+    }
+}
+}

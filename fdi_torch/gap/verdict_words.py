@@ -1,0 +1,74 @@
+"""The verdict of a gap diagnosis in one sentence, and its explanations in words, for the terminal and the page alike.
+
+The answer is its JSON, of format 1 or 2, perhaps from a log that anyone may have written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fdi_torch.gap.answer import UNKNOWN
+
+FORMAT_1 = "fdi_torch.gap/1"
+Named = Mapping[str, Any]
+
+
+def causes_of(explanation: Named) -> list[Named]:
+    """What an item of the posterior holds. Format 1 says what is unknown in `unknown_at` alone."""
+    causes = [c for c in explanation.get("causes") or [] if isinstance(c, Mapping)]
+    place = explanation.get("unknown_at")
+    if place and not any(c.get("effect") == UNKNOWN for c in causes):
+        causes.append({"effect": UNKNOWN, "location": place})
+    return causes
+
+
+def cause_words(cause: Named) -> str:
+    """'leak at T1', 'something unknown at Q1'."""
+    effect = "something unknown" if cause.get("effect") == UNKNOWN else cause.get("effect", "")
+    return f"{effect} at {cause.get('location', '')}"
+
+
+def explanation_words(causes: Sequence[Named]) -> str:
+    return " and ".join(cause_words(c) for c in causes) or "nothing beyond tolerances"
+
+
+def probability_words(probability: float) -> str:
+    """No more digits than mean something: 'over 99.9 %', '97.2 %'."""
+    if probability >= 0.9995:
+        return "over 99.9 %"
+    return f"{100.0 * probability:.1f} %" if probability >= 0.001 else "under 0.1 %"
+
+
+def verdict_sentence(answer: Named, best: str = "") -> str:
+    """best: the likeliest explanation in words, perhaps with sizes; by default without. Empty without a verdict."""
+    verdict = answer.get("verdict", "")
+    first: Named = next(iter(answer.get("posterior") or []), {})
+    probability = first.get("probability")
+    chance = f", probability {probability_words(probability)}" if isinstance(probability, int | float) else ""
+    best = best or explanation_words(causes_of(first))
+    if verdict == "no_gap":
+        return "No gap: the plant file explains the recording within noise and tolerances."
+    if verdict == "named":
+        return f"The gap comes from {best}{chance}."
+    if verdict == "ambiguous":
+        count = len(answer.get("ambiguity_set") or [])
+        shared = f"There is a gap that {count} explanations share at 95 %" if count > 1 else "There is a gap"
+        rest = "" if count > 1 else _rest(answer)
+        certain = answer.get("certain") or []
+        surely = f" All that is likely holds {explanation_words(certain)}." if certain else ""
+        return f"{shared}; the likeliest is {best}{chance}{rest}.{surely}"
+    if verdict != "unknown":
+        return ""
+    if causes_of(first):
+        return f"The gap comes from {best}{chance}; no effect of the library has the law that is there."
+    place = next((str(w["location"]) for w in answer.get("where") or []), "a sensor")
+    return f"Readings of {place} jump or stand still as no tank makes them; beyond them the plant file holds."
+
+
+def _rest(answer: Named) -> str:
+    """Why a single explanation does not suffice: what was not fitted may be likely."""
+    unexamined = answer.get("unexamined")
+    if not isinstance(unexamined, int | float):
+        return ""
+    return f"; explanations that were not fitted have {probability_words(unexamined)}"

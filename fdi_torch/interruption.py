@@ -1,0 +1,85 @@
+"""Ctrl-C and SIGTERM: each becomes an exception in the main thread, which lets an open log be finished in order.
+
+A step that must not be cut in two, such as a write to a log, runs inside `UNDISTURBED` (or holds a `SteadyLock`): a
+signal that arrives meanwhile is raised when the step is done.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType, TracebackType
+
+
+class Terminated(SystemExit):
+    """The process was asked to end (SIGTERM); the exit code is the shell's 128 + 15."""
+
+    def __init__(self) -> None:
+        super().__init__(128 + signal.SIGTERM)
+
+
+class _Undisturbed:
+    """Context manager, to any depth. In other threads it does nothing: signals are raised in the main thread only."""
+
+    def __init__(self) -> None:
+        self._main = threading.main_thread().ident
+        self._depth = 0
+        self._postponed: BaseException | None = None
+
+    def __enter__(self) -> None:
+        if threading.get_ident() == self._main:
+            self._depth += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if threading.get_ident() == self._main:
+            self._depth -= 1
+            if self._postponed is not None and not self._depth:
+                postponed, self._postponed = self._postponed, None
+                raise postponed
+
+    def raise_or_postpone(self, error: BaseException) -> None:
+        if not self._depth:
+            raise error
+        self._postponed = error
+
+
+UNDISTURBED = _Undisturbed()
+
+
+class SteadyLock:
+    """A reentrant lock; the main thread is undisturbed while it holds the lock or waits for it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+
+    def __enter__(self) -> None:
+        UNDISTURBED.__enter__()
+        self._lock.acquire()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._lock.release()
+        UNDISTURBED.__exit__(kind, error, trace)
+
+
+def catch_signals() -> None:
+    """Raise SIGTERM as `Terminated` and Ctrl-C as KeyboardInterrupt. Does nothing outside the main thread.
+
+    Ctrl-C stays as it is where the caller ignores it or handles it.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    signal.signal(signal.SIGTERM, _terminate)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    UNDISTURBED.raise_or_postpone(Terminated())
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    UNDISTURBED.raise_or_postpone(KeyboardInterrupt())

@@ -1,0 +1,101 @@
+"""One HTML page of one or more logs, and its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from fdi_torch.config.logged import logged_plant
+from fdi_torch.disk import write_text
+from fdi_torch.logbook import Run, compare, read_run
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.report.comparison import comparison_section
+from fdi_torch.report.material import gather
+from fdi_torch.report.page import RunReport, page, report_of, write_pictures
+from fdi_torch.report.section import Section
+from fdi_torch.report.verdict import headline
+from fdi_torch.tables import Shown, Table
+
+Tell = Callable[[float, str], None]
+
+
+@dataclass(frozen=True, repr=False)
+class Report(Shown):
+    """page: the HTML file. pictures: PNG and SVG files. headlines: what each log says. notes: what is missing."""
+
+    page: Path
+    pictures: tuple[Path, ...]
+    headlines: dict[str, str]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def headline(self) -> str:
+        return f"page: {self.page}"
+
+    def table(self) -> Table:
+        """A row a log."""
+        return Table({"log": list(self.headlines), "says": list(self.headlines.values())})
+
+
+def report(
+    logs: str | Path | Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    pictures: bool = False,
+    tell: Tell = lambda share, text: None,
+) -> Report:
+    """Writes one page of all that the logs say; of several, with a comparison first.
+
+    out: the page, or the folder for it; by default it lies beside the first log. pictures: whether every picture is
+    written as PNG and SVG too. Raises ValueError where a log cannot be read or the page would not end in .html.
+    """
+    paths = [Path(name) for name in ([logs] if isinstance(logs, str | Path) else logs)]
+    target = page_path(paths, None if out is None else str(out))
+    reports: list[RunReport] = []
+    notes: list[str] = []
+    for k, path in enumerate(paths):
+        log = read_run(path, salvage=True)
+        reports.append(report_of(gather(log, plant_of(log, notes))))
+        tell((k + 1) / (len(paths) + 1), path.name)
+    write_text(target, page(reports, [together(reports)] if len(reports) > 1 else []))
+    written: list[Path] = []
+    for k, each in enumerate(reports if pictures else ()):
+        several = f"{k + 1}_" if len(reports) > 1 else ""
+        written += write_pictures(each, target.with_suffix("") / several if several else target.with_suffix(""))
+    tell(1.0, "done")
+    headlines = {str(each.material.run.path): headline(each.material) for each in reports}
+    return Report(target, tuple(written), headlines, tuple(notes))
+
+
+def together(reports: Sequence[RunReport]) -> Section:
+    """The comparison of all runs; what stands in its way where they cannot be compared."""
+    runs = [report.material for report in reports]
+    try:
+        return comparison_section(compare([run.run.path for run in runs]), runs)
+    except (ValueError, KeyError, TypeError, IndexError, OSError) as error:
+        return Section("Comparison", [f"These logs cannot be compared: {error}"])
+
+
+def page_path(logs: list[Path], out: str | None) -> Path:
+    """Where the page goes: never over a log."""
+    name = logs[0].name.removesuffix(".partial").removesuffix(".mcap") + ("_and_more" if len(logs) > 1 else "")
+    if out is None:
+        return logs[0].with_name(f"{name}.html")
+    path = Path(out)
+    if path.is_dir() or not path.suffix:
+        return path / f"{name}.html"
+    if path.suffix not in (".html", ".htm"):
+        raise ValueError(f"expected a page that ends in .html, or a folder, got {out}; rename it")
+    return path
+
+
+def plant_of(log: Run, notes: list[str]) -> PlantDescription | None:
+    """The plant that the log describes; a page can do without, which is noted, and a blind benchmark has many rigs."""
+    if log.metadata.get("fdi_torch.run", {}).get("kind") == "challenge":
+        return None
+    try:
+        return logged_plant(log)
+    except (ValueError, OSError) as error:
+        notes.append(f"no drawing of the rig: {error}")
+        return None

@@ -1,0 +1,24 @@
+"""The vectors and matrices of a MATLAB file (up to version 7) as a table, by SciPy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import prod
+from pathlib import Path
+
+from scipy.io import loadmat, whosmat
+
+from fdi_torch.recordings.tables import Row, expect_cells
+from fdi_torch.recordings.vectors import rows_of_arrays
+
+_NUMBERS = frozenset(
+    {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+)
+
+
+def rows(path: Path, sheet: str | None) -> Iterator[Row]:
+    """Variables of numbers that are as long as the longest, a column each; of a matrix M its columns are M:1 ..."""
+    there = [(name, shape) for name, shape, kind in whosmat(str(path), appendmat=False) if kind in _NUMBERS]
+    expect_cells(path, sum(prod(shape) for _, shape in there))
+    found = loadmat(str(path), appendmat=False, variable_names=[name for name, _ in there], squeeze_me=False)
+    return rows_of_arrays(path, {name: found[name] for name, _ in there})

@@ -1,0 +1,149 @@
+"""Recordings in other formats than CSV, as the text that a CSV file of the same table would be.
+
+So every rule for headers, units, time stamps and cells, and every error, is that of CSV. A format is one line of
+`FORMATS` and a module with `rows(path, sheet)`, which yields a header and then rows of plain values.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import date, datetime
+from importlib import import_module
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from fdi_torch.outside import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, expect_unpacked
+
+Row = Sequence[object]
+DELIMITER = "\t"
+BYTES_A_CELL = 8
+_AT_ONCE = 256  # rows between two looks at how much there is
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file by its first bytes. module: the one below this package that reads it."""
+
+    magic: bytes
+    name: str
+    module: str
+
+
+FORMATS = (
+    Format(b"PAR1", "a Parquet file", "parquet"),
+    Format(b"PK\x03\x04", "an Excel workbook", "excel"),
+    Format(b"MATLAB 5.0", "a MATLAB file", "matlab"),
+    Format(b"\x89HDF", "an HDF5 file", "hdf5"),
+    Format(b"MATLAB 7.3", "an HDF5 file", "hdf5"),
+)
+
+
+def format_of(beginning: bytes) -> Format | None:
+    """The format of a file with these first bytes; None for text."""
+    return next((known for known in FORMATS if beginning.startswith(known.magic)), None)
+
+
+def table_text(path: Path, known: Format, sheet: str | None) -> TableText:
+    """The table in a file of that format. sheet: of a workbook with several; None for the first."""
+    if sheet is not None and known.module != "excel":
+        raise ValueError(f"{path}: sheet: expected this key of an Excel workbook only, got {known.name}; leave it out")
+    reader = import_module(f"fdi_torch.recordings.{known.module}")
+    return TableText(path, known, _begun(lambda: reader.rows(path, sheet)))
+
+
+class TableText(io.TextIOBase):
+    """The lines of a table as a CSV file with tabs has them, a few rows ahead of what is read.
+
+    Raises ValueError, naming the file, where its content is damaged or larger than a file of its size may be.
+    """
+
+    delimiter = DELIMITER
+    encoding = "utf-8"
+
+    def __init__(self, path: Path, known: Format, rows: Iterator[Row]) -> None:
+        self._path, self._known = path, known
+        self._rows = rows
+        self._lines = self._written()
+
+    def readable(self) -> bool:
+        return True
+
+    def readline(self, size: int | None = -1, /) -> str:  # type: ignore[override]
+        return next(self._lines, "")
+
+    def close(self) -> None:
+        with closing(self._lines):
+            super().close()
+
+    def _written(self) -> Generator[str, None, None]:
+        packed, cells, width = self._path.stat().st_size, 0, 0
+        while block := self._next_rows():
+            cells += sum(map(len, block))
+            expect_unpacked(BYTES_A_CELL * cells, packed, str(self._path), MOST_UNPACKED, MOST_EXPANSION)
+            width = width or max(len(_trimmed(row)) for row in block)
+            yield from _lines(_of_width(row, width) for row in block)
+
+    def _next_rows(self) -> list[Row]:
+        try:
+            return list(islice(self._rows, _AT_ONCE))
+        except MemoryError:
+            raise
+        except ImportError as error:
+            raise ValueError(f"{self._path}: {error}") from error
+        except Exception as error:  # what a library says of a file that is none, or damaged
+            if isinstance(error, ValueError) and str(error).startswith(str(self._path)):
+                raise
+            told = str(error).partition("\n")[0] or type(error).__name__
+            what = f"{self._path}: expected {self._known.name} that is whole, got one that cannot be read"
+            raise ValueError(f"{what}: {told}") from error
+
+
+def _begun(rows: Callable[[], Iterator[Row]]) -> Iterator[Row]:
+    """The rows of a file that is not opened before the first is asked for."""
+    yield from rows()
+
+
+def expect_cells(path: Path, cells: int) -> None:
+    """Raises ValueError where a file claims more cells than one of its size may have, before they are read."""
+    expect_unpacked(BYTES_A_CELL * cells, path.stat().st_size, str(path), MOST_UNPACKED, MOST_EXPANSION)
+
+
+def _lines(rows: Iterable[Row]) -> list[str]:
+    text = io.StringIO()
+    csv.writer(text, delimiter=DELIMITER, lineterminator="\n").writerows(
+        [_cell(value) for value in row] for row in rows
+    )
+    return text.getvalue().splitlines(keepends=True)
+
+
+def _trimmed(row: Row) -> Row:
+    """Without the empty cells at its end."""
+    last = next((k for k in range(len(row), 0, -1) if row[k - 1] not in (None, "")), 0)
+    return row[:last]
+
+
+def _of_width(row: Row, width: int) -> Row:
+    """As wide as the header, as far as what it has allows: empty cells at the end are added or left out."""
+    if len(row) < width:
+        return [*row, *[None] * (width - len(row))]
+    return row if any(value not in (None, "") for value in row[width:]) else row[:width]
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, int | float):
+        return "" if value != value else repr(float(value)) if isinstance(value, float) else str(value)
+    if isinstance(value, datetime | date):
+        return value.isoformat()
+    text = value if isinstance(value, str) else str(value)
+    if len(text) > MOST_LINE:
+        raise ValueError(f"expected cells of at most {MOST_LINE} characters, got more")
+    return " ".join(text.split()) if any(c in text for c in "\t\r\n\v\f\x1c\x1d\x1e\x85\u2028\u2029") else text

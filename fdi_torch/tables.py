@@ -1,0 +1,100 @@
+"""What a result shows of itself in a session: a headline and a table, as text, as HTML, and for pandas."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib import import_module
+from typing import Any
+
+MOST_ROWS = 60
+"""Rows that are shown; a data frame has all of them."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of equal length, by name."""
+
+    columns: Mapping[str, Sequence[Any]]
+
+    @classmethod
+    def of_rows(cls, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
+        """The table with these rows, each as long as there are names."""
+        return cls({name: [row[k] for row in rows] for k, name in enumerate(names)})
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def rows(self, most: int = MOST_ROWS) -> list[list[str]]:
+        """The first rows as text."""
+        columns = [[_cell(value) for value in column[:most]] for column in self.columns.values()]
+        return [list(row) for row in zip(*columns, strict=True)]
+
+    def text(self) -> str:
+        lines = [list(self.columns), *self.rows()] if len(self) else []
+        widths = [max(len(line[k]) for line in lines) for k in range(len(self.columns))] if lines else []
+        shown = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines]
+        return "\n".join([*shown, *self._rest()])
+
+    def html(self) -> str:
+        head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
+        body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in self.rows())
+        rest = "".join(f"<p>{line}</p>" for line in self._rest())
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{rest}" if len(self) else ""
+
+    def to_pandas(self) -> Any:
+        """A pandas.DataFrame. Raises ImportError, saying what to install, where there is no pandas."""
+        return needed("pandas").DataFrame({name: list(column) for name, column in self.columns.items()})
+
+    def _rest(self) -> list[str]:
+        return [f"... and {len(self) - MOST_ROWS} more rows"] if len(self) > MOST_ROWS else []
+
+
+class Shown:
+    """Base of results that are shown in a session: they have a headline and a table."""
+
+    @property
+    def headline(self) -> str:
+        """The answer, in one sentence."""
+        raise NotImplementedError
+
+    def table(self) -> Table:
+        """What the headline rests on. Numbers are SI, unless a column names another unit."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}: {self.headline}\n{self.table().text()}".rstrip()
+
+    def _repr_html_(self) -> str:
+        """Headline, table and picture, in a notebook."""
+        return f"<div><p><b>{escape(self.headline)}</b></p>{self.table().html()}{self.picture()}</div>"
+
+    def picture(self) -> str:
+        """What is drawn below the table, as HTML; empty where there is nothing to draw."""
+        return ""
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas.DataFrame (extra `pandas`)."""
+        return self.table().to_pandas()
+
+
+def needed(library: str, extra: str = "") -> Any:
+    """A library of an extra. Raises ImportError, saying what to install, where it is not there."""
+    try:
+        return import_module(library)
+    except ModuleNotFoundError as error:
+        if error.name != library.partition(".")[0]:
+            raise
+        told = (
+            f"expected the library {library.partition('.')[0]}, got none; pip install 'fdi_torch[{extra or library}]'"
+        )
+        raise ImportError(told) from error
+
+
+def _cell(value: Any) -> str:
+    if value is None or value != value:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

@@ -1,0 +1,142 @@
+"""Unit texts: 'cm^2', 'l/min/mA', 'cm3_s', 'm³·h⁻¹'. The only parser of units, and the only door of the unit library.
+
+    unit     = factor { ('*' | '·' | '/' | ' ') factor }
+    factor   = '1' | name [power] | '(' unit ')' [power]
+    power    = ('^' | '**') integer | superscript digits,     |integer| <= 9
+    quantity = number unit
+
+A text from outside is never evaluated: whatever is not of this grammar, or longer than `MOST_CHARACTERS`, is no unit.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import lru_cache
+from typing import Any
+
+import pint
+
+MOST_CHARACTERS = 64
+
+_registry: pint.UnitRegistry[float] = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+_registry.define("duty = [] ")
+_registry.define("lps = litre / second")
+_registry.define("percent = 0.01 = pct")
+for _short, _long in {"gpm": "gallon / minute", "gph": "gallon / hour", "lpm": "l / minute", "lph": "l / hour"}.items():
+    _registry.define(f"{_short} = {_long}")
+
+_SIGNS = {"%": "percent", "‰": "permille"}
+_SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+_NAME = r"[A-Za-zµμΩΩ°][A-Za-zµμ0-9_]*|[%‰]"
+_POWER = r"(?:\^|\*\*)\s*(?P<power>[+-]?\d)(?!\d)|(?P<super>⁻?[¹²³⁴⁵⁶⁷⁸⁹])"
+_TOKEN = re.compile(rf"\s*(?:(?P<name>{_NAME})|(?P<one>1)(?![\d.])|{_POWER}|(?P<sign>[*·/()]))", re.UNICODE)
+_NUMBER = re.compile(r"\s*([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)(?![\d.])\s*(.*)", re.DOTALL | re.ASCII)
+_VOLUME_A_TIME = re.compile(r"^((?:[cdm]?m|ft|in)3|m?[lL]|gal)_(s|min|h)$")  # no / in the headers of some loggers
+_CUBE = re.compile(r"(?<=[a-z])([23])(?![0-9])")
+
+
+class UnitError(ValueError):
+    """A text that is no unit or no quantity."""
+
+
+def number_and_unit(text: str) -> tuple[float, str]:
+    """'160 cm^2' -> (160.0, 'cm^2'); '5/s' -> (5.0, '1/s'); '0.3' -> (0.3, '1'). Raises UnitError."""
+    found = _NUMBER.fullmatch(text) if len(text) <= MOST_CHARACTERS else None
+    if found is None:
+        raise UnitError(f"no quantity: {text[:MOST_CHARACTERS]}")
+    number, rest = found[1], found[2].strip().removeprefix("*")
+    if not math.isfinite(float(number)):
+        raise UnitError(f"beyond all numbers: {number}")
+    return float(number), f"1{rest}" if rest.startswith("/") else rest or "1"
+
+
+def is_unit(text: str) -> bool:
+    try:
+        _parsed(text)
+    except UnitError:
+        return False
+    return True
+
+
+@lru_cache(maxsize=4096)
+def factor(unit: str, target: str) -> float:
+    """How many `target` one `unit` is. Raises UnitError where one is no unit, or they are of different kinds."""
+    return in_unit(1.0, unit, target)
+
+
+def in_unit(number: float, unit: str, target: str) -> float:
+    """A number of `unit` as a number of `target`. Raises UnitError."""
+    try:
+        converted = float(_registry.Quantity(number, _parsed(unit)).to(_parsed(target)).magnitude)
+    except (pint.PintError, OverflowError, ZeroDivisionError) as error:
+        raise UnitError(str(error)) from error
+    if math.isfinite(number) and not math.isfinite(converted):
+        raise UnitError(f"beyond all numbers: {number:g} {unit}")
+    return converted
+
+
+@lru_cache(maxsize=4096)
+def _parsed(text: str) -> Any:
+    """The library's unit. Raises UnitError."""
+    if len(text) > MOST_CHARACTERS:
+        raise UnitError(f"too long for a unit: {text[:MOST_CHARACTERS]}...")
+    return _Parser(_CUBE.sub(r"^\1", _VOLUME_A_TIME.sub(r"\1/\2", text.strip()))).whole()
+
+
+class _Parser:
+    """One walk over the tokens of a unit text; its depth is bounded by the length of the text."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._tokens: list[tuple[str, str]] = []
+        place = 0
+        while place < len(text):
+            found = _TOKEN.match(text, place)
+            if found is None or found.end() == place:
+                raise self._wrong()
+            self._tokens.append((str(found.lastgroup), found[str(found.lastgroup)]))
+            place = found.end()
+
+    def whole(self) -> Any:
+        unit = self._product()
+        if self._tokens:
+            raise self._wrong()
+        return unit
+
+    def _product(self) -> Any:
+        unit = self._factor()
+        while self._tokens and self._tokens[0] != ("sign", ")"):
+            divided = self._tokens[0] == ("sign", "/")
+            if self._tokens[0][0] == "sign" and self._tokens[0][1] in "*·/":
+                self._tokens.pop(0)
+            unit = unit / self._factor() if divided else unit * self._factor()
+        return unit
+
+    def _factor(self) -> Any:
+        kind, text = self._tokens.pop(0) if self._tokens else ("end", "")
+        if kind == "one":
+            return _registry.Unit("")
+        if kind == "name":
+            unit = _known(text)
+        elif (kind, text) == ("sign", "("):
+            unit = self._product()
+            if not self._tokens or self._tokens.pop(0) != ("sign", ")"):
+                raise self._wrong()
+        else:
+            raise self._wrong()
+        if self._tokens and self._tokens[0][0] in ("power", "super"):
+            unit = unit ** int(self._tokens.pop(0)[1].translate(_SUPERSCRIPTS))
+        return unit
+
+    def _wrong(self) -> UnitError:
+        return UnitError(f"no unit: {self._text}")
+
+
+def _known(name: str) -> Any:
+    """The unit of one name, with its prefix. Raises UnitError for what is none."""
+    name = _SIGNS.get(name, name)
+    try:
+        return _registry.Unit(_registry.UnitsContainer({_registry.get_name(name): 1}))
+    except (pint.PintError, KeyError, ValueError) as error:
+        raise UnitError(f"no unit: {name}") from error

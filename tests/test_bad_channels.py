@@ -1,0 +1,193 @@
+"""What is wrong between a sound rig and its recording is told or refused, and is never taken for a physical cause."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.acquisition import examined, usable
+from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.held import Scatter, held, scatter
+from tests.test_gap import SMALL, believed, noise, recorded
+
+
+def sound(seed: int = 11, **values: float) -> Recording:
+    """Of a rig whose constants are within their tolerances, read to a hundredth of a millimetre."""
+    changed = {name.replace("_", ".", 1): value for name, value in values.items()}
+    run = recorded({"P13.discharge_coefficient": 0.615, **changed}, seed, samples=2000)
+    return replace(run, outputs=(run.outputs / 1e-5).round() * 1e-5)
+
+
+def with_channel(recording: Recording, column: int, values: Tensor) -> Recording:
+    outputs = recording.outputs.clone()
+    outputs[:, column] = values
+    return replace(recording, outputs=outputs)
+
+
+def from_sample(recording: Recording, column: int, first: int, value: float | None = None) -> Recording:
+    values = recording.outputs[:, column].clone()
+    values[first:] = values[first] if value is None else value
+    return with_channel(recording, column, values)
+
+
+def test_readings_that_repeat_longer_than_noise_lets_them_are_held() -> None:
+    x = 0.3 + 0.1 * torch.sin(torch.arange(2000, dtype=torch.float64) / 90) + noise(2000, 0.0, 0.001, 1)[:, 0]
+    assert held(x) == []
+    stuck = x.clone()
+    stuck[400:430], stuck[1000:] = stuck[400], stuck[1000]
+    assert held(stuck) == [(400, 430), (1000, 2000)]
+    fine = (stuck / 1e-4).round() * 1e-4
+    assert held(fine)[-1] == (1000, 2000)
+
+
+@pytest.mark.parametrize("step", [3e-3, 1e-2, 3e-2])
+@pytest.mark.parametrize("slow", [90.0, 2000.0])
+def test_a_rounded_channel_is_not_held(step: float, slow: float) -> None:
+    for seed in range(5):
+        level = 0.3 + 0.1 * torch.sin(torch.arange(4000, dtype=torch.float64) / slow)
+        x = level + noise(4000, 0.0, 0.001, seed)[:, 0]
+        assert held((x / step).round() * step) == []
+
+
+def test_a_run_is_called_too_long_in_one_recording_of_a_thousand() -> None:
+    """Noise of 1 in steps of 0.8: every third reading repeats the last one."""
+    generator = torch.Generator().manual_seed(3)
+    calls = 0
+    for _ in range(300):
+        x = torch.randn(500, generator=generator, dtype=torch.float64)
+        calls += bool(held((x / 0.8).round() * 0.8))
+    assert calls <= 3
+
+
+def test_a_sensor_that_never_moves_is_held_against_its_neighbours_noise() -> None:
+    still = torch.full((500,), 0.3, dtype=torch.float64)
+    assert held(still) == []
+    assert held(still, Scatter(1e-3, 1e-5)) == [(0, 500)]
+    assert held(still, Scatter(1e-5, 1e-2)) == []
+    told = scatter((noise(5000, 0.0, 1e-3, 2)[:, 0] / 5e-4).round() * 5e-4)
+    assert told.noise == pytest.approx(1e-3, rel=0.2) and told.step == pytest.approx(5e-4)
+
+
+EACH_SENSOR = [(0, None, 0), (1, None, 800), (2, 0.0, 800), pytest.param(1, 0.0, 0, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize(("column", "value", "first"), EACH_SENSOR)
+def test_a_sensor_that_is_stuck_is_masked_and_told(column: int, value: float | None, first: int) -> None:
+    found = examined(believed(), from_sample(sound(), column, first, value))
+    assert [(s.sensor.name, s.first, s.for_good) for s in found.stuck] == [(f"h{column + 1}", first, True)]
+    assert found.slip is None
+    counted = found.recording.mask.sum(dim=0).tolist()
+    assert counted[column] == first
+    assert [n for c, n in enumerate(counted) if c != column] == [2000, 2000]
+    assert f"h{column + 1} is stuck at" in found.recording.notes[-1]
+
+
+@pytest.mark.parametrize("factor", [1e-3, 0.1, *(pytest.param(f, marks=pytest.mark.slow) for f in (1e-2, 10.0, 1e3))])
+def test_a_unit_that_slipped_is_refused(factor: float) -> None:
+    run = sound()
+    with pytest.raises(ValueError, match=r"h3: its unit seems wrong, for its numbers are \d+ times too"):
+        usable(believed(), with_channel(run, 2, factor * run.outputs[:, 2]))
+
+
+def test_a_command_in_the_wrong_unit_is_refused() -> None:
+    run = sound()
+    inputs = run.inputs.clone()
+    inputs[:, 0] *= 0.1
+    with pytest.raises(ValueError, match="Q1: its unit seems wrong, for its numbers are 10 times too small"):
+        usable(believed(), replace(run, inputs=inputs))
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (0, 2)])
+def test_swapped_sensors_are_refused(pair: tuple[int, int]) -> None:
+    run, (i, j) = sound(), pair
+    outputs = run.outputs.clone()
+    outputs[:, [i, j]] = outputs[:, [j, i]]
+    with pytest.raises(ValueError, match=f"h{i + 1} and h{j + 1} seem to be swapped"):
+        usable(believed(), replace(run, outputs=outputs))
+
+
+def test_swapped_commands_are_refused() -> None:
+    run = sound()
+    with pytest.raises(ValueError, match="Q1 and Q2 seem to be swapped"):
+        usable(believed(), replace(run, inputs=run.inputs.flip(1)))
+
+
+def late(run: Recording, seconds: int) -> Recording:
+    """All readings so many samples late, or early where that is below 0."""
+    first, last = max(seconds, 0), len(run) + min(seconds, 0)
+    moved = replace(run.stretch(first, last), outputs=run.outputs[first - seconds : last - seconds], ran=frozenset())
+    return replace(moved, mask=torch.isfinite(moved.outputs))
+
+
+@pytest.mark.parametrize("seconds", [40, -20, pytest.param(-200, marks=pytest.mark.slow)])
+def test_clocks_that_run_apart_are_refused(seconds: int) -> None:
+    with pytest.raises(ValueError, match=rf"the readings: the clock seems to run {abs(seconds)}(\.\d)? s (be|ah)"):
+        usable(believed(), late(sound(), seconds))
+
+
+def test_a_sensor_that_reads_ahead_of_the_others_is_refused() -> None:
+    run, early = sound(), 60
+    ahead = with_channel(run, 1, torch.cat([run.outputs[early:, 1], run.outputs[-early:, 1]])).stretch(0, 1900)
+    with pytest.raises(ValueError, match=r"h2: the clock seems to run \S+ s ahead of that of the other channels"):
+        usable(believed(), ahead)
+
+
+def test_random_readings_are_refused() -> None:
+    run = sound()
+    random = torch.rand(2000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    with pytest.raises(ValueError, match="h1: its readings do not follow the level of T1"):
+        usable(believed(), with_channel(run, 0, random))
+
+
+def test_what_is_trusted_is_not_refused() -> None:
+    run = sound()
+    wrong = with_channel(run, 2, 10.0 * run.outputs[:, 2])
+    assert usable(believed(), replace(wrong, trusted=True)).slip is None
+
+
+FAULTS = [
+    {"T1.leak.size": 0.5},
+    {"Q1.pump_gain.factor": 0.3},
+    {"P13.plugging.size": 0.8},
+    {"h2.sensor_gain.factor": 0.3},
+    {"h2.sensor_bias.bias": 0.2},
+    {"Q1.pump_delay.delay": 40.0},
+    {"h1.sensor_delay.delay": 40.0},
+    {"Q1.pump_lag.time_constant": 30.0, "Q2.pump_lag.time_constant": 30.0},
+    {"T2.leak.size": 0.9, "P13.plugging.size": 0.7},
+]
+
+
+@pytest.mark.parametrize("values", FAULTS, ids=lambda v: "+".join(v))
+def test_a_fault_however_large_is_no_slip(values: dict[str, float]) -> None:
+    found = examined(believed(), recorded(values, 5, samples=2000))
+    assert found.slip is None and not found.stuck
+
+
+def test_a_stuck_sensor_is_the_cause_and_hides_no_other() -> None:
+    library = Settings((*SMALL, "sensor_stuck"))
+    answer = diagnose(believed(), from_sample(sound(), 0, 700), settings=library)
+    assert (answer.verdict, [(c.effect, c.location) for c in answer.causes]) == ("named", [("sensor_stuck", "h1")])
+    assert answer.causes[0].parameters["onset"].value == 700.0
+    leaking = recorded({"T1.leak.size": 0.1}, 51, samples=2000)
+    whole = diagnose(believed(), from_sample(leaking, 1, 0), settings=library)
+    assert {(c.effect, c.location) for c in whole.causes} == {("sensor_stuck", "h2"), ("leak", "T1")}
+    assert whole.verdict == "named"
+
+
+def test_a_sensor_that_stands_still_for_a_while_is_unknown_there() -> None:
+    run = sound()
+    values = run.outputs[:, 1].clone()
+    values[500:900] = values[500]
+    answer = diagnose(believed(), with_channel(run, 1, values), settings=Settings(SMALL))
+    assert answer.verdict == "unknown" and answer.where[0] == ("h2", 1.0)
+
+
+def test_a_recording_without_a_sensor_that_reads_is_refused() -> None:
+    run = replace(sound(), outputs=torch.full((2000, 3), 0.3, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"expected a sensor that reads its level"):
+        diagnose(believed(), run, settings=Settings(SMALL))

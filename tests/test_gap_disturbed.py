@@ -1,0 +1,81 @@
+"""Random flows into the tanks are no gap, and hide no cause that is larger; the rig here has its own integrator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from fdi_torch.gap.answer import Answer
+from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.recording import Recording
+from tests.rigs import blank_recording
+from tests.test_gap import believed
+
+SUBSTEPS = 10  # a second
+LIBRARY = ("pump_gain", "plugging", "leak", "sensor_bias")
+SAMPLES = 700
+
+
+def recorded(flow: float, hold: int, seed: int, plugged: float = 0.0, onset: float = 0.0) -> Recording:
+    """Three tanks by Euler steps of a tenth of a second, read each second with 1 mm of noise.
+
+    flow: standard deviation of the random flow into each tank, m^3/s, new every `hold` s. plugged: by how much the
+    coefficient of P13 is lower from `onset` on.
+    """
+    plant, generator = believed(), torch.Generator().manual_seed(seed)
+    tanks = [t.name for t in plant.tanks]
+    levels = 15e-6 + 60e-6 * torch.rand(SAMPLES // 70 + 1, 2, generator=generator, dtype=torch.float64)
+    inputs = levels.repeat_interleave(70, dim=0)[:SAMPLES]
+    random = flow * torch.randn(SAMPLES // hold + 1, 3, generator=generator, dtype=torch.float64)
+    disturbing = random.repeat_interleave(hold, dim=0)[:SAMPLES]
+    level, rows = [0.3, 0.2, 0.25], []
+    for second in range(SAMPLES):
+        rows.append(list(level))
+        for _ in range(SUBSTEPS):
+            into = disturbing[second].tolist()
+            for pump, command in zip(plant.pumps, inputs[second].tolist(), strict=True):
+                into[tanks.index(pump.target)] += command
+            for pipe in plant.pipes:
+                far = level[tanks.index(pipe.target)] if pipe.target in tanks else 0.0
+                head = level[tanks.index(pipe.source)] - far
+                lost = plugged if pipe.name == "P13" and second >= onset else 0.0
+                root = math.copysign(math.sqrt(2.0 * plant.gravity * abs(head)), head)
+                through = (1.0 - lost) * pipe.discharge_coefficient * pipe.area * root
+                into[tanks.index(pipe.source)] -= through
+                if pipe.target in tanks:
+                    into[tanks.index(pipe.target)] += through
+            level = [max(h + q / (SUBSTEPS * t.area), 0.0) for h, q, t in zip(level, into, plant.tanks, strict=True)]
+    noise = 1e-3 * torch.randn(SAMPLES, 3, generator=generator, dtype=torch.float64)
+    blank = blank_recording(plant, inputs, torch.arange(SAMPLES, dtype=torch.float64))
+    return replace(blank, outputs=torch.tensor(rows, dtype=torch.float64) + noise, mask=None)  # type: ignore[arg-type]
+
+
+def diagnosed(recording: Recording) -> Answer:
+    answer = diagnose(believed(), recording, settings=Settings(LIBRARY))
+    total = sum(e.probability for e in answer.posterior) + answer.unexamined
+    assert total < 1.0 + 1e-9 and answer.unexamined > 0.0
+    assert all(0.0 <= share <= 1.0 + 1e-9 for _, share in answer.where)
+    return answer
+
+
+@pytest.mark.parametrize(("flow", "hold"), [(0.0, 1), (4e-6, 1), (1.5e-6, 15)], ids=["none", "white", "held 15 s"])
+def test_random_flows_are_no_gap(flow: float, hold: int) -> None:
+    answer = diagnosed(recorded(flow, hold, seed=3))
+    assert answer.verdict == "no_gap" and not answer.causes
+    if hold == 1 and flow:
+        sizes = [answer.disturbances[t]["std"] for t in ("T1", "T2", "T3")]
+        times = [answer.disturbances[t]["correlation_time"] for t in ("T1", "T2", "T3")]
+        assert times == [0.0] * 3 and sizes == pytest.approx([flow] * 3, rel=0.3)
+
+
+def test_a_plugging_in_mid_record_is_named_beside_random_flows() -> None:
+    answer = diagnosed(recorded(1.5e-6, 15, seed=5, plugged=0.4, onset=350.0))
+    assert answer.verdict == "named"
+    (cause,) = answer.causes
+    assert (cause.effect, cause.location) == ("plugging", "P13")
+    size, onset = cause.parameters["size"], cause.parameters["onset"]
+    assert abs(size.value - 0.4) < 5.0 * size.std < 0.3
+    assert abs(onset.value - 350.0) < max(5.0 * onset.std, 2.0)

@@ -1,0 +1,28 @@
+"""Prior odds, and probabilities that are never certain."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from fdi_torch.estimate.evidence import ODDS, posterior
+from fdi_torch.gap.evidence import log_prior
+
+
+def test_all_sets_of_effects_of_one_size_share_one_prior() -> None:
+    """How many effects a library holds is no evidence for there being several."""
+    choices = 7
+    one, two = (log_prior([("any", place) for place in places], choices) for places in (["T1"], ["T1", "T2"]))
+    assert math.exp(one) * choices == pytest.approx(ODDS.effect)
+    assert math.exp(two) * choices**2 / 2 == pytest.approx(ODDS.effect**2), "a set has no order"
+
+
+def test_two_effects_at_one_place_are_less_likely_than_at_two() -> None:
+    apart, together = (log_prior([("leak", "T1"), ("area_taper", place)], 7) for place in ("T2", "T1"))
+    assert apart - together == pytest.approx(-math.log(ODDS.same_place))
+
+
+def test_probabilities_follow_from_differences_of_logarithms_alone() -> None:
+    for shift in (0.0, 1e6, -1e6):
+        assert posterior([shift + math.log(3.0), shift]) == pytest.approx([0.75, 0.25], rel=1e-6)

@@ -1,0 +1,85 @@
+"""The answer of a gap diagnosis on the terminal, from an answer that is given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from fdi_torch.cli.gap_text import next_steps, show
+from fdi_torch.cli.screen import Screen
+from fdi_torch.gap.answer import Amount, Answer, Cause, Explanation, adopted
+from fdi_torch.gap.verdict_words import causes_of, probability_words, verdict_sentence
+from tests.test_gap import believed
+
+LEAK = Cause("leak", "T1", {"size": Amount(0.2, 0.01, "1")})
+ODD = ("unknown", "Q1")
+FLOWS = {
+    "T1": {"std": 2.5e-6, "unit": "m^3/s", "correlation_time": 15.0},
+    "T2": {"std": 1e-6, "unit": "m^3/s", "correlation_time": 0.0},
+}
+BOTH = Answer(
+    verdict="unknown",
+    p_value=0.0,
+    where=[("Q1", 0.97), ("T1", 0.96), ("P13", 1e-6)],
+    causes=[LEAK, Cause(*ODD)],
+    ambiguity_set=[],
+    posterior=[Explanation((("leak", "T1"),), 0.97, "Q1"), Explanation((("leak", "T1"),), 0.01)],
+    closure={},
+    noise={},
+    unexamined=0.02,
+    disturbances=FLOWS,
+)
+
+
+def test_the_terminal_says_what_is_unknown_beside_what_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    show(BOTH, Screen())
+    said = capsys.readouterr().out
+    assert said.startswith(
+        "The gap comes from leak at T1 and something unknown at Q1, probability 97.0 %; no effect of the library has "
+        "the law that is there."
+    )
+    rows = [line.split() for line in said.splitlines()]
+    assert ["T1", "2.5", "cm^3/s", "15", "s"] in rows and ["T2", "1", "cm^3/s", "none"] in rows
+    assert ["explanations", "that", "were", "not", "examined", "2.0", "%"] in rows
+    assert ["Q1", "97.0", "%"] in rows and not any(row[:1] == ["P13"] for row in rows)
+
+
+def test_ambiguity_says_what_is_certain_whatever_else_there_is() -> None:
+    sets = [(("leak", "T1"), ODD), (("leak", "T1"),)]
+    posterior = [Explanation((("leak", "T1"),), 0.6, "Q1"), Explanation((("leak", "T1"),), 0.39)]
+    answer = replace(BOTH, verdict="ambiguous", ambiguity_set=sets, posterior=posterior)
+    assert answer.certain == [("leak", "T1")]
+    assert verdict_sentence(answer.to_dict()) == (
+        "There is a gap that 2 explanations share at 95 %; the likeliest is leak at T1 and something unknown at Q1, "
+        "probability 60.0 %. All that is likely holds leak at T1."
+    )
+
+
+def test_one_explanation_that_does_not_suffice_says_what_was_not_fitted() -> None:
+    posterior = [Explanation((("leak", "T1"),), 0.8)]
+    answer = replace(BOTH, verdict="ambiguous", ambiguity_set=[(("leak", "T1"),)], posterior=posterior, unexamined=0.2)
+    assert verdict_sentence(answer.to_dict()) == (
+        "There is a gap; the likeliest is leak at T1, probability 80.0 %; "
+        "explanations that were not fitted have 20.0 %."
+    )
+
+
+def test_an_unknown_is_nothing_to_adopt() -> None:
+    alone = replace(BOTH, causes=[Cause(*ODD)])
+    assert adopted(believed(), alone).effects == ()
+    assert [p.effect for p in adopted(believed(), BOTH).effects] == ["leak"]
+    assert not any("--adopt FILE writes" in step for step in next_steps(alone, True, None, None, None))
+    assert any("--adopt FILE writes" in step for step in next_steps(BOTH, True, None, None, None))
+
+
+@pytest.mark.parametrize(("probability", "words"), [(1.0, "over 99.9 %"), (0.9721, "97.2 %"), (5e-4, "under 0.1 %")])
+def test_no_probability_is_certain(probability: float, words: str) -> None:
+    assert probability_words(probability) == words
+
+
+def test_an_unknown_of_either_format_is_read_once() -> None:
+    odd = {"effect": "unknown", "location": "Q1"}
+    assert causes_of({"causes": [], "unknown_at": "Q1"}) == [odd]
+    assert causes_of({"causes": [odd], "unknown_at": "Q1"}) == [odd]
+    assert verdict_sentence({}) == ""

@@ -1,0 +1,230 @@
+"""Files from outside, drawn by grammars: each is read, or refused in sentences; none ends in a traceback or hangs.
+
+The quick profile draws a few hundred files. The long one runs for two minutes, or as long as `--fuzz-minutes` says:
+
+    python -m pytest tests/test_hostile_files.py -m slow -s --fuzz-minutes 60
+
+What it finds goes, made small, into tests/corpus.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import signal
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import hostile_files as drawn
+import pytest
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+
+from fdi_torch.config.files import parse_yaml
+from fdi_torch.config.loaded_recordings import known_parts, read_recording
+from fdi_torch.config.logged import logged_plant
+from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_writer import dump_plant
+from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.run import build_run
+from fdi_torch.config.simulation import planned_recording
+from fdi_torch.config.study import build_study
+from fdi_torch.effects import build_network
+from fdi_torch.jobs.logged_recordings import recording_in
+from fdi_torch.jobs.replay import asked_again
+from fdi_torch.jobs.run_setup import wanted_space
+from fdi_torch.logbook import inspect_log, read_run
+from fdi_torch.logbook.channel import Channel
+from fdi_torch.logbook.schemas import json_schema, topic_definition
+from fdi_torch.logbook.sink import EPOCH_NS, Sink
+from fdi_torch.recordings.check import check_recording
+from fdi_torch.report.material import gather
+
+CORPUS = Path(__file__).with_name("corpus")
+MOST_SECONDS = 10
+PLANT = load_plant("three_tank")
+CSV = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n" + "".join(
+    f"{t},{50 + t % 7},50,{40 + t % 11},{30 + t % 5},{35 + t % 3}\n" for t in range(50)
+)
+
+
+def read_plant(data: bytes, folder: Path) -> None:
+    plant = build_plant({"name": "plant"} | parse_yaml(data, "plant.yaml"), "plant.yaml")
+    network = build_network(plant)
+    assert len(network.constants) > 0
+    again = build_plant(parse_yaml(dump_plant(plant).encode(), "again.yaml"), "again.yaml")
+    assert [t.name for t in again.tanks] == [t.name for t in plant.tanks]
+
+
+def read_run_file(data: bytes, folder: Path) -> None:
+    run = build_run(parse_yaml(data, "run.yaml"), folder, "run.yaml")
+    wanted_space(run)
+    if run.config.simulate is not None:
+        planned_recording(run.config.simulate, run.plant)
+    for config in run.config.recordings:
+        known_parts(read_recording(config, run.plant, folder), config, run.plant)
+
+
+def read_study(data: bytes, folder: Path) -> None:
+    build_study(parse_yaml(data, "study.yaml"), folder, "study.yaml")
+
+
+def read_csv(data: bytes, folder: Path) -> None:
+    (folder / "recording.csv").write_bytes(data)
+    config = RecordingConfig(file="recording.csv")
+    recording = read_recording(config, PLANT, folder)
+    check_recording(recording, PLANT)
+    known_parts(recording, config, PLANT)
+
+
+def read_log(data: bytes, folder: Path) -> None:
+    """All that `inspect`, `report`, `replay` and a recording in MCAP read of a log; each part may refuse by itself."""
+    path = folder / "log.mcap"
+    path.write_bytes(data)
+    run = read_run(path, salvage=True)
+    readers: list[Callable[[], Any]] = [
+        lambda: inspect_log(path),
+        lambda: logged_plant(run),
+        lambda: asked_again(run),
+        lambda: check_recording(recording_in(run, "", 0), PLANT),
+        lambda: read_recording(RecordingConfig(file="log.mcap"), PLANT, folder),
+    ]
+    refused = 0
+    for read in readers:
+        try:
+            read()
+        except (ValueError, OSError):
+            refused += 1
+    material = gather(run)
+    for part in ("groups", "recordings", "arrays", "residuals", "truth", "answer"):
+        try:
+            getattr(material, part)
+        except (ValueError, OSError):
+            refused += 1
+    if refused > 4:
+        raise ValueError("hardly anything in it")
+
+
+@st.composite
+def logs(draw: st.DrawFn, folder: Path) -> bytes:
+    """A log of ours: a plant or a run as its configuration, messages of ours or others, now and then damaged."""
+    path = folder / "drawn.mcap"
+    path.unlink(missing_ok=True)
+    sink = Sink(path, "fuzz")
+    sink.metadata("fdi_torch.run", {"kind": draw(st.sampled_from(["train", "gap", "study", "monitor", "x"]))})
+    sink.attachment("config.yaml", "", draw(drawn.spoiled(drawn.run_files())))
+    for k in range(draw(st.integers(2, 6))):
+        for topic, names in (("/plant/input", ("Q1", "Q2")), ("/plant/output", ("h1", "h2", "h3"))):
+            put(sink, topic, {"t": float(k)} | dict.fromkeys(names, 0.3 + 0.01 * k), names)
+    for topic, payload in draw(drawn.own_messages()):
+        put(sink, topic, payload, tuple(payload))
+    sink.finish()
+    data = path.read_bytes()
+    return draw(drawn.damaged(data)) if draw(st.integers(1, 4)) == 1 else data
+
+
+def put(sink: Sink, topic: str, payload: dict[str, Any], names: tuple[str, ...]) -> None:
+    definition = topic_definition(topic)
+    schema = json_schema(definition, dict.fromkeys(names, "number"))
+    pairs = tuple((f"unit.{name}", "m^3/s" if name.startswith("Q") else "m") for name in names)
+    sink.message(
+        Channel(topic, "json", definition.schema, "jsonschema", schema, pairs), EPOCH_NS, EPOCH_NS, 0, as_json(payload)
+    )
+
+
+def as_json(payload: dict[str, Any]) -> bytes:
+    return (
+        json.dumps(payload, default=str)
+        .replace("NaN", "null")
+        .replace("-Infinity", "-1e400")
+        .replace("Infinity", "1e400")
+        .encode()
+    )
+
+
+Kind = tuple[Callable[[bytes, Path], None], Callable[[Path], st.SearchStrategy[bytes]]]
+KINDS: dict[str, Kind] = {
+    "plants": (read_plant, lambda folder: drawn.spoiled(drawn.plants())),
+    "runs": (read_run_file, lambda folder: drawn.spoiled(drawn.run_files())),
+    "studies": (read_study, lambda folder: drawn.spoiled(drawn.run_files(study=True))),
+    "recordings": (read_csv, lambda folder: drawn.csv_files()),
+    "logs": (read_log, logs),
+}
+
+
+@contextmanager
+def at_most(seconds: int) -> Iterator[None]:
+    def stop(*_: Any) -> None:
+        raise AssertionError(f"took longer than {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def taken(read: Callable[[bytes, Path], None], data: bytes, folder: Path) -> bool:
+    """Whether the file was taken; refused is what raises ValueError or OSError with sentences that are not empty."""
+    with at_most(MOST_SECONDS), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            read(data, folder)
+        except (ValueError, OSError) as error:
+            assert str(error).strip() and len(str(error)) < 20_000
+            return False
+    return True
+
+
+def fuzz(kind: str, folder: Path, examples: int, start: int, quick: bool) -> Counter[str]:
+    """Draws files of a kind and reads them. Returns how many were taken and refused."""
+    read, strategy = KINDS[kind]
+    (folder / "rig.csv").write_text(CSV)
+    seen: Counter[str] = Counter()
+
+    @seed(start)
+    @settings(
+        max_examples=examples,
+        deadline=None,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+        phases=[Phase.generate, Phase.shrink] if quick else [Phase.generate],
+    )
+    @given(strategy(folder))
+    def each(data: bytes) -> None:
+        seen["taken" if taken(read, data, folder) else "refused"] += 1
+
+    each()
+    return seen
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_is_taken_or_refused_in_sentences(kind: str, tmp_path: Path) -> None:
+    seen = fuzz(kind, tmp_path, 60, 1, quick=True)
+    assert seen["taken"] >= 0.5 * seen.total(), f"{dict(seen)}: too few reach what lies behind the schema"
+
+
+@pytest.mark.parametrize("path", sorted(p for p in CORPUS.glob("*/*")), ids=lambda p: f"{p.parent.name}/{p.name}")
+def test_what_once_went_wrong_is_taken_or_refused_in_sentences(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "rig.csv").write_text(CSV)
+    taken(KINDS[path.parent.name][0], path.read_bytes(), tmp_path)
+
+
+@pytest.mark.slow
+def test_files_for_minutes(tmp_path: Path, pytestconfig: pytest.Config) -> None:
+    ends = time.monotonic() + 60.0 * pytestconfig.getoption("--fuzz-minutes")
+    seen = {kind: Counter[str]() for kind in KINDS}
+    for start in itertools.count(2):
+        for kind, counts in seen.items():
+            counts += fuzz(kind, tmp_path, 500, start, quick=False)
+            print(start, kind, dict(counts), flush=True)
+            if time.monotonic() > ends:
+                assert all(c["taken"] >= 0.5 * c.total() for c in seen.values() if c)
+                return

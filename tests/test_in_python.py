@@ -1,0 +1,245 @@
+"""A rig in code equals its file, and the commands as functions give results that show themselves."""
+
+from __future__ import annotations
+
+import doctest
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+import fdi_torch
+from fdi_torch import Pipe, PlacedEffect, Plant, Pump, Recording, Sensor, Tank
+from fdi_torch.config import plant_in_code
+from fdi_torch.config.files import shipped_plants
+from fdi_torch.config.plant import build_plant
+
+IN_YAML = """
+name: rig
+gravity: 9.81 m/s^2
+tanks:
+  A: {area: 200 cm^2, height: 60 cm, start_level: 30 cm, overflow_to: B}
+  B: {area: 0.03 m^2, height: 2 ft, leak_reference: drain}
+pipes:
+  link: {source: A, target: B, area: 0.6 cm^2, discharge_coefficient: 60 %, valve: v, unrecorded: 1}
+  drain: {source: B, target: outside, area: 0.5 cm^2, discharge_coefficient: 0.62, elevation: 5 mm}
+pumps:
+  Q: {target: A, max_flow: 6 l/min, gain: 2 l/min/V, command: u}
+sensors:
+  h: {tank: A}
+  p: {tank: B, gain: 98.1 mbar/m, offset: 2 mbar, low: 0 mbar, high: 100 mbar, channel: pB}
+tolerances: {"*.discharge_coefficient": 3 %, h.offset: 2 mm, Q.pump_lag.time_constant: 1 s}
+varying: ["*.offset"]
+effects:
+  - {effect: pump_lag, location: Q, parameters: {time_constant: 8 s}}
+"""
+
+
+def in_code(**changes: Any) -> Plant:
+    parts: dict[str, Any] = {
+        "tanks": [
+            Tank("A", area="200 cm^2", height="60 cm", start_level="30 cm", overflow_to="B"),
+            Tank("B", area=0.03, height="2 ft", leak_reference="drain"),
+        ],
+        "pipes": [
+            Pipe("link", "A", "B", area="0.6 cm^2", discharge_coefficient="60 %", valve="v", unrecorded=1),
+            Pipe("drain", "B", "outside", area="0.5 cm^2", discharge_coefficient=0.62, elevation="5 mm"),
+        ],
+        "pumps": [Pump("Q", "A", max_flow="6 l/min", gain="2 l/min/V", command="u")],
+        "sensors": [
+            Sensor("h", "A"),
+            Sensor("p", "B", gain="98.1 mbar/m", offset="2 mbar", low="0 mbar", high="100 mbar", channel="pB"),
+        ],
+        "tolerances": {"*.discharge_coefficient": "3 %", "h.offset": "2 mm", "Q.pump_lag.time_constant": 1.0},
+        "varying": ["*.offset"],
+        "effects": [PlacedEffect("pump_lag", "Q", {"time_constant": "8 s"})],  # type: ignore[dict-item]
+        "name": "rig",
+    }
+    return Plant(**(parts | changes))
+
+
+def test_a_plant_in_code_equals_its_file_both_ways() -> None:
+    plant = in_code()
+    read = build_plant(yaml.safe_load(IN_YAML), "rig.yaml")
+    assert plant == read and read == plant
+    assert build_plant(yaml.safe_load(fdi_torch.dump_plant(plant)), "again") == plant
+    assert plant.channel_units() == {"u": "V", "v": "1"} and plant.sensors[1].unit == "Pa"
+    assert in_code(gravity="981 cm/s^2") == plant and in_code(gravity=1.62) != plant
+
+
+@pytest.mark.parametrize("name", shipped_plants())
+def test_every_shipped_plant_can_be_taken_apart_and_put_together_in_code(name: str) -> None:
+    shipped = fdi_torch.load_plant(name)
+    again = Plant(
+        shipped.tanks,
+        shipped.pipes,
+        shipped.pumps,
+        shipped.sensors,
+        effects=shipped.effects,
+        tolerances=shipped.tolerances,
+        varying=shipped.varying,
+        gravity=shipped.gravity,
+        name=shipped.name,
+    )
+    assert again == shipped and again.effects == shipped.effects
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        (lambda: Tank("A", area="200 cm", height=1.0), "tanks.A.area: expected a quantity in m^2, got '200 cm'"),
+        (lambda: Pump("Q", "A", max_flow=1e-4, gain="2 bar"), "pumps.Q.gain: expected a quantity in 1 or m^3/s/V or"),
+        (lambda: Sensor("h", "A", gain="1 s"), "sensors.h.gain: expected a quantity in 1 or Pa/m or V/m"),
+        (lambda: Sensor("h", "A", offset="1 V"), "sensors.h.offset: expected a quantity in m, got '1 V'"),
+        (lambda: Pipe("P", "A", "B", area="1e14 m^2", discharge_coefficient=0.6), "pipes.P.area: expected a quantity"),
+        (lambda: in_code(sensors=[]), "sensors: expected at least one, got none"),
+        (lambda: in_code(tolerances={"linc.area": 0.1}), "tolerances.linc.area: expected a constant"),
+        (lambda: in_code(tolerances={"link.area": -0.1}), "tolerances.link.area: expected a positive tolerance"),
+        (lambda: in_code(varying=["link.area"]), "varying: expected a constant with a tolerance"),
+        (lambda: in_code(gravity="9.81 m"), "gravity: expected a quantity in m/s^2"),
+        (lambda: in_code(effects=[PlacedEffect("pump_lag", "A")]), "effects.0: A.pump_lag: expected a place of kind"),
+        (
+            lambda: in_code(effects=[PlacedEffect("pump_lag", "Q", {"tau": 1.0})]),
+            "effects.0.parameters: expected a parameter of pump_lag",
+        ),
+        (
+            lambda: in_code(pipes=[Pipe("drain", "A", "B", 1e-4, 60.0)]),
+            "at most 10, got 60; is it in per cent",
+        ),
+        (lambda: in_code(pipes=[Pipe("drain", "A", "B", 1e-4, 0.6, unrecorded=2)]), "expected an opening from 0 to 1"),
+    ],
+)
+def test_what_is_wrong_is_said_with_component_and_field(wrong: Any, sentence: str) -> None:
+    with pytest.raises(ValueError) as told:
+        wrong()
+    assert sentence in str(told.value)
+
+
+def test_the_example_of_a_plant_runs() -> None:
+    names = {name: getattr(fdi_torch, name) for name in ("Plant", "Tank", "Pipe", "Pump", "Sensor")}
+    example = doctest.DocTestFinder(recurse=False).find(plant_in_code.Plant, "Plant", globs=names)
+    assert doctest.DocTestRunner().run(example[0]).attempted == 1 and not doctest.DocTestRunner().failures
+
+
+RIG = Plant(
+    tanks=[Tank("A", area="200 cm^2", height="60 cm")],
+    pipes=[Pipe("drain", "A", "outside", area="0.5 cm^2", discharge_coefficient=0.6)],
+    pumps=[Pump("Q", "A", max_flow="6 l/min")],
+    sensors=[Sensor("h", "A")],
+    tolerances={"*.discharge_coefficient": "1 %"},
+    name="one tank",
+)
+STEPS = {"Q": {"steps": [["0 s", "3 l/min"], ["100 s", "4 l/min"], ["200 s", "2.5 l/min"]]}}
+
+
+def simulated(**faults: Any) -> Recording:
+    noise = {"std": {"h": "1 mm"}}
+    return fdi_torch.simulate(RIG, inputs=STEPS, duration="300 s", noise=noise, faults=faults, seed=3)
+
+
+def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path) -> None:
+    recording = simulated(**{"A.leak": 0.3})
+    again = simulated(**{"A.leak": 0.3})
+    assert torch.equal(recording.outputs, again.outputs)
+    assert "301 samples, 300 s" in repr(recording) and "<table>" in recording._repr_html_()
+    estimate = {"parameters": ["A.leak"]}
+    run = {"plant": RIG, "recordings": [recording], "estimate": estimate, "output": {"folder": str(tmp_path)}}
+    found = fdi_torch.train(run)
+    row = found.table().columns["parameter"].index("A.leak.size")
+    estimate_of, error_of = (found.table().columns[name][row] for name in ("estimate", "std error"))
+    assert abs(estimate_of - 0.3) < 4.0 * error_of < 0.2
+    assert found.headline == "single fault: A.leak.size" and "A.leak.size" in repr(found)
+    assert "<table>" in found._repr_html_() and "<svg" in found._repr_html_() and "<svg" in RIG._repr_html_()
+    assert "<svg" in fdi_torch.predict(RIG, recording)._repr_html_()
+    page = fdi_torch.report(found.log)
+    assert page.page.read_text().count("one tank") and "leak at A" in page.table().columns["says"][0]
+
+
+def test_a_gap_is_found_closed_and_adopted_in_python(tmp_path: Path) -> None:
+    recording, other = simulated(**{"Q.pump_lag.time_constant": "12 s"}), simulated(**{"Q.pump_gain.factor": 0.8})
+    found = fdi_torch.gap(RIG, other, recording, out=tmp_path, library=("pump_gain", "leak"))
+    assert found.answer.verdict == "named" and "pump_gain at Q" in found.headline
+    assert found.table().columns["parameter"] == ["factor"] and len(found.explanations()) >= 1
+    better = found.adopted()
+    before, after = (fdi_torch.predict(plant, other).prediction.rmse["h"] for plant in (RIG, better))
+    assert after < 0.5 * before
+    with pytest.raises(ValueError, match=r"gap: expected a setting .* got 'libary'; the nearest is 'library'"):
+        fdi_torch.gap(RIG, other, libary=())
+
+
+def test_a_monitor_runs_along_a_recording_in_memory(tmp_path: Path) -> None:
+    faults = {"A.leak": 0.3, "A.leak.onset": "400 s"}
+    noise = {"std": {"h": "1 mm"}}
+    recording = fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, duration="700 s", noise=noise, faults=faults)
+    wanted = {"plant": RIG, "recording": recording, "fault_free": ["0 s", "300 s"], "faults": ["A.leak"]}
+    wanted["output"] = {"folder": str(tmp_path)}
+    found = fdi_torch.monitor(wanted)
+    assert found.headline.startswith("1 alarm in 700 s; A.leak.size = 0.3")
+    table = found.table().columns
+    kinds = [kind for kind in table["kind"] if kind not in ("notice", "watching")]
+    assert kinds[:2] == ["alarm", "isolated"]
+    isolated = table["kind"].index("isolated")
+    assert table["onset"][isolated] == pytest.approx(400.0, abs=3.0) and table["units"][isolated] == ("1",)
+
+
+def test_a_recording_at_hand_is_asked_for_the_plant_s_channels() -> None:
+    blank = simulated()
+    with pytest.raises(fdi_torch.ConfigError, match=r"expected an output .*got 'h'"):
+        fdi_torch.predict(RIG, Recording(blank.time, blank.inputs, blank.outputs, ("Q",), ("x",), ("m^3/s",), ("m",)))
+
+
+def test_results_become_data_frames() -> None:
+    pandas = pytest.importorskip("pandas")
+    recording = simulated()
+    frame = recording.to_pandas()
+    assert list(frame.columns) == ["Q", "h"] and frame.attrs["units"] == {"t": "s", "Q": "m^3/s", "h": "m"}
+    assert frame["h"].to_numpy() == pytest.approx(recording.outputs[:, 0].numpy())
+    told = fdi_torch.predict(RIG, recording).to_pandas()
+    assert isinstance(told, pandas.DataFrame) and list(told.columns) == ["sensor", "RMSE", "unit"]
+    assert len(fdi_torch.effects().to_pandas()) == len(fdi_torch.EFFECTS)
+
+
+def test_a_recording_comes_back_from_its_data_frame() -> None:
+    pytest.importorskip("pandas")
+    recording = simulated()
+    again = fdi_torch.read_frame(recording.to_pandas(), RIG)
+    assert torch.equal(again.time, recording.time) and torch.equal(again.inputs, recording.inputs)
+    assert torch.equal(again.outputs, recording.outputs) and again.source == "data frame"
+
+
+def test_a_data_frame_follows_the_rules_of_files() -> None:
+    pandas = pytest.importorskip("pandas")
+    stamps = pandas.date_range("2026-03-29 08:30", periods=4, freq="2s", tz="UTC")
+    frame = pandas.DataFrame({"time": stamps, "Q_cm3_s": [50.0, 50.0, 60.0, 60.0], "LT1": [100.0, None, 120.0, 130.0]})
+    columns = {"h": {"column": "LT1", "unit": "mm"}}
+    found = fdi_torch.read_frame(frame, RIG, columns=columns)
+    assert found.time.tolist() == [0.0, 2.0, 4.0, 6.0] and found.mask[:, 0].tolist() == [True, False, True, True]
+    assert found.outputs[2, 0] == 0.12 and found.began is not None
+    with pytest.raises(fdi_torch.ConfigError, match=r"^data frame: expected a column for h "):
+        fdi_torch.read_frame(frame, RIG)
+    with pytest.raises(fdi_torch.ConfigError, match=r"data frame: colums: |data frame: expected a known key"):
+        fdi_torch.read_frame(frame, RIG, colums=columns)
+
+
+def test_a_file_is_read_by_its_name(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("t_s,Q_cm3_s,h_cm\n0,50,10\n1,50,11\n")
+    assert fdi_torch.read_recording(str(tmp_path / "run.csv"), RIG).outputs[:, 0].tolist() == [0.1, 0.11]
+
+
+def test_trajectories_become_labelled_arrays() -> None:
+    pytest.importorskip("xarray")
+    recording = simulated()
+    assert recording.to_xarray()["h"].attrs["units"] == "m" and recording.to_xarray().sizes == {"time": 301}
+    run = fdi_torch.predict(RIG, recording).to_xarray()
+    residual = run["measured"] - run["predicted"]
+    assert float(abs(residual - run["residual"]).max()) == 0.0 and str(run["unit"].values[0]) == "m"
+
+
+def test_a_library_that_is_not_there_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"expected the library pandas, got none; pip install 'fdi_torch\[pandas\]'"):
+        simulated().to_pandas()

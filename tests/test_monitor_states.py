@@ -1,0 +1,97 @@
+"""The states of alarms, and that what a monitor says rests on the readings until then alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from fdi_torch.monitor.detection import CHARTS, make_detector
+from fdi_torch.monitor.events import Event
+from fdi_torch.monitor.monitor import Monitor
+from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.states import FOLLOWS, Alarm, State
+from tests.test_monitor import SPACE, followed, monitor, recorded
+
+
+def test_an_alarm_takes_only_states_that_follow() -> None:
+    alarm = Alarm(1, 10.0, 10.0)
+    assert alarm.to(State.ISOLATED).to(State.EXPLAINED).to(State.RECOVERED).state is State.RECOVERED
+    with pytest.raises(ValueError, match="a state that follows 'confirming', got 'watching'"):
+        alarm.to(State.WATCHING)
+    assert set(FOLLOWS) == set(State)
+    again = alarm.again(20.0)
+    assert (again.first, again.last, again.count) == (10.0, 20.0, 2)
+
+
+def troubled() -> Samples:
+    """A leak that opens and closes, a bias that grows; gaps, repetitions, unknown inputs and missing readings."""
+
+    def truth(time: float) -> Tensor:
+        leak = 0.08 if 150.0 <= time < 330.0 else 0.0
+        return SPACE.vector({"T1.leak.size": leak, "h3.sensor_bias.bias": 1e-4 * max(time - 520.0, 0.0)})
+
+    samples = recorded(truth, 700, seed=12)
+    time, inputs, readings = samples.time.clone(), samples.inputs.clone(), samples.readings.clone()
+    time[60] = time[59]
+    time[440:] += 30.0
+    inputs[455:459] = torch.nan
+    readings[100:103, 1] = torch.nan
+    return replace(samples, time=time, inputs=inputs, readings=readings)
+
+
+def in_pieces(watch: Monitor, samples: Samples, cuts: list[int]) -> list[Event]:
+    state, events = watch.start(samples), []
+    for first, last in zip([1, *cuts], [*cuts, len(samples)], strict=True):
+        state, news = watch.advance(state, samples.stretch(first, last))
+        events += news
+    return events
+
+
+@pytest.fixture(scope="module")
+def whole() -> tuple[Monitor, Samples, list[Event]]:
+    watch, samples = monitor(incipient=True), troubled()
+    return watch, samples, followed(watch, samples, len(samples))[1]
+
+
+def test_every_state_but_learning_is_met(whole: tuple[Monitor, Samples, list[Event]]) -> None:
+    kinds = {event.kind for event in whole[2]}
+    assert {"alarm", "isolated", "revised", "recovered", "notice"} <= kinds
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_events_are_the_same_to_the_last_bit_however_samples_come(
+    seed: int, whole: tuple[Monitor, Samples, list[Event]]
+) -> None:
+    watch, samples, expected = whole
+    generator = torch.Generator().manual_seed(seed)
+    count = (3, 40, 400)[seed]
+    cuts = sorted(set((1 + torch.randperm(len(samples) - 1, generator=generator)[:count]).tolist()))
+    assert in_pieces(watch, samples, cuts) == expected
+
+
+@pytest.mark.parametrize("cut", [120, 158, 200, 341, 400, 452, 458, 600])
+def test_nothing_said_at_a_moment_rests_on_a_later_reading(
+    cut: int, whole: tuple[Monitor, Samples, list[Event]]
+) -> None:
+    """The events of a recording that ends earlier are the first of those of the whole one, byte for byte."""
+    watch, samples, expected = whole
+    events = in_pieces(watch, samples.stretch(0, cut), [])
+    assert events == expected[: len(events)]
+    assert all(event.time > float(samples.time[cut - 1]) for event in expected[len(events) :])
+
+
+@pytest.mark.parametrize("chart", CHARTS)
+def test_a_statistic_followed_in_pieces_is_that_of_the_whole(chart: str) -> None:
+    detector = make_detector(chart, 1000.0, 1.0, 3, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
+    white = torch.randn(700, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    white[50:53, 1] = torch.nan
+    whole, _ = detector.follow(white, None)
+    parts, charted = [], None
+    for first, last in ((0, 1), (1, 2), (2, 90), (90, 350), (350, 351), (351, 700)):
+        part, charted = detector.follow(white[first:last], charted)
+        parts.append(part)
+    assert torch.equal(torch.cat(parts), whole)
+    assert torch.allclose(whole[300:], detector.statistic(white)[300:], rtol=1e-9)

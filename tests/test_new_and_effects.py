@@ -1,0 +1,120 @@
+"""Files to begin with, and the catalogue of effects."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from fdi_torch import cli
+from fdi_torch.config.estimation import parameter_values, placements_of
+from fdi_torch.config.files import read_yaml, shipped_plants
+from fdi_torch.config.monitor import load_monitor
+from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.run import load_run
+from fdi_torch.config.study import load_study
+from fdi_torch.config.templates import TEMPLATES, template
+from fdi_torch.effects import EFFECTS, build_network
+from fdi_torch.effects.catalogue import effects
+from fdi_torch.recordings.csv_files import read_header
+
+
+def fdi(*words: str) -> None:
+    assert cli.main([*words]) == cli.DONE
+
+
+def test_from_nothing_to_a_diagnosis_with_new_files_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fdi("new", "plant", "--out", "rig.yaml")
+    fdi("check", "--plant", "rig.yaml")
+    for kind in ("run", "monitor", "study"):
+        fdi("new", kind, "--plant", "rig.yaml")
+    assert "run.yaml; next: fdi train --config run.yaml" in capsys.readouterr().out
+    Path("simulated.yaml").write_text(Path("study.yaml").read_text().partition("\nstudy:")[0])
+    fdi("simulate", "--config", "simulated.yaml", "--out", ".", "--set", "output.name=run")
+    header = Path("run.yaml").read_text().partition("with the header ")[2].split()[0]
+    assert ",".join(read_header(Path("run.csv"))) == header
+    fdi("train", "--config", "run.yaml")
+    assert "single fault: A.leak.size" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", shipped_plants())
+def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str, tmp_path: Path) -> None:
+    plant = load_plant(name)
+    paths = {kind: tmp_path / f"{kind}.yaml" for kind in TEMPLATES}
+    for kind, path in paths.items():
+        path.write_text(template(kind, plant, name, kind))
+        assert "@" not in path.read_text()
+    assert load_plant(paths["plant"]).name == "rig"
+    assert load_run(paths["run"]).plant == plant and load_monitor(paths["monitor"]).plant == plant
+    assert load_study(paths["study"]).plan.trials == 600
+
+
+def test_what_is_commented_out_in_a_new_file_holds_too(tmp_path: Path) -> None:
+    """A user takes the # away and expects it to work."""
+    text = template("plant", load_plant("three_tank"), "", "")
+    valve, pump, sensor, offset = "# valve: v1", "# Q: {target", "# pB: {tank", "# hA.offset"
+    for commented in (valve, "# elevation", sensor, offset):
+        assert commented in text
+        text = text.replace(commented, commented[2:])
+    text = text.replace("  Q: {target: A, max_flow: 6 l/min}\n", "").replace(pump, pump[2:])
+    before, _, after = text.partition("# effects:")
+    text = f"{before}effects:{after}".replace("#   - {effect", "  - {effect")
+    (tmp_path / "rig.yaml").write_text(text)
+    plant = build_plant(read_yaml(tmp_path / "rig.yaml"), "rig.yaml")
+    assert plant.channel_units() == {"Q": "V", "v1": "1"} and plant.sensors[-1].unit == "Pa" and plant.effects
+
+
+def test_a_file_that_is_there_is_never_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("run.yaml").write_text("mine")
+    assert cli.main(["new", "run"]) == cli.MISUSE
+    assert "run.yaml: expected a new file, got one that is there" in capsys.readouterr().err
+    assert cli.main(["new", "run", "--out", "run.txt"]) == cli.MISUSE
+    assert "expected a file that ends in .yaml, got run.txt" in capsys.readouterr().err
+    assert Path("run.yaml").read_text() == "mine" and [p.name for p in tmp_path.iterdir()] == ["run.yaml"]
+
+
+def test_the_catalogue_holds_every_effect_with_a_meaning_and_units() -> None:
+    catalogue = effects()
+    assert [entry.name for entry in catalogue.entries] == [each.name for each in EFFECTS]
+    for entry in catalogue.entries:
+        assert entry.meaning and entry.law and entry.at and all(p.unit and p.meaning for p in entry.parameters[:1])
+
+
+@pytest.mark.parametrize("name", [each.name for each in EFFECTS])
+def test_what_the_catalogue_says_can_be_written(name: str) -> None:
+    """Into a plant file and into the faults of a simulation, at a plant that has such a place."""
+    described = next(
+        p for n in shipped_plants() if (p := load_plant(n)) and name in {e.name for e in effects(p).entries}
+    )
+    entry = effects(described)[name]
+
+    data = plant_mapping(described) | {"effects": yaml.safe_load(entry.in_a_plant_file)}
+    assert build_plant(data, "plant").effects[0].effect == name
+    ((fault, value),) = yaml.safe_load(f"{{{entry.in_a_run_file}}}").items()
+    network = build_network(described, placements_of([fault], described))
+    assert set(parameter_values({fault: value}, network.constants, described)) == {fault}
+
+
+def test_effects_of_a_plant_are_told_with_places_and_in_full(capsys: pytest.CaptureFixture[str]) -> None:
+    fdi("effects", "--plant", "three_tank")
+    listed = capsys.readouterr().out
+    assert "valve_lag" not in listed and "pump_lag" in listed and "Q1, Q2" in listed
+    fdi("effects", "leak", "--plant", "three_tank")
+    told = capsys.readouterr().out
+    assert "0 to 95" in told and "at `onset` (0 s: from the start)" in told and "T1.leak.size: 0.1" in told
+    fdi("effects", "leak", "--json")
+    (leak,) = json.loads(capsys.readouterr().out)["effects"]
+    assert [p["unit"] for p in leak["parameters"]] == ["1", "m", "s", "s"]
+    assert cli.main(["effects", "leek"]) == cli.MISUSE
+    assert "got 'leek'; the nearest is 'leak'" in capsys.readouterr().err
+    assert cli.main(["effects", "valve_lag", "--plant", "three_tank"]) == cli.MISUSE
+    assert "valve_lag: expected a plant with a valve, got three_tank" in capsys.readouterr().err

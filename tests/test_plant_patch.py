@@ -1,0 +1,158 @@
+"""What is adopted changes the lines of the plant file that it has to, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdi_torch.cli.adoption import write_adopted
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.files import parse_yaml, shipped_plants
+from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_patch import patched_plant
+from fdi_torch.gap.answer import with_constants
+from fdi_torch.plant.description import PlacedEffect, PlantDescription
+
+TEXT = """# The rig in the cellar.
+name: rig   # ours
+tanks:
+  A: {area: 0.02 m^2, height: "600 mm"}   # measured on 3 May
+  B:
+    area: 300 cm^2
+    height: 24 in   # rim
+
+    # B has no leak
+pipes:
+  link: {source: A, target: B, area: 60 mm^2, discharge_coefficient: 60 %}
+  drain: {source: B, area: 0.5 cm^2, discharge_coefficient: 0.62}
+
+pumps: {Q: {target: A, max_flow: 6 l/min, gain: 2 l/min/V}}
+sensors:
+  hA: {tank: A}
+  pB:
+    tank: B
+    gain: 98.1 mbar/m   # from its sheet
+tolerances:
+  "*.discharge_coefficient": 3 %  # all of them
+effects:
+- {effect: pump_lag, location: Q, parameters: {time_constant: 500 ms}}
+# the end
+"""
+
+
+def read(text: str) -> PlantDescription:
+    return build_plant(parse_yaml(text.encode(), "rig.yaml"), "rig.yaml")
+
+
+def lines_changed(before: str, after: str) -> tuple[list[str], list[str]]:
+    old, new = before.splitlines(), after.splitlines()
+    return [line for line in old if line not in new], [line for line in new if line not in old]
+
+
+BEFORE = read(TEXT)
+
+
+@pytest.mark.parametrize(
+    ("constants", "gone", "come"),
+    [
+        (
+            {"A.area": 0.021},
+            '  A: {area: 0.02 m^2, height: "600 mm"}   # measured on 3 May',
+            '  A: {area: 0.021 m^2, height: "600 mm"}   # measured on 3 May',
+        ),
+        ({"B.height": 0.635}, "    height: 24 in   # rim", "    height: 25 in   # rim"),
+        (
+            {"A.height": 0.61},
+            '  A: {area: 0.02 m^2, height: "600 mm"}   # measured on 3 May',
+            '  A: {area: 0.02 m^2, height: "610 mm"}   # measured on 3 May',
+        ),
+        ({"pB.gain": 9800.0}, "    gain: 98.1 mbar/m   # from its sheet", "    gain: 98 mbar/m   # from its sheet"),
+        (
+            {"drain.discharge_coefficient": 0.6123456789},
+            "  drain: {source: B, area: 0.5 cm^2, discharge_coefficient: 0.62}",
+            "  drain: {source: B, area: 0.5 cm^2, discharge_coefficient: 0.6123457}",
+        ),
+        ({"hA.offset": 0.0021}, "  hA: {tank: A}", "  hA: {tank: A, offset: 0.21 cm}"),
+    ],
+)
+def test_a_constant_changes_its_line_in_its_own_unit(constants: dict[str, float], gone: str, come: str) -> None:
+    changed, kept = patched_plant(TEXT, BEFORE, with_constants(BEFORE, constants))
+    assert kept and lines_changed(TEXT, changed) == ([gone], [come])
+
+
+def test_a_key_that_was_not_there_comes_at_the_end_of_its_block() -> None:
+    changed, kept = patched_plant(TEXT, BEFORE, with_constants(BEFORE, {"pB.offset": 250.0, "B.start_level": 0.2}))
+    assert kept and lines_changed(TEXT, changed) == ([], ["    start_level: 20 cm", "    offset: 2.5 mbar"])
+    assert changed.index("start_level") < changed.index("# B has no leak")
+
+
+def test_effects_and_tolerances_are_added_and_wildcards_stay() -> None:
+    leak = PlacedEffect("leak", "B", {"size": 0.20454692828452672, "height": 0.1})
+    lag = PlacedEffect("pump_lag", "Q", {"time_constant": 0.75})
+    after = replace(BEFORE, effects=(leak, lag), tolerances=BEFORE.tolerances | {"B.leak.size": 0.04})
+    changed, kept = patched_plant(TEXT, BEFORE, after)
+    gone, come = lines_changed(TEXT, changed)
+    assert kept and gone == ["- {effect: pump_lag, location: Q, parameters: {time_constant: 500 ms}}"]
+    assert come == [
+        "  B.leak.size: 0.04",
+        "- {effect: pump_lag, location: Q, parameters: {time_constant: 750 ms}}",
+        "- {effect: leak, location: B, parameters: {size: 0.2045469, height: 10 cm}}",
+    ]
+    assert changed.endswith("# the end\n") and '"*.discharge_coefficient": 3 %  # all of them' in changed
+
+
+def test_a_file_without_effects_gets_them_at_its_end() -> None:
+    text = TEXT.partition("tolerances:")[0]
+    before = read(text)
+    after = replace(before, effects=(PlacedEffect("leak", "B", {"size": 0.2}),), tolerances={"B.leak.size": 0.04})
+    changed, kept = patched_plant(text.rstrip(), before, after)
+    assert kept and changed.startswith(text.rstrip())
+    assert "\neffects:\n  - {effect: leak, location: B, parameters: {size: 0.2}}\n" in changed
+    assert "\ntolerances:\n  B.leak.size: 0.04\n" in changed
+
+
+@pytest.mark.parametrize("name", shipped_plants())
+def test_every_shipped_plant_can_be_changed_everywhere(name: str) -> None:
+    from fdi_torch.config.files import find_plant
+
+    text = find_plant(name, Path.cwd()).read_text()
+    before = load_plant(name)
+    constants: dict[str, float] = {f"{t.name}.area": 1.07 * t.area for t in before.tanks}
+    constants |= {f"{p.name}.discharge_coefficient": 0.93 * p.discharge_coefficient for p in before.pipes}
+    constants |= {f"{p.name}.gain": 1.03 * p.gain for p in before.pumps}
+    constants |= {f"{s.name}.gain": 0.99 * s.gain for s in before.sensors}
+    constants |= {f"{s.name}.offset": s.offset + 0.01 for s in before.sensors}
+    after = with_constants(before, constants)
+    after = replace(after, effects=(*after.effects, PlacedEffect("evaporation", before.tanks[0].name, {"rate": 1e-7})))
+    changed, kept = patched_plant(text, before, after)
+    assert kept
+    comments: list[Any] = [line.partition("#")[2] for line in text.splitlines() if "#" in line]
+    assert comments == [line.partition("#")[2] for line in changed.splitlines() if "#" in line]
+
+
+def test_a_file_whose_components_share_a_value_is_written_anew_and_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shared = TEXT.replace("  A: {area: 0.02 m^2", "  A: &wide {area: 0.02 m^2").replace(
+        "  B:\n    area: 300 cm^2\n    height: 24 in   # rim\n", "  B: *wide\n"
+    )
+    Path("rig.yaml").write_text(shared)
+    before = read(shared)
+    write_adopted("rig.yaml", before, with_constants(before, {"A.area": 0.021}), Path("new.yaml"), Screen())
+    told = capsys.readouterr()
+    assert "new.yaml: written anew, without the comments of rig.yaml" in told.err
+    found = load_plant("new.yaml")
+    assert [tank.area for tank in found.tanks] == [pytest.approx(0.021), 0.02]
+
+
+def test_the_diff_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rig.yaml").write_text(TEXT)
+    write_adopted("rig.yaml", BEFORE, with_constants(BEFORE, {"B.height": 0.635}), Path("new.yaml"), Screen())
+    told = capsys.readouterr().out
+    assert "-    height: 24 in   # rim\n+    height: 25 in   # rim\n" in told
+    assert "--- rig.yaml\n+++ new.yaml\n" in told

@@ -1,0 +1,300 @@
+"""State noise against dense multivariate normals, central differences, and the truth of simulated disturbances."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.kalman import KalmanWhitening, Propagation, SensorNoise, StateNoise, Wander
+from fdi_torch.estimate.state_noise import _Problem, estimate_state_noise
+
+DOUBLE = torch.float64
+WHITE = torch.zeros(2, dtype=DOUBLE)
+COLOURED = torch.tensor([0.6, 0.6], dtype=DOUBLE)
+STD = torch.tensor([1e-3, 2e-3], dtype=DOUBLE)
+INTENSITY = torch.tensor([3e-6, 1e-6], dtype=DOUBLE)  # m^3/s: per second 0.2 and 0.07 mm in tanks of 154 cm^2
+AREA = 0.0154
+
+
+def two_tanks(samples: int, fresh: tuple[int, ...] = (0,), masked: float = 0.0) -> Propagation:
+    """Two tanks joined by a pipe, the second one drained; both levels are read each second."""
+    rates = torch.tensor([[-0.02, 0.02], [0.02, -0.05]], dtype=DOUBLE)
+    transition = torch.matrix_exp(rates)
+    forcing = torch.linalg.solve(rates, transition - torch.eye(2, dtype=DOUBLE)) / AREA
+    starts = torch.zeros(samples, dtype=torch.bool)
+    starts[list(fresh)] = True
+    seen = torch.rand(samples, 2, generator=torch.Generator().manual_seed(9)) >= masked
+    each = (m.expand(samples, 2, 2).clone() for m in (transition, forcing, torch.eye(2, dtype=DOUBLE)))
+    return Propagation(*each, interval=1.0, fresh=starts, mask=seen)
+
+
+def correlation_of(noise: StateNoise) -> float:
+    return math.exp(-1.0 / noise.correlation_time) if noise.correlation_time else 0.0
+
+
+def simulated(p: Propagation, sensors: SensorNoise, noise: StateNoise, seed: int) -> Tensor:
+    """Residuals (S, C) of levels that random flows move, read with noise."""
+    generator = torch.Generator().manual_seed(seed)
+    keep, a = correlation_of(noise), sensors.correlation
+    std = noise.scale * sensors.std
+
+    def normal() -> Tensor:
+        return torch.randn(2, generator=generator, dtype=DOUBLE)
+
+    rows = []
+    for s in range(len(p.mask)):
+        if bool(p.fresh[s]):
+            level, flow, error = torch.zeros(2, dtype=DOUBLE), noise.intensity * normal(), std * normal()
+        rows.append(p.output[s] @ level + error)
+        level = p.transition[s] @ level + p.forcing[s] @ flow
+        flow = keep * flow + math.sqrt(1.0 - keep**2) * noise.intensity * normal()
+        error = a * error + torch.sqrt(1.0 - a**2) * std * normal()
+    return torch.where(p.mask, torch.stack(rows), 0.0)
+
+
+def dense(p: Propagation, sensors: SensorNoise, noise: StateNoise) -> tuple[Tensor, Tensor]:
+    """Covariance of all readings (S C, S C), and of the levels (S n) with the readings, of one recording."""
+    samples = len(p.mask)
+    gap = (torch.arange(samples).unsqueeze(0) - torch.arange(samples).unsqueeze(1)).abs().to(DOUBLE)
+    keep = correlation_of(noise)
+    of_flows = (keep**gap if keep else torch.eye(samples, dtype=DOUBLE))[:, None, :, None] * torch.diag(
+        noise.intensity**2
+    ).reshape(1, 2, 1, 2)
+    response = torch.zeros(samples, 2, samples, 2, dtype=DOUBLE)  # levels at s by flows at r
+    for s in range(1, samples):
+        response[s] = torch.einsum("ij,jrk->irk", p.transition[s - 1], response[s - 1])
+        response[s, :, s - 1] += p.forcing[s - 1]
+    flat = response.reshape(2 * samples, 2 * samples)
+    of_levels = flat @ of_flows.reshape(2 * samples, 2 * samples) @ flat.T
+    std = noise.scale * sensors.std
+    of_errors = torch.diag_embed(std**2 * sensors.correlation ** gap.unsqueeze(-1))
+    if noise.wander:
+        slow = noise.wander.std**2 * torch.exp(-gap / noise.wander.correlation_time)
+        of_errors[:, :, noise.wander.channel, noise.wander.channel] += slow
+    of_errors = of_errors.permute(0, 2, 1, 3).reshape(2 * samples, 2 * samples)
+    return of_levels + of_errors, of_levels
+
+
+def problem(p: Propagation, sensors: SensorNoise, residual: Tensor, columns: int = 0) -> _Problem:
+    """columns: linear parameters beside the noise, with priors of unit width."""
+    jacobian = torch.randn(*residual.shape, columns, generator=torch.Generator().manual_seed(4), dtype=DOUBLE) * 1e-3
+    pull = torch.ones(columns, dtype=DOUBLE)
+    return _Problem(p, sensors, residual, jacobian, pull, 0.3 * pull, INTENSITY)
+
+
+@pytest.mark.parametrize("time", [0.0, 15.0])
+@pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
+@pytest.mark.parametrize("masked", [0.0, 0.3])
+def test_the_likelihood_is_that_of_a_dense_normal_distribution(time: float, correlation: Tensor, masked: float) -> None:
+    p, sensors = two_tanks(12, masked=masked), SensorNoise(STD, correlation)
+    noise = StateNoise(INTENSITY, time, torch.tensor([1.0, 1.3], dtype=DOUBLE))
+    residual, seen = simulated(p, sensors, noise, 1), p.mask.flatten()
+    covariance = dense(p, sensors, noise)[0][seen][:, seen]
+    y = residual.flatten()[seen]
+    expected = -0.5 * float(y @ torch.linalg.solve(covariance, y)) - 0.5 * float(torch.logdet(covariance))
+    value, _ = problem(p, sensors, residual).likelihood(noise)
+    assert value == pytest.approx(expected, rel=1e-9)
+    white = KalmanWhitening(p, sensors, noise)
+    assert white.log_det == pytest.approx(float(torch.logdet(covariance)), rel=1e-9)
+    squares = float(y @ torch.linalg.solve(covariance, y))
+    assert float(white(residual).square().sum()) == pytest.approx(squares, rel=1e-9)
+
+
+@pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
+def test_a_sensor_that_wanders_has_the_likelihood_of_a_dense_normal_distribution(correlation: Tensor) -> None:
+    p, sensors = two_tanks(12, masked=0.3), SensorNoise(STD, correlation)
+    noise = StateNoise(INTENSITY, 15.0, torch.tensor([1.0, 1.3], dtype=DOUBLE), Wander(1, 4e-3, 6.0))
+    residual, seen = simulated(p, sensors, noise, 1), p.mask.flatten()
+    covariance = dense(p, sensors, noise)[0][seen][:, seen]
+    y = residual.flatten()[seen]
+    expected = -0.5 * float(y @ torch.linalg.solve(covariance, y)) - 0.5 * float(torch.logdet(covariance))
+    assert problem(p, sensors, residual).likelihood(noise)[0] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
+def test_the_slope_by_a_wander_is_a_central_difference(correlation: Tensor) -> None:
+    p, sensors = two_tanks(80, masked=0.2), SensorNoise(STD, correlation)
+    noise = StateNoise(INTENSITY, 15.0, torch.ones(2, dtype=DOUBLE), Wander(0, 3e-3, 20.0))
+    whole = problem(p, sensors, simulated(p, sensors, noise, 3), columns=2)
+
+    def value(log: float) -> float:
+        return whole.likelihood(replace(noise, wander=Wander(0, 3e-3 * math.exp(log), 20.0)))[0]
+
+    expected = (value(1e-4) - value(-1e-4)) / 2e-4
+    assert float(whole.likelihood(noise)[1].slope[-1]) == pytest.approx(expected, rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+def test_what_a_sensor_wanders_by_is_told_from_random_flows(channel: int) -> None:
+    """A reading that wanders by 5 mm over 80 s, on a rig without random flows: size, and more likely than any flows."""
+    p, sensors = two_tanks(3000), SensorNoise(STD, WHITE)
+    still = StateNoise(torch.zeros(2, dtype=DOUBLE), 0.0, torch.ones(2, dtype=DOUBLE))
+    residual = simulated(p, sensors, still, 31)
+    generator, error, keep = torch.Generator().manual_seed(32), 0.0, math.exp(-1.0 / 80.0)
+    for row in residual:
+        row[channel] += error
+        shock = float(torch.randn(1, generator=generator, dtype=DOUBLE))
+        error = keep * error + math.sqrt(1.0 - keep**2) * 5e-3 * shock
+    whole = problem(p, sensors, residual)
+    given = (p, sensors, residual, whole.jacobian, whole.pull, whole.off, INTENSITY)
+    flows = estimate_state_noise(*given)
+    start = replace(still, intensity=0.01 * INTENSITY, wander=Wander(channel, 2e-3, 20.0))
+    found = estimate_state_noise(*given, start=start)
+    wander = found.noise.wander
+    assert (
+        wander is not None and wander.std == pytest.approx(5e-3, rel=0.5) and wander.correlation_time in (80.0, 320.0)
+    )
+    assert found.log_likelihood > flows.log_likelihood + 50.0
+
+
+def test_parameters_beside_the_noise_are_at_their_most_likely_values() -> None:
+    """The profile over linear parameters with normal priors: the dense generalised least squares, S = 12."""
+    p, sensors = two_tanks(12), SensorNoise(STD, COLOURED)
+    noise = StateNoise(INTENSITY, 15.0, torch.ones(2, dtype=DOUBLE))
+    residual = simulated(p, sensors, noise, 2)
+    whole = problem(p, sensors, residual, columns=3)
+    precision = torch.linalg.inv(dense(p, sensors, noise)[0])
+    j, y = whole.jacobian.reshape(-1, 3), residual.flatten()
+
+    def cost(x: Tensor) -> Tensor:
+        left, prior = y - j @ x, whole.pull * x + whole.off
+        return left @ precision @ left + prior @ prior
+
+    x = torch.linalg.solve(j.T @ precision @ j + torch.eye(3, dtype=DOUBLE), j.T @ precision @ y - whole.off)
+    expected = -0.5 * float(cost(x)) + 0.5 * float(torch.logdet(precision))
+    assert whole.likelihood(noise)[0] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("time", [0.0, 15.0])
+@pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
+@pytest.mark.parametrize(("fresh", "masked"), [((0,), 0.0), ((0,), 0.3), ((0, 35), 0.0)])
+def test_slopes_are_central_differences(
+    time: float, correlation: Tensor, fresh: tuple[int, ...], masked: float
+) -> None:
+    p, sensors = two_tanks(80, fresh, masked), SensorNoise(STD, correlation)
+    noise = StateNoise(INTENSITY, time, torch.tensor([0.9, 1.2], dtype=DOUBLE))
+    whole = problem(p, sensors, simulated(p, sensors, noise, 3), columns=2)
+    log = torch.zeros(4, dtype=DOUBLE)
+
+    def value(log: Tensor) -> float:
+        factor = torch.exp(log)
+        moved = replace(noise, intensity=noise.intensity * factor[:2], scale=noise.scale * factor[2:])
+        return whole.likelihood(moved)[0]
+
+    step = 1e-4 * torch.eye(4, dtype=DOUBLE)
+    expected = [(value(log + h) - value(log - h)) / 2e-4 for h in step]
+    assert whole.likelihood(noise)[1].slope.tolist() == pytest.approx(expected, rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("time", [0.0, 15.0])
+def test_innovations_under_the_true_noise_are_white_and_of_unit_variance(time: float) -> None:
+    p, sensors = two_tanks(4000, (0, 1500), 0.1), SensorNoise(STD, COLOURED)
+    noise = StateNoise(INTENSITY, time, torch.ones(2, dtype=DOUBLE))
+    white = KalmanWhitening(p, sensors, noise)(simulated(p, sensors, noise, 5))
+    assert float(white[~p.mask].abs().max()) == 0.0
+    assert float(white[p.mask].square().mean()) == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 7200))
+    for lag in (1, 2, 10):
+        both = p.mask[lag:] & p.mask[:-lag]
+        products = (white[lag:] * white[:-lag])[both]
+        assert float(products.mean()) == pytest.approx(0.0, abs=4.0 / math.sqrt(int(both.sum())))
+    apart = (white[:, 0] * white[:, 1])[p.mask.all(dim=1)]
+    assert float(apart.mean()) == pytest.approx(0.0, abs=4.0 / math.sqrt(len(apart)))
+
+
+def test_a_recording_is_whitened_as_if_it_were_alone() -> None:
+    sensors, noise = SensorNoise(STD, COLOURED), StateNoise(INTENSITY, 15.0, torch.ones(2, dtype=DOUBLE))
+    y = simulated(two_tanks(90, (0, 40)), sensors, noise, 6)
+    together = KalmanWhitening(two_tanks(90, (0, 40)), sensors, noise)
+    pieces = [KalmanWhitening(two_tanks(n), sensors, noise) for n in (40, 50)]
+    expected = torch.cat([piece(part) for piece, part in zip(pieces, (y[:40], y[40:]), strict=True)])
+    torch.testing.assert_close(together(y), expected, rtol=1e-9, atol=1e-12)
+    assert together.log_det == pytest.approx(sum(piece.log_det for piece in pieces), rel=1e-12)
+
+
+def test_lanes_and_columns_are_whitened_alike() -> None:
+    p, sensors = two_tanks(30, masked=0.2), SensorNoise(STD, COLOURED)
+    whitening = KalmanWhitening(p, sensors, StateNoise(INTENSITY, 5.0, torch.ones(2, dtype=DOUBLE)))
+    x = torch.randn(3, 30, 2, 4, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
+    white = whitening(x)
+    for lane in range(3):
+        torch.testing.assert_close(whitening(x[lane, ..., 1]), white[lane, ..., 1], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(whitening(x[..., 0]), white[..., 0], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
+@pytest.mark.parametrize("columns", [1, 3, 40])
+def test_what_is_transposed_has_the_same_products(correlation: Tensor, columns: int) -> None:
+    p, sensors = two_tanks(90, (0, 40), masked=0.2), SensorNoise(STD, correlation)
+    whitening = KalmanWhitening(p, sensors, StateNoise(INTENSITY, 5.0, torch.ones(2, dtype=DOUBLE)))
+    y, v = torch.randn(2, 90, 2, columns, generator=torch.Generator().manual_seed(3), dtype=DOUBLE)
+    products = (whitening(y) * v).sum((0, 1))
+    torch.testing.assert_close((y * whitening.transposed(v)).sum((0, 1)), products, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("time", [0.0, 15.0])
+@pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
+def test_smoothed_levels_are_the_dense_conditional_mean(time: float, correlation: Tensor) -> None:
+    p, sensors = two_tanks(12, masked=0.2), SensorNoise(STD, correlation)
+    noise = StateNoise(INTENSITY, time, torch.ones(2, dtype=DOUBLE))
+    residual, seen = simulated(p, sensors, noise, 7), p.mask.flatten()
+    readings, levels = dense(p, sensors, noise)
+    expected = levels[:, seen] @ torch.linalg.solve(readings[seen][:, seen], residual.flatten()[seen])
+    found = KalmanWhitening(p, sensors, noise).smoothed(residual)
+    torch.testing.assert_close(found.flatten(), expected, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize(("time", "seed"), [(0.0, 11), (15.0, 12), (60.0, 13)])
+def test_disturbances_are_found_with_their_size(time: float, seed: int) -> None:
+    p, sensors = two_tanks(3000), SensorNoise(STD, WHITE)
+    truth = StateNoise(INTENSITY, time, torch.ones(2, dtype=DOUBLE))
+    residual = simulated(p, sensors, truth, seed)
+    whole = problem(p, sensors, residual)
+    far = StateNoise(4.0 * INTENSITY, time, torch.full((2,), 0.5, dtype=DOUBLE))
+    found = whole.solve(far)
+    assert found.converged
+    ratio = torch.cat([found.noise.intensity / truth.intensity, found.noise.scale])
+    allowed = torch.maximum(3.0 * standard_errors(whole, found.noise), torch.tensor(0.15))
+    assert bool(((ratio - 1.0).abs() < allowed).all()), ratio
+
+
+@pytest.mark.parametrize(
+    ("time", "chosen", "seed"), [(0.0, (0.0,), 11), (15.0, (5.0, 20.0), 12), (60.0, (20.0, 80.0), 13)]
+)
+def test_the_correlation_time_is_the_nearest_of_the_candidates(
+    time: float, chosen: tuple[float, ...], seed: int
+) -> None:
+    p, sensors = two_tanks(3000), SensorNoise(STD, WHITE)
+    truth = StateNoise(INTENSITY, time, torch.ones(2, dtype=DOUBLE))
+    residual = simulated(p, sensors, truth, seed)
+    whole = problem(p, sensors, residual)
+    found = estimate_state_noise(p, sensors, residual, whole.jacobian, whole.pull, whole.off, INTENSITY)
+    assert found.converged and found.noise.correlation_time in chosen
+    assert found.log_likelihood > whole.likelihood(truth)[0] - 1.0
+
+
+def standard_errors(whole: _Problem, noise: StateNoise) -> Tensor:
+    """Of the logarithms of intensities and scales, by differences of the slopes."""
+    step, rows = 1e-3, []
+    for h in step * torch.eye(4, dtype=DOUBLE):
+        up, down = (
+            replace(noise, intensity=noise.intensity * torch.exp(t * h[:2]), scale=noise.scale * torch.exp(t * h[2:]))
+            for t in (1.0, -1.0)
+        )
+        rows.append((whole.likelihood(up)[1].slope - whole.likelihood(down)[1].slope) / (2.0 * step))
+    return torch.sqrt(torch.diagonal(torch.linalg.inv(-torch.stack(rows))))
+
+
+def test_a_plant_without_disturbances_shows_none_that_matter() -> None:
+    """What is estimated moves the levels over the recording by less than the sensors' noise."""
+    p, sensors = two_tanks(2000), SensorNoise(STD, WHITE)
+    still = StateNoise(torch.zeros(2, dtype=DOUBLE), 0.0, torch.ones(2, dtype=DOUBLE))
+    residual = simulated(p, sensors, still, 21)
+    whole = problem(p, sensors, residual)
+    found = estimate_state_noise(p, sensors, residual, whole.jacobian, whole.pull, whole.off, INTENSITY)
+    moved = KalmanWhitening(p, sensors, found.noise).smoothed(residual)
+    assert float(moved.square().mean(dim=0).sqrt().max()) < 2e-4
+    assert found.noise.scale.tolist() == pytest.approx([1.0, 1.0], abs=0.06)
