@@ -136,6 +136,14 @@ def test_a_sensor_that_reads_ahead_of_the_others_is_refused() -> None:
         usable(believed(), ahead)
 
 
+def test_a_sensor_that_reads_late_is_left_to_who_knows_the_delay_of_a_sensor() -> None:
+    run, delay = sound(), 60
+    late_one = with_channel(run, 1, torch.cat([run.outputs[:delay, 1], run.outputs[:-delay, 1]])).stretch(delay, 2000)
+    assert usable(believed(), late_one, effects=True).slip is not None
+    with pytest.raises(ValueError, match=r"h2: the clock seems to run \S+ s behind that of the other channels"):
+        usable(believed(), late_one)
+
+
 def test_random_readings_are_refused() -> None:
     run = sound()
     random = torch.rand(2000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

@@ -118,7 +118,7 @@ def test_rounded_readings_are_no_mean_of_several() -> None:
     mean = torch.stack([fresh[j : j + 6000] for j in range(8)]).mean(dim=0)
     mask = torch.ones_like(mean, dtype=torch.bool)
     assert estimate_noise(mean, mask).mean_of == 8
-    assert estimate_noise(mean, mask, (False, False, True)).mean_of == 0
+    assert estimate_noise(mean, mask, (0.0, 0.0, 0.1)).mean_of == 0
 
 
 def test_a_rounded_channel_shows_its_step_and_a_printed_one_does_not() -> None:

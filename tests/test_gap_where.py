@@ -101,3 +101,22 @@ def test_a_curvature_that_rounding_spoilt_harms_no_neighbour() -> None:
     found, expected = sparse(spoilt, score, 20), sparse(gram, score, 20)
     assert bool(torch.isfinite(found.evidence).all())
     assert torch.equal(found.evidence[[0, 2]], expected.evidence[[0, 2]])
+
+
+def test_the_error_of_rounding_is_nothing_unknown() -> None:
+    """It changes as slowly as the level does, but by no more than half a step."""
+    run = recorded({}, 7, samples=1500)
+    run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
+    fitter, fit, steps = _recalibrated(case_of(believed(), (run,), (), Settings()).subject)
+    assert [step > 0.0 for step in steps] == [False, False, True]
+    under, likely = with_own_noise(fitter, fit)
+    assert all(place.gain < 0.0 for place in localized(under, fit, likely.noise, ["h3"]))
+
+
+def test_a_sensor_that_wanders_by_more_than_its_rounding_is_unknown() -> None:
+    run = recorded({}, 7, samples=1500)
+    run.outputs[:, 2] += noise(1500, 0.95, 0.02, 3)[:, 0]
+    run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
+    fitter, fit, _ = _recalibrated(case_of(believed(), (run,), (), Settings()).subject)
+    under, likely = with_own_noise(fitter, fit)
+    assert localized(under, fit, likely.noise, ["h3"])[0].gain > 10.0

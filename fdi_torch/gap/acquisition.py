@@ -77,10 +77,13 @@ def examined(plant: PlantDescription, recording: Recording) -> Examined:
     return Examined(_noted(sound, stuck), tuple(stuck), slip)
 
 
-def usable(plant: PlantDescription, recording: Recording) -> Examined:
-    """The same. Raises ValueError where something has slipped."""
+def usable(plant: PlantDescription, recording: Recording, effects: bool = False) -> Examined:
+    """The same. Raises ValueError where something has slipped.
+
+    effects: whether the caller considers effects of sensors: then one that reads late is left to it.
+    """
     found = examined(plant, recording)
-    if found.slip:
+    if found.slip and not (effects and found.slip.physical):
         raise ValueError(
             f"{recording.source}: {found.slip.text}; where all is as it should be, say trusted: true beside the file"
         )

@@ -113,7 +113,7 @@ def _examined(
 ) -> tuple[list[Recording], list[Stuck]]:
     """The recordings without readings of sensors that are stuck, and these. Raises ValueError for one that is not
     what it seems."""
-    found = [usable(plant, replace(r, trusted=r.trusted or trusted)) for r in recordings]
+    found = [usable(plant, replace(r, trusted=r.trusted or trusted), effects=True) for r in recordings]
     return [f.recording for f in found], [s for f in found for s in f.stuck]
 
 

@@ -78,7 +78,7 @@ def run_all(subject: Subject, noise: Noise, models: Mapping[str, Model], lattice
         runs[name], levels = free_run(subject, noise, model, levels)
     residuals = (subject.readings - runs[m] for m in ("augmented", "recalibrated") if m in runs)
     nearest = min(residuals, key=lambda r: float(torch.where(subject.mask, r * r, 0.0).sum()))
-    fast = estimate_noise(nearest, subject.mask, [step > 0.0 for step in lattice])
+    fast = estimate_noise(nearest, subject.mask, lattice)
     return HeldOut(subject, runs, with_rounding(fast, lattice, subject.readings - nearest))
 
 

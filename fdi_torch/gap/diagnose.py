@@ -105,7 +105,7 @@ def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
     noise = estimate_noise(residual, subject.mask, rows=subject.rows)
     values = [subject.readings[subject.mask[:, c], c] for c in range(channels)]
     lattice = [lattice_step(v, float(noise.std[c])) for c, v in enumerate(values)]
-    noise = estimate_noise(residual, subject.mask, [step > 0.0 for step in lattice], subject.rows)
+    noise = estimate_noise(residual, subject.mask, lattice, subject.rows)
     noise = unclipped(noise, subject, null.near.readings[0])
     fitter = Fitter(with_clipped_noise(subject, null, noise), noise)
     return fitter, fitter.fit(Candidate(), null), lattice

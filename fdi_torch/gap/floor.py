@@ -41,12 +41,14 @@ DOUBLINGS = 6  # of the undoing of a mean: 0.9^64 is nothing
 class Noise:
     """innovation (C,): standard deviation of what is new in each sample, in the reading's unit; ar (C,).
 
-    mean_of: over how many samples what is new lasts; 0: for ever, AR(1).
+    mean_of: over how many samples what is new lasts; 0: for ever, AR(1). steps (C,): quantization step of each
+    channel in the reading's unit, 0 where there is none; empty: none anywhere.
     """
 
     innovation: Tensor
     ar: Tensor
     mean_of: int = 0
+    steps: tuple[float, ...] = ()
 
     @property
     def energy(self) -> Tensor:
@@ -116,13 +118,15 @@ def slow_excess(white: Tensor) -> float:
 
 
 def estimate_noise(
-    residual: Tensor, mask: Tensor, rounded: Sequence[bool] = (), rows: Sequence[slice] = (slice(None),)
+    residual: Tensor, mask: Tensor, steps: Sequence[float] = (), rows: Sequence[slice] = (slice(None),)
 ) -> Noise:
     """residual (S, C), mask (S, C) -> level and colour of each channel's noise.
 
-    One colour for all channels: they are read by one system. rounded (C,): channels that have no say in it, for
-    what rounding adds has a colour of its own. rows: the stretches that follow each other without a jump.
+    One colour for all channels: they are read by one system. steps (C,): quantization steps; channels that have one
+    have no say in the colour, for the error of rounding has its own. rows: the stretches that follow each other
+    without a jump.
     """
+    rounded = [step > 0.0 for step in steps]
     spectra = [_spectrum_of_all([residual[r][mask[r][:, c], c] for r in rows]) for c in range(residual.shape[1])]
     say = [not r for r in rounded] if rounded and not all(rounded) else [True] * len(spectra)
     levels = [_levels(*s) for s in spectra]
@@ -137,7 +141,7 @@ def estimate_noise(
     errors = [int(x[i].argmin()) for x, i in zip(likelihoods, chosen, strict=True)]
     level = torch.stack([x[i, j] for x, i, j in zip(levels, chosen, errors, strict=True)])
     innovation = torch.sqrt(torch.clamp(level, min=torch.finfo(level.dtype).tiny))
-    return Noise(innovation, _COLOURS.to(level)[torch.tensor(chosen)], int(_LASTING[common]))
+    return Noise(innovation, _COLOURS.to(level)[torch.tensor(chosen)], int(_LASTING[common]), tuple(steps))
 
 
 _AR = torch.cat([torch.linspace(-0.5, 0.9, 281), torch.linspace(0.901, 0.98, 80)])

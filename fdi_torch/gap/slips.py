@@ -49,13 +49,16 @@ RIVALS, TOGETHER = 6, 2
 
 @dataclass(frozen=True)
 class Slip:
-    """What went wrong, with which channels, in a sentence that says what to do. silent: whether the channel (one
-    sensor) tells nothing of its level.
+    """What went wrong, with which channels, in a sentence that says what to do.
+
+    silent: the channel (one sensor) tells nothing of its level. physical: a delay of the sensor itself does the same,
+    so that the gap diagnosis must not refuse it.
     """
 
     channels: tuple[str, ...]
     text: str
     silent: bool = False
+    physical: bool = False
 
 
 @dataclass(frozen=True)
@@ -337,7 +340,7 @@ def _late(columns: tuple[str, ...], delay: float, everything: bool) -> Slip:
         f"{what}: the clock seems to run {abs(delay):.3g} s {'behind' if delay > 0 else 'ahead of'} that of {beside}; "
         "give each file's shift under columns: {t: {shift: ...}}"
     )
-    return Slip(("all",) if everything else columns, text)
+    return Slip(("all",) if everything else columns, text, physical=delay > 0 and not everything)
 
 
 def _follows_nothing(sensor: Sensor, still: bool) -> Slip:

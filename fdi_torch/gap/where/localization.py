@@ -114,7 +114,9 @@ def _wandering(
         best = max(first, weighed(wandering.likeliest(fitter, fit, first.noise)), key=_gain)
         refining = max(refining, best.gain - first.gain)
         needed = max(needed, best.gain + math.log(RARE))
-        found.append(best)
+        assert best.noise.wander is not None
+        if not wandering.is_rounding(fitter, best.noise.wander):
+            found.append(best)
     return found
 
 

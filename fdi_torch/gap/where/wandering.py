@@ -43,6 +43,12 @@ def cost(fitter: Fitter, wander: Wander) -> float:
     return math.log(len(CORRELATION_TIMES) - 1) + max(math.log(width * math.sqrt(values / math.pi)), 0.0)
 
 
+def is_rounding(fitter: Fitter, wander: Wander) -> bool:
+    """Whether it is no more than the error of rounding, which changes slowly with the level: half a step at most."""
+    steps = fitter.noise.steps
+    return bool(steps) and wander.std < 0.5 * steps[wander.channel]
+
+
 def size(fitter: Fitter, wander: Wander) -> float:
     """Of what it does to the readings, root of the sum of squares in units of the sensor's noise."""
     count = float(fitter.subject.mask[:, wander.channel].sum())
