@@ -82,8 +82,11 @@ def slip_of(plant: PlantDescription, recording: Recording, constant: tuple[str, 
     if not found or not _likelier(found, rivals):
         return None
     silent = {c for h in found if h.slip.silent for c in h.slip.channels}
-    rivals += list(_with_effects(as_is, recording, {s.name for s in plant.sensors if s.column in silent}))
-    return max(found, key=lambda h: h.log_weight).slip if _likelier(found, rivals) else None
+    for rival in _with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}):
+        rivals.append(rival)
+        if not _likelier(found, rivals):
+            return None
+    return max(found, key=lambda h: h.log_weight).slip
 
 
 def _odds(probability: float) -> float:
@@ -235,17 +238,12 @@ class _Hypotheses:
     def _begin(self, late: list[int]) -> tuple[float, float]:
         """The delay (s) by which readings follow the model best, in whole samples of the thinned recording, and what it
         gains."""
-        case, model = self.as_is.case, self.as_is.readings
+        case, model = self.as_is.case, self.as_is.readings[:, late]
         most = int(FARTHEST * len(model))
-        found = []
-        for lag in range(-most, most + 1):
-            moved, shown = _overlap(case.subject.readings, lag), _overlap(model, -lag)
-            mask = _overlap(case.subject.mask, lag)[:, late]
-            residual = torch.where(mask, moved[:, late] - shown[:, late], 0.0)
-            each = residual.square().sum(dim=0) / mask.sum(dim=0).clamp(min=1)
-            found.append(float((self.as_is.means[late] * torch.log(each + case.noise[late])).sum()))
-        best = min(range(len(found)), key=found.__getitem__)
-        return (best - most) * case.recording.interval, 0.5 * (found[most] - found[best])
+        mean_square = _mean_square(case.subject.readings[:, late], model, case.subject.mask[:, late], most)
+        log_likelihood = -0.5 * (torch.log(mean_square + case.noise[late]) @ self.as_is.means[late])
+        best = int(log_likelihood.argmax())
+        return (best - most) * case.recording.interval, float(log_likelihood[best] - log_likelihood[most])
 
     def _silent(self) -> Iterator[tuple[Slip, float]]:
         """Sensors that scatter by more than their level moves, or that never move."""
@@ -264,9 +262,20 @@ class _Hypotheses:
             yield _follows_nothing(sensor, still), rest + own + gain
 
 
-def _overlap(x: Tensor, lag: int) -> Tensor:
-    """x (S, C) without its first samples, or its last ones."""
-    return x[lag:] if lag >= 0 else x[:lag]
+def _mean_square(readings: Tensor, model: Tensor, mask: Tensor, most: int) -> Tensor:
+    """Mean square of readings[k + lag] - model[k] over the readings that count, (2 most + 1, C) for lags of -most to
+    most samples, by Fourier transforms of (S, C) each."""
+    center = torch.where(mask, readings, 0.0).sum(dim=0) / mask.sum(dim=0).clamp(min=1)
+    x, m, keep = torch.where(mask, readings - center, 0.0), model - center, mask.to(readings.dtype)
+    size = 2 * len(m)
+
+    def correlated(a: Tensor, b: Tensor) -> Tensor:
+        whole = torch.fft.irfft(torch.fft.rfft(a, size, dim=0) * torch.fft.rfft(b, size, dim=0).conj(), size, dim=0)
+        return torch.cat([whole[size - most :], whole[: most + 1]])
+
+    one = torch.ones_like(m)
+    square = correlated(x**2, one) - 2.0 * correlated(x, m) + correlated(keep, m**2)
+    return square.clamp(min=0.0) / correlated(keep, one).clamp(min=1.0)
 
 
 def _delay(found: Run, late: list[int]) -> float:
@@ -279,7 +288,7 @@ def _delay(found: Run, late: list[int]) -> float:
     return -float((residual * slope * weight).sum() / (slope * slope * weight).sum().clamp(min=1e-300))
 
 
-def _with_effects(as_is: Run, recording: Recording, elsewhere: set[str]) -> Iterator[float]:
+def _with_effects(as_is: Run, elsewhere: set[str]) -> Iterator[float]:
     """Weights of the recording as it is, with one effect of the library and with two, by a greedy search.
 
     elsewhere: places that have none.
@@ -298,13 +307,12 @@ def _with_effects(as_is: Run, recording: Recording, elsewhere: set[str]) -> Iter
         best: dict[tuple[str, str], Option] = {}
         for k in torch.argsort(shown.gain, descending=True).tolist():
             best.setdefault(shown.options[k].cause, shown.options[k])
-        runs = []
+        runs: list[Run] = []
         for option in list(best.values())[:RIVALS]:
             start = fit.effect_values | dict(option.start)
             further = Candidate((*fit.candidate.placements, option.placement), (start,))
             runs.append(run(case, further, as_is, FEW))
-        for each in runs:
-            yield _weight_of(each, len(library))
+            yield _weight_of(runs[-1], len(library))
         if not runs:
             return
         parent = max(runs, key=lambda each: each.log_likelihood)
