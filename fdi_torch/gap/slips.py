@@ -195,13 +195,19 @@ class _Hypotheses:
                 yield _swap(a.column, b.column), self._weight(replace(r, output_names=tuple(turned)))
 
     def _swapped_inputs(self) -> Iterator[tuple[Slip, float]]:
+        """The pair that explains most: a recording has only one."""
         units, r = self.plant.channel_units(), self.recording
+        each: list[tuple[float, tuple[str, str], Recording]] = []
         for first, second in combinations(self.plant.channels(), 2):
             i, j = r.input_names.index(first), r.input_names.index(second)
             if units[first] == units[second] and not torch.equal(r.inputs[:, i], r.inputs[:, j]):
                 turned = list(r.input_names)
                 turned[i], turned[j] = turned[j], turned[i]
-                yield _swap(first, second), self._weight(replace(r, input_names=tuple(turned)))
+                corrected = replace(r, input_names=tuple(turned))
+                each.append((self._run(corrected, look=True).log_likelihood, (first, second), corrected))
+        if each:
+            _, pair, corrected = max(each, key=lambda found: found[0])
+            yield _swap(*pair), self._weight(corrected)
 
     def _clocks(self) -> Iterator[tuple[Slip, float]]:
         """All readings late or early, or those of one sensor; the delay by Gauss and Newton."""
