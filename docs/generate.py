@@ -1,7 +1,7 @@
 """Generate the reference pages from the code, and pages that show the source files to which other pages link.
 
-MkDocs calls `on_files` and `on_page_markdown` (`hooks` in mkdocs.yml). `generated()` needs fdi_torch only, so that tests can
-check links without MkDocs.
+MkDocs calls `on_files` and `on_page_markdown` (`hooks` in mkdocs.yml). `generated()` needs fdi_torch only, so that
+tests can check links without MkDocs.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ def commands() -> str:
     rows = ((f"[`{name}`](#fdi-{name})", what) for name, what in COMMANDS.items())
     parts = [
         "# Commands",
-        "Generated from the argument parsers. Results go to standard output, progress to standard error. Exit codes: 0 "
-        "done, 2 misuse, 3 ran but did not converge (recover, replay: something was lost, or differs), 130 interrupted, "
-        "143 terminated.",
+        "Generated from the argument parsers. Results go to standard output, progress to standard error. Exit codes: "
+        "0 done, 2 misuse, 3 ran but did not converge (recover, replay: something was lost, or differs), 130 "
+        "interrupted, 143 terminated.",
         "\n".join(["| command | purpose |", "|---|---|", *(f"| {a} | {cell(b)} |" for a, b in rows)]),
         "Every command also has `--json` (print JSON and nothing else on standard output), `--quiet` (no progress) and "
         "`--traceback` (show where an error arose).",
@@ -108,8 +108,8 @@ def plain(text: str) -> str:
 def configuration() -> str:
     parts = [
         "# Configuration files",
-        "Generated from the models that read the files. `N` stands for the index in a list, `NAME` for any name; values "
-        "may have units (`300 s`, `50 cm^3/s`). `extends: FILE` takes the keys of another file first, and `--set "
+        "Generated from the models that read the files. `N` stands for the index in a list, `NAME` for any name; "
+        "values may have units (`300 s`, `50 cm^3/s`). `extends: FILE` takes the keys of another file first, and `--set "
         "KEY=VALUE` changes one key on the command line. The recordings' keys are explained in "
         "[Use your own data](../how-to/own-data.md).",
     ]
@@ -128,17 +128,20 @@ def key_table(rows: Iterable[tuple[str, str, str]]) -> str:
 
 def plant_file() -> str:
     shipped = sorted((ROOT / "configs" / "plants").glob("*.yaml"))
-    return "\n\n".join(
-        [
-            "# Plant file",
-            "Generated from the model that reads the file. `fdi new plant` writes a commented example, `fdi check --plant "
-            "FILE` checks one, and `--picture FILE` draws it. Values have units; the tables give the SI unit.",
-            key_table(keys(PlantConfig)),
-            "## Shipped plants",
-            "A name may stand in place of a file: " + ", ".join(f"`{path.stem}`" for path in shipped) + ".",
-            f"```yaml title=\"three_tank\"\n{(ROOT / 'configs/plants/three_tank.yaml').read_text(encoding='utf-8')}```",
-        ]
-    ) + "\n"
+    return (
+        "\n\n".join(
+            [
+                "# Plant file",
+                "Generated from the model that reads the file. `fdi new plant` writes a commented example, `fdi check "
+                "--plant FILE` checks one, and `--picture FILE` draws it. Values have units; the tables give the SI unit.",
+                key_table(keys(PlantConfig)),
+                "## Shipped plants",
+                "A name may stand in place of a file: " + ", ".join(f"`{path.stem}`" for path in shipped) + ".",
+                "```yaml\n" + (ROOT / "configs/plants/three_tank.yaml").read_text(encoding="utf-8") + "```",
+            ]
+        )
+        + "\n"
+    )
 
 
 def effects() -> str:
@@ -149,7 +152,7 @@ def effects() -> str:
         "# Effects",
         "Generated from the library. A fault and an unmodelled effect are the same thing: a deviation of one component "
         "with an equation and parameters. The first parameter is the size; where it is nominal, the effect is absent. "
-        "Ranges are those of a rig of 1 m height; `fdi effects --plant FILE` gives them for a plant of yours. A new one is "
+        "Ranges are those of a rig of 1 m height; `fdi effects --plant FILE` gives them for your plant. A new one is "
         "[one file and one line](../contributing.md#add-an-effect-without-or-with-memory).",
         "\n".join(["| effect | meaning | sits at a | stage |", "|---|---|---|---|", *rows]),
     ]
@@ -172,8 +175,8 @@ def effects() -> str:
 def log_topics() -> str:
     parts = [
         "# Log topics",
-        "Generated from the schemas. Every message also has `t`, the plant's time in seconds. Topics marked *named* carry "
-        "further numbers under names of channels or parameters. How a log is built: [Logs](logs.md).",
+        "Generated from the schemas. Every message also has `t`, the plant's time in seconds. Topics marked *named* "
+        "carry further numbers under names of channels or parameters. How a log is built: [Logs](logs.md).",
     ]
     for name, topic in TOPICS.items():
         fields = [(code(field), kind, unit, meaning) for field, (kind, unit, meaning) in topic.fields.items()]
@@ -260,7 +263,7 @@ def members(cls: type) -> Iterator[tuple[str, str]]:
 
 
 def outside(page: str, text: str) -> Iterator[tuple[str, str]]:
-    """Links of a page to files that the site does not show as pages: the link, and the file's path in the repository."""
+    """Links of a page to files that are no pages of the site: the link, and the file's path in the repository."""
     for target, _ in LINK.findall(FENCE.sub("", text)):
         path = (DOCS / PurePosixPath(page).parent / target).resolve()
         if path.is_file() and (path.suffix == ".py" or not path.is_relative_to(DOCS)):

@@ -1,8 +1,8 @@
 """Run the console sessions of a Markdown page, and compare what they print with what the page shows.
 
-A fenced block with a title (```yaml title="rig.yaml") is a file of the session. A block ```console holds commands after
-`$ ` and the lines that they print; a line `...` stands for any lines. Words must be equal, numbers equal to 2 % or to one
-unit of the last digit shown. `python -m tests.sessions PAGE ...` runs pages and rewrites the shown lines in place.
+A fenced block with a title (```yaml title="rig.yaml") is a file of the session. A block ```console holds commands
+after `$ ` and the lines that they print; a line `...` stands for any lines. Words must be equal, numbers equal to 2 % or to
+one unit of the last digit shown. `python -m tests.sessions PAGE ...` runs pages and rewrites the shown lines in place.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def check(command: str, expected: list[str], printed: list[str]) -> None:
             free = True
             continue
         found = next((k for k in range(at, len(printed)) if same(line, printed[k])), None)
-        assert found is not None and (free or found == at), (
-            f"$ {command}\nshown, not printed: {line}\n" + "\n".join(printed)
+        assert found is not None and (free or found == at), f"$ {command}\nshown, not printed: {line}\n" + "\n".join(
+            printed
         )
         at, free = found + 1, False
     assert free or at == len(printed), f"$ {command}\nprinted, not shown: " + "\n".join(printed[at:])
