@@ -109,8 +109,8 @@ def configuration() -> str:
     parts = [
         "# Configuration files",
         "Generated from the models that read the files. `N` stands for the index in a list, `NAME` for any name; "
-        "values may have units (`300 s`, `50 cm^3/s`). `extends: FILE` takes the keys of another file first, and `--set "
-        "KEY=VALUE` changes one key on the command line. The recordings' keys are explained in "
+        "values may have units (`300 s`, `50 cm^3/s`). `extends: FILE` takes the keys of another file first, and "
+        "`--set KEY=VALUE` changes one key on the command line. The recordings' keys are explained in "
         "[Use your own data](../how-to/own-data.md).",
     ]
     for title, (users, module, model) in FILES.items():
@@ -133,7 +133,7 @@ def plant_file() -> str:
             [
                 "# Plant file",
                 "Generated from the model that reads the file. `fdi new plant` writes a commented example, `fdi check "
-                "--plant FILE` checks one, and `--picture FILE` draws it. Values have units; the tables give the SI unit.",
+                "--plant FILE` checks one, and `--picture FILE` draws it. Values have units; the table gives SI units.",
                 key_table(keys(PlantConfig)),
                 "## Shipped plants",
                 "A name may stand in place of a file: " + ", ".join(f"`{path.stem}`" for path in shipped) + ".",

@@ -1,8 +1,9 @@
 """Run the console sessions of a Markdown page, and compare what they print with what the page shows.
 
 A fenced block with a title (```yaml title="rig.yaml") is a file of the session. A block ```console holds commands
-after `$ ` and the lines that they print; a line `...` stands for any lines. Words must be equal, numbers equal to 2 % or to
-one unit of the last digit shown. `python -m tests.sessions PAGE ...` runs pages and rewrites the shown lines in place.
+after `$ ` and the lines that they print; a line `...` stands for any lines. Words must be equal, and numbers to 2 %
+or to one unit of the last digit shown. `python -m tests.sessions PAGE ...` runs pages and
+rewrites the shown lines in place.
 """
 
 from __future__ import annotations
