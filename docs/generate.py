@@ -16,18 +16,12 @@ from typing import Any
 
 import fdi_torch
 from fdi_torch.cli import COMMANDS
-from fdi_torch.config.plant import PlantConfig
 from fdi_torch.config.reference import keys
 from fdi_torch.logbook.schemas import TOPICS
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
-FILES = {
-    "Run file": ("train, simulate", "run", "RunConfig"),
-    "Monitor file": ("monitor", "monitor", "MonitorConfig"),
-    "Study file": ("study", "study", "StudyConfig"),
-    "Rehearsal file": ("rehearse", "rehearsal", "RehearsalConfig"),
-}
+FILES = {"Run file": "train", "Monitor file": "monitor", "Study file": "study", "Rehearsal file": "rehearse"}
 LINK = re.compile(r"(?<!!)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
 FENCE = re.compile(r"^```.*?^```", re.S | re.M)
 CODE = {".py": "python", ".yaml": "yaml", ".toml": "toml", ".md": "markdown", ".hpp": "cpp"}
@@ -53,8 +47,8 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def cell(text: str) -> str:
-    text = " ".join(text.split()).replace("|", "\\|")
-    return text if text.startswith("`") else text.replace("<", "&lt;").replace("*", "\\*")
+    text = " ".join(text.split())
+    return text if text.startswith("`") else text.replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
 
 
 def code(text: str) -> str:
@@ -78,12 +72,16 @@ def commands() -> str:
 
 def command(name: str) -> str:
     options = import_module(f"fdi_torch.cli.options.{name}")
-    parser = argparse.ArgumentParser(prog=f"fdi {name}", add_help=False)
-    options.add_arguments(parser)
-    rows = [(code(usage(action)), (action.help or "").replace("%%", "%")) for action in parser._actions]
+    rows = [(code(usage(action)), (action.help or "").replace("%%", "%")) for action in parser_of(name)._actions]
     listed = [table(("argument", "meaning"), rows)] if rows else []
     examples = options.EXAMPLES.replace("examples:", "").strip("\n")
     return "\n\n".join([f"## fdi {name}", doc(options), *listed, f"```sh\n{inspect.cleandoc(examples)}\n```"])
+
+
+def parser_of(command: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=f"fdi {command}", add_help=False)
+    import_module(f"fdi_torch.cli.options.{command}").add_arguments(parser)
+    return parser
 
 
 def usage(action: argparse.Action) -> str:
@@ -113,13 +111,20 @@ def configuration() -> str:
         "`--set KEY=VALUE` changes one key on the command line. The recordings' keys are explained in "
         "[Use your own data](../how-to/own-data.md).",
     ]
-    for title, (users, module, model) in FILES.items():
-        rows = keys(getattr(import_module(f"fdi_torch.config.{module}"), model))
-        if title == "Study file":
-            rows = ((f"study.{path}", default, meaning) for path, default, meaning in rows)
-        note = "All keys of a run file, and in addition:\n\n" if title == "Study file" else ""
-        parts.append(f"## {title}\n\nRead by `fdi {users.replace(', ', '` and `fdi ')}`.\n\n{note}{key_table(rows)}")
+    run_keys = set(keys_of("train"))
+    for title, command in FILES.items():
+        rows = [row for row in keys_of(command) if command != "study" or row not in run_keys]
+        users = "`fdi train` and `fdi simulate`" if command == "train" else f"`fdi {command}`"
+        note = "All keys of a run file, and in addition:\n\n" if command == "study" else ""
+        parts.append(f"## {title}\n\nRead by {users}.\n\n{note}{key_table(rows)}")
     return "\n\n".join(parts) + "\n"
+
+
+def keys_of(command: str) -> list[tuple[str, str, str]]:
+    """Path, default and meaning of every key of the file that a command reads, as its option `--keys` prints them."""
+    shown = next(action for action in parser_of(command)._actions if "--keys" in action.option_strings)
+    models = [model.split(":") for model in shown.models]  # type: ignore[attr-defined]
+    return [row for module, name in models for row in keys(getattr(import_module(module), name))]
 
 
 def key_table(rows: Iterable[tuple[str, str, str]]) -> str:
@@ -134,7 +139,7 @@ def plant_file() -> str:
                 "# Plant file",
                 "Generated from the model that reads the file. `fdi new plant` writes a commented example, `fdi check "
                 "--plant FILE` checks one, and `--picture FILE` draws it. Values have units; the table gives SI units.",
-                key_table(keys(PlantConfig)),
+                key_table(keys_of("check")),
                 "## Shipped plants",
                 "A name may stand in place of a file: " + ", ".join(f"`{path.stem}`" for path in shipped) + ".",
                 "```yaml\n" + (ROOT / "configs/plants/three_tank.yaml").read_text(encoding="utf-8") + "```",
