@@ -13,7 +13,7 @@ LOWEST = tests/test_units.py tests/test_yaml_files.py tests/test_config_plant.py
 	tests/test_recording_csv.py tests/test_hostile_files.py tests/test_command_line.py tests/logbook/test_reader.py
 EXTRAS := test$(if $(COMPILER),,$(comma)compiler)
 
-.PHONY: run test slow longest lint paper lowest clean
+.PHONY: run test slow longest lint paper docs lowest clean
 
 run: $(STAMP)
 	$(BIN)/python -m fdi_torch.train
@@ -35,6 +35,11 @@ lint: $(STAMP)
 paper: $(STAMP)
 	$(BIN)/python -m fdi_torch paper
 
+# The site, in site/; its links are checked.
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 # The quickest tests of every reader and writer, on the lowest versions that pyproject.toml allows.
 lowest:
 	$(PYTHON) -m venv .venv-lowest
@@ -48,4 +53,4 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-lowest .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-lowest .pytest_cache .mypy_cache .ruff_cache site

@@ -1,4 +1,4 @@
-"""The blocks of docs/python.md run one after the other and give what the page says."""
+"""The blocks of docs/how-to/python.md run one after the other and give what the page says."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ from pathlib import Path
 import pytest
 import torch
 
-PAGE = (Path(__file__).parent.parent / "docs" / "python.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parent.parent / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
 
 
 def test_the_page_runs_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"__name__": "page"}
     for code in re.findall(r"```python\n(.*?)```", PAGE, flags=re.S):
-        exec(compile(code, "docs/python.md", "exec"), names)
+        exec(compile(code, "docs/how-to/python.md", "exec"), names)
     assert names["found"].headline.endswith("A.leak.size")  # type: ignore[attr-defined]
     assert "leak at A" in names["gap"].headline  # type: ignore[attr-defined]
     assert "B.leak.size" in names["events"].headline  # type: ignore[attr-defined]
+    assert tuple(names["readings"].shape) == (1000, 601, 2)  # type: ignore[attr-defined]
+    assert tuple(names["jacobian"].shape) == (10, 601, 2, 2)  # type: ignore[attr-defined]
     slope = names["slope"]
     assert isinstance(slope, torch.Tensor) and float(slope[0, 0]) < 0.0
     flow = names["model"].outflow(names["levels"]).detach() / names["hole"]  # type: ignore[attr-defined]

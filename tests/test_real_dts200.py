@@ -41,7 +41,7 @@ def test_the_adopted_plant_runs_freely_within_5_mm_where_hoses_are_full_or_told_
     for run in runs("dts200_trials"):
         start = float(run.time[0])
         if "smc" in run.source and start == 0.0:
-            continue  # the pumps draw air there, and R's reading slips: docs/real-rigs.md
+            continue  # the pumps draw air there, and R's reading slips: docs/evidence/real-rigs.md
         filling = "exp4" in run.source and start == 90.0  # R's hose takes 140 cm^3, twice what is typical
         found = predict(plant, run, 3, settle=30.0 if filling else None)
         assert found.settled
