@@ -21,8 +21,8 @@ from fdi_torch.effects import build_network, placements_for
 from fdi_torch.jobs.arrived import reaching
 from fdi_torch.jobs.replay import run_again
 from fdi_torch.logbook import RunLog, follow, read_run
-from fdi_torch.monitor.arrivals import Arrivals, Punctuality
-from fdi_torch.monitor.observer import bound
+from fdi_torch.monitor.live_batches import DelayWatch, LiveBatches
+from fdi_torch.monitor.observer import bind_parameters
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.equilibrium import equilibrium
@@ -37,8 +37,8 @@ def readings(size: float = 0.05, onset: float = ONSET) -> list[list[float]]:
     network = build_network(load_plant("three_tank"), placements_for([FAULT]))
     space = ParameterSpace([network.constants[FAULT]])
     inputs = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
-    stepper, sound = Stepper(network), bound(network, None, None)
-    leaking = bound(network, space, torch.tensor([size], dtype=torch.float64))
+    stepper, sound = Stepper(network), bind_parameters(network, None, None)
+    leaking = bind_parameters(network, space, torch.tensor([size], dtype=torch.float64))
     state, levels = stepper.start(equilibrium(network, inputs), inputs, sound), []
     for k in range(SAMPLES):
         levels.append(state.levels)
@@ -303,28 +303,30 @@ def test_arrivals_come_in_batches_and_with_their_errors() -> None:
         yield from range(5)
         raise ValueError("torn")
 
-    arrivals, got = Arrivals(source()), []
+    arrivals, got = LiveBatches(source()), []
     with pytest.raises(ValueError, match="torn"):
         for batch in arrivals:
             got += batch
     assert got == list(range(5))
-    assert [item for batch in Arrivals(iter("abc")) for item in batch] == ["a", "b", "c"]
+    assert [item for batch in LiveBatches(iter("abc")) for item in batch] == ["a", "b", "c"]
 
 
 def test_lateness_and_bursts_are_told_once_until_they_double() -> None:
     wall = [100.0]
-    punctual = Punctuality(lambda: wall[0])
-    assert punctual.arrived([0.0, 1.0, 2.0]) == [] and punctual.handled(2.0) == []
+    delay_watch = DelayWatch(lambda: wall[0])
+    assert delay_watch.received([0.0, 1.0, 2.0]) == [] and delay_watch.processed(2.0) == []
     wall[0] += 30.0
-    assert "31 samples came at once after 30.0 s of silence" in punctual.arrived([float(t) for t in range(3, 34)])[0]
-    assert punctual.handled(33.0) == []
+    assert (
+        "31 samples came at once after 30.0 s of silence" in delay_watch.received([float(t) for t in range(3, 34)])[0]
+    )
+    assert delay_watch.processed(33.0) == []
     wall[0] += 40.0
-    assert punctual.arrived([34.0]) == []
-    assert "39.0 s later than real time" in punctual.handled(34.0)[0]
+    assert delay_watch.received([34.0]) == []
+    assert "39.0 s behind real time" in delay_watch.processed(34.0)[0]
     wall[0] += 2.0
-    assert punctual.handled(35.0) == []
-    punctual.restarted()
-    assert punctual.handled(0.0) == []
+    assert delay_watch.processed(35.0) == []
+    delay_watch.clock_jumped()
+    assert delay_watch.processed(0.0) == []
 
 
 @pytest.mark.parametrize("look", range(4))

@@ -14,7 +14,7 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
-from fdi_torch.monitor.prepare import usual_faults
+from fdi_torch.monitor.monitor_setup import usual_faults
 from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import time_scale

@@ -11,7 +11,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.config.monitor import load_monitor
 from fdi_torch.jobs.monitor import Listening, watch
 from fdi_torch.monitor.events import FORMAT, Event
-from fdi_torch.monitor.prepare import Prepared
+from fdi_torch.monitor.monitor_setup import PreparedMonitor
 from fdi_torch.parameters import display_unit
 
 
@@ -34,7 +34,7 @@ def _tell(event: Event, screen: Screen) -> None:
     screen.line(orjson.dumps({"format": FORMAT, **event.to_dict()}).decode())
 
 
-def _introduce(prepared: Prepared, screen: Screen) -> None:
+def _introduce(prepared: PreparedMonitor, screen: Screen) -> None:
     noise, detector = prepared.noise, prepared.monitor.detector
     stds = ", ".join(
         f"{sensor.name} {display_unit(sensor.unit)[1] * std:.3g} {display_unit(sensor.unit)[0]}".rstrip()

@@ -26,13 +26,13 @@ from fdi_torch.jobs.arrived import followed_on, logged_rows, reaching, recording
 from fdi_torch.jobs.log_paths import RESUMES, free_path, go_on_from
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.logbook import Run as LoggedRun
-from fdi_torch.monitor.arrivals import Arrivals, Punctuality
 from fdi_torch.monitor.diagnosability import diagnosability
 from fdi_torch.monitor.events import FORMAT, Event
-from fdi_torch.monitor.monitor import Monitor, Seen
-from fdi_torch.monitor.prepare import Prepared, fault_free_part, prepare
-from fdi_torch.monitor.samples import Samples, take
-from fdi_torch.monitor.windows import WindowMonitor
+from fdi_torch.monitor.live_batches import DelayWatch, LiveBatches
+from fdi_torch.monitor.monitor import Monitor, ResidualTrace
+from fdi_torch.monitor.monitor_setup import PreparedMonitor, fault_free_part, prepare_monitor
+from fdi_torch.monitor.samples import Samples, samples_of_recording
+from fdi_torch.monitor.window_monitor import WindowMonitor
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -58,7 +58,7 @@ class Listening:
 
     tell: Callable[[float, str], None]
     event: Callable[[Event], None]
-    ready: Callable[[Prepared], None]
+    ready: Callable[[PreparedMonitor], None]
     log: Listener | None = None
 
 
@@ -117,7 +117,7 @@ def _heard(payload: dict[str, Any]) -> tuple[Any, ...]:
 def _follow(run: MonitorRun, watcher: Watcher, listening: Listening, idle: float, earlier: Sequence[Row]) -> None:
     """As samples arrive; those until the end of the fault-free part are waited for first."""
     source = growing_rows(run.config.recording, run.plant, run.base, idle)
-    arrivals = Arrivals(followed_on(earlier, source) if earlier else source)
+    arrivals = LiveBatches(followed_on(earlier, source) if earlier else source)
     early: list[Row] = []
     said: list[str] = []
     learnt: list[Row] = []
@@ -131,19 +131,19 @@ def _follow(run: MonitorRun, watcher: Watcher, listening: Listening, idle: float
         if learnt:
             break
     watcher.learn(recording_of(learnt or early, run))
-    punctual = Punctuality(time.monotonic)
+    delay_watch = DelayWatch(time.monotonic)
     first: list[Row | str] = [*said, *early]
     batches: Iterable[list[Row | str]] = chain([first], arrivals)
     for batch in batches:
         rows = [row for row in batch if not isinstance(row, str)]
         notices = [row for row in batch if isinstance(row, str)]
-        notices += punctual.arrived([row[0] for row in rows]) if rows else []
+        notices += delay_watch.received([row[0] for row in rows]) if rows else []
         for notice in notices:
             watcher.say(notice)
         if rows:
             if watcher.take(samples_of(rows, run)):
-                punctual.restarted()
-            for notice in punctual.handled(rows[-1][0]):
+                delay_watch.clock_jumped()
+            for notice in delay_watch.processed(rows[-1][0]):
                 watcher.say(notice)
             listening.tell(0.5, f"{rows[-1][0]:g} s")
 
@@ -169,7 +169,7 @@ class Watcher:
     def along(self, whole: Recording) -> None:
         """A recording that is all there."""
         self.learn(whole)
-        samples = take(whole, self.run.plant)
+        samples = samples_of_recording(whole, self.run.plant)
         lasts, reach = float(whole.time[-1] - whole.time[0]), self.run.config.window.longest
         if reach > lasts and self.run.config.mode != "changes":
             raise ValueError(
@@ -178,7 +178,7 @@ class Watcher:
             )
         for first in range(0, len(samples), CHUNK):
             last = min(first + CHUNK, len(samples))
-            self.take(samples.stretch(first, last))
+            self.take(samples.segment(first, last))
             self.listening.tell(last / len(samples), f"{float(samples.time[last - 1]):g} s")
 
     def learn(self, whole: Recording) -> None:
@@ -199,13 +199,13 @@ class Watcher:
             )
         self.listening.ready(prepared)
         self._now = config.fault_free[1]
-        self._tell(Event(self._now, "watching", prepared.learnt))
+        self._tell(Event(self._now, "watching", prepared.false_alarm_text))
         self.say(self._suspects(prepared, whole))
         part = fault_free_part(whole, *config.fault_free)
-        for doubt in (*doubts(part, self.plant), *prepared.doubts):
+        for doubt in (*doubts(part, self.plant), *prepared.warnings):
             self.say(doubt)
 
-    def _suspects(self, prepared: Prepared, whole: Recording) -> str:
+    def _suspects(self, prepared: PreparedMonitor, whole: Recording) -> str:
         """What is watched for, and which of it the inputs of the fault-free part cannot separate."""
         names = [self.space.names[fault.size] for fault in prepared.monitor.faults]
         told = f"watches for {', '.join(names)}"
@@ -231,10 +231,10 @@ class Watcher:
         self._log_samples(samples)
         if self.state is None:
             self.state, self._began = self._start(samples), float(samples.time[0])
-            samples = samples.stretch(1, len(samples))
+            samples = samples.segment(1, len(samples))
         events: list[Event] = []
         if len(samples):
-            seen: list[Seen] = []
+            seen: list[ResidualTrace] = []
             try:
                 self.state, events = self.monitor.advance(self.state, samples, seen.append)
             finally:  # all at once, in a third of the time
@@ -302,7 +302,7 @@ class Watcher:
             hold=samples.hold,
         )
 
-    def _log_seen(self, seen: Sequence[Seen]) -> None:
+    def _log_seen(self, seen: Sequence[ResidualTrace]) -> None:
         """Residuals, and the one statistic of all channels beside its threshold."""
         if not seen:
             return
@@ -342,7 +342,7 @@ def logged(event: Event) -> dict[str, Any]:
         "onset_std": event.onset_std,
         "delay": event.delay,
         "growing": event.growing if event.faults else None,
-        "explanations": [e.words for e in event.explanations] or None,
+        "explanations": [e.text for e in event.explanations] or None,
         "masses": [e.mass for e in event.explanations] or None,
         "sensors": [name for name, _ in event.shares] or None,
         "shares": [share for _, share in event.shares] or None,
@@ -357,12 +357,12 @@ def logged(event: Event) -> dict[str, Any]:
     return fields
 
 
-def _prepared(run: MonitorRun, whole: Recording) -> Prepared:
+def _prepared(run: MonitorRun, whole: Recording) -> PreparedMonitor:
     c = run.config
     part = _sound(run.plant, fault_free_part(whole, *c.fault_free))
     # Levels that are known at the recording's start are those of no later moment.
     at_start = float(part.time[0]) == float(whole.time[0])
-    return prepare(
+    return prepare_monitor(
         run.plant,
         part,
         c.faults,

@@ -13,15 +13,15 @@ from fdi_torch.config.rehearsal import Rehearsal
 from fdi_torch.jobs.log_paths import RESUMES
 from fdi_torch.jobs.study import carried_over, log_and_earlier
 from fdi_torch.logbook import Listener, RunLog
-from fdi_torch.monitor.rehearsal.pieces import Shown
+from fdi_torch.monitor.monte_carlo.tasks import ResultTable
 
 
 @dataclass(frozen=True)
 class Rehearsed:
     """tables: one a rehearsal. computed: pieces of this run, of `pieces`. seconds: they took. log: where all lies."""
 
-    tables: tuple[Shown, ...]
-    pieces: int
+    tables: tuple[ResultTable, ...]
+    tasks: int
     computed: int
     seconds: float
     log: Path
@@ -36,7 +36,7 @@ def rehearse(
     """Computes every piece that the log does not hold yet. tell(share, text) is called after each."""
     folder = Path(rehearsal.config.output.folder)
     path, before = log_and_earlier(folder, rehearsal.name, rehearsal.text, resume)
-    pieces = [piece for plan in rehearsal.plans for piece in plan.pieces()]
+    pieces = [piece for plan in rehearsal.plans for piece in plan.tasks()]
     seeds = {"seed": rehearsal.config.seed}
     with RunLog(
         path,
@@ -59,13 +59,15 @@ def rehearse(
                 log.trial(number, known[number][1], group=piece.group, seed=seed, status="done")
                 log.flush()
         tables = tabled(rehearsal, [known[number] for number in sorted(known)])
-        log.result({"tables": [{"title": t.title, "header": t.header, "rows": t.rows, "said": t.said} for t in tables]})
+        log.result(
+            {"tables": [{"title": t.title, "header": t.header, "rows": t.rows, "said": t.summary} for t in tables]}
+        )
     return Rehearsed(tables, len(pieces), len(known) - found, time.monotonic() - started, path)
 
 
-def tabled(rehearsal: Rehearsal, known: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[Shown, ...]:
+def tabled(rehearsal: Rehearsal, known: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[ResultTable, ...]:
     """Every plan's table of what there is."""
     groups: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     for group, numbers in known:
         groups[group].append(numbers)
-    return tuple(plan.shown(groups) for plan in rehearsal.plans)
+    return tuple(plan.result_table(groups) for plan in rehearsal.plans)
