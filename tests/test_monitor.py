@@ -17,7 +17,8 @@ from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor import load_monitor
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, place
-from fdi_torch.jobs.monitor import Listening, watch
+from fdi_torch.jobs.logged_monitor import MonitorCallbacks
+from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.fault_free_checks import residual_warnings
@@ -92,10 +93,10 @@ def monitor(**settings: float) -> Monitor:
     return Monitor(NETWORK, SPACE, noise(), detector, MonitorSettings(**chosen))  # type: ignore[arg-type]
 
 
-def followed(watch: Monitor, samples: Samples, chunk: int = 20) -> tuple[MonitorState, list[Event]]:
-    state, events = watch.start(samples), []
+def followed(run_monitor: Monitor, samples: Samples, chunk: int = 20) -> tuple[MonitorState, list[Event]]:
+    state, events = run_monitor.start(samples), []
     for first in range(1, len(samples), chunk):
-        state, news = watch.advance(state, samples.segment(first, min(first + chunk, len(samples))))
+        state, news = run_monitor.advance(state, samples.segment(first, min(first + chunk, len(samples))))
         events += news
     return state, events
 
@@ -144,8 +145,8 @@ def test_sensors_may_be_read_at_rates_of_their_own_and_never_together(period: tu
     assert 1.0 < second.stds[0] / first.stds[0] < 2.2
 
 
-def replace_noise(watch: Monitor, learnt: NoiseModel) -> Monitor:
-    return Monitor(watch.network, watch.space, learnt, watch.detector, watch.settings)
+def replace_noise(run_monitor: Monitor, learnt: NoiseModel) -> Monitor:
+    return Monitor(run_monitor.network, run_monitor.space, learnt, run_monitor.detector, run_monitor.settings)
 
 
 def test_random_moments_are_no_gaps() -> None:
@@ -188,8 +189,8 @@ def test_a_slowly_growing_fault_is_told_from_a_sudden_one() -> None:
         return SPACE.vector({"h3.sensor_bias.bias": 1e-4 * max(time - 100.0, 0.0)})
 
     samples = recorded(truth, 260)
-    watch = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
-    best = isolate(watch, from_rest(samples), SPACE.nominal(), FAULTS, incipient=True, deepest=1)[0]
+    run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
+    best = isolate(run_monitor, from_rest(samples), SPACE.nominal(), FAULTS, incipient=True, deepest=1)[0]
     assert best.hypothesis.columns == (4,) and best.hypothesis.incipient
     assert float(best.value[4]) == pytest.approx(1e-4 * 159.0, rel=0.05)
     assert abs(best.onset - 100.0) < 10.0
@@ -199,19 +200,19 @@ def test_two_faults_at_once_are_found_together() -> None:
     def truth(time: float) -> Tensor:
         return SPACE.vector({"T1.leak.size": 0.05, "h3.sensor_bias.bias": 0.01} if time > 100.0 else {})
 
-    watch = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
-    best = isolate(watch, from_rest(recorded(truth, 260)), SPACE.nominal(), FAULTS, incipient=False, deepest=2)[0]
+    run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
+    best = isolate(run_monitor, from_rest(recorded(truth, 260)), SPACE.nominal(), FAULTS, incipient=False, deepest=2)[0]
     assert best.hypothesis.columns == (0, 4)
     for column, size in ((0, 0.05), (4, 0.01)):
         assert abs(float(best.value[column]) - size) < 4 * float(best.std[column])
 
 
 def test_standard_errors_are_those_of_repeated_runs() -> None:
-    watch = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
+    run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
     pulls = []
     for seed in range(8):
         samples = recorded(step_to("T3.leak.size", 0.05, 60.0), 140, seed=seed)
-        best = isolate(watch, from_rest(samples), SPACE.nominal(), FAULTS[1:2], incipient=False, deepest=1)[0]
+        best = isolate(run_monitor, from_rest(samples), SPACE.nominal(), FAULTS[1:2], incipient=False, deepest=1)[0]
         pulls.append((float(best.value[1]) - 0.05) / float(best.std[1]))
     assert 0.5 < float(torch.tensor(pulls).square().mean().sqrt()) < 1.7  # 8 runs: 95 % within 0.5 to 1.5
 
@@ -379,8 +380,10 @@ def test_figures_6_and_7() -> None:
     )
     learnt, _ = learn_noise(network, free, space, space.nominal())
     detector = make_detector("cusum", 20000.0, 1.0, 3, torch.Generator().manual_seed(0))
-    watch = Monitor(network, space, learnt, detector, MonitorSettings(lookback=200.0, together=4, incipient=False))
-    _, events = followed(watch, samples, 50)
+    run_monitor = Monitor(
+        network, space, learnt, detector, MonitorSettings(lookback=200.0, together=4, incipient=False)
+    )
+    _, events = followed(run_monitor, samples, 50)
     alarms = [event.time for event in events if event.kind == "alarm"]
     assert len(alarms) == 2 and 1000 < alarms[0] < 1010 and 2000 < alarms[1] < 2010
     ends = [[e for e in events if e.sizes and e.time <= end][-1] for end in (2000.0, 3000.0)]
@@ -405,8 +408,8 @@ def test_a_level_that_is_known_at_the_start_is_not_taken_for_that_of_a_later_fau
         f"output: {{folder: {tmp_path}}}\n"
     )
     told: list[float] = []
-    silent = Listening(lambda *_: None, lambda _: None, lambda ready: told.append(ready.calibrated["Q.gain"]))
-    watch(load_monitor(tmp_path / "watch.yaml"), silent)
+    silent = MonitorCallbacks(lambda *_: None, lambda _: None, lambda ready: told.append(ready.calibrated["Q.gain"]))
+    run_monitor(load_monitor(tmp_path / "watch.yaml"), silent)
     assert told == [pytest.approx(50.0 / 45.0, rel=0.01)]
 
 

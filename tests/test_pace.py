@@ -17,7 +17,7 @@ from fdi_torch.config.understood import understood
 from fdi_torch.effects import EFFECTS, all_placements, build_network, placements_for
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.hybrid import estimate_parameters
-from fdi_torch.jobs.run_setup import fitting_of, recordings_of, wanted_space
+from fdi_torch.jobs.run_setup import fitting_of, recordings_of, requested_space
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import prepare_monitor
 from fdi_torch.monitor.samples import Samples
@@ -160,5 +160,5 @@ def test_the_monitor_says_the_same_of_a_rig_of_another_size() -> None:
 
 def test_an_onset_is_sought_within_the_recording() -> None:
     run = load_run(overrides=["estimate.parameters=[T1.leak, T1.leak.onset]", "simulate.duration=400 s"])
-    fitting = fitting_of(run, wanted_space(run), recordings_of(run))
+    fitting = fitting_of(run, requested_space(run), recordings_of(run))
     assert (fitting.space["T1.leak.onset"].low, fitting.space["T1.leak.onset"].high) == (0.0, 400.0)

@@ -26,7 +26,7 @@ from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.library import STANDARD as LIBRARY
 from fdi_torch.gap.one_at_a_time import one_at_a_time
 from fdi_torch.interruption import Terminated
-from fdi_torch.jobs.blind_benchmark import LOG, conclude, write_plants
+from fdi_torch.jobs.blind_results import LOG, write_plants, write_results
 from fdi_torch.logbook.provenance import git_state
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import area_scale, length_scale, time_scale
@@ -57,7 +57,7 @@ def _joined(arguments: argparse.Namespace, out: Path) -> tuple[Sequence[Row], Ta
         raise ValueError(f"--join: expected folders only, got --{told[0].replace('_', '-')} beside it; leave that out")
     folders = [Path(name) for name in arguments.join]
     rows = joined(folders)
-    return rows, conclude(out, rows, {"join": arguments.join}, [folder / "rows.jsonl" for folder in folders])
+    return rows, write_results(out, rows, {"join": arguments.join}, [folder / "rows.jsonl" for folder in folders])
 
 
 def _challenged(arguments: argparse.Namespace, out: Path, screen: Screen) -> tuple[Sequence[Row], Tables]:
@@ -88,7 +88,7 @@ def _challenged(arguments: argparse.Namespace, out: Path, screen: Screen) -> tup
         )
     config = {"cases": cases, "seed": seed, "rig": rig.name, "leave_out": list(denied)}
     write_plants(out)
-    return rows, conclude(out, rows, config, [out / "manifest.jsonl", out / "key.jsonl"])
+    return rows, write_results(out, rows, config, [out / "manifest.jsonl", out / "key.jsonl"])
 
 
 def _rig(arguments: argparse.Namespace) -> Rig | Networks:

@@ -9,7 +9,8 @@ import orjson
 from fdi_torch.cli.options import live
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.monitor import load_monitor
-from fdi_torch.jobs.monitor import Listening, watch
+from fdi_torch.jobs.logged_monitor import MonitorCallbacks
+from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.events import FORMAT, Event
 from fdi_torch.monitor.monitor_setup import PreparedMonitor
 from fdi_torch.parameters import display_unit
@@ -19,8 +20,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     folder = [f"output.folder={arguments.out}"] if arguments.out else []
     wanted = load_monitor(arguments.config, [*arguments.set, *folder])
     with screen.progress("following") as advance, live(arguments, wanted.name, screen) as listener:
-        heard = Listening(advance, lambda e: _tell(e, screen), lambda p: _introduce(p, screen), listener)
-        done = watch(wanted, heard, arguments.follow, arguments.idle, arguments.resume)
+        heard = MonitorCallbacks(advance, lambda e: _tell(e, screen), lambda p: _introduce(p, screen), listener)
+        done = run_monitor(wanted, heard, arguments.follow, arguments.idle, arguments.resume)
     slow = "" if done.spent < done.lasted else "; slower than real time"
     screen.note(f"{done.lasted:g} s of recording in {done.spent:.1f} s of work{slow}; log: {done.log}")
     if not done.events:

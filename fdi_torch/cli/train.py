@@ -12,7 +12,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.windows import show_windows
 from fdi_torch.config.run import load_run
 from fdi_torch.jobs.train import TrainResult, train
-from fdi_torch.jobs.windows import windows_of
+from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.parameters import display_unit
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts
@@ -22,7 +22,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     job = load_run(arguments.config, overrides(arguments))
     if job.config.estimate.windows is not None:
         with screen.progress(job.name) as advance:
-            found = windows_of(job, advance)
+            found = fit_windows(job, advance)
         show_windows(found, screen)
         return DONE
     with live(arguments, job.name, screen) as listener, screen.progress(job.name) as advance:

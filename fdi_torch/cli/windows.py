@@ -5,14 +5,14 @@ from __future__ import annotations
 from fdi_torch.cli.screen import Screen
 from fdi_torch.estimate.stretches import Stretch
 from fdi_torch.estimate.windows import WindowFault
-from fdi_torch.jobs.windows import WindowsResult
+from fdi_torch.jobs.windowed_fit import WindowedFit
 from fdi_torch.parameters import display_unit
 
 TELLING = 10.0  # a standard error of more than so many sizes says nothing
 MARKS = {"absent": "-", "cannot tell": "?"}
 
 
-def show_windows(found: WindowsResult, screen: Screen) -> None:
+def show_windows(found: WindowedFit, screen: Screen) -> None:
     """A line a window, and a line a stretch; sizes without a unit are shares of the reference, flows at mean levels."""
     names = [_name(fault) for fault in found.windows[0].faults] if found.windows else []
     rows = [[f"{w.start:g}", f"{w.stop:g}", *(_cell(fault) for fault in w.faults)] for w in found.windows]

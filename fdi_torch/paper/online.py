@@ -18,7 +18,7 @@ from fdi_torch.effects import build_network
 from fdi_torch.estimate.diagnosis import sample_noise
 from fdi_torch.estimate.fitting import set_up, start_levels
 from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
-from fdi_torch.jobs.run_setup import hybrid_settings, wanted_space
+from fdi_torch.jobs.run_setup import hybrid_settings, requested_space
 from fdi_torch.monitor.detection import NO_ALARM, Detector, make_detector
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observation, Observer
@@ -104,7 +104,7 @@ def laid_end_to_end(runs: Sequence[Run]) -> tuple[Recording, Recording, TankNetw
     last = runs[-1]
     assert last.config.simulate is not None
     network = faulty_network(last)
-    space = wanted_space(last)
+    space = requested_space(last)
     pieces: list[Tensor] = []
     levels = None
     for run in runs:

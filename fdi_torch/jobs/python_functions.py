@@ -1,7 +1,7 @@
-"""The commands as functions, for sessions and notebooks: plants and recordings in, results that show themselves out.
+"""The commands as Python functions, for scripts and notebooks, with results that display themselves.
 
-Where a command takes a file (a run, monitor or study file), its function also takes the same as a mapping, in which a
-`Plant` may stand for the plant's name and a `Recording` for its file's.
+A function accepts a file (run, monitor or study file) or the same content as a mapping, in which a `Plant` may replace
+the plant's name and a `Recording` the recording's file name.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.prediction import START_SAMPLES, Prediction
 from fdi_torch.gap.prediction import predict as run_freely
 from fdi_torch.gap.verdict_words import cause_words, explanation_words, verdict_sentence
-from fdi_torch.jobs import monitor as monitor_job
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs import train as train_job
 from fdi_torch.jobs.gap import one_thread, run_gap
 from fdi_torch.jobs.log_paths import free_path
+from fdi_torch.jobs.logged_monitor import MonitorCallbacks
+from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
@@ -42,7 +43,7 @@ HERE = "session"
 
 
 def silent(share: float, text: str) -> None:
-    """Tells nobody how far the work is."""
+    """Ignore progress messages."""
 
 
 def simulate(
@@ -57,11 +58,11 @@ def simulate(
     hold: str = "zero_order",
     seed: int = 0,
 ) -> Recording:
-    """The recording of a simulated run: `fdi simulate`. The arguments are the keys of `simulate:` in a run file.
+    """Simulate a recording, as `fdi simulate` does. The arguments are the keys of `simulate:` in a run file.
 
-    inputs: of every channel a value or steps, {"Q1": "50 cm^3/s", "Q2": {"steps": [["0 s", "50 cm^3/s"], ...]}}.
-    faults: {"T1.leak": 0.3}. noise: {"std": {"h1": "1 mm"}} or {"snr_db": 30}. Repeats bit for bit for a seed.
-    Raises ConfigError, naming the key and what it should be.
+    inputs: a value or steps for every channel, {"Q1": "50 cm^3/s", "Q2": {"steps": [["0 s", "50 cm^3/s"], ...]}}.
+    faults: {"T1.leak": 0.3}. noise: {"std": {"h1": "1 mm"}} or {"snr_db": 30}. The result is reproducible to the last
+    bit for a given seed. Raises ConfigError, which names the wrong key and the expected value.
     """
     keys = {"inputs": inputs, "duration": duration, "sample_time": sample_time, "hold": hold}
     keys |= {"start_levels": start_levels, "faults": dict(faults or {}), "noise": dict(noise or {})}
@@ -74,11 +75,11 @@ def train(
     resume: bool = False,
     listener: Any = None,
 ) -> train_job.TrainResult:
-    """Which faults are in the recordings, how large and how surely: `fdi train`, logged and drawn.
+    """Estimate fault sizes and their uncertainty from recordings, as `fdi train` does, with a log and pictures.
 
-    run: a run file, or the same as a mapping such as {"plant": plant, "recordings": [recording],
-    "estimate": {"parameters": ["T1.leak"]}}; None: the built-in example. tell(share, text): progress. resume: goes on
-    where a killed run of the same file stopped. listener: hears every message of the log.
+    run: a run file, or a mapping such as {"plant": plant, "recordings": [recording],
+    "estimate": {"parameters": ["T1.leak"]}}; None: the built-in example. tell(share, text): progress. resume: continue
+    a killed run of the same file. listener: receives every log message.
     """
     if run is None or isinstance(run, str | Path):
         run = load_run(run)
@@ -89,7 +90,7 @@ def train(
 
 @dataclass(frozen=True, repr=False)
 class GapResult(Shown):
-    """answer: verdict, causes, explanations and closure, typed. log: the MCAP log, for `report` and `fdi replay`."""
+    """answer: verdict, causes, explanations and closure. log: the MCAP log, for `report` and `fdi replay`."""
 
     answer: Answer
     plant: PlantDescription
@@ -100,7 +101,7 @@ class GapResult(Shown):
         return verdict_sentence(self.answer.to_dict())
 
     def table(self) -> Table:
-        """A row a parameter of each cause, SI; without a named cause, the explanations and their probabilities."""
+        """One row per parameter of each cause, SI; without a cause, the explanations and their probabilities."""
         rows = [
             (cause_words({"effect": c.effect, "location": c.location}), name, a.value, a.std, a.unit)
             for c in self.answer.causes
@@ -111,13 +112,13 @@ class GapResult(Shown):
         )
 
     def explanations(self) -> Table:
-        """Every explanation that was weighed, the likeliest first."""
-        told = self.answer.to_dict()["posterior"]
-        rows = [(explanation_words(e["causes"]), e["probability"]) for e in told]
+        """All explanations with their posterior probabilities, likeliest first."""
+        posterior = self.answer.to_dict()["posterior"]
+        rows = [(explanation_words(e["causes"]), e["probability"]) for e in posterior]
         return Table.of_rows(("explanation", "probability"), rows)
 
     def adopted(self, constants: bool = False) -> PlantDescription:
-        """The plant with the causes among its effects. constants: also with the constants as fitted beside them."""
+        """The plant with the causes added as effects. constants: also use the constants fitted together with them."""
         return adopted(self.plant, self.answer, constants)
 
 
@@ -130,16 +131,16 @@ def gap(
     tell: Tell = silent,
     **settings: Any,
 ) -> GapResult:
-    """Where the plant falls short of recordings, by which effect, and how far the gap closes on hold-outs: `fdi gap`.
+    """Find where and by which effect the plant model deviates from recordings, as `fdi gap` does.
 
-    out: folder of the log. settings: library, leave_out (names of effects), step (s), most, named_only, as the options
-    of `fdi gap`. Raises ValueError for others.
+    holdouts: recordings on which the corrected model is validated. out: folder of the log. settings: library, leave_out
+    (names of effects), step (s), most, named_only, as the options of `fdi gap`. Raises ValueError for other settings.
     """
     plant = plant_of(plant)
-    known = [field.name for field in fields(Settings)]
+    valid_settings = [field.name for field in fields(Settings)]
     for name in settings:
-        if name not in known:
-            raise ValueError(f"gap: {unknown('a setting', name, known)}")
+        if name not in valid_settings:
+            raise ValueError(f"gap: {unknown('a setting', name, valid_settings)}")
     log = free_path(Path(out), "gap")
     answer = run_gap(
         log, plant, recordings_of(recordings, plant), recordings_of(holdouts, plant), Settings(**settings), tell
@@ -149,7 +150,7 @@ def gap(
 
 @dataclass(frozen=True, repr=False)
 class MonitorResult(Shown):
-    """events: alarms, isolations, recoveries in their order. lasted, spent: s of recording and of work."""
+    """events: in order of time. lasted: duration of the recording, s. spent: computing time, s."""
 
     events: tuple[Event, ...]
     lasted: float
@@ -159,34 +160,33 @@ class MonitorResult(Shown):
     @property
     def headline(self) -> str:
         alarms = sum(event.kind == "alarm" for event in self.events)
-        told = "no alarm" if not alarms else "1 alarm" if alarms == 1 else f"{alarms} alarms"
+        count = "no alarm" if not alarms else "1 alarm" if alarms == 1 else f"{alarms} alarms"
         isolated = [event for event in self.events if event.kind in ("isolated", "revised")]
-        return f"{told} in {self.lasted:g} s" + (f"; {isolated[-1].headline}" if isolated else "")
+        return f"{count} in {self.lasted:g} s" + (f"; {isolated[-1].headline}" if isolated else "")
 
     def table(self) -> Table:
-        """A row an event; sizes in the units beside them."""
+        """One row per event; sizes in the units of the column `units`."""
         names = ("time", "kind", "alarm", "text", "headline", "faults", "sizes", "stds", "units", "onset", "onset_std")
         return Table({name: [getattr(event, name) for event in self.events] for name in names})
 
 
 def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = silent) -> MonitorResult:
-    """The events along a recording: `fdi monitor`.
+    """Run a monitor along a recording, as `fdi monitor` does.
 
-    run: a monitor file, or the same as a mapping such as {"plant": plant, "recording": recording,
-    "fault_free": ["0 s", "300 s"]}.
+    run: a monitor file, or a mapping such as {"plant": plant, "recording": recording, "fault_free": ["0 s", "300 s"]}.
     """
     if isinstance(run, str | Path):
         run = load_monitor(run)
     elif not isinstance(run, MonitorRun):
         run = build_monitor(run, Path.cwd(), HERE)
     events: list[Event] = []
-    done = monitor_job.watch(run, monitor_job.Listening(tell, events.append, lambda prepared: None))
-    return MonitorResult(tuple(events), done.lasted, done.spent, done.log)
+    summary = run_monitor(run, MonitorCallbacks(tell, events.append, lambda prepared: None))
+    return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
 
 
 @dataclass(frozen=True, repr=False)
 class FreeRun(Shown):
-    """A plant run freely along a recording, from levels that the first samples tell."""
+    """Free run of a plant along a recording, from initial levels estimated from the first samples."""
 
     plant: PlantDescription
     recording: Recording
@@ -197,15 +197,15 @@ class FreeRun(Shown):
         return f"free run of {self.plant.name} along {self.recording.source}"
 
     def table(self) -> Table:
-        """A row a sensor: root mean square error, SI."""
+        """One row per sensor: root mean square error, SI."""
         rows = [(s.name, self.prediction.rmse[s.name], s.unit) for s in self.plant.sensors]
         return Table.of_rows(("sensor", "RMSE", "unit"), rows)
 
     def picture(self) -> str:
-        """Measured and predicted, as SVG."""
+        """Measured and predicted readings, as SVG."""
         columns = [sensor.column for sensor in self.plant.sensors]
-        drawn = free_run_figure(self.recording, columns, {self.plant.name: self.prediction.readings}, self.headline)
-        return str(inline_svg(drawn, "free-run", self.headline))
+        figure = free_run_figure(self.recording, columns, {self.plant.name: self.prediction.readings}, self.headline)
+        return str(inline_svg(figure, "free-run", self.headline))
 
     def to_xarray(self) -> Any:
         """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
@@ -222,10 +222,11 @@ def predict(
     settle: float | None = None,
     vary: Sequence[str] = (),
 ) -> FreeRun:
-    """The free run of a plant along a recording, and how far off it gets: `fdi predict`.
+    """Simulate a plant freely along a recording and compare it with the readings, as `fdi predict` does.
 
-    start_samples: for the start levels; settle: s, in place of those. step: of the simulation, s. vary: patterns of
-    constants that are taken from the start too. Raises ValueError where an input is unknown for a time.
+    start_samples: number of samples for estimating the initial levels; settle: the same as a time, s. step: of the
+    integration, s. vary: patterns of constants that are estimated from the start too. Raises ValueError if an input is
+    unknown for a time.
     """
     plant = plant_of(plant)
     parts = recordings_of(recording, plant)
@@ -235,8 +236,8 @@ def predict(
             "cut one with Recording.known_stretches()"
         )
     with one_thread():
-        found = run_freely(plant, parts[0], start_samples, step, settle, vary)
-    return FreeRun(plant, parts[0], found)
+        prediction = run_freely(plant, parts[0], start_samples, step, settle, vary)
+    return FreeRun(plant, parts[0], prediction)
 
 
 def study(
@@ -246,10 +247,10 @@ def study(
     cluster: str | None = None,
     tell: Tell | None = None,
 ) -> study_job.StudyResult:
-    """Many trials of one experiment, against their bounds: `fdi study`.
+    """Repeat an experiment many times and compare the estimates with their bounds, as `fdi study` does.
 
-    study: a study file, or the same as a mapping. resume: goes on from what a killed run left. cluster: the address of
-    a Dask scheduler, or 'local'.
+    study: a study file, or the same as a mapping. resume: continue a killed run. cluster: address of a Dask scheduler,
+    or 'local'.
     """
     if isinstance(study, str | Path):
         study = load_study(study)
@@ -259,17 +260,17 @@ def study(
 
 
 def plant_of(plant: AnyPlant) -> PlantDescription:
-    """The plant itself, or the one in a file or shipped under that name."""
+    """The plant itself, or the plant of a file or of a shipped name."""
     return plant if isinstance(plant, PlantDescription) else load_plant(plant)
 
 
 def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDescription) -> list[Recording]:
-    """Recordings as the plant's channels, each in stretches whose inputs are known; names are read as files."""
-    found: list[Recording] = []
+    """Recordings with the plant's channels, split into segments with known inputs; names are read as files."""
+    segments: list[Recording] = []
     for each in [wanted] if isinstance(wanted, Recording | str | Path) else wanted:
         if isinstance(each, Recording):
             whole = read_recording(each.source, plant, given={each.source: each})
-            found += [part for part in whole.known_stretches() if len(part) > 1]
+            segments += [part for part in whole.known_stretches() if len(part) > 1]
         else:
-            found += named_recordings(str(each), plant, Path.cwd())
-    return found
+            segments += named_recordings(str(each), plant, Path.cwd())
+    return segments
