@@ -58,7 +58,7 @@ def test_inspect_fits_on_a_screen(tmp_path: Path, capsys: pytest.CaptureFixture[
     log = write_estimate(tmp_path / "run.mcap", 0.3)
     assert cli.main(["inspect", str(log)]) == cli.DONE
     shown = capsys.readouterr().out
-    assert "a log of fdi train" in shown and "sound: all CRCs, indices and counts agree" in shown
+    assert "a log of fdi train" in shown and "intact: all CRCs, indices and counts agree" in shown
     assert "/estimator/de/generation" in shown and shown.count("\n") < 40
 
 

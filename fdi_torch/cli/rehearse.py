@@ -18,7 +18,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     for table in done.tables:
         screen.table(table.title, table.header, table.rows, left=2)
         screen.say()
-    screen.say(f"{done.computed} of {done.tasks} pieces in {done.seconds:.0f} s; log: {done.log}")
+    screen.say(f"{done.computed} of {done.tasks} tasks in {done.seconds:.0f} s; log: {done.log}")
     screen.result(as_json(done))
     return 0
 
