@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.cli import main
-from fdi_torch.jobs.train import Watch
+from fdi_torch.jobs.train import SearchLogger
 from fdi_torch.logbook import RunLog, read_run
 
 Row = tuple[str, int, int, float, float, float]
@@ -78,7 +78,7 @@ class Clock:
 @contextlib.contextmanager
 def clocked(clock: Clock) -> Iterator[None]:
     """While it lasts, the clock runs in every method of a log and in those that collect what a search logs."""
-    doors: list[tuple[type, str]] = [(Watch, "write")]
+    doors: list[tuple[type, str]] = [(SearchLogger, "write")]
     doors += [(RunLog, name) for name in dir(RunLog) if name in ("__init__", "__enter__", "__exit__") or name[0] != "_"]
     own = {(kind, name): vars(kind).get(name) for kind, name in doors}
     for kind, name in doors:

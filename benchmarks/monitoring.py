@@ -9,13 +9,13 @@ import torch
 from benchmarks.timing import seconds_in_rounds
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
-from fdi_torch.monitor.change import ChangedObserver, Window
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor import Monitor
-from fdi_torch.monitor.noise import Noise, learn_noise
-from fdi_torch.monitor.prepare import usual_faults
+from fdi_torch.monitor.monitor_setup import usual_faults
+from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
+from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
@@ -34,14 +34,14 @@ def measure(seconds: float) -> list[dict[str, Any]]:
         space = ParameterSpace(network.constants[name] for name in names)
         samples = at_rest(network, SAMPLES + 1)
         noise, _ = learn_noise(network, samples, space, space.nominal())
-        observer = ChangedObserver(network, space, noise.gain, noise.whitening)
-        window = Window(samples, samples.readings[0], SAMPLES)
+        observer = ObserverBank(network, space, noise.gain, noise.whitening)
+        window = ObserverWindow(samples, samples.readings[0], SAMPLES)
         rows += [isolation(observer, window, slow) for slow in (False, True)]
         rows += [follow(network, space, noise, chunk) for chunk in (10, 10_000)]
     return rows
 
 
-def isolation(observer: ChangedObserver, window: Window, slow: bool) -> dict[str, Any]:
+def isolation(observer: ObserverBank, window: ObserverWindow, slow: bool) -> dict[str, Any]:
     """Every fault alone, sudden; or sudden and slow, alone and in pairs."""
     believed, count = observer.space.nominal(), len(observer.space)
     faults = [Fault(column) for column in range(count)]
@@ -57,7 +57,7 @@ def at_rest(network: TankNetwork, count: int) -> Samples:
     return Samples(torch.arange(count, dtype=torch.float64), inputs.expand(count, 2), rest + NOISE * noise)
 
 
-def follow(network: TankNetwork, space: ParameterSpace, noise: Noise, chunk: int) -> dict[str, Any]:
+def follow(network: TankNetwork, space: ParameterSpace, noise: NoiseModel, chunk: int) -> dict[str, Any]:
     """10,000 samples without an alarm."""
     detector = make_detector("cusum", 1e9, 1.0, 3, torch.Generator().manual_seed(0))
     samples, watch = at_rest(network, 10_001), Monitor(network, space, noise, detector)
@@ -65,7 +65,7 @@ def follow(network: TankNetwork, space: ParameterSpace, noise: Noise, chunk: int
     def run() -> None:
         state = watch.start(samples)
         for first in range(1, len(samples), chunk):
-            state, _ = watch.advance(state, samples.stretch(first, first + chunk))
+            state, _ = watch.advance(state, samples.segment(first, first + chunk))
 
     (spent,) = seconds_in_rounds([run], rounds=3)
     return {"what": f"following, {len(space)} faults, {chunk:,} samples at a time", "samples": 10_000, "seconds": spent}

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, place
-from fdi_torch.monitor.adaptive import JointModel, adaptive_observer, joint_filter
-from fdi_torch.monitor.gain import hand_gain
-from fdi_torch.monitor.observer import bound
+from fdi_torch.monitor.adaptive_observer import JointModel, adaptive_observer, joint_filter
+from fdi_torch.monitor.observer import bind_parameters
+from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
@@ -26,7 +26,7 @@ MODEL = JointModel(NETWORK, SPACE)
 
 
 def faulty(samples: int, runs: int = 3) -> Samples:
-    stepper, values = Stepper(NETWORK), bound(NETWORK, SPACE, TRUTH)
+    stepper, values = Stepper(NETWORK), bind_parameters(NETWORK, SPACE, TRUTH)
     state = stepper.start(REST, INPUTS, values)
     levels = [state.levels]
     for k in range(samples - 1):

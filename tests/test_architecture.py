@@ -39,7 +39,7 @@ DOORS = {
         "recordings/matlab.py",
         "blind/statistics.py",
         "estimate/state_noise.py",
-        "monitor/rehearsal/false_alarms.py",
+        "monitor/monte_carlo/false_alarm_plan.py",
     ),
     "mcap": ("logbook/",),
     "yaml": ("config/",),

@@ -121,4 +121,4 @@ def test_missing_readings_are_counted_and_unknown_inputs_cut_out(outcome, tmp_pa
     code, said, shown = outcome(data=holes)
     assert code in (cli.DONE, cli.NOT_CONVERGED) and not said
     assert f"{tmp_path / 'rig.csv'}: 1 of 177 readings are missing or masked and do not count" in shown
-    assert f"{tmp_path / 'rig.csv'}: an input is unknown now and then; fitted as 2 stretches without that" in shown
+    assert f"{tmp_path / 'rig.csv'}: an input is sometimes unknown; fitted as 2 segments with known inputs" in shown

@@ -34,9 +34,9 @@ def test_a_sound_rig_is_called_sound(tmp_path: Path, capsys: pytest.CaptureFixtu
     [
         (["--cases", "0"], "--cases: expected at least one case, got 0"),
         (["--rig", "three_tank", "--plant", "three_tank"], "expected --rig or --plant, got both"),
-        (["--tanks", "3..5"], "--tanks: expected it beside --plant network, got it alone"),
+        (["--tanks", "3..5"], "--tanks: expected --plant network with it"),
         (["--plant", "network", "--tanks", "3-5"], "--tanks: expected a number or a range, got '3-5'"),
-        (["--join", "here", "--seed", "3"], "--join: expected folders only, got --seed beside it"),
+        (["--join", "here", "--seed", "3"], "--join: expected folders only, got also --seed"),
     ],
 )
 def test_misuse_is_said_in_a_sentence(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,7 @@ from fdi_torch.blind.rows import reliability, write_rows
 from fdi_torch.blind.score import by_effect, judge, summary, utility
 from fdi_torch.blind.sizes import size_errors, sizes
 from fdi_torch.blind.statistics import clopper_pearson, mean_interval, median_interval, root_mean_square_interval
-from fdi_torch.jobs.blind_benchmark import LOG, conclude
+from fdi_torch.jobs.blind_results import LOG, write_results
 from fdi_torch.logbook import read_run
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -207,8 +207,8 @@ def test_a_folder_without_answers_is_refused(tmp_path: Path) -> None:
 
 def test_what_is_concluded_stands_in_the_folder(tmp_path: Path) -> None:
     rows = [row("single", True, stated=0.9, stated_right=True), row("single", False, index=1)]
-    found = conclude(tmp_path / "out", rows, {"join": ["a"]}, [])
-    assert conclude(tmp_path / "out", rows, {"join": ["a"]}, []) == found
+    found = write_results(tmp_path / "out", rows, {"join": ["a"]}, [])
+    assert write_results(tmp_path / "out", rows, {"join": ["a"]}, []) == found
     assert json.loads((tmp_path / "out" / "scores.json").read_text()).keys() == {"three_tank"}
     text = (tmp_path / "out" / "scores.md").read_text()
     assert "2 cases of seeds 1, answered by the code of abc (2)." in text

@@ -18,7 +18,7 @@ from fdi_torch.config.study import load_study
 from fdi_torch.estimate.evolution import EvolutionSettings, evolve
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.windows import cut_up
-from fdi_torch.jobs.run_setup import fitting_of, recordings_of, wanted_space
+from fdi_torch.jobs.run_setup import fitting_of, recordings_of, requested_space
 from fdi_torch.monitor.stepper import substeps
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import grid_nodes
@@ -97,7 +97,7 @@ def test_a_step_is_positive(key: str, value: str) -> None:
 @pytest.fixture(scope="module")
 def fitting() -> Fitting:
     run = load_run(None, ["simulate.duration=100 s"])
-    return fitting_of(run, wanted_space(run), recordings_of(run))
+    return fitting_of(run, requested_space(run), recordings_of(run))
 
 
 def test_steps_below_the_rounding_of_levels_are_refused(fitting: Fitting) -> None:

@@ -16,7 +16,7 @@ import pytest
 
 import fdi_torch
 from fdi_torch import cli
-from fdi_torch.cli.options import LIVE, overrides, who_may_read
+from fdi_torch.cli.options import LIVE, overrides, access_text
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import DiskError, write_text
 
@@ -87,7 +87,7 @@ def test_what_help_says_by_itself_is_what_the_jobs_do() -> None:
     from fdi_torch.cli.options import challenge, gap, predict
     from fdi_torch.gap.prediction import START_SAMPLES
     from fdi_torch.gap.search import DEEPEST
-    from fdi_torch.jobs.blind_benchmark import LOG
+    from fdi_torch.jobs.blind_results import LOG
 
     assert (gap.MOST_CAUSES, gap.START_SAMPLES, predict.START_SAMPLES) == (DEEPEST, START_SAMPLES, START_SAMPLES)
     assert sorted(RIGS) == sorted(challenge.RIGS)
@@ -128,7 +128,7 @@ def test_check_of_a_run_file_says_what_is_usable(tmp_path: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["RIG"], "fdi check: expected --plant, a recording and --plant, or --config; fdi check --help tells more"),
+        (["RIG"], "fdi check: expected --plant, a recording and --plant, or --config; see fdi check --help"),
         (["RIG", "--plant", "three_tonk"], "got 'three_tonk'; the nearest is 'three_tank'"),
         (["gone.csv", "--plant", "three_tank"], "fdi check: gone.csv: expected a file, got none there"),
         (["RIG", "--plant", "dts200"], "expected a column for qL_cmd"),
@@ -263,15 +263,15 @@ def test_a_job_that_is_interrupted_before_it_logs_promises_nothing(
     monkeypatch.setattr(cli.importlib, "import_module", interrupted)
     for name in ("train", "report"):
         assert cli.main([name, "--quiet"]) == cli.INTERRUPTED
-        assert capsys.readouterr().err == f"fdi {name}: interrupted; the same command starts anew\n"
+        assert capsys.readouterr().err == f"fdi {name}: interrupted; the same command starts again from the beginning\n"
 
 
 @pytest.mark.parametrize(
     ("host", "alone"), [("127.0.0.1", True), ("localhost", True), ("[::1]", True), ("0.0.0.0", False)]
 )
-def test_who_may_read_a_running_job_is_said(host: str, alone: bool) -> None:
+def test_access_to_a_live_job_is_stated(host: str, alone: bool) -> None:
     assert LIVE.startswith("127.0.0.1:")
-    assert ("nobody else" in who_may_read(host)) is alone
+    assert ("only users of this machine" in access_text(host)) is alone
 
 
 def with_streams(words: str, redirections: str) -> subprocess.CompletedProcess[str]:

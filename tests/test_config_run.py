@@ -16,7 +16,7 @@ from fdi_torch.config.monitor import load_monitor
 from fdi_torch.config.run import Run
 from fdi_torch.config.simulation import NoiseConfig, noise_std, planned_recording
 from fdi_torch.effects import build_network
-from fdi_torch.jobs.run_setup import wanted_space
+from fdi_torch.jobs.run_setup import requested_space
 from fdi_torch.parameters import ParameterSpace
 
 PAPER = ["T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size"]
@@ -360,4 +360,4 @@ def test_a_monitor_file_that_names_what_the_plant_lacks_is_refused(
 def test_an_effect_at_a_place_of_another_kind_is_refused(name: str, there: str) -> None:
     run = load_run(overrides=[f"estimate.parameters=[{name}]"])
     with pytest.raises(ConfigError, match=f"default.yaml: estimate.parameters: {name}: expected .*{there}"):
-        wanted_space(run)
+        requested_space(run)

@@ -9,18 +9,24 @@ import torch
 
 from fdi_torch.monitor.detection import (
     CHARTS,
-    NEVER,
+    NO_ALARM,
     Detector,
     cusum,
-    cusum_on,
+    cusum_update,
+    false_alarm_inflation,
     glr,
-    largest,
+    log_rate_std,
     make_detector,
-    more_alarms,
-    rate_error,
+    max_abs,
     window_lengths,
 )
-from fdi_torch.monitor.run_length import cusum_run_length, cusum_threshold, fixed_threshold, highest, threshold_of
+from fdi_torch.monitor.run_length import (
+    block_maxima,
+    cusum_run_length,
+    cusum_threshold,
+    fixed_threshold,
+    threshold_from_maxima,
+)
 from fdi_torch.monitor.whitening import fit_whitening, score_whitenings
 
 
@@ -65,7 +71,7 @@ def test_how_far_one_recording_leaves_the_rate_of_false_alarms_off() -> None:
     asked, h = 20000.0, fixed_threshold(20000.0, 3)
     spread = torch.stack([noise(1000, 3, seed=s).square().mean(0).sqrt() for s in range(400)])
     rates = 2.0 * torch.special.ndtr(-h * spread).sum(1)
-    claimed = rate_error("fixed", asked, 3, 0.5, fit_whitening(noise(1000, 3), 0))
+    claimed = log_rate_std("fixed", asked, 3, 0.5, fit_whitening(noise(1000, 3), 0))
     assert claimed == pytest.approx(float(rates.log().std()), rel=0.15)
 
 
@@ -76,16 +82,16 @@ def test_the_first_alarm_from_a_moment_on_is_one_of_all_alarms(chart: str) -> No
     white[:, 600:] += 0.5
     white[3, 700] = torch.nan
     since = torch.arange(40) * 15
-    first, early = detector.first_from(white, since)
+    first, early = detector.first_alarm_since(white, since)
     for run, raised in enumerate(detector.alarms(white)):
         moments = raised.nonzero().flatten().tolist()
         assert early[run] == sum(m < since[run] for m in moments)
         assert first[run] == next(m for m in moments if m >= since[run])
-    assert detector.first_from(torch.zeros(1, 50, 3), torch.tensor([0]))[0].tolist() == [NEVER]
+    assert detector.first_alarm_since(torch.zeros(1, 50, 3), torch.tensor([0]))[0].tolist() == [NO_ALARM]
 
 
 def test_simulated_threshold_agrees_with_the_exact_one() -> None:
-    found = threshold_of(highest(largest, 3, torch.Generator().manual_seed(0)), 5000.0)
+    found = threshold_from_maxima(block_maxima(max_abs, 3, torch.Generator().manual_seed(0)), 5000.0)
     assert found == pytest.approx(fixed_threshold(5000.0, 3), abs=0.03)
 
 
@@ -95,7 +101,7 @@ def test_a_shift_is_found_sooner_by_cusum_than_by_a_fixed_threshold() -> None:
     delays = {}
     for chart in CHARTS:
         first = make_detector(chart, 20000.0, 1.0, 3, torch.Generator().manual_seed(0)).first_alarm(shifted)
-        late = torch.where(first == NEVER, 3000, first)
+        late = torch.where(first == NO_ALARM, 3000, first)
         delays[chart] = float(late[late > 1000].median() - 1000)
     assert delays["cusum"] < 0.5 * delays["fixed"] and delays["glr"] < 0.5 * delays["fixed"]
 
@@ -124,16 +130,16 @@ def test_channels_share_what_the_glr_suffers_from_spreads_that_are_off() -> None
     off = noise(200_000, 3, seed=3) * learnt.slow_error
     # ln of the rate goes as half the threshold, about ln of the run length, times the variance: 2 d.
     rates = torch.exp(2.0 * math.log(20000.0) * (share * off).sum(1))
-    claimed = more_alarms("glr", 20000.0, 3, 0.5, learnt)
+    claimed = false_alarm_inflation("glr", 20000.0, 3, 0.5, learnt)
     assert claimed - 1.0 == pytest.approx(float(rates.mean()) - 1.0, rel=0.1)
 
 
 def test_an_alarm_starts_the_detector_afresh() -> None:
     e = torch.zeros(20, 1, dtype=torch.float64)
     e[5], e[6], e[12] = 10.0, 10.0, 10.0
-    raised = Detector("cusum", lambda x: cusum(x, 0.5), 5.0, lambda x, _: cusum_on(x, 0.5, None)).alarms(e)
+    raised = Detector("cusum", lambda x: cusum(x, 0.5), 5.0, lambda x, _: cusum_update(x, 0.5, None)).alarms(e)
     assert raised.nonzero().flatten().tolist() == [5, 6, 12]
-    quiet = Detector("cusum", lambda x: cusum(x, 0.5), 15.0, lambda x, _: cusum_on(x, 0.5, None)).alarms(e)
+    quiet = Detector("cusum", lambda x: cusum(x, 0.5), 15.0, lambda x, _: cusum_update(x, 0.5, None)).alarms(e)
     assert quiet.nonzero().flatten().tolist() == [6]
 
 
@@ -216,7 +222,7 @@ def test_thresholds_allow_for_what_their_recording_does_not_tell() -> None:
     generator = torch.Generator().manual_seed(1)
     long, short = (fit_whitening(torch.randn(n, 2, generator=generator, dtype=torch.float64)) for n in (20000, 400))
     for chart in CHARTS:
-        sure, unsure = (more_alarms(chart, 5000.0, 2, 0.5, learnt) for learnt in (long, short))
+        sure, unsure = (false_alarm_inflation(chart, 5000.0, 2, 0.5, learnt) for learnt in (long, short))
         assert 1.0 < sure < 1.05 < unsure < 2.0
     known, doubted = (make_detector("cusum", 5000.0, 1.0, 2, generator, learnt=w) for w in (None, short))
     assert doubted.threshold > known.threshold

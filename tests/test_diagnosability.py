@@ -12,7 +12,7 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import placements_for
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.monitor.diagnosability import diagnosability
-from fdi_torch.monitor.structure import Structure, structure_of
+from fdi_torch.monitor.structural_analysis import Structure, structure_of
 from fdi_torch.recording import Recording
 
 PLANT = load_plant("three_tank")

@@ -17,7 +17,7 @@ from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.jobs.gap import run_gap
-from fdi_torch.jobs.gap_replay import no_longer_done, settings_of
+from fdi_torch.jobs.gap_replay import removed_options, settings_of
 from fdi_torch.logbook import own_signals, read_run
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.recordings.csv_files import write_csv
@@ -76,14 +76,14 @@ def test_a_key_that_a_gap_diagnosis_lacks_is_refused(
 
 def test_an_option_that_is_gone_is_said_and_the_rest_of_the_log_is_read(logged: Path) -> None:
     run = read_run(logged)
-    assert no_longer_done(run) == []
+    assert removed_options(run) == []
     old = {**run.metadata["fdi_torch.config"], "settings.cross_validate": "true"}
     run.metadata["fdi_torch.config"] = old
-    (sentence,) = no_longer_done(run)
+    (sentence,) = removed_options(run)
     assert "--cross-validate, an option that no longer exists" in sentence
     assert settings_of(run) == Settings(LIBRARY)
     old["settings.cross_validate"] = "false"
-    assert no_longer_done(run) == []
+    assert removed_options(run) == []
 
 
 def test_every_setting_of_a_diagnosis_can_be_asked_anew(logged: Path) -> None:
@@ -127,7 +127,7 @@ def test_rivals_leave_the_next_input_as_a_file(tmp_path: Path, capsys: pytest.Ca
     words = ["gap", "--plant", "three_tank", "--recording", file, "--library", "pump_lag,pump_delay", "--quiet"]
     assert cli.main([*words, "--out", str(tmp_path)]) == cli.DONE
     shown = capsys.readouterr().out
-    assert shown.startswith("There is a gap that ") and "next_input.csv; the two likeliest explanations" in shown
+    assert shown.startswith("There is a gap that ") and "next_input.csv; it should distinguish the two likeliest explanations" in shown
     planned = (tmp_path / "next_input.csv").read_text().splitlines()
     assert planned[0] == "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm" and len(planned) == 1501
     assert cli.main([*words[:3], "--recording", str(tmp_path / "next_input.csv"), "--plan"]) == cli.DONE

@@ -35,9 +35,9 @@ from fdi_torch.config.run import build_run
 from fdi_torch.config.simulation import planned_recording
 from fdi_torch.config.study import build_study
 from fdi_torch.effects import build_network
-from fdi_torch.jobs.logged_recordings import recording_in
-from fdi_torch.jobs.replay import asked_again
-from fdi_torch.jobs.run_setup import wanted_space
+from fdi_torch.jobs.logged_recordings import logged_recording
+from fdi_torch.jobs.replay import logged_run
+from fdi_torch.jobs.run_setup import requested_space
 from fdi_torch.logbook import inspect_log, read_run
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.schemas import json_schema, topic_definition
@@ -63,7 +63,7 @@ def read_plant(data: bytes, folder: Path) -> None:
 
 def read_run_file(data: bytes, folder: Path) -> None:
     run = build_run(parse_yaml(data, "run.yaml"), folder, "run.yaml")
-    wanted_space(run)
+    requested_space(run)
     if run.config.simulate is not None:
         planned_recording(run.config.simulate, run.plant)
     for config in run.config.recordings:
@@ -90,8 +90,8 @@ def read_log(data: bytes, folder: Path) -> None:
     readers: list[Callable[[], Any]] = [
         lambda: inspect_log(path),
         lambda: logged_plant(run),
-        lambda: asked_again(run),
-        lambda: check_recording(recording_in(run, "", 0), PLANT),
+        lambda: logged_run(run),
+        lambda: check_recording(logged_recording(run, "", 0), PLANT),
         lambda: read_recording(RecordingConfig(file="log.mcap"), PLANT, folder),
     ]
     refused = 0

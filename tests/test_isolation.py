@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from fdi_torch.estimate.evidence import ODDS, log_volume
-from fdi_torch.monitor.hypothesis import NOTHING, Finding, Hypothesis, content, distinct, ranked
+from fdi_torch.monitor.hypothesis import NO_CHANGE, Hypothesis, HypothesisFit, credible_set, merged, with_posterior
 from fdi_torch.monitor.isolation import Prior
 
 READINGS = 600
@@ -20,10 +20,12 @@ LIMIT = READINGS + 4.0 * (2.0 * READINGS) ** 0.5
 
 def found(
     columns: tuple[int, ...], evidence: float, misfit: float = 300.0, late: bool = False, mass: float = 1.0
-) -> Finding:
+) -> HypothesisFit:
     value = torch.tensor([0.3, 0.2, 0.1], dtype=torch.float64)
     std = torch.full_like(value, 0.02)
-    return Finding(Hypothesis(columns, late), value, std, 100.0, 1.5, evidence, misfit, READINGS, LIMIT, mass=mass)
+    return HypothesisFit(
+        Hypothesis(columns, late), value, std, 100.0, 1.5, evidence, misfit, READINGS, LIMIT, probability=mass
+    )
 
 
 def test_a_set_of_several_pays_for_each_fault_and_twice_for_one_place() -> None:
@@ -32,8 +34,8 @@ def test_a_set_of_several_pays_for_each_fault_and_twice_for_one_place() -> None:
     assert one == pytest.approx(math.log(ODDS.effect / 6))
     assert two == pytest.approx(2.0 * math.log(ODDS.effect / 6) + math.log(2.0))
     assert prior(Hypothesis((0, 2))) == pytest.approx(two + math.log(ODDS.same_place))
-    assert prior(Hypothesis((0, 1), gone=(0, 1))) == pytest.approx(one), "what goes away together does so once"
-    assert prior(NOTHING) == 0.0
+    assert prior(Hypothesis((0, 1), recovered=(0, 1))) == pytest.approx(one), "what goes away together does so once"
+    assert prior(NO_CHANGE) == 0.0
 
 
 def test_the_volume_is_that_of_a_normal_posterior_in_a_uniform_prior() -> None:
@@ -48,29 +50,29 @@ def test_where_nothing_fits_all_standard_errors_and_differences_count_by_what_is
     """Four times the squares that noise has: errors are twice as large, evidence is a quarter."""
     base = 4000.0
     near, far = found((0,), base - 1200.0, 1200.0), found((1,), base - 1300.0, 1300.0)
-    first, second = ranked([far, near])
+    first, second = with_posterior([far, near])
     assert (first.hypothesis.columns, second.hypothesis.columns) == ((0,), (1,))
     assert first.std.tolist() == pytest.approx([0.04] * 3) and first.onset_std == pytest.approx(3.0)
-    assert math.log(first.mass / second.mass) == pytest.approx(100.0 / 4.0)
+    assert math.log(first.probability / second.probability) == pytest.approx(100.0 / 4.0)
     fitting = replace(near, misfit=300.0)
-    assert ranked([far, fitting])[0].std.tolist() == [0.02] * 3, "where one fits, nothing is doubted"
+    assert with_posterior([far, fitting])[0].std.tolist() == [0.02] * 3, "where one fits, nothing is doubted"
 
 
 def test_masses_sum_to_one_and_ways_of_one_change_are_one_explanation() -> None:
-    all_of_them = ranked([found((0,), 10.0), found((0,), 10.0, late=True), found((1,), 10.5), found((2,), 5.0)])
-    assert sum(f.mass for f in all_of_them) == pytest.approx(1.0)
-    told = distinct(all_of_them)
+    all_of_them = with_posterior([found((0,), 10.0), found((0,), 10.0, late=True), found((1,), 10.5), found((2,), 5.0)])
+    assert sum(f.probability for f in all_of_them) == pytest.approx(1.0)
+    told = merged(all_of_them)
     assert [f.hypothesis.columns for f in told] == [(0,), (1,), (2,)], "0.5 nats are less than two ways"
-    assert sum(f.mass for f in told) == pytest.approx(1.0)
+    assert sum(f.probability for f in told) == pytest.approx(1.0)
 
 
 def test_what_is_told_holds_95_percent_and_every_exact_twin() -> None:
     rival, small = found((1,), 0.0, 301.0, mass=0.3), found((2,), 0.0, 305.0, mass=0.04)
-    told = content([found((0,), 0.0, mass=0.66), rival, small])
+    told = credible_set([found((0,), 0.0, mass=0.66), rival, small])
     assert [f.hypothesis.columns for f in told] == [(0,), (1,)]
     twin = found((2,), 0.0, mass=0.01)
-    assert len(content([found((0,), 0.0, mass=0.96), rival, twin])) == 2, "no reading tells the twin apart"
+    assert len(credible_set([found((0,), 0.0, mass=0.96), rival, twin])) == 2, "no reading tells the twin apart"
 
 
 def test_a_value_at_the_end_of_its_range_never_fits() -> None:
-    assert found((0,), 0.0).fits and not replace(found((0,), 0.0), at_end=(0,)).fits
+    assert found((0,), 0.0).fits and not replace(found((0,), 0.0), at_bound=(0,)).fits

@@ -15,7 +15,7 @@ import torch
 from fdi_torch import cli
 from fdi_torch.config.run import load_run
 from fdi_torch.config.study import load_study
-from fdi_torch.jobs.replay import run_again
+from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.jobs.study import run_study
 from fdi_torch.jobs.train import train
 from fdi_torch.logbook import LogError, Message, RunLog, read_run, replay
@@ -58,7 +58,7 @@ def test_inspect_fits_on_a_screen(tmp_path: Path, capsys: pytest.CaptureFixture[
     log = write_estimate(tmp_path / "run.mcap", 0.3)
     assert cli.main(["inspect", str(log)]) == cli.DONE
     shown = capsys.readouterr().out
-    assert "a log of fdi train" in shown and "sound: all CRCs, indices and counts agree" in shown
+    assert "a log of fdi train" in shown and "intact: all CRCs, indices and counts agree" in shown
     assert "/estimator/de/generation" in shown and shown.count("\n") < 40
 
 
@@ -156,9 +156,9 @@ def test_the_number_of_threads_changes_no_bit(trained: Path, capsys: pytest.Capt
 @pytest.mark.slow
 def test_a_whole_run_of_the_paper_replays(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     log = train(load_run("configs/paper/table3_snr30.yaml", [f"output.folder={tmp_path}"])).log
-    assert replay(log, lambda run: run_again(run, tmp_path / "same.mcap")).outcome == "bit-equal"
+    assert replay(log, lambda run: repeat_run(run, tmp_path / "same.mcap")).outcome == "bit-equal"
     request.getfixturevalue("two_threads")
-    again = replay(log, lambda run: run_again(run, tmp_path / "threads.mcap"))
+    again = replay(log, lambda run: repeat_run(run, tmp_path / "threads.mcap"))
     assert again.outcome == "bit-equal" and list(again.versions) == ["threads"]
 
 
@@ -227,7 +227,7 @@ def test_what_if_writes_a_new_log_with_its_parent(trained: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--set", "simulate.duration=5 s"], "expected a key other than the data's, got one; use fdi train"),
+        (["--set", "simulate.duration=5 s"], "expected a key other than those of the data"),
         (["--set", "estimate.sarch=1"], "got 'sarch'; the nearest is 'search'"),
     ],
 )
@@ -251,5 +251,5 @@ def test_a_log_of_another_command_cannot_be_replayed(tmp_path: Path, capsys: pyt
 def test_a_fit_window_by_window_is_not_replayed_as_another(tmp_path: Path) -> None:
     source = Path(__file__).parent / "data" / "log_format_1_windows.mcap"
     with pytest.raises(LogError, match="got one window by window"):
-        run_again(read_run(source), tmp_path / "again.mcap")
+        repeat_run(read_run(source), tmp_path / "again.mcap")
     assert not list(tmp_path.iterdir())

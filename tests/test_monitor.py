@@ -17,21 +17,22 @@ from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor import load_monitor
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, place
-from fdi_torch.jobs.monitor import Listening, watch
-from fdi_torch.monitor.change import ChangedObserver, Window
+from fdi_torch.jobs.logged_monitor import MonitorCallbacks
+from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.events import Event
-from fdi_torch.monitor.following import MonitorState
-from fdi_torch.monitor.gain import hand_gain
+from fdi_torch.monitor.fault_free_checks import residual_warnings
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
-from fdi_torch.monitor.learning import residual_doubts
 from fdi_torch.monitor.monitor import Monitor
-from fdi_torch.monitor.noise import Noise, learn_noise
-from fdi_torch.monitor.observer import Observation, bound
-from fdi_torch.monitor.prepare import fault_free_part, prepare, usual_faults
-from fdi_torch.monitor.samples import Arrived, Samples, continuous, take, usual_interval
-from fdi_torch.monitor.settings import MonitorSettings
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor, usual_faults
+from fdi_torch.monitor.monitor_state import MonitorState
+from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
+from fdi_torch.monitor.observer import Observation, bind_parameters
+from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
+from fdi_torch.monitor.observer_gain import hand_gain
+from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.whitening import fit_whitening
 from fdi_torch.parameters import ParameterSpace
@@ -54,13 +55,13 @@ def recorded(
 ) -> Samples:  # type: ignore[no-untyped-def]
     """One run whose parameters follow `truth` (s -> values of the space)."""
     stepper, generator = Stepper(network), torch.Generator().manual_seed(seed)
-    state = stepper.start(REST, INPUTS, bound(network, None, None))
+    state = stepper.start(REST, INPUTS, bind_parameters(network, None, None))
     readings: list[Tensor] = []
-    theta, values = None, bound(network, None, None)
+    theta, values = None, bind_parameters(network, None, None)
     for k in range(samples):
         if theta is None or not torch.equal(theta, truth(k - 0.5)):
             theta = truth(k - 0.5)
-            values = bound(network, space, theta)
+            values = bind_parameters(network, space, theta)
         if k:
             state = stepper.advance(state, lambda share: INPUTS, k - 1.0, 1.0, values)
         readings.append(stepper.read(state, float(k), 1.0, values)[0])
@@ -69,9 +70,9 @@ def recorded(
     return Samples(torch.arange(samples, dtype=torch.float64), INPUTS.expand(samples, 2), noisy)
 
 
-def from_rest(samples: Samples) -> Window:
+def from_rest(samples: Samples) -> ObserverWindow:
     """All of a run whose levels at its first sample are known, the observer settled."""
-    return Window(samples, REST, 10**6)
+    return ObserverWindow(samples, REST, 10**6)
 
 
 def step_to(name: str, size: float, at: float, until: float = 1e9) -> Truth:
@@ -82,7 +83,7 @@ def step_to(name: str, size: float, at: float, until: float = 1e9) -> Truth:
 
 
 @lru_cache
-def noise() -> Noise:
+def noise() -> NoiseModel:
     return learn_noise(NETWORK, recorded(lambda t: SPACE.nominal(), 600, seed=99), SPACE, SPACE.nominal())[0]
 
 
@@ -92,10 +93,10 @@ def monitor(**settings: float) -> Monitor:
     return Monitor(NETWORK, SPACE, noise(), detector, MonitorSettings(**chosen))  # type: ignore[arg-type]
 
 
-def followed(watch: Monitor, samples: Samples, chunk: int = 20) -> tuple[MonitorState, list[Event]]:
-    state, events = watch.start(samples), []
+def followed(run_monitor: Monitor, samples: Samples, chunk: int = 20) -> tuple[MonitorState, list[Event]]:
+    state, events = run_monitor.start(samples), []
     for first in range(1, len(samples), chunk):
-        state, news = watch.advance(state, samples.stretch(first, min(first + chunk, len(samples))))
+        state, news = run_monitor.advance(state, samples.segment(first, min(first + chunk, len(samples))))
         events += news
     return state, events
 
@@ -144,8 +145,8 @@ def test_sensors_may_be_read_at_rates_of_their_own_and_never_together(period: tu
     assert 1.0 < second.stds[0] / first.stds[0] < 2.2
 
 
-def replace_noise(watch: Monitor, learnt: Noise) -> Monitor:
-    return Monitor(watch.network, watch.space, learnt, watch.detector, watch.settings)
+def replace_noise(run_monitor: Monitor, learnt: NoiseModel) -> Monitor:
+    return Monitor(run_monitor.network, run_monitor.space, learnt, run_monitor.detector, run_monitor.settings)
 
 
 def test_random_moments_are_no_gaps() -> None:
@@ -153,8 +154,8 @@ def test_random_moments_are_no_gaps() -> None:
     gaps = torch.empty(3000, dtype=torch.float64).exponential_(generator=torch.Generator().manual_seed(1))
     samples = replace(run, time=torch.cumsum(gaps, 0))
     assert float(gaps.max()) > 10.0 * float(gaps.median())
-    stretches, arrived = continuous(
-        Arrived(float(samples.time[0])), samples.stretch(1, 3000), usual_interval(samples.time)
+    stretches, arrived = split_at_gaps(
+        ClockState(float(samples.time[0])), samples.segment(1, 3000), usual_interval(samples.time)
     )
     assert [notice for _, notice in stretches] == [""] and arrived.last == float(samples.time[-1])
 
@@ -188,8 +189,8 @@ def test_a_slowly_growing_fault_is_told_from_a_sudden_one() -> None:
         return SPACE.vector({"h3.sensor_bias.bias": 1e-4 * max(time - 100.0, 0.0)})
 
     samples = recorded(truth, 260)
-    watch = ChangedObserver(NETWORK, SPACE, noise().gain, noise().whitening)
-    best = isolate(watch, from_rest(samples), SPACE.nominal(), FAULTS, incipient=True, deepest=1)[0]
+    run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
+    best = isolate(run_monitor, from_rest(samples), SPACE.nominal(), FAULTS, incipient=True, deepest=1)[0]
     assert best.hypothesis.columns == (4,) and best.hypothesis.incipient
     assert float(best.value[4]) == pytest.approx(1e-4 * 159.0, rel=0.05)
     assert abs(best.onset - 100.0) < 10.0
@@ -199,19 +200,19 @@ def test_two_faults_at_once_are_found_together() -> None:
     def truth(time: float) -> Tensor:
         return SPACE.vector({"T1.leak.size": 0.05, "h3.sensor_bias.bias": 0.01} if time > 100.0 else {})
 
-    watch = ChangedObserver(NETWORK, SPACE, noise().gain, noise().whitening)
-    best = isolate(watch, from_rest(recorded(truth, 260)), SPACE.nominal(), FAULTS, incipient=False, deepest=2)[0]
+    run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
+    best = isolate(run_monitor, from_rest(recorded(truth, 260)), SPACE.nominal(), FAULTS, incipient=False, deepest=2)[0]
     assert best.hypothesis.columns == (0, 4)
     for column, size in ((0, 0.05), (4, 0.01)):
         assert abs(float(best.value[column]) - size) < 4 * float(best.std[column])
 
 
 def test_standard_errors_are_those_of_repeated_runs() -> None:
-    watch = ChangedObserver(NETWORK, SPACE, noise().gain, noise().whitening)
+    run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
     pulls = []
     for seed in range(8):
         samples = recorded(step_to("T3.leak.size", 0.05, 60.0), 140, seed=seed)
-        best = isolate(watch, from_rest(samples), SPACE.nominal(), FAULTS[1:2], incipient=False, deepest=1)[0]
+        best = isolate(run_monitor, from_rest(samples), SPACE.nominal(), FAULTS[1:2], incipient=False, deepest=1)[0]
         pulls.append((float(best.value[1]) - 0.05) / float(best.std[1]))
     assert 0.5 < float(torch.tensor(pulls).square().mean().sqrt()) < 1.7  # 8 runs: 95 % within 0.5 to 1.5
 
@@ -245,16 +246,16 @@ def test_an_offset_of_the_observer_is_told_where_it_is_sure_and_matters() -> Non
     assert white.mean(0).tolist() == pytest.approx(whitening.offset.tolist())
     one = torch.ones(1, 3, dtype=torch.float64)
     seen = Observation(torch.arange(3600.0), residual, residual, one, 3)
-    noise_of_it = Noise(one[0], one[0], 1.0, whitening, hand_gain(torch.eye(3, dtype=torch.float64)))
+    noise_of_it = NoiseModel(one[0], one[0], 1.0, whitening, hand_gain(torch.eye(3, dtype=torch.float64)))
     detector = make_detector("fixed", 1e7, 1.0, 3, torch.Generator())
-    [doubt] = residual_doubts(load_plant("three_tank"), noise_of_it, detector, seen, 1e7)
+    [doubt] = residual_warnings(load_plant("three_tank"), noise_of_it, detector, seen, 1e7)
     assert "h3 lies 0.04" in doubt and "cm off the observer throughout" in doubt
 
 
 def test_a_sample_that_comes_twice_is_taken_once() -> None:
     samples = recorded(lambda t: SPACE.nominal(), 6)
     twice = Samples(samples.time[[1, 1, 2]], samples.inputs[:3], samples.readings[[1, 1, 2]])
-    [(kept, notice)], _ = continuous(Arrived(0.0), twice, 1.0)
+    [(kept, notice)], _ = split_at_gaps(ClockState(0.0), twice, 1.0)
     assert kept.time.tolist() == [1.0, 2.0] and notice == ""
 
 
@@ -282,7 +283,7 @@ def test_misuse_is_refused() -> None:
         MonitorSettings(lookback=0.0)
     late = build_network(PLANT, [place("pump_delay", "Q1")])
     with pytest.raises(ValueError, match="without pure delays, got Q1"):
-        ChangedObserver(late, SPACE, noise().gain, noise().whitening)
+        ObserverBank(late, SPACE, noise().gain, noise().whitening)
 
 
 def test_a_fault_may_be_named_by_its_effect_alone(tmp_path: Path) -> None:
@@ -310,14 +311,14 @@ def test_the_real_leak_opens_at_61_s_and_nothing_else_is_found(
     wanted = load_monitor(LEAK)
     recording = read_recording(wanted.config.recording, wanted.plant, wanted.base)
     c = wanted.config
-    ready = prepare(
+    ready = prepare_monitor(
         wanted.plant, fault_free_part(recording, *c.fault_free), c.faults, c.calibrate, c.detector,
         c.false_alarms_every, c.window.settings(), c.step, c.seed, c.recording.start_levels, c.ranges,
     )  # fmt: skip
-    samples = take(recording, wanted.plant)
+    samples = samples_of_recording(recording, wanted.plant)
     state, events = ready.monitor.start(samples, ready.believed), []
     for first in range(1, len(samples), 10):
-        state, news = ready.monitor.advance(state, samples.stretch(first, first + 10))
+        state, news = ready.monitor.advance(state, samples.segment(first, first + 10))
         events += news
     assert [e.time for e in events if e.kind == "alarm"] == [63.0]
     assert all(e.faults == ("T2.leak.size",) for e in events if e.kind != "alarm")
@@ -379,8 +380,10 @@ def test_figures_6_and_7() -> None:
     )
     learnt, _ = learn_noise(network, free, space, space.nominal())
     detector = make_detector("cusum", 20000.0, 1.0, 3, torch.Generator().manual_seed(0))
-    watch = Monitor(network, space, learnt, detector, MonitorSettings(lookback=200.0, together=4, incipient=False))
-    _, events = followed(watch, samples, 50)
+    run_monitor = Monitor(
+        network, space, learnt, detector, MonitorSettings(lookback=200.0, together=4, incipient=False)
+    )
+    _, events = followed(run_monitor, samples, 50)
     alarms = [event.time for event in events if event.kind == "alarm"]
     assert len(alarms) == 2 and 1000 < alarms[0] < 1010 and 2000 < alarms[1] < 2010
     ends = [[e for e in events if e.sizes and e.time <= end][-1] for end in (2000.0, 3000.0)]
@@ -405,8 +408,8 @@ def test_a_level_that_is_known_at_the_start_is_not_taken_for_that_of_a_later_fau
         f"output: {{folder: {tmp_path}}}\n"
     )
     told: list[float] = []
-    silent = Listening(lambda *_: None, lambda _: None, lambda ready: told.append(ready.calibrated["Q.gain"]))
-    watch(load_monitor(tmp_path / "watch.yaml"), silent)
+    silent = MonitorCallbacks(lambda *_: None, lambda _: None, lambda ready: told.append(ready.calibrated["Q.gain"]))
+    run_monitor(load_monitor(tmp_path / "watch.yaml"), silent)
     assert told == [pytest.approx(50.0 / 45.0, rel=0.01)]
 
 
@@ -418,7 +421,7 @@ def test_the_time_to_overflow_is_told_with_an_interval_that_holds_it() -> None:
     noisy = samples.readings + STD * torch.randn(
         samples.readings.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64
     )
-    _, events = followed(monitor(confirm=20.0), replace(samples, readings=noisy).stretch(0, 330))
+    _, events = followed(monitor(confirm=20.0), replace(samples, readings=noisy).segment(0, 330))
     told = [(e.time, limit) for e in events for limit in e.limits]
     assert len(told) >= 2 and all(limit.tank == "T1" and limit.what == "overflows" for _, limit in told)
     assert all(time + limit.low < truth < time + limit.high for time, limit in told)

@@ -18,11 +18,11 @@ from fdi_torch.cli import INTERRUPTED, main
 from fdi_torch.config.plant import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.effects import build_network, placements_for
-from fdi_torch.jobs.arrived import reaching
-from fdi_torch.jobs.replay import run_again
+from fdi_torch.jobs.replay import repeat_run
+from fdi_torch.jobs.row_buffer import rows_until
 from fdi_torch.logbook import RunLog, follow, read_run
-from fdi_torch.monitor.arrivals import Arrivals, Punctuality
-from fdi_torch.monitor.observer import bound
+from fdi_torch.monitor.live_batches import DelayWatch, LiveBatches
+from fdi_torch.monitor.observer import bind_parameters
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.equilibrium import equilibrium
@@ -37,8 +37,8 @@ def readings(size: float = 0.05, onset: float = ONSET) -> list[list[float]]:
     network = build_network(load_plant("three_tank"), placements_for([FAULT]))
     space = ParameterSpace([network.constants[FAULT]])
     inputs = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
-    stepper, sound = Stepper(network), bound(network, None, None)
-    leaking = bound(network, space, torch.tensor([size], dtype=torch.float64))
+    stepper, sound = Stepper(network), bind_parameters(network, None, None)
+    leaking = bind_parameters(network, space, torch.tensor([size], dtype=torch.float64))
     state, levels = stepper.start(equilibrium(network, inputs), inputs, sound), []
     for k in range(SAMPLES):
         levels.append(state.levels)
@@ -174,7 +174,7 @@ def test_ctrl_c_keeps_what_was_logged(tmp_path: Path, monkeypatch: pytest.Monkey
         return advance(self, state, samples, show)
 
     monkeypatch.setattr(Monitor, "advance", interrupted)
-    monkeypatch.setattr("fdi_torch.jobs.monitor.CHUNK", 20)
+    monkeypatch.setattr("fdi_torch.jobs.logged_monitor.CHUNK", 20)
     assert main(["monitor", "--config", config(tmp_path), "--quiet"]) == INTERRUPTED
     [path] = (tmp_path / "logs").glob("*.mcap")
     assert "alarm" in [message.payload["event"] for message in read_run(path).messages(["/observer/alarm"])]
@@ -288,14 +288,14 @@ def test_the_part_to_learn_from_is_the_first_that_reaches_its_end() -> None:
         return [(float(t), [], []) for t in times]
 
     once = at(*range(101))
-    assert reaching(once, 100.0) == once and reaching(once[:-1], 100.0) == []
+    assert rows_until(once, 100.0) == once and rows_until(once[:-1], 100.0) == []
     wild = [*at(*range(20)), *at(1e6), *at(*range(21, 300))]
-    assert [r[0] for r in reaching(wild, 100.0)] == [float(t) for t in range(21, 101)]
+    assert [r[0] for r in rows_until(wild, 100.0)] == [float(t) for t in range(21, 101)]
     restarted = at(*range(120), *range(120))
-    assert reaching(restarted, 100.0) == once
+    assert rows_until(restarted, 100.0) == once
     gap = at(*range(60), *range(150, 170))
-    assert len(reaching(gap, 100.0)) == 70 and reaching(gap[:69], 100.0) == []
-    assert len(reaching(at(*range(50), *range(49, 101)), 100.0)) == 101
+    assert len(rows_until(gap, 100.0)) == 70 and rows_until(gap[:69], 100.0) == []
+    assert len(rows_until(at(*range(50), *range(49, 101)), 100.0)) == 101
 
 
 def test_arrivals_come_in_batches_and_with_their_errors() -> None:
@@ -303,28 +303,30 @@ def test_arrivals_come_in_batches_and_with_their_errors() -> None:
         yield from range(5)
         raise ValueError("torn")
 
-    arrivals, got = Arrivals(source()), []
+    arrivals, got = LiveBatches(source()), []
     with pytest.raises(ValueError, match="torn"):
         for batch in arrivals:
             got += batch
     assert got == list(range(5))
-    assert [item for batch in Arrivals(iter("abc")) for item in batch] == ["a", "b", "c"]
+    assert [item for batch in LiveBatches(iter("abc")) for item in batch] == ["a", "b", "c"]
 
 
 def test_lateness_and_bursts_are_told_once_until_they_double() -> None:
     wall = [100.0]
-    punctual = Punctuality(lambda: wall[0])
-    assert punctual.arrived([0.0, 1.0, 2.0]) == [] and punctual.handled(2.0) == []
+    delay_watch = DelayWatch(lambda: wall[0])
+    assert delay_watch.received([0.0, 1.0, 2.0]) == [] and delay_watch.processed(2.0) == []
     wall[0] += 30.0
-    assert "31 samples came at once after 30.0 s of silence" in punctual.arrived([float(t) for t in range(3, 34)])[0]
-    assert punctual.handled(33.0) == []
+    assert (
+        "31 samples came at once after 30.0 s of silence" in delay_watch.received([float(t) for t in range(3, 34)])[0]
+    )
+    assert delay_watch.processed(33.0) == []
     wall[0] += 40.0
-    assert punctual.arrived([34.0]) == []
-    assert "39.0 s later than real time" in punctual.handled(34.0)[0]
+    assert delay_watch.received([34.0]) == []
+    assert "39.0 s behind real time" in delay_watch.processed(34.0)[0]
     wall[0] += 2.0
-    assert punctual.handled(35.0) == []
-    punctual.restarted()
-    assert punctual.handled(0.0) == []
+    assert delay_watch.processed(35.0) == []
+    delay_watch.clock_jumped()
+    assert delay_watch.processed(0.0) == []
 
 
 @pytest.mark.parametrize("look", range(4))
@@ -369,7 +371,7 @@ def test_a_growing_file_is_followed_on_after_a_kill_to_the_same_events(
         def killed(self: object) -> None:
             raise KeyboardInterrupt
 
-        patch.setattr("fdi_torch.jobs.monitor.Watcher.close", killed)
+        patch.setattr("fdi_torch.jobs.logged_monitor.LoggedMonitor.close", killed)
         assert main(["monitor", *words, "--json", "--quiet"]) == INTERRUPTED
     early = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert kinds(early) == ["alarm"]
@@ -397,8 +399,8 @@ def test_a_monitors_log_is_replayed_to_the_same_events(tmp_path: Path, capsys: p
     [log] = (tmp_path / "logs").glob("*.mcap")
     assert main(["replay", str(log), "--quiet"]) == 0
     assert capsys.readouterr().out.startswith("bit-equal")
-    with pytest.raises(ValueError, match="a key other than the data's"):
-        run_again(read_run(log), tmp_path / "again.mcap", ["recording.file=other.csv"])
+    with pytest.raises(ValueError, match="a key other than those of the data"):
+        repeat_run(read_run(log), tmp_path / "again.mcap", ["recording.file=other.csv"])
 
 
 def test_a_fault_below_its_smallest_size_is_logged_and_not_said_aloud(

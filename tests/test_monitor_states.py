@@ -8,21 +8,24 @@ import pytest
 import torch
 from torch import Tensor
 
+from fdi_torch.monitor.alarm_state import FOLLOWS, Alarm, State
 from fdi_torch.monitor.detection import CHARTS, make_detector
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.states import FOLLOWS, Alarm, State
 from tests.test_monitor import SPACE, followed, monitor, recorded
 
 
 def test_an_alarm_takes_only_states_that_follow() -> None:
     alarm = Alarm(1, 10.0, 10.0)
-    assert alarm.to(State.ISOLATED).to(State.EXPLAINED).to(State.RECOVERED).state is State.RECOVERED
+    assert (
+        alarm.with_state(State.ISOLATED).with_state(State.EXPLAINED).with_state(State.RECOVERED).state
+        is State.RECOVERED
+    )
     with pytest.raises(ValueError, match="a state that follows 'confirming', got 'watching'"):
-        alarm.to(State.WATCHING)
+        alarm.with_state(State.WATCHING)
     assert set(FOLLOWS) == set(State)
-    again = alarm.again(20.0)
+    again = alarm.raised_again(20.0)
     assert (again.first, again.last, again.count) == (10.0, 20.0, 2)
 
 
@@ -45,7 +48,7 @@ def troubled() -> Samples:
 def in_pieces(watch: Monitor, samples: Samples, cuts: list[int]) -> list[Event]:
     state, events = watch.start(samples), []
     for first, last in zip([1, *cuts], [*cuts, len(samples)], strict=True):
-        state, news = watch.advance(state, samples.stretch(first, last))
+        state, news = watch.advance(state, samples.segment(first, last))
         events += news
     return events
 
@@ -78,7 +81,7 @@ def test_nothing_said_at_a_moment_rests_on_a_later_reading(
 ) -> None:
     """The events of a recording that ends earlier are the first of those of the whole one, byte for byte."""
     watch, samples, expected = whole
-    events = in_pieces(watch, samples.stretch(0, cut), [])
+    events = in_pieces(watch, samples.segment(0, cut), [])
     assert events == expected[: len(events)]
     assert all(event.time > float(samples.time[cut - 1]) for event in expected[len(events) :])
 
@@ -88,10 +91,10 @@ def test_a_statistic_followed_in_pieces_is_that_of_the_whole(chart: str) -> None
     detector = make_detector(chart, 1000.0, 1.0, 3, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
     white = torch.randn(700, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     white[50:53, 1] = torch.nan
-    whole, _ = detector.follow(white, None)
+    whole, _ = detector.update(white, None)
     parts, charted = [], None
     for first, last in ((0, 1), (1, 2), (2, 90), (90, 350), (350, 351), (351, 700)):
-        part, charted = detector.follow(white[first:last], charted)
+        part, charted = detector.update(white[first:last], charted)
         parts.append(part)
     assert torch.equal(torch.cat(parts), whole)
     assert torch.allclose(whole[300:], detector.statistic(white)[300:], rtol=1e-9)

@@ -76,7 +76,7 @@ def test_a_file_that_is_there_is_never_replaced(
     monkeypatch.chdir(tmp_path)
     Path("run.yaml").write_text("mine")
     assert cli.main(["new", "run"]) == cli.MISUSE
-    assert "run.yaml: expected a new file, got one that is there" in capsys.readouterr().err
+    assert "run.yaml: expected a new file, but it exists" in capsys.readouterr().err
     assert cli.main(["new", "run", "--out", "run.txt"]) == cli.MISUSE
     assert "expected a file that ends in .yaml, got run.txt" in capsys.readouterr().err
     assert Path("run.yaml").read_text() == "mine" and [p.name for p in tmp_path.iterdir()] == ["run.yaml"]

@@ -11,11 +11,11 @@ from scipy.linalg import solve_discrete_are
 
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, place
-from fdi_torch.monitor.gain import hand_gain, kalman_gain, linearised, riccati, spectral_radius, timed_gain
-from fdi_torch.monitor.noise import learn_noise, operating_point
-from fdi_torch.monitor.observer import Observer, bound, first_levels
-from fdi_torch.monitor.running import run_lanes
-from fdi_torch.monitor.samples import Samples, stack, take
+from fdi_torch.monitor.noise_model import learn_noise, operating_point
+from fdi_torch.monitor.observer import Observer, bind_parameters, initial_levels
+from fdi_torch.monitor.observer_gain import hand_gain, kalman_gain, linearised, riccati, spectral_radius, timed_gain
+from fdi_torch.monitor.observer_run import run_observers
+from fdi_torch.monitor.samples import Samples, samples_of_recording, stack_recordings
 from fdi_torch.monitor.stepper import PlantState, Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect
@@ -34,7 +34,7 @@ INPUTS = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
 REST = equilibrium(NETWORK, INPUTS)
 NOISE = torch.full((3,), 1e-3, dtype=torch.float64)
 START = torch.full((3,), 1.0, dtype=torch.float64)
-LINEAR = linearised(Stepper(NETWORK), REST, INPUTS, 1.0, bound(NETWORK, None, None))
+LINEAR = linearised(Stepper(NETWORK), REST, INPUTS, 1.0, bind_parameters(NETWORK, None, None))
 
 
 def at_rest(samples: int, runs: tuple[int, ...] = (), seed: int = 0, std: float = 1e-3) -> Samples:
@@ -55,7 +55,7 @@ def test_the_stepper_is_the_reference_engine_sample_by_sample() -> None:
     )
     experiment = lay_out(recording, PLANT.channels(), 1.0)
     truth = ReferenceEngine(network, ParameterSpace(), experiment).levels(inputs.new_zeros(0))
-    samples = take(replace(recording, outputs=truth), PLANT)
+    samples = samples_of_recording(replace(recording, outputs=truth), PLANT)
     seen = Observer(network, hand_gain(torch.zeros(3, 3, dtype=torch.float64))).run(samples, truth[0])
     assert seen.residual.abs().max() < 1e-12
 
@@ -99,7 +99,7 @@ def test_an_unmeasured_level_is_found() -> None:
     plant = replace(PLANT, sensors=PLANT.sensors[:2])
     network = build_network(plant)
     samples = replace(at_rest(1500, std=1e-5), readings=at_rest(1500, std=1e-5).readings[:, :2])
-    linear = linearised(Stepper(network), REST, INPUTS, 1.0, bound(network, None, None))
+    linear = linearised(Stepper(network), REST, INPUTS, 1.0, bind_parameters(network, None, None))
     observer = Observer(network, kalman_gain(linear, 1e-6 * torch.ones(3, dtype=torch.float64), NOISE[:2], START))
     seen = observer.run(samples, REST + torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64))
     assert (seen.levels[-1] - REST).abs().max() < 2e-4
@@ -184,8 +184,10 @@ def test_a_run_goes_on_from_any_of_its_states() -> None:
     samples = at_rest(40)
     samples = replace(samples, inputs=torch.where(samples.time < 18.0, 1.0, 2.0).unsqueeze(1) * INPUTS)
     gains = 0.1 * torch.eye(3, dtype=torch.float64).expand(40, 3, 3)
-    whole = run_lanes(lagging, space, theta, samples, REST[None], gains, 1.0, from_first=True).state
-    rest = run_lanes(lagging, space, theta, samples.stretch(20, 40), whole[:, 20], gains[21:], 1.0, from_first=False)
+    whole = run_observers(lagging, space, theta, samples, REST[None], gains, 1.0, from_first=True).state
+    rest = run_observers(
+        lagging, space, theta, samples.segment(20, 40), whole[:, 20], gains[21:], 1.0, from_first=False
+    )
     assert torch.equal(rest.state, whole[:, 21:])
 
 
@@ -201,7 +203,7 @@ def test_a_correction_within_a_step_is_refused() -> None:
 
 def test_noise_is_learnt_from_a_fault_free_recording() -> None:
     generator = torch.Generator().manual_seed(3)
-    stepper, values = Stepper(NETWORK), bound(NETWORK, None, None)
+    stepper, values = Stepper(NETWORK), bind_parameters(NETWORK, None, None)
     state, readings = stepper.start(REST, INPUTS, values), []
     for k in range(1500):
         readings.append(state.levels + 1e-3 * torch.randn(3, generator=generator, dtype=torch.float64))
@@ -237,13 +239,13 @@ def test_recordings_on_different_clocks_do_not_stack() -> None:
             ("m",) * 3,
         )
 
-    assert stack([recording(1.0), recording(1.0)], PLANT).batch == (2,)
-    with pytest.raises(ValueError, match="expected recordings on one clock"):
-        stack([recording(1.0), recording(2.0)], PLANT)
+    assert stack_recordings([recording(1.0), recording(1.0)], PLANT).batch == (2,)
+    with pytest.raises(ValueError, match="expected recordings with the same sample times"):
+        stack_recordings([recording(1.0), recording(2.0)], PLANT)
     with pytest.raises(ValueError, match="expected at least one recording"):
-        stack([], PLANT)
+        stack_recordings([], PLANT)
     with pytest.raises(ValueError, match="expected an input 'Q2'"):
-        take(replace(recording(1.0), input_names=("Q1", "Qx")), PLANT)
+        samples_of_recording(replace(recording(1.0), input_names=("Q1", "Qx")), PLANT)
 
 
 def test_operating_point_is_about_the_middle_of_the_readings() -> None:
@@ -271,6 +273,6 @@ def test_first_levels_are_those_behind_what_the_plant_is_believed_to_do_to_readi
     network = build_network(plant)
     readings = torch.tensor([[0.25, 0.15, 0.10]], dtype=torch.float64)
     first = Samples(torch.zeros(1, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64), readings)
-    assert first_levels(network, first, bound(network, None, None)).tolist() == pytest.approx(
+    assert initial_levels(network, first, bind_parameters(network, None, None)).tolist() == pytest.approx(
         [0.2, 0.15, 0.10], abs=1e-4
     )

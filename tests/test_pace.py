@@ -17,10 +17,10 @@ from fdi_torch.config.understood import understood
 from fdi_torch.effects import EFFECTS, all_placements, build_network, placements_for
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.hybrid import estimate_parameters
-from fdi_torch.jobs.run_setup import fitting_of, recordings_of, wanted_space
-from fdi_torch.monitor.prepare import prepare
+from fdi_torch.jobs.run_setup import fitting_of, recordings_of, requested_space
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_setup import prepare_monitor
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
@@ -149,7 +149,7 @@ def test_the_monitor_says_the_same_of_a_rig_of_another_size() -> None:
         names = ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3
         settings = MonitorSettings(120.0 * s, 40.0 * s, longest=400.0 * s, incipient=False, together=1)
         learnt = Recording(quiet.time, quiet.inputs, quiet.readings, *names)
-        watch = prepare(plant, learnt, NAMES, time_between_false_alarms=20000.0 * s, settings=settings).monitor
+        watch = prepare_monitor(plant, learnt, NAMES, time_between_false_alarms=20000.0 * s, settings=settings).monitor
         _, events = followed(watch, faulty)
         assert [e.kind for e in events][:2] == ["alarm", "isolated"]
         said.append([(e.kind, e.time / s, e.faults, e.sizes, (e.onset or 0.0) / s) for e in events])
@@ -160,5 +160,5 @@ def test_the_monitor_says_the_same_of_a_rig_of_another_size() -> None:
 
 def test_an_onset_is_sought_within_the_recording() -> None:
     run = load_run(overrides=["estimate.parameters=[T1.leak, T1.leak.onset]", "simulate.duration=400 s"])
-    fitting = fitting_of(run, wanted_space(run), recordings_of(run))
+    fitting = fitting_of(run, requested_space(run), recordings_of(run))
     assert (fitting.space["T1.leak.onset"].low, fitting.space["T1.leak.onset"].high) == (0.0, 400.0)

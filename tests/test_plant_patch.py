@@ -144,7 +144,7 @@ def test_a_file_whose_components_share_a_value_is_written_anew_and_that_is_said(
     before = read(shared)
     write_adopted("rig.yaml", before, with_constants(before, {"A.area": 0.021}), Path("new.yaml"), Screen())
     told = capsys.readouterr()
-    assert "new.yaml: written anew, without the comments of rig.yaml" in told.err
+    assert "new.yaml: rewritten without the comments of rig.yaml" in told.err
     found = load_plant("new.yaml")
     assert [tank.area for tank in found.tanks] == [pytest.approx(0.021), 0.02]
 

@@ -13,7 +13,7 @@ from fdi_torch.config.run import load_run
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.prediction import predict
 from fdi_torch.gap.refit import refit
-from fdi_torch.jobs.windows import windows_of
+from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.recording import Recording
 
 pytestmark = pytest.mark.data
@@ -63,7 +63,7 @@ def test_openings_of_the_valve_that_were_not_used_are_predicted_by_the_others(da
 def test_windows_with_open_drains_are_told_and_sized_from_levels_and_commands_alone(data: Path, tmp_path: Path) -> None:
     """The first of five cycles; the recorded positions of the drains, which are not shown, are the truth."""
     changes = ["recordings.0.start=300 s", "recordings.0.stop=480 s", f"output.folder={tmp_path}"]
-    found = windows_of(load_run(REAL / "dts200_exp5_windows.yaml", changes))
+    found = fit_windows(load_run(REAL / "dts200_exp5_windows.yaml", changes))
     truth = read_recording(RecordingConfig(file=EXP5), load_plant("dts200"), ROOT)
     seen = 0
     for place, valve, sensor in (("L", "vLD", "h1_L"), ("R", "vRD", "h2_R")):
@@ -84,7 +84,7 @@ def test_windows_with_open_drains_are_told_and_sized_from_levels_and_commands_al
 
 def test_a_hose_that_fills_is_no_leak(data: Path, tmp_path: Path) -> None:
     """The first stroke of exp5: 80 cm^3 pumped at R while its level stands."""
-    found = windows_of(
+    found = fit_windows(
         load_run(REAL / "dts200_exp5_windows.yaml", ["recordings.0.stop=40 s", f"output.folder={tmp_path}"])
     )
     states = {f.name: f for f in found.windows[0].faults}

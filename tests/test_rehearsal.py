@@ -12,18 +12,17 @@ from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.proportion import wilson
 from fdi_torch.monitor.detection import make_detector
-from fdi_torch.monitor.following import observe
 from fdi_torch.monitor.monitor import Monitor
-from fdi_torch.monitor.noise import learn_noise
-from fdi_torch.monitor.prepare import with_shapes
-from fdi_torch.monitor.rehearsal.alarms import count_false_alarms, delays, detectors
-from fdi_torch.monitor.rehearsal.naming import Kind, confusions, name, smallest_isolable
-from fdi_torch.monitor.rehearsal.naming_plan import moving_set_points
-from fdi_torch.monitor.rehearsal.rivals import RIVALS, compare, draw_runs, track
-from fdi_torch.monitor.rehearsal.runs import Course, LevelControl, Rig, fault_free
-from fdi_torch.monitor.rehearsal.scoring import score
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_setup import with_shapes
+from fdi_torch.monitor.monte_carlo.detector_trials import count_false_alarms, delays, detectors
+from fdi_torch.monitor.monte_carlo.estimator_comparison import ESTIMATOR_NAMES, compare, draw_runs, track_estimates
+from fdi_torch.monitor.monte_carlo.isolation_trials import FaultScenario, confusions, isolate_run, smallest_isolable
+from fdi_torch.monitor.monte_carlo.level_control import LevelControl, moving_set_points
+from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig, fault_free_schedule
+from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.settings import MonitorSettings
+from fdi_torch.monitor.state_update import advance_observer
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.equilibrium import equilibrium
@@ -45,7 +44,7 @@ def fitting(samples: int = 301):  # type: ignore[no-untyped-def]
 def test_estimators_of_the_likelihood_reach_the_bound_and_the_others_say_how_far_they_are() -> None:
     runs = draw_runs(fitting(), 12, 30.0, torch.Generator().manual_seed(0))
     rows = {row.rival: row for row in compare(runs, 30.0, [100, 300])}
-    assert set(rows) == set(RIVALS)
+    assert set(rows) == set(ESTIMATOR_NAMES)
     for rival in ("hybrid", "multi_start", "least_squares"):
         # Some 18 errors: their root mean square is known to a third. Where a fault is absent the truth lies on the edge
         # of the box, which cuts half the errors off: less than the bound is right.
@@ -53,15 +52,15 @@ def test_estimators_of_the_likelihood_reach_the_bound_and_the_others_say_how_far
     assert rows["evolution"].over_bound > 1.0
     assert all(row.cost < 0.05 for row in rows.values())  # CPU seconds a sample
     with pytest.raises(ValueError, match="expected a rival of hybrid"):
-        track("crystal ball", runs, [100])
+        track_estimates("crystal ball", runs, [100])
 
 
-def rig(faults: list[str], **kind: float) -> tuple[Rig, Monitor, ParameterSpace]:
+def rig(faults: list[str], **kind: float) -> tuple[SimulatedRig, Monitor, ParameterSpace]:
     names = with_shapes(faults, PLANT)
     network = build_network(PLANT, placements_for(names))
     space = ParameterSpace(network.constants[n] for n in names)
-    made = Rig(network, space, INPUTS, equilibrium(network, INPUTS), STD, **kind)  # type: ignore[arg-type]
-    learnt = made.run(fault_free(space, 1), 600, torch.Generator().manual_seed(3))
+    made = SimulatedRig(network, space, INPUTS, equilibrium(network, INPUTS), STD, **kind)  # type: ignore[arg-type]
+    learnt = made.run(fault_free_schedule(space, 1), 600, torch.Generator().manual_seed(3))
     inputs = learnt.inputs[0] if learnt.inputs.dim() > 2 else learnt.inputs
     one = Samples(learnt.time, inputs, learnt.readings[0])
     noise, _ = learn_noise(network, one, space, space.nominal(), levels=made.levels)
@@ -82,7 +81,7 @@ def test_false_alarms_are_as_often_as_asked_and_large_faults_are_found_sooner() 
     for size in (0.05, 0.2):
         theta = torch.full((20, 1), size, dtype=torch.float64)
         at, still = torch.full((20,), 50.0, dtype=torch.float64), torch.zeros(20, dtype=torch.float64)
-        course = Course(theta, at, still)
+        course = FaultSchedule(theta, at, still)
         seen = made.run(course, 300, torch.Generator().manual_seed(2))
         found_at = delays(made, monitor.noise, charts, seen, course)
         assert all(d.missed() == 0 for d in found_at)
@@ -113,7 +112,7 @@ def test_sensor_and_actuator_faults_are_told_from_leaks_under_control(
 
         def control(readings: torch.Tensor, span: torch.Tensor) -> torch.Tensor:
             clock[0] += 1
-            pi.wanted = level[:2] + (0.03 if (clock[0] // 50) % 2 else -0.03)
+            pi.set_points = level[:2] + (0.03 if (clock[0] // 50) % 2 else -0.03)
             return pi(readings, span)
 
         return control
@@ -122,18 +121,20 @@ def test_sensor_and_actuator_faults_are_told_from_leaks_under_control(
     named = {f"{fault.rpartition('.')[0]}.{k}": v for k, v in shape.items()}
     theta = space.vector({fault: size, **named})[None]
     onset = torch.tensor([150.0], dtype=torch.float64)
-    seen = made.run(Course(theta, onset, torch.zeros(1, dtype=torch.float64)), 360, torch.Generator().manual_seed(4))
+    seen = made.run(
+        FaultSchedule(theta, onset, torch.zeros(1, dtype=torch.float64)), 360, torch.Generator().manual_seed(4)
+    )
     one = Samples(seen.time, seen.inputs[0], seen.readings[0])
-    found = name(monitor, one, space.nominal(), made.levels, 150.0)
+    found = isolate_run(monitor, one, space.nominal(), made.levels, 150.0)
     assert found.last == (fault,) and found.early == 0, found
 
 
 def test_the_smallest_isolable_size_is_infinite_for_twins_and_grows_with_a_rival() -> None:
     made, monitor, space = rig(["T1.leak.size", "T2.leak.size", "OUT2.plugging.size"])
-    seen = made.run(fault_free(space, 1), 300, torch.Generator().manual_seed(5))
+    seen = made.run(fault_free_schedule(space, 1), 300, torch.Generator().manual_seed(5))
     one = Samples(seen.time, seen.inputs, seen.readings[0])
-    state = observe(monitor.observer, monitor.start(one, levels=made.levels), one.stretch(1, 300))
-    kinds = [Kind(f) for f in monitor.faults]
+    state = advance_observer(monitor.observer, monitor.start(one, levels=made.levels), one.segment(1, 300))
+    kinds = [FaultScenario(f) for f in monitor.faults]
     window = state.window(60.0)
     alone = smallest_isolable(monitor.observer, window, space.nominal(), kinds[:1], 100.0)[0]
     sizes = smallest_isolable(monitor.observer, window, space.nominal(), kinds, 100.0)
@@ -150,11 +151,6 @@ def test_shares_come_with_their_interval_and_wrong_answers_with_their_number() -
     assert confusions(["a", "a", "b"], [("a",), ("b",), ()]) == [("a", "b", 1), ("b", "nothing", 1)]
 
 
-def test_alarms_are_hits_with_a_delay_misses_or_false() -> None:
-    found = score([3.0, 12.0, 14.0, 95.0], [10.0, 50.0, 100.0], early=6.0, late=5.0)
-    assert found.hits == ((10.0, 2.0), (100.0, -5.0)) and found.misses == (50.0,) and found.false == (3.0, 14.0)
-
-
 def test_each_pump_is_controlled_by_the_sensor_of_its_own_tank() -> None:
     """Into the outer two of three tanks, whose levels are read in volts, from a lower one, by pumps in volts."""
     sensors = tuple(replace(s, unit="V", gain=-20.0, offset=9.0) for s in PLANT.sensors)
@@ -164,8 +160,8 @@ def test_each_pump_is_controlled_by_the_sensor_of_its_own_tank() -> None:
     levels = equilibrium(network, volts)
     swing = 0.02
     made = moving_set_points(plant, volts, levels, swing)
-    rig = Rig(network, ParameterSpace(), volts, levels, torch.zeros(3, dtype=torch.float64), controller=made)
-    seen = rig.run(fault_free(ParameterSpace(), 1), 600, torch.Generator().manual_seed(0)).readings[0]
+    rig = SimulatedRig(network, ParameterSpace(), volts, levels, torch.zeros(3, dtype=torch.float64), controller=made)
+    seen = rig.run(fault_free_schedule(ParameterSpace(), 1), 600, torch.Generator().manual_seed(0)).readings[0]
     off = (seen - 9.0) / -20.0 - levels
     assert float(off[300:, [0, 2]].abs().max()) < 1.5 * swing
     assert float(off[300:, [0, 2]].abs().amax(0).min()) > 0.5 * swing, "it moves"

@@ -12,12 +12,12 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.monitor import Monitor
-from fdi_torch.monitor.noise import learn_noise
-from fdi_torch.monitor.prepare import with_shapes
-from fdi_torch.monitor.rehearsal.runs import Course, Rig, fault_free
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_setup import with_shapes
+from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig, fault_free_schedule
+from fdi_torch.monitor.noise_model import learn_noise
+from fdi_torch.monitor.oscillation import strongest_periods
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.settings import MonitorSettings
-from fdi_torch.monitor.swinging import strongest_periods
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.equilibrium import equilibrium
 
@@ -41,8 +41,8 @@ def test_an_oscillating_pump_is_followed_a_day_after_the_clock_began() -> None:
     network = build_network(PLANT, placements_for(names))
     space = ParameterSpace(network.constants[n] for n in names)
     std = torch.full((3,), 1e-3, dtype=torch.float64)
-    rig = Rig(network, space, INPUTS, equilibrium(network, INPUTS), std)
-    learnt = rig.run(fault_free(space, 1), 600, torch.Generator().manual_seed(2))
+    rig = SimulatedRig(network, space, INPUTS, equilibrium(network, INPUTS), std)
+    learnt = rig.run(fault_free_schedule(space, 1), 600, torch.Generator().manual_seed(2))
     one = Samples(learnt.time, learnt.inputs, learnt.readings[0])
     noise, _ = learn_noise(network, one, space, space.nominal(), levels=rig.levels)
     detector = make_detector("cusum", 20000.0, 1.0, 3, torch.Generator().manual_seed(0))
@@ -50,12 +50,12 @@ def test_an_oscillating_pump_is_followed_a_day_after_the_clock_began() -> None:
     monitor = Monitor(network, space, noise, detector, settings)
     truth = {"Q1.pump_oscillation.amplitude": 0.1, "Q1.pump_oscillation.period": 40.0, "Q1.pump_oscillation.phase": 0.7}
     still = torch.zeros(1, dtype=torch.float64)
-    course = Course(space.vector(truth)[None], torch.full((1,), 200.0, dtype=torch.float64), still)
+    course = FaultSchedule(space.vector(truth)[None], torch.full((1,), 200.0, dtype=torch.float64), still)
     seen = rig.run(course, 601, torch.Generator().manual_seed(3))
     day = 86400.0 + 13.0
     seen = replace(seen, time=seen.time + day, readings=seen.readings[0])
     state = monitor.start(seen, space.nominal(), rig.levels)
-    _, events = monitor.advance(state, seen.stretch(1, len(seen)))
+    _, events = monitor.advance(state, seen.segment(1, len(seen)))
     last = [event for event in events if event.faults][-1]
     assert last.faults[0] == "Q1.pump_oscillation.amplitude"
     found = dict(zip(last.faults, zip(last.sizes, last.stds, strict=True), strict=True))

@@ -11,7 +11,7 @@ from fdi_torch.config.plant import build_plant
 from fdi_torch.config.run import Run, build_run
 from fdi_torch.estimate.stretches import stretches_of
 from fdi_torch.estimate.windows import Window, WindowFault, cut_up, noise_of, state_of
-from fdi_torch.jobs.windows import windows_of
+from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.recording import Recording
 
 
@@ -80,11 +80,11 @@ def leaking(folder: Path, duration: str, step: str) -> Run:
 
 
 def test_the_step_is_the_one_asked_for(tmp_path: Path) -> None:
-    assert windows_of(leaking(tmp_path, "100 s", "0.7 s")).step == 0.7
+    assert fit_windows(leaking(tmp_path, "100 s", "0.7 s")).step == 0.7
 
 
 def test_a_leak_that_opens_halfway_is_in_the_windows_after_it(tmp_path: Path) -> None:
-    found = windows_of(leaking(tmp_path, "400 s", "auto"))
+    found = fit_windows(leaking(tmp_path, "400 s", "auto"))
     assert 0.1 <= found.step <= 5.0  # no longer than a twentieth of a window
     assert [[f.state for f in w.faults] for w in found.windows] == [["absent"] * 2] * 2 + [["present", "absent"]] * 2
     (leak,) = found.stretches

@@ -1,10 +1,10 @@
-"""`fdi COMMAND`: finds the command, runs it, and turns what goes wrong into one sentence and an exit code.
+"""`fdi COMMAND`: parse the command line, run the command, and turn errors into a message and an exit code.
 
-Exit codes: 0 done, 2 misuse (said in one sentence on standard error), 3 ran but did not converge, 130 interrupted,
+Exit codes: 0 done, 2 wrong use (explained on standard error), 3 ran but did not converge, 130 interrupted,
 143 terminated.
 A command is one line of `COMMANDS`, a module `options/NAME.py` with its description, EXAMPLES and
-`add_arguments(parser)`, and a module `NAME.py` with `run(arguments, screen) -> exit code`. The latter is imported only
-once the arguments are read, so that help does not wait for torch.
+`add_arguments(parser)`, and a module `NAME.py` with `run(arguments, screen) -> exit code`. The latter is imported after
+the arguments are parsed, so that help does not wait for torch.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from fdi_torch.names import unknown
 DONE, MISUSE, NOT_CONVERGED, INTERRUPTED, TERMINATED = 0, 2, 3, 130, 143
 
 COMMANDS = {
-    "train": "estimate the faults in a recording, and log how",
-    "simulate": "write a recording from a plant, inputs, faults and noise",
+    "train": "estimate the sizes of faults in a recording",
+    "simulate": "generate a recording from a plant, inputs, faults and noise",
     "check": "examine a plant and a recording before any fit",
-    "effects": "the catalogue of faults and unmodelled effects, and how each is written",
+    "effects": "show the catalogue of faults and unmodelled effects",
     "new": "write a commented minimal file: a plant, run, monitor or study",
-    "monitor": "follow a recording: alarms, faults with their onset and size, recoveries",
-    "diagnosability": "what an experiment can tell: which faults show, which can be told apart",
-    "rehearse": "try a monitor out on simulated runs: false alarms, delays, names, rivals",
+    "monitor": "detect, isolate and size faults along a recording or live",
+    "diagnosability": "which faults an experiment can detect and distinguish, and from which size",
+    "rehearse": "validate a monitor on simulated runs: false alarms, delays, isolation",
     "report": "make one HTML page of one or more logs",
-    "inspect": "what a log is about, whether it is sound, and its messages for other tools",
-    "replay": "run a logged estimation or study again and compare, or try what another choice gives",
-    "compare": "what differs between runs, and whether their results agree",
-    "recover": "save what is whole of a broken or unfinished log",
-    "gap": "where a plant file falls short of a recording, by which effect, and how far the gap closes",
-    "predict": "run a plant freely along a recording, and how far off it gets",
-    "challenge": "blind benchmark: the gap diagnosis on hidden rigs whose causes are sealed",
-    "study": "many trials at once: errors against their bounds, coverage, failures",
-    "paper": "make the 2020 paper's tables and figures again",
+    "inspect": "show what a log contains and whether it is intact, or export its messages",
+    "replay": "repeat a logged run and compare, or try another setting",
+    "compare": "compare runs: settings, data and results",
+    "recover": "recover a broken or unfinished log",
+    "gap": "find where and by which effect a plant file deviates from a recording",
+    "predict": "run a plant freely along a recording and report the error",
+    "challenge": "blind benchmark of the gap diagnosis on hidden rigs",
+    "study": "repeat an experiment many times: errors against their bounds, coverage, failures",
+    "paper": "reproduce the tables and figures of the 2020 paper",
 }
 
 LONG = ("train", "study", "gap", "monitor", "challenge", "paper")
-"""Commands that work for more than a moment, and say so at once."""
+"""Commands that take more than a moment to start, and announce that."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def command_line() -> NoReturn:
-    """The entry point `fdi`. Who reads may stop reading, as `| head` does, or never have begun."""
+    """The entry point `fdi`. Standard output may be closed early, as by `| head`, or from the start."""
     _open_standard_streams()
     try:
         code = main()
@@ -82,7 +82,7 @@ def command_line() -> NoReturn:
 
 
 def _open_standard_streams() -> None:
-    """Where one was closed (`>&-`), nothing that is opened later may take its number and hear what is printed."""
+    """Open closed standard streams (`>&-`), so that no file opened later gets their numbers and the printed text."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(number)
@@ -92,7 +92,7 @@ def _open_standard_streams() -> None:
 
 def _overview() -> str:
     lines = [f"  {name:<16}{what}" for name, what in COMMANDS.items()]
-    ending = "fdi COMMAND --help tells more, and ends in examples."
+    ending = "fdi COMMAND --help describes a command and shows examples."
     return "\n".join(["usage: fdi COMMAND [options]", "       fdi --version", "", *lines, "", ending, ""])
 
 
@@ -106,8 +106,8 @@ def _run(name: str, words: list[str]) -> int:
 
 
 def ending(error: KeyboardInterrupt | Terminated) -> str:
-    """What is left of a job that was interrupted, and how it goes on: as its log says, if it had begun one."""
-    notes = getattr(error, "__notes__", ()) or ("the same command starts anew",)
+    """Message about an interrupted job, with the log's notes on how to resume it."""
+    notes = getattr(error, "__notes__", ()) or ("the same command starts again from the beginning",)
     return "; ".join(["terminated" if isinstance(error, Terminated) else "interrupted", *notes])
 
 
@@ -130,27 +130,27 @@ def _carried_out(name: str, words: list[str]) -> int:
             screen.complain(f"fdi {name}: {line}")
         return MISUSE
     except (MemoryError, RuntimeError) as error:
-        sentence = _of_the_machine(error)
+        sentence = _resource_problem(error)
         if arguments.traceback or not sentence:
             raise
         screen.complain(f"fdi {name}: {sentence}")
         return MISUSE
 
 
-def _of_the_machine(error: Exception) -> str:
-    """What to say of memory that is not there and of numbers that determine nothing; nothing of other errors."""
+def _resource_problem(error: Exception) -> str:
+    """Message about a lack of memory or a singular problem; empty for other errors."""
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
         return "expected less work than this machine has memory for, got more; shorten the run, or lower population"
     if "LinAlgError" in type(error).__name__:
         return (
-            "expected readings that determine the result, got a singular matrix: channels that are constant, alike or "
-            "without noise; fdi check tells which"
+            "expected readings that determine the result, got a singular matrix: channels that are constant, identical "
+            "or without noise; fdi check shows which"
         )
     return ""
 
 
 def _say_that_it_began(name: str, quiet: bool) -> None:
-    """A job's libraries take seconds to load where they are not there yet: its first sign of life comes before them."""
+    """Announce the start of a job before its libraries load, which takes seconds."""
     if name in LONG and "torch" not in sys.modules and not quiet:
         with suppress(BrokenPipeError):
             sys.stderr.write(f"fdi {name}: loading\n")
@@ -169,6 +169,6 @@ def _parser(name: str, options: ModuleType) -> argparse.ArgumentParser:
     parser.add_argument("--json", action="store_true", help="print JSON and nothing else on standard output")
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     parser.add_argument(
-        "--traceback", action="store_true", help="where a sentence would be printed, show the code's path"
+        "--traceback", action="store_true", help="print the Python traceback of an error instead of its message"
     )
     return parser

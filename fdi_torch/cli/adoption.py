@@ -1,4 +1,4 @@
-"""--adopt: a plant file with what was found in it, and what is different from the one before."""
+"""--adopt: write a plant file with the adopted effects and constants, and show what changed."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from fdi_torch.plant.description import PlantDescription
 
 
 def write_adopted(name: str, before: PlantDescription, after: PlantDescription, target: Path, screen: Screen) -> None:
-    """Writes the plant of that name (a file, or shipped), read as `before`, as `after` has it, and tells the lines that
-    are different.
+    """Write the plant file `name` (a file or a shipped plant, read as `before`) changed to `after`, and
+    print the diff.
     """
     text = find_plant(name, Path.cwd()).read_text(encoding="utf-8")
     changed, kept = patched_plant(text, before, after)
     write_text(target, changed)
     if not kept:
-        screen.note(f"{target}: written anew, without the comments of {name}: components share values in it")
+        screen.note(f"{target}: rewritten without the comments of {name}, because components share values in it")
     for line in unified_diff(text.splitlines(), changed.splitlines(), name, str(target), lineterm="", n=1):
         screen.say(line)

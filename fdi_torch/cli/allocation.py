@@ -1,19 +1,19 @@
-"""What is freed is kept for the next array of its size, instead of going back to the system and being cleared again.
+"""Keep freed memory in the process, to speed up fits of whole trajectories.
 
-Fits of whole trajectories make and drop the same few large arrays all the time. The GNU C library maps each of them
-anew by default, and the system clears every page: a good part of a short run. Elsewhere nothing is changed.
+Such fits allocate and free the same few large arrays again and again. By default the GNU C library maps each of them
+anew and the system clears every page, which takes a considerable part of a short run.
 """
 
 from __future__ import annotations
 
 import ctypes
 
-KEPT = 1 << 30  # bytes that may lie idle; the most an array may have to be kept
+KEPT = 1 << 30  # bytes of free memory to keep, and size up to which an array is kept
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 
 
 def keep_memory() -> bool:
-    """From now on, in this process. Returns whether the C library can do it."""
+    """Apply the setting to this process. Returns False if the C library does not support it."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # another C library; TypeError: Windows wants a name

@@ -26,7 +26,7 @@ from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.library import STANDARD as LIBRARY
 from fdi_torch.gap.one_at_a_time import one_at_a_time
 from fdi_torch.interruption import Terminated
-from fdi_torch.jobs.blind_benchmark import LOG, conclude, write_plants
+from fdi_torch.jobs.blind_results import LOG, write_plants, write_results
 from fdi_torch.logbook.provenance import git_state
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import area_scale, length_scale, time_scale
@@ -36,64 +36,66 @@ from fdi_torch.study.cluster import connected, each_on
 CASES = 22
 NETWORK = "network"
 REGRESSIONS: Mapping[str, Diagnosis] = {f.__name__: f for f in (split_f_test, sparse_regression, gaussian_process)}
-"""Rivals of the diagnosis that are quick."""
+"""Fast competing methods."""
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     out = Path(arguments.out)
     if arguments.join:
-        rows, found = _joined(arguments, out)
+        rows, scores = _merged(arguments, out)
     else:
-        rows, found = _challenged(arguments, out, screen)
-    show(found, rows, screen)
+        rows, scores = _benchmarked(arguments, out, screen)
+    show(scores, rows, screen)
     screen.say(f"tables: {out / 'scores.md'}; log: {out / LOG} (fdi report {out / LOG} makes the page)")
-    screen.result({"format": "fdi_torch.challenge/2", "answers": len(rows), "tables": found})
+    screen.result({"format": "fdi_torch.challenge/2", "answers": len(rows), "tables": scores})
     return DONE
 
 
-def _joined(arguments: argparse.Namespace, out: Path) -> tuple[Sequence[Row], Tables]:
-    asked = {"cases", "seed", "rig", "plant", "tanks", "kinds", "leave_out", "cluster"}
-    if told := sorted(name for name in asked if getattr(arguments, name)):
-        raise ValueError(f"--join: expected folders only, got --{told[0].replace('_', '-')} beside it; leave that out")
+def _merged(arguments: argparse.Namespace, out: Path) -> tuple[Sequence[Row], Tables]:
+    """Rows and scores of several folders together."""
+    excluded = {"cases", "seed", "rig", "plant", "tanks", "kinds", "leave_out", "cluster"}
+    if given := sorted(name for name in excluded if getattr(arguments, name)):
+        raise ValueError(f"--join: expected folders only, got also --{given[0].replace('_', '-')}; leave that out")
     folders = [Path(name) for name in arguments.join]
     rows = joined(folders)
-    return rows, conclude(out, rows, {"join": arguments.join}, [folder / "rows.jsonl" for folder in folders])
+    return rows, write_results(out, rows, {"join": arguments.join}, [folder / "rows.jsonl" for folder in folders])
 
 
-def _challenged(arguments: argparse.Namespace, out: Path, screen: Screen) -> tuple[Sequence[Row], Tables]:
-    torch.set_num_threads(1)  # arrays of this size lose more by sharing work than they gain
+def _benchmarked(arguments: argparse.Namespace, out: Path, screen: Screen) -> tuple[Sequence[Row], Tables]:
+    """Rows and scores of a new or resumed benchmark."""
+    torch.set_num_threads(1)  # faster for arrays of this size
     cases, seed = (CASES if arguments.cases is None else arguments.cases), arguments.seed or 0
     if cases < 1:
         raise ValueError(f"--cases: expected at least one case, got {cases}")
     if arguments.plant and arguments.rig:
         raise ValueError("expected --rig or --plant, got both; leave one out")
     rig = _rig(arguments)
-    denied = LIBRARY if arguments.leave_out == "all" else tuple(n for n in arguments.leave_out.split(",") if n)
+    left_out = LIBRARY if arguments.leave_out == "all" else tuple(n for n in arguments.leave_out.split(",") if n)
     code = git_state()
-    with _each(arguments.cluster) as each, screen.progress("blind benchmark") as advance, _kept_in(out):
+    with _mapper(arguments.cluster) as each, screen.progress("blind benchmark") as advance, _resumable(out):
         rows = blind_benchmark(
             cases,
             seed,
             out,
-            _diagnosed,
+            _diagnose,
             rig=rig,
             kinds=tuple(arguments.kinds.split(",")) if arguments.kinds else (),
             library=LIBRARY,
-            leave_out=denied,
-            rivals={**REGRESSIONS} | ({} if arguments.no_bic else {"one_at_a_time_bic": _textbook}),
+            leave_out=left_out,
+            rivals={**REGRESSIONS} | ({} if arguments.no_bic else {"one_at_a_time_bic": _one_at_a_time}),
             each=each,
             minutes=arguments.minutes,
             code=code["commit"][:12] + ("+" if code["changed"] == "yes" else ""),
             tell=advance,
         )
-    config = {"cases": cases, "seed": seed, "rig": rig.name, "leave_out": list(denied)}
+    config = {"cases": cases, "seed": seed, "rig": rig.name, "leave_out": list(left_out)}
     write_plants(out)
-    return rows, conclude(out, rows, config, [out / "manifest.jsonl", out / "key.jsonl"])
+    return rows, write_results(out, rows, config, [out / "manifest.jsonl", out / "key.jsonl"])
 
 
 def _rig(arguments: argparse.Namespace) -> Rig | Networks:
     if arguments.tanks and arguments.plant != NETWORK:
-        raise ValueError(f"--tanks: expected it beside --plant {NETWORK}, got it alone; add that or leave --tanks out")
+        raise ValueError(f"--tanks: expected --plant {NETWORK} with it; add that or leave --tanks out")
     if arguments.plant == NETWORK:
         return _networks(arguments.tanks) if arguments.tanks else Networks()
     return _rig_like(load_plant(arguments.plant)) if arguments.plant else RIGS[arguments.rig or "three_tank"]()
@@ -111,19 +113,19 @@ def _rig_like(plant: PlantDescription) -> Rig:
 
 
 @contextmanager
-def _kept_in(out: Path) -> Iterator[None]:
-    """Who interrupts is told what is left."""
+def _resumable(out: Path) -> Iterator[None]:
+    """Add to an interruption where the answers are and how to resume."""
     try:
         yield
     except (KeyboardInterrupt, Terminated) as error:
-        error.add_note(f"the answers until now are in {out}")
-        error.add_note("the same command goes on from there")
+        error.add_note(f"the answers so far are in {out}")
+        error.add_note("the same command continues from there")
         raise
 
 
 @contextmanager
-def _each(cluster: str | None) -> Iterator[Each]:
-    """How to go through the cases: in this process, or on a cluster."""
+def _mapper(cluster: str | None) -> Iterator[Each]:
+    """The `map` over cases: in this process, or on a cluster."""
     if cluster is None:
         yield map
         return
@@ -131,21 +133,21 @@ def _each(cluster: str | None) -> Iterator[Each]:
         yield partial(each_on, client)
 
 
-def _diagnosed(
+def _diagnose(
     plant: PlantDescription, recording: Recording, holdout: Recording, leave_out: Collection[str] = ()
 ) -> dict[str, Any]:
     return diagnose(plant, recording, holdout, Settings(leave_out=tuple(leave_out))).to_dict()
 
 
-def _textbook(
+def _one_at_a_time(
     plant: PlantDescription, recording: Recording, holdout: Recording, leave_out: Collection[str] = ()
 ) -> dict[str, Any]:
     return one_at_a_time(plant, recording, leave_out=tuple(leave_out))
 
 
-def show(found: Tables, rows: Sequence[Row], screen: Screen) -> None:
-    """Every table of every rig, then every miss."""
-    for group, by in found.items():
+def show(scores: Tables, rows: Sequence[Row], screen: Screen) -> None:
+    """Print all tables of every rig, then every wrong answer."""
+    for group, by in scores.items():
         screen.say(f"{group}, {by['fdi']['strata']['all']['cases']} cases, with 95 % intervals")
         for sheet in sheets(by):
             screen.table(sheet.title, sheet.header, sheet.rows, sheet.left)

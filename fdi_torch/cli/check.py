@@ -41,23 +41,26 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
-    """What is odd about each channel; first of all what would be refused or masked."""
-    check, found = check_recording(whole, plant), [examined(plant, part) for part in whole.known_stretches()]
-    wrong = [Finding("slip", ", ".join(f.slip.channels), f.slip.text) for f in found if f.slip]
-    wrong += [
-        Finding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop}) for f in found for s in f.stuck
+    """The check of a recording, with refused or masked channels first."""
+    check = check_recording(whole, plant)
+    examinations = [examined(plant, part) for part in whole.known_stretches()]
+    problems = [Finding("slip", ", ".join(e.slip.channels), e.slip.text) for e in examinations if e.slip]
+    problems += [
+        Finding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})
+        for e in examinations
+        for s in e.stuck
     ]
-    return replace(check, findings=(*wrong, *check.findings))
+    return replace(check, findings=(*problems, *check.findings))
 
 
 def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[RecordingConfig], Path]:
     if arguments.config is not None:
-        wanted = load_run(arguments.config, arguments.set)
-        if not wanted.config.recordings:
+        run_file = load_run(arguments.config, arguments.set)
+        if not run_file.config.recordings:
             raise ValueError("expected recordings in the run file, got a simulation; fdi simulate writes its recording")
-        return wanted.plant, wanted.config.recordings, wanted.base
+        return run_file.plant, run_file.config.recordings, run_file.base
     if arguments.plant is None:
-        raise ValueError("expected --plant, a recording and --plant, or --config; fdi check --help tells more")
+        raise ValueError("expected --plant, a recording and --plant, or --config; see fdi check --help")
     named = [] if arguments.recording is None else [RecordingConfig(file=arguments.recording)]
     return load_plant(arguments.plant), named, Path.cwd()
 

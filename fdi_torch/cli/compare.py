@@ -18,29 +18,31 @@ MOST_TEXT = 40
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
-    compared = compare(arguments.logs)
-    show(compared, screen)
+    comparison = compare(arguments.logs)
+    show(comparison, screen)
     if arguments.csv:
         with replacing(Path(arguments.csv)) as new, new.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows(compared.rows())
+            csv.writer(file).writerows(comparison.rows())
         screen.say(f"table: {arguments.csv}")
     if arguments.pictures:
-        section = comparison_section(compared, [gather(read_run(name)) for name in arguments.logs])
+        section = comparison_section(comparison, [gather(read_run(name)) for name in arguments.logs])
         for picture in section.pictures:
             for ending in (".png", ".svg"):
                 save(picture.figure, Path(arguments.pictures) / f"{picture.name}{ending}")
         screen.say(f"{len(section.pictures)} pictures: {arguments.pictures}")
-    screen.result({"format": "fdi_torch.compare/1", "comparison": compared})
+    screen.result({"format": "fdi_torch.compare/1", "comparison": comparison})
     return DONE
 
 
-def show(compared: Comparison, screen: Screen) -> None:
-    for sentence in in_words(compared):
+def show(comparison: Comparison, screen: Screen) -> None:
+    for sentence in in_words(comparison):
         screen.say(sentence)
-    for section, entries in compared.differences.items():
+    for section, entries in comparison.differences.items():
         rows = [[key, *(text[:MOST_TEXT] for text in texts)] for key, texts in entries.items()]
         screen.say()
-        screen.table(section, ("key", *compared.labels), rows, left=1 + len(compared.labels))
-    if compared.results:
+        screen.table(section, ("key", *comparison.labels), rows, left=1 + len(comparison.labels))
+    if comparison.results:
         screen.say()
-        screen.table("estimates", ("parameter", "unit", *compared.labels, "p", "agree"), result_rows(compared), left=2)
+        screen.table(
+            "estimates", ("parameter", "unit", *comparison.labels, "p", "agree"), result_rows(comparison), left=2
+        )

@@ -14,7 +14,7 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
-from fdi_torch.monitor.prepare import usual_faults
+from fdi_torch.monitor.monitor_setup import usual_faults
 from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.pace import time_scale
@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     named = [full_name(name.strip(), plant) for name in (arguments.faults or "").split(",") if name.strip()]
     faults = named or usual_faults(plant)
     recording, constant = _inputs(arguments, plant)
-    found = diagnosability(
+    report = diagnosability(
         plant,
         faults,
         recording,
@@ -36,23 +36,24 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         false_alarm=arguments.false_alarm,
         miss=arguments.miss,
     )
-    _show(found, screen)
-    screen.result({"format": "fdi_torch.diagnosability/1", **found.to_dict()})
+    _show(report, screen)
+    screen.result({"format": "fdi_torch.diagnosability/1", **report.to_dict()})
     return 0
 
 
 def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Recording, bool]:
+    """A recording with the inputs, and whether they are constant ones from the command line."""
     if Path(arguments.input).exists():
         return read_recording(RecordingConfig(file=arguments.input), plant, Path.cwd()), False
     units = plant.channel_units()
     amounts = arguments.input.split(",")
     if len(amounts) != len(units):
-        wanted = ", ".join(f"{name} in {unit}" for name, unit in units.items())
-        raise ValueError(f"--input: expected a file or {len(units)} amounts ({wanted}), got '{arguments.input}'")
+        expected = ", ".join(f"{name} in {unit}" for name, unit in units.items())
+        raise ValueError(f"--input: expected a file or {len(units)} amounts ({expected}), got '{arguments.input}'")
     values = [parse_quantity(text.strip(), unit) for text, unit in zip(amounts, units.values(), strict=True)]
-    pace = time_scale(plant)
-    duration = 1000.0 * pace if arguments.duration is None else arguments.duration
-    time = torch.arange(0.0, duration + 0.5 * pace, pace, dtype=torch.float64)
+    step = time_scale(plant)
+    duration = 1000.0 * step if arguments.duration is None else arguments.duration
+    time = torch.arange(0.0, duration + 0.5 * step, step, dtype=torch.float64)
     inputs = torch.tensor(values, dtype=torch.float64).expand(len(time), len(values))
     columns = tuple(sensor.column for sensor in plant.sensors)
     readings = time.new_zeros(len(time), len(columns))
@@ -71,13 +72,11 @@ def _show(found: Diagnosability, screen: Screen) -> None:
     screen.table("", header, rows, left=2)
     screen.say()
     shows = [[name, *(f"{v:.3g}" for v in row)] for name, row in zip(found.faults, found.shows, strict=True)]
-    screen.table("how a unit of each fault shows, in noise levels", ("fault", *found.sensors), shows)
+    screen.table("effect of a unit of each fault, in noise standard deviations", ("fault", *found.sensors), shows)
     screen.say()
     apart = [[str(i + 1), name, *(f"{v:.2g}" for v in row)] for i, (name, row) in
              enumerate(zip(found.faults, found.apart, strict=True))]  # fmt: skip
     numbers = tuple(str(i + 1) for i in range(len(found.faults)))
-    screen.table(
-        "how far signatures lie apart (sine of the angle; 0: one and the same)", ("", "fault", *numbers), apart, 2
-    )
+    screen.table("sine of the angle between signatures (0: not distinguishable)", ("", "fault", *numbers), apart, 2)
     for sentence in (*found.groups, *found.remarks):
         screen.say(f"- {sentence}")

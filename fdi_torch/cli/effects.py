@@ -22,16 +22,16 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     else:
         rows = [[e.name, ", ".join(e.at if arguments.plant else e.kinds), e.meaning] for e in entries]
         screen.table(
-            catalogue.headline, ("effect", "at" if arguments.plant else "sits at a", "what it is"), rows, left=3
+            catalogue.headline, ("effect", "at" if arguments.plant else "location", "description"), rows, left=3
         )
-        screen.say("fdi effects NAME tells its equation, parameters and units, and how to write it")
+        screen.say("fdi effects NAME shows the equation, parameters and units of an effect, and how to write it")
     screen.result({"format": "fdi_torch.effects/1", "effects": [_as_json(entry) for entry in entries]})
     return DONE
 
 
 def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
     screen.say(f"{entry.name}: {entry.meaning}")
-    screen.say(f"  sits at a {' or '.join(entry.kinds)}" + (f": {', '.join(entry.at)}" if of_plant else ""))
+    screen.say(f"  location: a {' or '.join(entry.kinds)}" + (f": {', '.join(entry.at)}" if of_plant else ""))
     screen.say(f"  acts {entry.begins}")
     screen.table("", ("parameter", "unit", "nominal", "range", "meaning"), [_row(p) for p in entry.parameters], left=5)
     screen.say(f"  in simulate.faults:     {entry.in_a_run_file}")

@@ -73,8 +73,10 @@ def _keep(
     answer: Answer,
     screen: Screen,
 ) -> Path | None:
-    """gap.json and, where rivals stand, next_input.csv in the output folder; the plant with the causes where that was
-    asked for. Returns the path of the input."""
+    """Write gap.json, next_input.csv if several explanations are plausible, and the adopted plant if requested.
+
+    Returns the path of the next input, if any.
+    """
     folder = Path(arguments.out)
     write_text(folder / "gap.json", json.dumps(answer.to_dict(), indent=1) + "\n")
     named = any(cause.effect != UNKNOWN for cause in answer.causes)
@@ -85,18 +87,18 @@ def _keep(
         better = adopted(plant, answer, arguments.with_constants)
         if not _error(better, recordings) <= _error(plant, recordings):
             screen.complain(
-                "fdi gap: nothing adopted: the plant with the causes runs further off the recording than the plant "
-                "file as it is; --with-constants also writes the constants that the causes were fitted beside"
+                "fdi gap: nothing adopted: the plant with the causes has a larger free-run error than the plant file; "
+                "--with-constants also writes the constants that were fitted together with the causes"
             )
             return _next_input(plant, answer, folder)
         write_adopted(arguments.plant, plant, better, target, screen)
         constants = (
-            "as fitted beside them" if arguments.with_constants else "as they were (--with-constants: as fitted)"
+            "as fitted with them" if arguments.with_constants else "unchanged (--with-constants writes the fitted ones)"
         )
         screen.note(f"plant file with the causes, its constants {constants}: {target}")
     elif arguments.adopt and arguments.with_constants and answer.verdict == "no_gap":
         write_adopted(arguments.plant, plant, adopted(plant, answer, True), Path(arguments.adopt), screen)
-        screen.note(f"plant file with its constants as fitted, for no cause was found: {arguments.adopt}")
+        screen.note(f"plant file with its fitted constants; no cause was found: {arguments.adopt}")
     elif arguments.adopt:
         screen.complain(f"fdi gap: nothing to adopt: the verdict is {answer.verdict.replace('_', ' ')}")
     return _next_input(plant, answer, folder)
@@ -109,12 +111,12 @@ def _next_input(plant: PlantDescription, answer: Answer, folder: Path) -> Path |
 
 
 def _error(plant: PlantDescription, recordings: Sequence[Recording]) -> float:
-    """Sum of the squared errors of free runs, every sensor in units of the scatter of its readings."""
+    """Sum over sensors of the squared free-run error, in units of the standard deviation of the readings."""
     total = 0.0
     for recording in recordings:
         errors = predict(plant, recording).rmse
         for sensor in plant.sensors:
             column = recording.output_names.index(sensor.column)
-            spread = float(recording.outputs[recording.mask[:, column], column].std())
-            total += (errors[sensor.name] / max(spread, 1e-300)) ** 2
+            std = float(recording.outputs[recording.mask[:, column], column].std())
+            total += (errors[sensor.name] / max(std, 1e-300)) ** 2
     return total

@@ -1,5 +1,5 @@
-"""`fdi gap --refit`: nothing is searched; a plant's own effects and constants are fitted together, and tried on runs
-that were not used.
+"""`fdi gap --refit`: fit a plant's own effects and constants together, without a search, and validate them on other
+runs.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ def run_refit(
 ) -> int:
     hold = [name for name in arguments.hold.split(",") if name]
     vary = [name for name in arguments.vary.split(",") if name]
-    found = refit(plant, recordings, leave_out, arguments.step, hold, arguments.white, vary)
-    _show(found, screen)
-    _show_own(found, screen)
+    fitted = refit(plant, recordings, leave_out, arguments.step, hold, arguments.white, vary)
+    _show(fitted, screen)
+    _show_run_specific(fitted, screen)
     if arguments.adopt:
-        write_adopted(arguments.plant, plant, found.plant, Path(arguments.adopt), screen)
-        screen.note(f"plant file as fitted: {arguments.adopt}")
+        write_adopted(arguments.plant, plant, fitted.plant, Path(arguments.adopt), screen)
+        screen.note(f"plant file with the fitted values: {arguments.adopt}")
     trials: list[Trial] = []
     if arguments.in_turn:
-        with screen.progress("without each file in turn") as advance:
+        with screen.progress("leave-one-file-out validation") as advance:
             trials = in_turn(
                 plant,
                 recordings,
                 holdouts or recordings,
-                lambda rest: refit(plant, rest, leave_out, arguments.step, hold, arguments.white, vary).plant,
+                lambda others: refit(plant, others, leave_out, arguments.step, hold, arguments.white, vary).plant,
                 arguments.start_samples,
                 advance,
                 arguments.settle,
@@ -52,11 +52,11 @@ def run_refit(
     screen.result(
         {
             "format": "fdi_torch.refit/1",
-            "before": dict(found.before),
-            "rmse": dict(found.rmse),
-            "parameters": found.parameters,
-            "fitted": {n: {"value": v, "std": s} for n, (v, s) in found.fitted.items()},
-            "own": found.own,
+            "before": dict(fitted.before),
+            "rmse": dict(fitted.rmse),
+            "parameters": fitted.parameters,
+            "fitted": {n: {"value": v, "std": s} for n, (v, s) in fitted.fitted.items()},
+            "own": fitted.own,
             "in_turn": trials,
         }
     )
@@ -75,11 +75,11 @@ def _show(found: Refit, screen: Screen) -> None:
         unit, scale = display_unit(constants[name].unit)
         rows.append([name, f"{scale * value:.4g}", f"{scale * error:.2g}", "" if unit == "1" else unit])
     screen.table("fitted to all recordings", ("parameter", "value", "std error", "unit"), rows)
-    screen.say(f"{found.parameters} numbers fitted, start levels among them")
+    screen.say(f"{found.parameters} values fitted, including initial levels")
 
 
-def _show_own(found: Refit, screen: Screen) -> None:
-    """What each recording has for itself, and how much it differs from one to the next."""
+def _show_run_specific(found: Refit, screen: Screen) -> None:
+    """Values that differ by recording, and their between-run variation."""
     constants = build_network(found.plant).constants
     rows = []
     for name in dict.fromkeys(own.name for own in found.own):
@@ -88,16 +88,20 @@ def _show_own(found: Refit, screen: Screen) -> None:
         for own in each:
             numbers = [f"{scale * own.value:.4g}", f"{scale * own.std:.2g}", unit]
             rows.append([name, Path(own.source).name, f"{own.start:g}", *numbers])
-        told = spread(each, constants[name].std)
-        if told:
-            interval = f"{scale * told.std:.2g} (95 %: {scale * told.low:.2g} to {scale * told.high:.2g})"
-            rows.append([name, f"mean and spread of {told.count}", "", f"{scale * told.mean:.4g}", interval, unit])
+        variation = spread(each, constants[name].std)
+        if variation:
+            interval = (
+                f"{scale * variation.std:.2g} (95 %: {scale * variation.low:.2g} to {scale * variation.high:.2g})"
+            )
+            mean = f"{scale * variation.mean:.4g}"
+            rows.append([name, f"mean and standard deviation of {variation.count}", "", mean, interval, unit])
     if rows:
-        screen.table("each recording's own", ("parameter", "recording", "from, s", "value", "std error", "unit"), rows)
+        header = ("parameter", "recording", "from, s", "value", "std error", "unit")
+        screen.table("values of each recording", header, rows)
 
 
 def _show_trials(trials: Sequence[Trial], plant: PlantDescription, screen: Screen) -> None:
-    """One line a free run: the plant file as it is, and as refitted without that file."""
+    """One line per free run: error of the plant file, and of the plant refitted without the run's file."""
     header = ["run", "from, s", "to, s"]
     header += [f"{s.name} {of}, {display_unit(s.unit)[0]}" for of in ("as is", "refitted") for s in plant.sensors]
     rows = []
@@ -106,4 +110,4 @@ def _show_trials(trials: Sequence[Trial], plant: PlantDescription, screen: Scree
             f"{display_unit(s.unit)[1] * of[s.name]:.3g}" for of in (trial.as_is, trial.refitted) for s in plant.sensors
         ]
         rows.append([Path(trial.source).name, f"{trial.start:g}", f"{trial.stop:g}", *errors])
-    screen.table("root mean square error of free runs, refitted without the file that the run is of", header, rows)
+    screen.table("root mean square error of free runs; refitted: without the file of the run", header, rows)

@@ -1,4 +1,4 @@
-"""The answer of `fdi gap` as people read it: one sentence, a few short tables with units, and what to do next."""
+"""Text of the answer of `fdi gap`: the verdict, short tables with units, and what to do next."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from fdi_torch.gap.verdict_words import causes_of, explanation_words, probabilit
 from fdi_torch.parameters import display_unit
 
 MOST_ROWS = 5
-LEAST_SHOWN = 1e-4  # of a probability
-MOVED = 2.0  # tolerances by which a constant has to move to be spoken of
+SMALLEST_SHOWN = 1e-4  # probability
+MOVED = 2.0  # tolerances by which a constant must have moved to be shown
 STAGES = {
-    "nominal": "as believed",
+    "nominal": "nominal model",
     "recalibrated": "recalibrated",
     "augmented": "with the causes",
     "ceiling": "with free functions there",
@@ -26,44 +26,46 @@ STAGES = {
 
 
 def show(answer: Answer, screen: Screen) -> None:
-    """Everything but what to do next."""
+    """Print the answer, except for the next steps."""
     as_json = answer.to_dict()
     screen.say(verdict_sentence(as_json))
     _causes(answer, screen)
     _explanations(as_json, screen)
-    rows = [[place, probability_words(p)] for place, p in answer.where[:MOST_ROWS] if p >= LEAST_SHOWN]
+    rows = [[place, probability_words(p)] for place, p in answer.where[:MOST_ROWS] if p >= SMALLEST_SHOWN]
     if rows and answer.verdict != "no_gap":
-        screen.table("where", ("place", "probability that something is wrong there"), rows)
+        screen.table("where", ("location", "probability that the model is wrong there"), rows)
     _disturbances(answer.disturbances, screen)
     if answer.closure:
         _closure(answer.closure, screen)
     _constants(answer.constants, screen)
-    for remark in [*answer.remarks, *_impostors(answer.impostors)]:
+    for remark in [*answer.remarks, *_confusability(answer.impostors)]:
         screen.say(f"- {remark}")
 
 
 def next_steps(
     answer: Answer, has_holdout: bool, library: Sequence[str] | None, planned: Path | None, adopted: str | None
 ) -> list[str]:
-    """What a reader of this answer may do now. planned: the next input; adopted: the plant file, as far as written."""
+    """What to do next. planned: path of the next input; adopted: path of the adopted plant file; None if
+    not written.
+    """
     steps = []
     if planned and answer.next_input:
         samples = answer.next_input.get("parted_after_samples")
         when = f"after some {samples} samples" if samples else "in a longer run"
-        steps.append(f"next: record the input {planned}; the two likeliest explanations should part {when}")
+        steps.append(f"next: record the input {planned}; it should distinguish the two likeliest explanations {when}")
     elif answer.verdict == "ambiguous":
-        steps.append("next: no input within the limits of pumps and levels parts the two likeliest explanations soon")
+        steps.append("next: no input within the limits of pumps and levels soon distinguishes the two explanations")
     if answer.verdict == "unknown" and library is None:
-        steps.append("next: --library all searches further effects; the report draws the discrepancy's shape")
+        steps.append("next: --library all also searches the other effects; the report draws the discrepancy's shape")
     if answer.verdict == "unknown":
         steps.append(
-            "next: --named-only leads past it, to the best that has a name, where several things may be wrong at once; "
-            "--adopt then has something to write, and the next diagnosis tells what is left"
+            "next: --named-only reports the best named effect instead of `unknown`, which helps if several things are "
+            "wrong at once; --adopt can then write it, and the next diagnosis continues from there"
         )
     if any(c.effect != UNKNOWN for c in answer.causes):
-        no_longer = "train and monitor no longer take the gap for a fault"
-        written = f"with {adopted} as their plant, {no_longer}" if adopted else ""
-        steps.append(f"next: {written or f'--adopt FILE writes the plant file with the causes; with it {no_longer}'}")
+        benefit = "train and monitor no longer take the gap for a fault"
+        written = f"with {adopted} as their plant, {benefit}" if adopted else ""
+        steps.append(f"next: {written or f'--adopt FILE writes the plant file with the causes; with it {benefit}'}")
     if not has_holdout and answer.verdict != "no_gap":
         steps.append("next: --holdout FILE, another recording of the same rig, measures how far the gap closes")
     hidden, twins = answer.excitation.get("hidden", []), answer.excitation.get("inseparable", [])
@@ -74,19 +76,19 @@ def next_steps(
     if twins:
         first = " and ".join(f"{c['effect']} at {c['location']}" for c in twins[0]["between"])
         many = f"{len(twins)} pairs of effects, such as {first}" if len(twins) > 1 else first
-        steps.append(f"these inputs cannot tell apart {many}")
+        steps.append(f"these inputs cannot distinguish {many}")
     return steps
 
 
 def show_plan(found: Excitation, screen: Screen) -> int:
-    """What the planned inputs hide and what they cannot tell apart."""
+    """Print which effects the planned inputs do not show and which they cannot distinguish."""
     for name, place in found.hidden:
         screen.say(f"does not show at its typical size: {name} at {place}")
-    for (a, at), (b, there), left in found.twins:
-        screen.say(f"cannot be told apart: {a} at {at} and {b} at {there} ({left:.1f} chi-square units between them)")
+    for (a, at), (b, there), distance in found.twins:
+        screen.say(f"cannot be distinguished: {a} at {at} and {b} at {there} (chi-square distance {distance:.1f})")
     if not found.hidden and not found.twins:
-        screen.say("every effect of the library shows at its typical size and can be told from every other")
-    shown = {f"{place}.{name}": left for (name, place), left in found.shown.items()}
+        screen.say("every effect of the library shows at its typical size and is distinguishable from every other")
+    shown = {f"{place}.{name}": residual for (name, place), residual in found.shown.items()}
     screen.result({"format": "fdi_torch.gap_plan/1", "hidden": found.hidden, "twins": found.twins, "shown": shown})
     return DONE
 
@@ -102,11 +104,11 @@ def _causes(answer: Answer, screen: Screen) -> None:
         screen.table("causes", ("effect", "at", "parameter", "value", "std error", "unit"), rows, left=3)
     for cause in answer.causes:
         if cause.same_as:
-            screen.say(f"- {_listed([(cause.effect, cause.location)])} is the same thing as {_listed(cause.same_as)}")
+            screen.say(f"- {_listed([(cause.effect, cause.location)])} is equivalent to {_listed(cause.same_as)}")
 
 
 def _disturbances(disturbances: Mapping[str, Any], screen: Screen) -> None:
-    """The random flow into each tank beside the likeliest explanation."""
+    """Random flow into each tank, estimated together with the likeliest explanation."""
     rows = []
     for tank, flow in disturbances.items():
         unit, scale = display_unit(flow["unit"])
@@ -114,20 +116,20 @@ def _disturbances(disturbances: Mapping[str, Any], screen: Screen) -> None:
         rows.append([tank, f"{scale * flow['std']:.3g}", unit, f"{time:.3g} s" if time else "none"])
     if rows:
         header = ("into", "standard deviation", "unit", "correlation time")
-        screen.table("random flows, which are no fault", header, rows)
+        screen.table("random disturbance flows, which are no fault", header, rows)
 
 
 def _explanations(answer: Mapping[str, Any], screen: Screen) -> None:
-    weighed = [(explanation_words(causes_of(e)), e["probability"]) for e in answer["posterior"]]
-    rows = [[words, probability_words(p)] for words, p in weighed if p >= LEAST_SHOWN][: MOST_ROWS + 3]
-    if answer["unexamined"] >= LEAST_SHOWN:
+    weighted = [(explanation_words(causes_of(e)), e["probability"]) for e in answer["posterior"]]
+    rows = [[words, probability_words(p)] for words, p in weighted if p >= SMALLEST_SHOWN][: MOST_ROWS + 3]
+    if answer["unexamined"] >= SMALLEST_SHOWN:
         rows.append(["explanations that were not examined", probability_words(answer["unexamined"])])
     if len(rows) > 1:
         screen.table("explanations", ("causes", "probability"), rows)
 
 
 def _closure(closure: Mapping[str, Any], screen: Screen) -> None:
-    """Free-run errors, a row a model and a column a sensor."""
+    """Free-run errors: one row per model, one column per sensor."""
     sensors = list(closure["per_sensor"])
     rows = []
     for stage, name in STAGES.items():
@@ -137,9 +139,9 @@ def _closure(closure: Mapping[str, Any], screen: Screen) -> None:
     header = sensors if len(set(closure["units"].values())) == 1 else [f"{s}, {closure['units'][s]}" for s in sensors]
     screen.table(f"error of free runs on {files}, {closure['unit']}", ("plant", "all", *header), rows)
     if closure["closed"] is None:
-        screen.say("The hold-out's gap is too small, against its standard error, to say how much of it closes.")
+        screen.say("The hold-out's gap is too small, compared with its standard error, to say how much of it closes.")
     elif closure["closed"] < 0.0:
-        screen.say("The gap does not close on data not used for fitting: what was found does not carry over to it.")
+        screen.say("The gap does not close on data not used for fitting: the causes do not carry over to them.")
     else:
         low, high = closure["closed_ci95"]
         between = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"
@@ -151,13 +153,13 @@ def _closure(closure: Mapping[str, Any], screen: Screen) -> None:
         )
     if closure["augmented_with"] and closure["frozen"]["recalibrated"] > 1.5 * closure["augmented"]:
         screen.say(
-            f"With the causes, but the constants as recalibrated without them, the error is "
-            f"{closure['frozen']['recalibrated']:.3g} {closure['unit']}: recalibration had taken up part of the gap."
+            f"With the causes but with the constants recalibrated without them, the error is "
+            f"{closure['frozen']['recalibrated']:.3g} {closure['unit']}: recalibration had absorbed part of the gap."
         )
 
 
 def _constants(constants: Mapping[str, Any], screen: Screen) -> None:
-    """Constants that recalibration moved far out of their tolerance."""
+    """Constants that moved far out of their tolerance."""
     rows = []
     for name, c in constants.items():
         if max(abs(c[stage] - c["nominal"]) for stage in ("recalibrated", "augmented")) > MOVED * c["tolerance"]:
@@ -165,18 +167,18 @@ def _constants(constants: Mapping[str, Any], screen: Screen) -> None:
             numbers = [c["nominal"], c["tolerance"], c["recalibrated"], c["augmented"], c["std"]]
             rows.append([name, *(f"{scale * v:.4g}" for v in numbers[:4]), f"{scale * numbers[4]:.2g}", unit])
     if rows:
-        header = ("constant", "believed", "tolerance", "recalibrated", "with the causes", "std error", "unit")
+        header = ("constant", "nominal", "tolerance", "recalibrated", "with the causes", "std error", "unit")
         screen.table(f"constants more than {MOVED:g} tolerances off", header, rows)
 
 
-def _impostors(impostors: Mapping[str, Any] | None) -> list[str]:
-    """How much the name is worth under this excitation."""
-    told = impostors.get("simulated") if impostors else None
-    if not told:
+def _confusability(impostors: Mapping[str, Any] | None) -> list[str]:
+    """How often another cause would have been given this name under these inputs."""
+    simulated = impostors.get("simulated") if impostors else None
+    if not simulated:
         return []
-    confused, passed, draws = told["confused"], told["passed"], told["draws"]
+    confused, passed, draws = simulated["confused"], simulated["passed"], simulated["draws"]
     return [
-        f"had another of {told['rivals']} causes made a gap of this size, this one would have been named in "
+        f"if another of {simulated['rivals']} causes had made a gap of this size, this one would have been named in "
         f"{confused} of {draws} simulated recordings, and in {passed} if the library lacked the true one (first order)"
     ]
 

@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def write_topic(arguments: argparse.Namespace, screen: Screen) -> None:
-    """The messages of a topic, to a new file or to standard output."""
+    """Write the messages of a topic to a new file or to standard output."""
     log = read_run(arguments.log, salvage=True)
     if arguments.out is None:
         with screen.stream() as stream:
@@ -47,7 +47,7 @@ def write_topic(arguments: argparse.Namespace, screen: Screen) -> None:
 
 
 def show(found: Inspection, screen: Screen) -> None:
-    """One screen: what ran, on what, with which result; topics; health."""
+    """Print run, data, result, topics and integrity of the log."""
     kind = found.about.get("run", {}).get("kind", "")
     screen.say(f"{found.path}: {'a log of fdi ' + kind if kind else 'a foreign MCAP file'}, written by {found.library}")
     for record in RECORDS:
@@ -68,7 +68,7 @@ def show(found: Inspection, screen: Screen) -> None:
     for item in found.attachments.values():
         screen.say(f"attachment {item.name}, {item.size} bytes")
     screen.say()
-    state = "sound: all CRCs, indices and counts agree" if found.health.sound else "not sound"
+    state = "intact: all CRCs, indices and counts agree" if found.health.sound else "damaged"
     screen.say(f"{found.size} bytes, {found.messages} messages in {found.health.chunks} chunks; {state}")
     for sentence in (*found.health.problems, found.advice):
         if sentence:

@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         raise ValueError(f"--out: expected a file that ends in .yaml, got {path}; rename it")
     text = template(arguments.kind, load_plant(arguments.plant), arguments.plant, path.stem)
     if path.exists():
-        raise ValueError(f"{path}: expected a new file, got one that is there; name another by --out")
+        raise ValueError(f"{path}: expected a new file, but it exists; choose another name with --out")
     with named_errors(path), path.open("x", encoding="utf-8") as file:
         file.write(text)
     screen.say(f"{path}; next: {NEXT[arguments.kind].format(path)}")

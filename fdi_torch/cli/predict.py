@@ -34,9 +34,9 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     recordings = [r for name in names for r in _recordings(name, plant, arguments)]
     for note in dict.fromkeys(note for r in recordings for note in r.notes):
         screen.note(note)
-    found = [(recording, _predict(plant, recording, arguments)) for recording in recordings]
+    predictions = [(recording, _predict(plant, recording, arguments)) for recording in recordings]
     first = f"{arguments.start_samples} samples" if arguments.settle is None else f"{arguments.settle:g} s"
-    screen.say(f"free run of {plant.name}, start levels from the first {first}")
+    screen.say(f"free run of {plant.name}, initial levels from the first {first}")
     screen.table(
         "root mean square error" + ("" if arguments.settle is None else f" after the first {arguments.settle:g} s"),
         (
@@ -46,10 +46,10 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             *(f"{s.name}, {display_unit(s.unit)[0] or 'share'}" for s in plant.sensors),
             "start at",
         ),
-        [_row(plant, recording, prediction) for recording, prediction in found],
+        [_row(plant, recording, prediction) for recording, prediction in predictions],
     )
     if arguments.picture:
-        recording, prediction = found[-1]
+        recording, prediction = predictions[-1]
         runs = {plant.name: prediction.readings}
         if arguments.beside:
             other = load_plant(arguments.beside)
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         columns = [sensor.column for sensor in plant.sensors]
         title = f"free run along {Path(recording.source).name}"
         screen.note(f"picture: {save(free_run_figure(recording, columns, runs, title), Path(arguments.picture))}")
-    results = [_result(plant, recording, prediction, arguments) for recording, prediction in found]
+    results = [_result(plant, recording, prediction, arguments) for recording, prediction in predictions]
     screen.result(results[0] if len(results) == 1 else {"format": "fdi_torch.predictions/1", "runs": results})
     return DONE
 
@@ -92,7 +92,7 @@ def _other_name(other: PlantDescription, plant: PlantDescription, arguments: arg
 
 
 def _constants(arguments: argparse.Namespace, plant: PlantDescription) -> dict[str, dict[str, Any]]:
-    """Inputs that were not recorded, as `columns` of a run file has them; a bare number is in SI."""
+    """Inputs that were not recorded, in the form of `columns` of a run file; a number without a unit is SI."""
     units, columns = plant.channel_units(), {}
     for text in arguments.constant:
         name, _, value = (part.strip() for part in text.partition("="))
@@ -113,16 +113,16 @@ def _is_number(text: str) -> bool:
 
 
 def _expect_inputs(name: str, plant: PlantDescription, columns: Collection[str]) -> None:
-    """Every input has to be known. Raises ValueError telling all those that a CSV file lacks, and what to do."""
+    """Raises ValueError with all inputs that a CSV file lacks, and how to supply them."""
     path = find_data(name, Path.cwd())
-    lacking = [c for c in missing_inputs(path, plant) if c not in columns]
-    if lacking:
-        still = " ".join(f"--constant {channel}=0" for channel in lacking)
-        listed = f"recordings: [{{file: {name}, columns: {{{lacking[0]}: {{column: ..., unit: ...}}}}}}]"
+    missing = [c for c in missing_inputs(path, plant) if c not in columns]
+    if missing:
+        constants = " ".join(f"--constant {channel}=0" for channel in missing)
+        mapping = f"recordings: [{{file: {name}, columns: {{{missing[0]}: {{column: ..., unit: ...}}}}}}]"
         raise ValueError(
-            f"{path}: expected a column for {' and '.join(lacking)}, got {', '.join(read_header(path))}; where they "
-            f"stood still, add {still} (--from and --to choose the stretch); a column by another name is mapped in a "
-            f"YAML file: {listed}"
+            f"{path}: expected a column for {' and '.join(missing)}, got {', '.join(read_header(path))}; if they were "
+            f"constant, add {constants} (--from and --to select a part); if a column has another name, map it in a "
+            f"YAML file: {mapping}"
         )
 
 

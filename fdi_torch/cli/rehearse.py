@@ -7,7 +7,7 @@ import argparse
 from fdi_torch.cli.options import live
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.rehearsal import load_rehearsal
-from fdi_torch.jobs.rehearsal import Rehearsed, rehearse
+from fdi_torch.jobs.rehearsal import RehearsalResult, rehearse
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -18,12 +18,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     for table in done.tables:
         screen.table(table.title, table.header, table.rows, left=2)
         screen.say()
-    screen.say(f"{done.computed} of {done.pieces} pieces in {done.seconds:.0f} s; log: {done.log}")
+    screen.say(f"{done.computed} of {done.tasks} tasks in {done.seconds:.0f} s; log: {done.log}")
     screen.result(as_json(done))
     return 0
 
 
-def as_json(done: Rehearsed) -> dict[str, object]:
+def as_json(done: RehearsalResult) -> dict[str, object]:
     tables = [
         {"title": t.title, "rows": [dict(zip(t.header, row, strict=True)) for row in t.rows]} for t in done.tables
     ]

@@ -19,17 +19,17 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
-    """The same again: every event must be the same."""
-    from fdi_torch.jobs.gap_replay import no_longer_done
-    from fdi_torch.jobs.replay import comparable, run_again
+    """Repeat the run unchanged; every event must be the same."""
+    from fdi_torch.jobs.gap_replay import removed_options
+    from fdi_torch.jobs.replay import comparable, repeat_run
 
-    for sentence in no_longer_done(read_run(arguments.log)):
+    for sentence in removed_options(read_run(arguments.log)):
         screen.note(sentence)
     with tempfile.TemporaryDirectory() as folder, screen.progress("replay") as advance:
         target = Path(arguments.out or Path(folder) / "again.mcap")
         done = replay(
             arguments.log,
-            lambda log: run_again(log, target, (), arguments.trial, advance),
+            lambda log: repeat_run(log, target, (), arguments.trial, advance),
             relative=arguments.relative,
             select=comparable(arguments.trial),
         )
@@ -41,16 +41,16 @@ def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
-    """The same data with another choice: a new log, compared with the old one."""
-    from fdi_torch.jobs.gap_replay import no_longer_done
-    from fdi_torch.jobs.replay import run_again
+    """Repeat the run with another setting, and compare the new log with the old one."""
+    from fdi_torch.jobs.gap_replay import removed_options
+    from fdi_torch.jobs.replay import repeat_run
 
-    for sentence in no_longer_done(read_run(arguments.log)):
+    for sentence in removed_options(read_run(arguments.log)):
         screen.note(sentence)
     source = Path(arguments.log)
     target = Path(arguments.out or source.with_name(f"{source.name.removesuffix('.mcap')}.what_if.mcap"))
     with screen.progress("replay") as advance:
-        run_again(read_run(source), target, arguments.set, arguments.trial, advance)
+        repeat_run(read_run(source), target, arguments.set, arguments.trial, advance)
         advance(1.0)
     compared = compare([source, target])
     comparing.show(compared, screen)
@@ -60,13 +60,13 @@ def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def in_words(done: Replay, relative: float) -> list[str]:
-    """The outcome, and what differs first."""
+    """Lines with the outcome and the first difference."""
     lines = [f"{done.outcome}: {done.events} events compared, largest relative difference {done.largest:.3g}"]
     if done.outcome == "within tolerance":
         lines[0] += f" of {relative:g}"
-    for title, found in (("beyond the tolerance", done.first), ("not bit-equal", done.first_inexact)):
-        if found is not None:
-            where = f"event {found.event}, {found.topic} at {found.place}, {found.field}"
-            lines.append(f"first {title}: {where}: {found.logged} became {found.replayed}")
+    for title, difference in (("beyond the tolerance", done.first), ("not bit-equal", done.first_inexact)):
+        if difference is not None:
+            where = f"event {difference.event}, {difference.topic} at {difference.place}, {difference.field}"
+            lines.append(f"first {title}: {where}: {difference.logged} became {difference.replayed}")
     lines += [f"{name} was {then or 'absent'}, is {now or 'absent'}" for name, (then, now) in done.versions.items()]
     return lines

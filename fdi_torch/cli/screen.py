@@ -1,7 +1,7 @@
-"""What a command shows: results on standard output, progress and complaints on standard error.
+"""Output of a command: results on standard output, progress and errors on standard error.
 
-Names, units and messages come out of files that others wrote. All of them go through `_shown`: no markup is read in
-them, and what would command the terminal is spelled out.
+Names, units and messages come from files that others wrote. All of them go through `_shown`: markup in them is not
+interpreted, and terminal control characters are escaped.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from fdi_torch.disk import named_errors
 from fdi_torch.outside import printable, printable_json
 
 SECONDS_BETWEEN_LINES = 2.0
-ENDLESS = 1 << 16  # characters in a line of a pipe or a file
+ENDLESS = 1 << 16  # characters per line of a pipe or a file
 
 
 class Advance(Protocol):
-    """Tells how far a stage is (0 to 1), and one line about it."""
+    """Reports the progress of a stage (0 to 1) and one line about it."""
 
     def __call__(self, share: float, text: str = "") -> None: ...
 
 
 def _shown(text: str) -> Text:
-    """The only way of text onto the terminal."""
+    """Text in the only form in which it is printed to the terminal."""
     return Text(printable(text))
 
 
 class _Results(Console):
-    """Standard output. Who stops reading ends the command, and is no error."""
+    """Standard output. A reader that stops reading ends the command without an error."""
 
     def on_broken_pipe(self) -> None:
         raise
@@ -50,7 +50,7 @@ class _Results(Console):
 
 
 class _Progress(Console):
-    """Standard error. The work goes on though nobody reads of its progress."""
+    """Standard error. The work continues even if nobody reads the progress."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
@@ -58,7 +58,7 @@ class _Progress(Console):
 
 
 class Screen:
-    """json: results as JSON only. quiet: no progress. On a terminal progress is a bar, otherwise plain lines."""
+    """json: print results as JSON only. quiet: no progress. Progress is a bar on a terminal, otherwise plain lines."""
 
     def __init__(self, json: bool = False, quiet: bool = False) -> None:
         self.json = json
@@ -67,14 +67,14 @@ class Screen:
         self._err = _Progress(stderr=True, highlight=False, soft_wrap=True)
 
     def say(self, text: str = "") -> None:
-        """A line of the result; not beside JSON."""
+        """Print a line of the result; not with JSON."""
         if not self.json:
             self._out.print(_shown(text))
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> None:
-        """Rows of words and numbers, the first `left` columns flush left; not beside JSON.
+        """Print a table whose first `left` columns are left-aligned; not with JSON.
 
-        Where a terminal is too narrow words are folded and numbers stay whole; elsewhere lines are as long as they are.
+        On a narrow terminal words are folded and numbers stay whole; elsewhere lines are not folded.
         """
         if self.json:
             return
@@ -89,19 +89,19 @@ class Screen:
         self._out.print(table, soft_wrap=False)
 
     def result(self, data: Any) -> None:
-        """The result as JSON (dataclasses too; what is not finite becomes null), where JSON was asked for."""
+        """Print the result as JSON if requested; dataclasses are allowed, and non-finite numbers become null."""
         if self.json:
             options = orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_DATACLASS | orjson.OPT_SERIALIZE_NUMPY
             try:
                 text = orjson.dumps(data, option=options).decode()
             except orjson.JSONEncodeError as error:
                 raise ValueError(
-                    f"expected results that JSON can hold, got others: {error}; is a path no UTF-8?"
+                    f"expected results that JSON can represent, got others: {error}; is a path not UTF-8?"
                 ) from error
             self.line(text)
 
     def line(self, text: str) -> None:
-        """A line of JSON at once, for results that come one by one; only where JSON was asked for."""
+        """Print a line of JSON immediately, for results that come one by one; only with JSON."""
         if self.json:
             with named_errors("standard output"):
                 sys.stdout.write(printable_json(text) + "\n")
@@ -109,7 +109,7 @@ class Screen:
 
     @contextmanager
     def stream(self) -> Iterator[BinaryIO]:
-        """Standard output for the bytes of a file; on a terminal only what it shows of them."""
+        """Standard output for the bytes of a file; on a terminal, control characters are escaped."""
         with named_errors("standard output"):
             if not sys.stdout.isatty():
                 yield sys.stdout.buffer
@@ -121,17 +121,17 @@ class Screen:
             sys.stdout.flush()
 
     def note(self, text: str) -> None:
-        """A line of progress."""
+        """Print a line of progress."""
         if not self.quiet:
             self._err.print(_shown(text))
 
     def complain(self, text: str) -> None:
-        """What went wrong, also where all else is quiet."""
+        """Print an error, also in quiet mode."""
         self._err.print(_shown(text))
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Advance]:
-        """A bar on a terminal; elsewhere a line at once and then every few seconds."""
+        """A progress bar on a terminal; elsewhere a line at the start and then every few seconds."""
         if self.quiet:
             yield lambda share, text="": None
         elif self._err.is_terminal:

@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def show(result: StudyResult, screen: Screen) -> None:
-    """One table a setting, then the isolation of modes, then where the log is."""
+    """Print a table per setting, the isolation of modes, and the path of the log."""
     single = len(result.summaries) <= 10
     for summary in result.summaries if single else ():
         screen.table(heading(summary), HEADER, [_row(score) for score in summary.scores], left=2)
@@ -34,8 +34,8 @@ def show(result: StudyResult, screen: Screen) -> None:
         screen.table("", header, [_short_row(summary) for summary in result.summaries])
     if result.isolation is not None:
         screen.say(isolation_in_words(result.isolation))
-    pace = f", {1e3 * result.seconds / result.computed:.0f} ms each" if result.computed else ""
-    screen.say(f"{result.computed} trials in {result.seconds:.0f} s{pace}")
+    per_trial = f", {1e3 * result.seconds / result.computed:.0f} ms each" if result.computed else ""
+    screen.say(f"{result.computed} trials in {result.seconds:.0f} s{per_trial}")
     for path in (result.log, *result.pictures):
         screen.say(str(path))
 

@@ -12,7 +12,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.windows import show_windows
 from fdi_torch.config.run import load_run
 from fdi_torch.jobs.train import TrainResult, train
-from fdi_torch.jobs.windows import windows_of
+from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.parameters import display_unit
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts
@@ -22,7 +22,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     job = load_run(arguments.config, overrides(arguments))
     if job.config.estimate.windows is not None:
         with screen.progress(job.name) as advance:
-            found = windows_of(job, advance)
+            found = fit_windows(job, advance)
         show_windows(found, screen)
         return DONE
     with live(arguments, job.name, screen) as listener, screen.progress(job.name) as advance:
@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def show(done: TrainResult, screen: Screen) -> None:
-    """The estimate as a table with units, the diagnosis in words, and where log and pictures are."""
+    """Print the estimate as a table with units, the diagnosis, and the paths of log and pictures."""
     final, diagnosis = done.result.estimate, done.result.diagnosis
     rows = []
     for i, p in enumerate(done.fitting.space):
@@ -60,39 +60,41 @@ def show(done: TrainResult, screen: Screen) -> None:
 
 
 def in_words(done: TrainResult) -> list[str]:
-    """What the diagnosis says, one sentence a line."""
+    """The diagnosis, one sentence per line."""
     diagnosis, final = done.result.diagnosis, done.result.estimate
     recordings = done.fitting.recordings
     lines = not_counted(recordings) + list(dict.fromkeys(s for r in recordings for s in doubts(r, done.fitting.plant)))
     if diagnosis.faults:
-        found = ", ".join(f.name for f in diagnosis.present) or "every suspect is nominal as far as can be told"
-        lines.append(f"{diagnosis.kind}: {found}")
+        present = (
+            ", ".join(f.name for f in diagnosis.present) or "no suspected fault differs significantly from nominal"
+        )
+        lines.append(f"{diagnosis.kind}: {present}")
     for fault in diagnosis.present:
         parts = [f"{fault.value:.4g} instead of {fault.nominal:g}"]
         if fault.flow is not None:
             parts.append(f"{1e6 * fault.flow:.3g} cm^3/s at the mean levels")
         if fault.hole is not None:
-            parts.append(f"as a sharp-edged hole of {1e3 * fault.hole:.3g} mm")
+            parts.append(f"equivalent to a sharp-edged hole of {1e3 * fault.hole:.3g} mm")
         lines.append(f"- {fault.name}: " + ", ".join(parts))
     lines += [f"- {name} lies at the {end} end of its range" for name, end in final.at_bounds.items()]
     lines += [f"- {sentence}" for sentence in final.undetermined]
     if not diagnosis.explained:
         ratio = diagnosis.unexplained_ratio
         lines.append(f"this model does not explain the recording: residuals are {ratio:.2g} times the sensors' noise")
-        lines.append("- next: fdi gap tells where the plant file falls short of it, and by which effect")
+        lines.append("- next: fdi gap finds where and by which effect the plant file deviates from it")
     return lines
 
 
 def not_counted(recordings: Sequence[Recording]) -> list[str]:
-    """What was done to the rows of each file, and what does not count: readings missing or masked, unknown inputs."""
+    """Notes on the rows of each file: what was changed, missing or masked readings, unknown inputs."""
     lines = list(dict.fromkeys(note for r in recordings for note in r.notes))
     for source in dict.fromkeys(r.source for r in recordings):
         masks = [r.mask for r in recordings if r.source == source]
-        missing, all_of_them = sum(int((~mask).sum()) for mask in masks), sum(mask.numel() for mask in masks)
+        missing, total = sum(int((~mask).sum()) for mask in masks), sum(mask.numel() for mask in masks)
         if missing:
-            lines.append(f"{source}: {missing} of {all_of_them} readings are missing or masked and do not count")
+            lines.append(f"{source}: {missing} of {total} readings are missing or masked and do not count")
         if len(masks) > 1:
-            lines.append(f"{source}: an input is unknown now and then; fitted as {len(masks)} stretches without that")
+            lines.append(f"{source}: an input is sometimes unknown; fitted as {len(masks)} segments with known inputs")
     return lines
 
 

@@ -1,22 +1,24 @@
-"""How faults of windows are shown: each window with every suspect's size, then the stretches in which one is there."""
+"""Output of a window-by-window fit: sizes in each window, then the periods in which each fault was present."""
 
 from __future__ import annotations
 
 from fdi_torch.cli.screen import Screen
 from fdi_torch.estimate.stretches import Stretch
 from fdi_torch.estimate.windows import WindowFault
-from fdi_torch.jobs.windows import WindowsResult
+from fdi_torch.jobs.windowed_fit import WindowedFit
 from fdi_torch.parameters import display_unit
 
-TELLING = 10.0  # a standard error of more than so many sizes says nothing
+LARGEST_RELATIVE_ERROR = 10.0  # a size with a larger standard error is not shown as a number
 MARKS = {"absent": "-", "cannot tell": "?"}
 
 
-def show_windows(found: WindowsResult, screen: Screen) -> None:
-    """A line a window, and a line a stretch; sizes without a unit are shares of the reference, flows at mean levels."""
+def show_windows(found: WindowedFit, screen: Screen) -> None:
+    """Print one line per window and per period. Sizes without a unit are relative, flows hold at the mean levels."""
     names = [_name(fault) for fault in found.windows[0].faults] if found.windows else []
     rows = [[f"{w.start:g}", f"{w.stop:g}", *(_cell(fault) for fault in w.faults)] for w in found.windows]
-    screen.table("windows (?: cannot tell, as where a tank is empty)", ["from, s", "to, s", *names], rows, left=0)
+    screen.table(
+        "windows (?: not determined, for example in an empty tank)", ["from, s", "to, s", *names], rows, left=0
+    )
     screen.say()
     rows = []
     for s in found.stretches:
@@ -37,11 +39,11 @@ def show_windows(found: WindowsResult, screen: Screen) -> None:
 
 
 def _size(found: WindowFault | Stretch, beyond: str) -> tuple[str, str]:
-    """Size and standard error in the unit in which people read them; `beyond` before a size that has none."""
+    """Size and standard error in a practical unit; `beyond` and the size without an error if that is too large."""
     _, scale = display_unit(found.unit)
     size, std = scale * found.size, scale * found.std
     shown = f"{size:.3f}" if found.unit == "1" else f"{size:.4g}"
-    return (shown, f"{std:.2g}") if std < TELLING * max(abs(size), 1.0) else (f"{beyond}{shown}", "")
+    return (shown, f"{std:.2g}") if std < LARGEST_RELATIVE_ERROR * max(abs(size), 1.0) else (f"{beyond}{shown}", "")
 
 
 def _name(found: WindowFault | Stretch) -> str:

@@ -17,8 +17,8 @@ from fdi_torch.config.recordings import RecordingConfig
 from fdi_torch.config.run import OutputConfig
 from fdi_torch.config.strict import BenchSeconds, Seconds, Strict
 from fdi_torch.config.understood import understood, values_in
-from fdi_torch.monitor.prepare import GainWish
-from fdi_torch.monitor.settings import MonitorSettings
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_setup import GainSpecification
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
@@ -51,10 +51,10 @@ class ObserverConfig(Strict):
         None, description="by hand: rows of tanks, columns of sensors, m per unit of the reading and sample"
     )
 
-    def wish(self) -> GainWish | None:
+    def wish(self) -> GainSpecification | None:
         if self.time_constant is None and self.gain is None:
             return None
-        return GainWish(self.time_constant, tuple(tuple(row) for row in self.gain or ()))
+        return GainSpecification(self.time_constant, tuple(tuple(row) for row in self.gain or ()))
 
 
 class MonitorConfig(Strict):

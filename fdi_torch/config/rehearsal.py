@@ -20,13 +20,14 @@ from fdi_torch.config.strict import BenchSeconds, Decibel, Share, Strict, quanti
 from fdi_torch.config.understood import understood, values_in
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import Fitting, set_up
-from fdi_torch.monitor.prepare import with_shapes
-from fdi_torch.monitor.rehearsal.false_alarms import FalseAlarmPlan
-from fdi_torch.monitor.rehearsal.faults_found import FaultsFoundPlan
-from fdi_torch.monitor.rehearsal.naming_plan import NamingPlan, moving_commands, moving_set_points
-from fdi_torch.monitor.rehearsal.rivals import RIVALS
-from fdi_torch.monitor.rehearsal.rivals_plan import RivalPlan
-from fdi_torch.monitor.rehearsal.runs import Rig
+from fdi_torch.monitor.monitor_setup import with_shapes
+from fdi_torch.monitor.monte_carlo.detection_plan import DetectionPlan
+from fdi_torch.monitor.monte_carlo.estimator_comparison import ESTIMATOR_NAMES
+from fdi_torch.monitor.monte_carlo.estimator_comparison_plan import EstimatorComparisonPlan
+from fdi_torch.monitor.monte_carlo.false_alarm_plan import FalseAlarmPlan
+from fdi_torch.monitor.monte_carlo.isolation_plan import IsolationPlan
+from fdi_torch.monitor.monte_carlo.level_control import moving_commands, moving_set_points
+from fdi_torch.monitor.monte_carlo.simulated_runs import SimulatedRig
 from fdi_torch.parameters import ParameterSpace, parse_quantity
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -74,7 +75,7 @@ class RivalConfig(Strict):
     sets: int = Field(200, ge=1, description="of faults")
     part: int = Field(50, ge=1, description="sets computed at once")
     snr_db: list[Decibel] = Field([30.0, 10.0], min_length=1, description="signal-to-noise ratios, dB")
-    rivals: list[Literal[RIVALS]] = Field(list(RIVALS), min_length=1, description="who is compared")  # type: ignore[valid-type]
+    rivals: list[Literal[ESTIMATOR_NAMES]] = Field(list(ESTIMATOR_NAMES), min_length=1, description="who is compared")  # type: ignore[valid-type]
     looks: list[int] = Field([30, 60, 100, 150, 200, 300, 400, 600, 800, 1000], description="in samples")
 
 
@@ -93,7 +94,7 @@ class RehearsalConfig(Strict):
     seed: int = Field(0, ge=0, description="of everything drawn at random")
 
 
-Plan = FalseAlarmPlan | FaultsFoundPlan | NamingPlan | RivalPlan
+Plan = FalseAlarmPlan | DetectionPlan | IsolationPlan | EstimatorComparisonPlan
 
 
 @dataclass(frozen=True)
@@ -139,19 +140,19 @@ def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:
         yield FalseAlarmPlan(rigs, f.runs, count(f.lasts), f.calibrations, every, c.seed)
     if (d := c.faults_found) is not None:
         rig, settings = _rig(c, plant, d.faults), d.window.settings()
-        yield FaultsFoundPlan(
+        yield DetectionPlan(
             rig, settings, d.runs, d.named, count(d.lasts), tuple(d.sizes), d.onset, every, c.seed
         )  # fmt: skip
     if (n := c.naming) is not None:
         for loop in n.loops:
             rig, settings = _rig(c, plant, n.faults, None, loop), n.window.settings()
-            yield NamingPlan(
+            yield IsolationPlan(
                 rig, loop, c.detector, settings, n.runs, count(n.lasts), n.onset, n.times, every, c.seed
             )  # fmt: skip
     if (r := c.rivals) is not None:
         expect_room(float(max(r.looks)) * (1 + len(plant.sensors)), f"{max(r.looks):.3g} samples", "look earlier")
         fitting = _fitting(c, plant, r, max(r.looks) + 1)
-        yield RivalPlan(fitting, r.sets, r.part, tuple(r.snr_db), tuple(r.looks), c.seed, tuple(r.rivals))
+        yield EstimatorComparisonPlan(fitting, r.sets, r.part, tuple(r.snr_db), tuple(r.looks), c.seed, tuple(r.rivals))
 
 
 def _inputs(c: RehearsalConfig, plant: PlantDescription) -> torch.Tensor:
@@ -168,7 +169,7 @@ def _rig(
     faults: Iterable[str],
     noise: NoiseConfig | None = None,
     loop: str | None = None,
-) -> Rig:
+) -> SimulatedRig:
     names = with_shapes([full_name(name, plant) for name in faults], plant)
     network, inputs, noise = build_network(plant, placements_for(names)), _inputs(c, plant), noise or NoiseConfig()
     space = ParameterSpace(network.constants[name] for name in names)
@@ -179,7 +180,7 @@ def _rig(
         controller = moving_commands(inputs, c.naming.share if c.naming else 0.0)
     elif loop == "closed":
         controller = moving_set_points(plant, inputs, levels, c.naming.swing if c.naming else 0.0)
-    return Rig(network, space, inputs, levels, std, c.sampling, noise.wander, noise.colour, controller)
+    return SimulatedRig(network, space, inputs, levels, std, c.sampling, noise.wander, noise.colour, controller)
 
 
 def _fitting(c: RehearsalConfig, plant: PlantDescription, r: RivalConfig, samples: int) -> Fitting:

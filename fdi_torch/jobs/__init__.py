@@ -1,1 +1,1 @@
-"""Whole jobs, one a file: what a command asks for is read, computed, logged and drawn. The commands call these."""
+"""The job behind each command: read the input, compute, log and draw."""

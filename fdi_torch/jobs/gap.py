@@ -1,4 +1,4 @@
-"""The gap job: a diagnosis, and everything that a page, a viewer, a replay or a later reader needs, in its log."""
+"""The gap job: a diagnosis, logged with everything that a report page, a viewer or a replay needs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.case import PLAIN, Settings, case_of
 from fdi_torch.gap.diagnose import Tell, solved
-from fdi_torch.jobs.log_paths import STARTS_ANEW
+from fdi_torch.jobs.log_paths import STARTS_OVER
 from fdi_torch.logbook import RunLog
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -30,7 +30,7 @@ def run_gap(
     tell: Tell = lambda share, text: None,
     parent_run_id: str | None = None,
 ) -> Answer:
-    """Diagnoses, and writes the log `path`: recordings first, then what is said on the way, then the answer."""
+    """Diagnose the gap, and write the log `path`: recordings, progress messages and the answer."""
     recordings = (recording,) if isinstance(recording, Recording) else tuple(recording)
     every = (*recordings, *holdouts)
     settings = replace(settings, trusted=settings.trusted or any(r.trusted for r in every))
@@ -46,7 +46,7 @@ def run_gap(
         config=config,
         data=sources,
         parent_run_id=parent_run_id,
-        after_interruption=STARTS_ANEW,
+        after_interruption=STARTS_OVER,
     ) as log:
         for group, each in zip(groups(len(holdouts), len(recordings)), every, strict=True):
             log_recording(log, each, group)
@@ -63,20 +63,20 @@ def run_gap(
 
 
 def groups(holdouts: int, recordings: int = 1) -> tuple[str, ...]:
-    """Names of the recordings in the log: none for the diagnosed one (the first of them), then the hold-outs'."""
+    """Log groups of the recordings: "" for the first diagnosed one, then those of further ones and of the hold-outs."""
     further = (f"recording_{k + 1}" for k in range(1, recordings))
     return ("", *further, *("holdout" if k == 0 else f"holdout_{k + 1}" for k in range(holdouts)))
 
 
 def log_recording(log: RunLog, recording: Recording, group: str) -> None:
-    """On /plant/input and /plant/output, or /plant/GROUP/..."""
+    """Log a recording on /plant/input and /plant/output, or on /plant/GROUP/..."""
     r = recording
     names = (r.input_names, r.output_names, r.input_units, r.output_units)
     log.recording(r.time, r.inputs, r.outputs, *names, mask=r.mask, hold=r.hold, group=group)
 
 
 def log_answer(log: RunLog, answer: Mapping[str, Any], arrays: Mapping[str, Tensor]) -> None:
-    """answer: as JSON. arrays: see the page's predictions."""
+    """Log the answer (as JSON) and its arrays, which the report page draws."""
     for place in answer.get("where", ()):
         log.gap_where(place["location"], place["share"])
     log.gap_verdict(answer)
@@ -86,7 +86,7 @@ def log_answer(log: RunLog, answer: Mapping[str, Any], arrays: Mapping[str, Tens
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Arrays of this size lose more by sharing work than they gain, and sums in another order have other last bits."""
+    """Run torch on one thread: faster for arrays of this size, and sums are reproducible to the last bit."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,4 +1,4 @@
-"""Recordings out of a log, as they were read, so that a run can be done again."""
+"""Recordings restored from a log, to repeat a run."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from fdi_torch.logbook import own_signals
 from fdi_torch.recording import Recording
 
 
-def recording_in(log: LoggedRun, group: str, number: int) -> Recording:
-    """A logged recording, with the name and the fingerprint of the file that it was read from."""
+def logged_recording(log: LoggedRun, group: str, number: int) -> Recording:
+    """A logged recording with name and hash of its original file."""
     signals, about = own_signals(log, group), log.metadata.get("fdi_torch.data", {})
     time, inputs, outputs = (torch.as_tensor(a) for a in (signals.time, signals.inputs, signals.outputs))
     return Recording(

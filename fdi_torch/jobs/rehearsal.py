@@ -1,4 +1,4 @@
-"""A whole rehearsal: pieces computed one after the other, logged as they come, resumed, and put into tables."""
+"""The rehearsal job: Monte Carlo validation of a monitor, task by task, logged and resumable."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from typing import Any
 
 from fdi_torch.config.rehearsal import Rehearsal
 from fdi_torch.jobs.log_paths import RESUMES
-from fdi_torch.jobs.study import carried_over, log_and_earlier
+from fdi_torch.jobs.study import copied_trials, new_and_unfinished_log
 from fdi_torch.logbook import Listener, RunLog
-from fdi_torch.monitor.rehearsal.pieces import Shown
+from fdi_torch.monitor.monte_carlo.tasks import ResultTable
 
 
 @dataclass(frozen=True)
-class Rehearsed:
-    """tables: one a rehearsal. computed: pieces of this run, of `pieces`. seconds: they took. log: where all lies."""
+class RehearsalResult:
+    """tables: one per plan. tasks: number of all tasks; computed: those of this run, which took
+    `seconds` s. log: path.
+    """
 
-    tables: tuple[Shown, ...]
-    pieces: int
+    tables: tuple[ResultTable, ...]
+    tasks: int
     computed: int
     seconds: float
     log: Path
@@ -32,11 +34,11 @@ def rehearse(
     resume: bool = False,
     tell: Callable[[float, str], None] = lambda share, text: None,
     listener: Listener | None = None,
-) -> Rehearsed:
-    """Computes every piece that the log does not hold yet. tell(share, text) is called after each."""
+) -> RehearsalResult:
+    """Compute every task that the log does not have yet. tell(share, text): progress, called before each task."""
     folder = Path(rehearsal.config.output.folder)
-    path, before = log_and_earlier(folder, rehearsal.name, rehearsal.text, resume)
-    pieces = [piece for plan in rehearsal.plans for piece in plan.pieces()]
+    path, before = new_and_unfinished_log(folder, rehearsal.name, rehearsal.text, resume)
+    tasks = [task for plan in rehearsal.plans for task in plan.tasks()]
     seeds = {"seed": rehearsal.config.seed}
     with RunLog(
         path,
@@ -47,25 +49,27 @@ def rehearse(
         listener=listener,
         after_interruption=RESUMES,
     ) as log:
-        known: dict[int, tuple[str, Mapping[str, Any]]] = {
-            n: (done.setting, done.numbers) for n, done in carried_over(log, before).items()
+        results: dict[int, tuple[str, Mapping[str, Any]]] = {
+            n: (done.setting, done.numbers) for n, done in copied_trials(log, before).items()
         }
-        found, started = len(known), time.monotonic()
-        for number, piece in enumerate(pieces):
-            if number not in known:
-                tell(len(known) / len(pieces), piece.group)
-                known[number] = (piece.group, dict(piece.compute()))
+        earlier, started = len(results), time.monotonic()
+        for number, task in enumerate(tasks):
+            if number not in results:
+                tell(len(results) / len(tasks), task.group)
+                results[number] = (task.group, dict(task.compute()))
                 seed = f"{rehearsal.config.seed}/{number}"
-                log.trial(number, known[number][1], group=piece.group, seed=seed, status="done")
+                log.trial(number, results[number][1], group=task.group, seed=seed, status="done")
                 log.flush()
-        tables = tabled(rehearsal, [known[number] for number in sorted(known)])
-        log.result({"tables": [{"title": t.title, "header": t.header, "rows": t.rows, "said": t.said} for t in tables]})
-    return Rehearsed(tables, len(pieces), len(known) - found, time.monotonic() - started, path)
+        tables = result_tables(rehearsal, [results[number] for number in sorted(results)])
+        log.result(
+            {"tables": [{"title": t.title, "header": t.header, "rows": t.rows, "said": t.summary} for t in tables]}
+        )
+    return RehearsalResult(tables, len(tasks), len(results) - earlier, time.monotonic() - started, path)
 
 
-def tabled(rehearsal: Rehearsal, known: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[Shown, ...]:
-    """Every plan's table of what there is."""
+def result_tables(rehearsal: Rehearsal, results: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[ResultTable, ...]:
+    """Result table of each plan."""
     groups: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
-    for group, numbers in known:
+    for group, numbers in results:
         groups[group].append(numbers)
-    return tuple(plan.shown(groups) for plan in rehearsal.plans)
+    return tuple(plan.result_table(groups) for plan in rehearsal.plans)

@@ -1,4 +1,4 @@
-"""A logged run, study or gap diagnosis done again from its own recordings and settings; `fdi replay` calls it."""
+"""Repetition of a logged run from the log's recordings and settings, for `fdi replay`."""
 
 from __future__ import annotations
 
@@ -14,32 +14,29 @@ from fdi_torch.config.run import Run, build_run
 from fdi_torch.config.study import build_study
 from fdi_torch.jobs import monitor as monitor_job
 from fdi_torch.jobs import study as study_job
-from fdi_torch.jobs.arrived import logged_rows, reaching, recording_of, samples_of
-from fdi_torch.jobs.gap_replay import gap_again
-from fdi_torch.jobs.logged_recordings import recording_in
-from fdi_torch.jobs.monitor import Listening
-from fdi_torch.jobs.run_setup import fitting_of, wanted_space
-from fdi_torch.jobs.study import TRIAL, concluded, log_trials
+from fdi_torch.jobs.gap_replay import replay_gap
+from fdi_torch.jobs.logged_monitor import ALARM, LoggedMonitor, MonitorCallbacks
+from fdi_torch.jobs.logged_recordings import logged_recording
+from fdi_torch.jobs.row_buffer import logged_rows, recording_of_rows, rows_until, samples_of_rows
+from fdi_torch.jobs.run_setup import fitting_of, requested_space
+from fdi_torch.jobs.study import TRIAL, log_summary, log_trials
 from fdi_torch.jobs.train import STATE, Tell, estimate_logged, log_recordings, origin_of, state_is_due
 from fdi_torch.logbook import LogError, Message, RunLog, series
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook.replay import Select
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 
-# The data are the log's own: what would make others cannot be changed.
+# A replay uses the log's data, so configuration keys of the data cannot be changed.
 _DATA_KEYS = ("simulate", "recordings")
 
 
-def run_again(
+def repeat_run(
     log: LoggedRun, path: Path, overrides: Iterable[str] = (), trials: Sequence[int] = (), tell: Tell | None = None
 ) -> Path:
-    """Does again what a log of `fdi train`, `fdi study`, `fdi gap` or `fdi monitor` says, into a new log: its child.
+    """Repeat the run of a log of `fdi train`, `fdi study`, `fdi gap` or `fdi monitor`, and log it at `path`.
 
-    Returns the new log's path.
-
-    trials: of a study, only these; by default all that were logged.
-    Raises LogError for other logs, ConfigError for a configuration that cannot be used, ValueError for overrides of
-    the data and for trials that there are not.
+    Returns the new log's path. trials: of a study, only these; by default all logged ones. Raises LogError for other
+    logs, ConfigError for an invalid configuration, ValueError for overrides of the data and for unknown trials.
     """
     about = log.metadata.get("fdi_torch.run", {})
     kind, parent = about.get("kind", ""), about.get("run_id", "")
@@ -47,55 +44,55 @@ def run_again(
     if trials and kind != "study":
         raise ValueError(f"--trial: expected a study's log, got one of fdi {kind}: {log.path}; leave --trial out")
     if kind == "study":
-        study_again(log, path, overrides, trials, tell, parent)
+        replay_study(log, path, overrides, trials, tell, parent)
     elif kind == "gap":
-        gap_again(log, path, overrides, tell, parent)
+        replay_gap(log, path, overrides, tell, parent)
     elif kind == "monitor":
-        watch_again(log, path, overrides, tell, parent)
+        replay_monitor(log, path, overrides, tell, parent)
     elif kind == "train":
-        estimate_again(log, path, overrides, tell, parent)
+        replay_estimate(log, path, overrides, tell, parent)
     else:
         wanted = "fdi train, fdi study, fdi gap or fdi monitor"
         raise LogError(f"{log.path}: expected a log of {wanted}, got one of {kind or 'another program'}")
     return path
 
 
-def estimate_again(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
-    """The estimation, from the recordings in the log."""
-    run = asked_again(log, overrides)
+def replay_estimate(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
+    """Repeat an estimation from the recordings in the log."""
+    run = logged_run(log, overrides)
     if run.config.estimate.windows is not None:
         raise LogError(
-            f"{log.path}: expected a fit of whole recordings, got one window by window, which leaves no events to "
-            "compare; do it again by fdi train"
+            f"{log.path}: expected a fit of whole recordings, got one window by window, which has no events to "
+            "compare; repeat it with fdi train"
         )
-    space, loaded = wanted_space(run), recorded(log, run)
+    space, loaded = requested_space(run), logged_recordings(log, run)
     fitting = fitting_of(run, space, loaded)
     with RunLog(path, "train", **origin_of(run, loaded), parent_run_id=parent) as again:
         log_recordings(again, loaded, logged_truth(log))
         estimate_logged(run, fitting, again, tell)
 
 
-def watch_again(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
-    """The monitor, along the samples in the log."""
+def replay_monitor(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
+    """Repeat a monitor run along the samples in the log."""
     overrides = list(overrides)
     _expect_no_data(overrides, ("recording",))
     run = build_monitor(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
-    listening = Listening(tell, lambda event: None, lambda prepared: None)
+    callbacks = MonitorCallbacks(tell, lambda event: None, lambda prepared: None)
     rows = logged_rows(log, run)
     about = log.metadata.get("fdi_torch.data", {})
     data = [{"path": about["0.path"], "sha256": about.get("0.sha256", "")}] if "0.path" in about else []
     with RunLog(path, "monitor", **monitor_job.origin_of(run, None) | {"data": data}, parent_run_id=parent) as again:
-        watcher = monitor_job.Watcher(run, again, listening)
-        watcher.learn(recording_of(reaching(rows, run.config.fault_free[1]) or rows, run))
-        watcher.take(samples_of(rows, run))
-        watcher.close()
-        again.result({"events": watcher.events, "faults": watcher.faults()})
+        monitor = LoggedMonitor(run, again, callbacks)
+        monitor.learn(recording_of_rows(rows_until(rows, run.config.fault_free[1]) or rows, run))
+        monitor.process(samples_of_rows(rows, run))
+        monitor.close()
+        again.result({"events": monitor.events, "faults": monitor.faults()})
 
 
-def study_again(
+def replay_study(
     log: LoggedRun, path: Path, overrides: Iterable[str], trials: Sequence[int], tell: Tell, parent: str
 ) -> None:
-    """The study's trials; its sums too where every trial is made."""
+    """Repeat trials of a study, and its summary if all trials are repeated."""
     overrides = list(overrides)
     study = build_study(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
     logged = range(study.plan.trials) if overrides else (m.payload["trial"] for m in log.messages([TRIAL]))
@@ -107,20 +104,21 @@ def study_again(
             done |= {trial.number: trial for trial in block}
             tell(len(done) / len(numbers), f"{len(done)} of {len(numbers)} trials")
         if len(done) == study.plan.trials:
-            concluded(study, done, again)
+            log_summary(study, done, again)
 
 
 def comparable(trials: Sequence[int] = ()) -> Select:
-    """Which events of a log and its replay are held against each other: a study's trials by number, then its sums.
+    """Selection of the events of a log that are compared with its replay.
 
-    Of a search's states only those that are logged today: older versions logged more of them.
+    A study's trials are sorted by number, followed by its summary. Search states are compared only where the present
+    version logs them; older versions logged more.
     """
 
     def select(messages: Iterable[Message]) -> Iterator[Message]:
         waiting: list[Message] = []
         for message in messages:
-            if message.topic == monitor_job.ALARM and message.payload.get("event") == "notice":
-                continue  # what came late, or could not be read
+            if message.topic == ALARM and message.payload.get("event") == "notice":
+                continue  # about delays and unreadable rows, which a replay does not have
             if message.topic == STATE and not state_is_due(message.payload["generation"]):
                 continue
             if message.topic != TRIAL:
@@ -135,8 +133,8 @@ def comparable(trials: Sequence[int] = ()) -> Select:
     return select
 
 
-def asked_again(log: LoggedRun, overrides: Iterable[str] = ()) -> Run:
-    """The run as its log describes it, with some values changed."""
+def logged_run(log: LoggedRun, overrides: Iterable[str] = ()) -> Run:
+    """The run as its log describes it, with overrides."""
     overrides = list(overrides)
     _expect_no_data(overrides, _DATA_KEYS)
     return build_run(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
@@ -146,12 +144,13 @@ def _expect_no_data(overrides: Iterable[str], keys: Sequence[str]) -> None:
     for override in overrides:
         if override.split("=")[0].split(".")[0] in keys:
             raise ValueError(
-                f"--set {override}: expected a key other than the data's, got one; use fdi train or fdi monitor"
+                f"--set {override}: expected a key other than those of the data; to change the data, use fdi train or "
+                "fdi monitor"
             )
 
 
-def recorded(log: LoggedRun, run: Run) -> list[LoadedRecording]:
-    """The recordings in a log, with what its configuration says of their start levels."""
+def logged_recordings(log: LoggedRun, run: Run) -> list[LoadedRecording]:
+    """The recordings in a log, with the configured knowledge of their initial levels."""
     topics = dict.fromkeys(m.topic for m in log.messages() if m.topic.startswith("/plant/"))
     groups = [
         topic.removeprefix("/plant").strip("/").removesuffix("output").strip("/")
@@ -160,13 +159,13 @@ def recorded(log: LoggedRun, run: Run) -> list[LoadedRecording]:
     ]
     levels = start_levels(run, len(groups), log.path)
     return [
-        LoadedRecording(recording_in(log, group, k), level)
+        LoadedRecording(logged_recording(log, group, k), level)
         for k, (group, level) in enumerate(zip(groups, levels, strict=True))
     ]
 
 
 def start_levels(run: Run, count: int, path: Path) -> list[Any]:
-    """What is known of the levels at the start of each recording."""
+    """Configured initial levels of each recording."""
     if run.config.simulate is not None:
         return [run.config.simulate.start_levels] * count
     if count != len(run.config.recordings):
@@ -177,6 +176,6 @@ def start_levels(run: Run, count: int, path: Path) -> list[Any]:
 
 
 def logged_truth(log: LoggedRun) -> dict[str, float]:
-    """What was simulated, SI by full name; empty for real data."""
+    """Simulated fault values, SI by full name; empty for real data."""
     truth = series(log, "/plant/truth")
     return {name: float(values[0]) for name, values in truth.items() if name != "t" and len(values)}

@@ -1,4 +1,4 @@
-"""One HTML page of one or more logs, and its pictures."""
+"""The report job: one HTML page for one or more logs, and its pictures as files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Tell = Callable[[float, str], None]
 
 @dataclass(frozen=True, repr=False)
 class Report(Shown):
-    """page: the HTML file. pictures: PNG and SVG files. headlines: what each log says. notes: what is missing."""
+    """page: the HTML file. pictures: PNG and SVG files. headlines: one per log. notes: what could not be shown."""
 
     page: Path
     pictures: tuple[Path, ...]
@@ -34,7 +34,7 @@ class Report(Shown):
         return f"page: {self.page}"
 
     def table(self) -> Table:
-        """A row a log."""
+        """One row per log."""
         return Table({"log": list(self.headlines), "says": list(self.headlines.values())})
 
 
@@ -45,10 +45,10 @@ def report(
     pictures: bool = False,
     tell: Tell = lambda share, text: None,
 ) -> Report:
-    """Writes one page of all that the logs say; of several, with a comparison first.
+    """Write one page for the logs; several logs are also compared.
 
-    out: the page, or the folder for it; by default it lies beside the first log. pictures: whether every picture is
-    written as PNG and SVG too. Raises ValueError where a log cannot be read or the page would not end in .html.
+    out: the page or its folder; by default next to the first log. pictures: also write each picture as PNG and SVG.
+    Raises ValueError if a log cannot be read or the page's name does not end in .html.
     """
     paths = [Path(name) for name in ([logs] if isinstance(logs, str | Path) else logs)]
     target = page_path(paths, None if out is None else str(out))
@@ -58,7 +58,7 @@ def report(
         log = read_run(path, salvage=True)
         reports.append(report_of(gather(log, plant_of(log, notes))))
         tell((k + 1) / (len(paths) + 1), path.name)
-    write_text(target, page(reports, [together(reports)] if len(reports) > 1 else []))
+    write_text(target, page(reports, [comparison_of(reports)] if len(reports) > 1 else []))
     written: list[Path] = []
     for k, each in enumerate(reports if pictures else ()):
         several = f"{k + 1}_" if len(reports) > 1 else ""
@@ -68,8 +68,8 @@ def report(
     return Report(target, tuple(written), headlines, tuple(notes))
 
 
-def together(reports: Sequence[RunReport]) -> Section:
-    """The comparison of all runs; what stands in its way where they cannot be compared."""
+def comparison_of(reports: Sequence[RunReport]) -> Section:
+    """Comparison of all runs, or the reason why they cannot be compared."""
     runs = [report.material for report in reports]
     try:
         return comparison_section(compare([run.run.path for run in runs]), runs)
@@ -78,7 +78,7 @@ def together(reports: Sequence[RunReport]) -> Section:
 
 
 def page_path(logs: list[Path], out: str | None) -> Path:
-    """Where the page goes: never over a log."""
+    """Path of the page; it never overwrites a log."""
     name = logs[0].name.removesuffix(".partial").removesuffix(".mcap") + ("_and_more" if len(logs) > 1 else "")
     if out is None:
         return logs[0].with_name(f"{name}.html")
@@ -91,7 +91,9 @@ def page_path(logs: list[Path], out: str | None) -> Path:
 
 
 def plant_of(log: Run, notes: list[str]) -> PlantDescription | None:
-    """The plant that the log describes; a page can do without, which is noted, and a blind benchmark has many rigs."""
+    """The logged plant. None, with a note, if it cannot be read, and None for a blind benchmark, which
+    has many rigs.
+    """
     if log.metadata.get("fdi_torch.run", {}).get("kind") == "challenge":
         return None
     try:

@@ -1,4 +1,4 @@
-"""From a run file to what a job works on: recordings, the truth where they are simulated, parameters, settings."""
+"""Input of a job from a run file: recordings, simulated truth, parameters to estimate, settings."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from fdi_torch.simulate.record import clean_readings, with_noise
 
 
 def recordings_of(run: Run) -> list[LoadedRecording]:
-    """The recordings that a run file names, without readings that are none, or the one that it asks to simulate."""
+    """The recordings of a run file without unusable readings, or the simulated recording that it asks for."""
     if run.config.simulate is None:
         loaded = load_recordings(run.config.recordings, run.plant, run.base, run.given)
-        parts = [replace(part, recording=_readings_that_count(run, part.recording)) for part in loaded]
+        parts = [replace(part, recording=_usable_readings(run, part.recording)) for part in loaded]
         for part in parts:
             if not bool(part.recording.mask.any()):
                 raise ConfigError([f"{part.recording.source}: expected readings, got none: all are missing or masked"])
@@ -36,26 +36,30 @@ def recordings_of(run: Run) -> list[LoadedRecording]:
     return [LoadedRecording(simulate_recording(run), run.config.simulate.start_levels)]
 
 
-def _readings_that_count(run: Run, recording: Recording) -> Recording:
-    """The recording without those of sensors that are stuck. Raises ValueError for one that is not what it seems, and
-    for a sensor that is stuck throughout where its correlation is asked for, which it has not.
+def _usable_readings(run: Run, recording: Recording) -> Recording:
+    """The recording without readings of stuck sensors.
+
+    Raises ValueError if units, channels or clocks are wrong, and if a sensor is stuck throughout but the objective
+    needs its correlation.
     """
-    found = usable(run.plant, recording)
+    checked = usable(run.plant, recording)
     objectives = run.config.estimate.objective.search, run.config.estimate.objective.refine
-    silent = [s for s in found.stuck if not bool(found.recording.mask[:, s.column_in(recording)].any())]
-    if silent and "correlation" in objectives:
+    stuck_throughout = [s for s in checked.stuck if not bool(checked.recording.mask[:, s.column_in(recording)].any())]
+    if stuck_throughout and "correlation" in objectives:
         raise ValueError(
-            f"{recording.source}: expected readings that vary, but {silent[0].text}; leave the sensor out of the plant "
-            "file, or use the objective 'likelihood'"
+            f"{recording.source}: expected readings that vary, but {stuck_throughout[0].text}; leave the sensor out of "
+            "the plant file, or use the objective 'likelihood'"
         )
-    return found.recording
+    return checked.recording
 
 
 def simulate_recording(run: Run) -> Recording:
-    """The recording that `simulate:` of a run file describes, with its faults and its noise; repeats for a seed."""
+    """Simulate the recording described by `simulate:` of a run file, with faults and noise.
+    Deterministic for a seed.
+    """
     config = run.config.simulate
     if config is None:
-        raise ValueError(f"{run.source}: expected simulate, got none; say what is to be simulated")
+        raise ValueError(f"{run.source}: expected simulate, got none; describe the simulation under that key")
     with told_in(run.source):
         planned = planned_recording(config, run.plant)
         placements = placements_of(config.faults, run.plant)
@@ -72,15 +76,15 @@ def simulate_recording(run: Run) -> Recording:
 
 
 def simulated_truth(run: Run) -> dict[str, float]:
-    """The faults that were simulated, SI by full name; empty for real data."""
+    """Values of the simulated faults, SI by full name; empty for real data."""
     if run.config.simulate is None:
         return {}
     network = build_network(run.plant, placements_of(run.config.simulate.faults, run.plant))
     return parameter_values(run.config.simulate.faults, network.constants, run.plant)
 
 
-def wanted_space(run: Run) -> ParameterSpace:
-    """The parameters that the run file asks for, and the constants to calibrate beside them."""
+def requested_space(run: Run) -> ParameterSpace:
+    """The parameters to estimate, and the constants to calibrate with them."""
     config = run.config.estimate
     if not config.parameters:
         raise ValueError(
@@ -95,7 +99,7 @@ def wanted_space(run: Run) -> ParameterSpace:
 
 
 def usable_device(name: str) -> torch.device:
-    """The device of that name. Raises ValueError where this machine or this torch lacks it."""
+    """The device of that name. Raises ValueError if it is not available."""
     try:
         torch.zeros(1, device=name)
     except (RuntimeError, AssertionError) as error:
@@ -104,12 +108,14 @@ def usable_device(name: str) -> torch.device:
 
 
 def tensors_on(device: torch.device) -> AbstractContextManager[object]:
-    """New tensors are made there. Where they are made anyway this is nothing: torch's context slows every call down."""
+    """Context that creates tensors on a device; empty for the default device, because torch's context
+    slows each call.
+    """
     return nullcontext() if device == torch.get_default_device() else device
 
 
 def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording]) -> Fitting:
-    """These parameters on these recordings, with all tensors on the device that the run file asks for."""
+    """The estimation problem of parameters and recordings, with all tensors on the configured device."""
     device = usable_device(run.config.device)
     recordings = [part.recording.to(device) for part in loaded]
     space = bounded(space, max(float(r.time[-1]) for r in recordings))
@@ -120,7 +126,7 @@ def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording
 
 
 def expect_enough_samples(recordings: Sequence[Recording], space: ParameterSpace) -> None:
-    """Raises ValueError where there are fewer readings than parameters, start levels among them."""
+    """Raises ValueError unless there are more readings than parameters, including initial levels."""
     readings = sum(int(r.mask.sum()) for r in recordings)
     if readings <= len(space):
         source = recordings[0].source
@@ -131,7 +137,7 @@ def expect_enough_samples(recordings: Sequence[Recording], space: ParameterSpace
 
 
 def hybrid_settings(config: EstimationConfig) -> HybridSettings:
-    """The run file's settings in the estimator's own form."""
+    """The run file's settings as settings of the estimator."""
     steps = [None if step == "auto" else float(step) for step in (config.step.search, config.step.refine)]
     return HybridSettings(
         objectives=(config.objective.search, config.objective.refine),

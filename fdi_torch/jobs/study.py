@@ -1,4 +1,4 @@
-"""A whole study: trials computed here or on a cluster, logged as they come, resumed, summed up and drawn."""
+"""The study job: trials computed locally or on a cluster, logged, resumable, summarised and drawn."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.study import Study
-from fdi_torch.jobs.log_paths import RESUMES, free_path, go_on_from
+from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
 from fdi_torch.logbook import Listener, RunLog
-from fdi_torch.logbook.reader import Run as OldLog
+from fdi_torch.logbook.reader import Run as LoggedRun
 from fdi_torch.report.fit_figure import save
 from fdi_torch.report.study_figures import correlation_figure, error_figure
 from fdi_torch.study.cluster import run_on_cluster
@@ -29,7 +29,9 @@ _ENVELOPE = ("t", "trial", "group", "seed", "status")
 
 @dataclass(frozen=True, repr=False)
 class StudyResult(Shown):
-    """summaries: one a setting. isolation: where faults are drawn by mode. seconds: of this run's own trials."""
+    """summaries: one per setting. isolation: if faults are drawn by mode. computed, seconds: trials of this run and
+    their computing time.
+    """
 
     summaries: tuple[Summary, ...]
     isolation: Isolation | None
@@ -45,7 +47,7 @@ class StudyResult(Shown):
         return f"{len(self.trials)} trials in {settings}"
 
     def table(self) -> Table:
-        """A row a setting, estimator and parameter; bias and RMSE in the parameter's SI unit."""
+        """One row per setting, estimator and parameter; bias and RMSE in the parameter's SI unit."""
         names = ("setting", "estimator", "parameter", "bias", "RMSE", "RMSE / bound", "coverage")
         rows = [
             (s.setting, e.estimator, e.parameter, e.bias, e.rmse, _value(e.over_bound), _value(e.coverage))
@@ -66,44 +68,44 @@ def run_study(
     tell: Tell | None = None,
     listener: Listener | None = None,
 ) -> StudyResult:
-    """Computes every trial that the log does not hold yet. tell(share, text) is called after each block.
+    """Compute every trial that the log does not have yet. tell(share, text): progress, called after each block.
 
-    cluster: address of a Dask scheduler, or 'local'; None: this process. listener: hears every message of the log.
+    cluster: address of a Dask scheduler, or 'local'; None: this process. listener: receives every log message.
     """
     tell = tell or (lambda share, text: None)
     output = study.run.config.output
-    path, before = log_and_earlier(Path(output.folder), study.run.name, study.text, resume)
+    path, before = new_and_unfinished_log(Path(output.folder), study.run.name, study.text, resume)
     with RunLog(path, "study", **origin_of(study), listener=listener, after_interruption=RESUMES) as log:
-        trials = carried_over(log, before)
-        found = len(trials)
+        trials = copied_trials(log, before)
+        copied = len(trials)
         started = time.monotonic()
-        for done in computed(study.plan, trials, cluster):
+        for done in computed_trials(study.plan, trials, cluster):
             log_trials(log, study.plan, [trial for trial in done if trial.number not in trials])
             trials |= {trial.number: trial for trial in done if trial.number not in trials}
-            tell(*progress(len(trials), found, study.plan.trials, time.monotonic() - started))
+            tell(*progress(len(trials), copied, study.plan.trials, time.monotonic() - started))
         seconds = time.monotonic() - started
-        summaries, isolation = concluded(study, trials, log)
+        summaries, isolation = log_summary(study, trials, log)
         pictures = draw(study, trials, path)
-    return StudyResult(summaries, isolation, trials, len(trials) - found, seconds, path, pictures)
+    return StudyResult(summaries, isolation, trials, len(trials) - copied, seconds, path, pictures)
 
 
 def origin_of(study: Study) -> dict[str, Any]:
-    """What a log says of where its study comes from."""
+    """Configuration and seed of a study, as its log records them."""
     resolved = study.run.resolved | {"study": study.config.model_dump(mode="json")}
     return {"config_text": study.text, "config": resolved, "seeds": {"seed": study.plan.seed}}
 
 
-def log_and_earlier(folder: Path, name: str, text: str, resume: bool) -> tuple[Path, OldLog | None]:
-    """Where the log is written, and with `resume` what an unfinished run of the same configuration left, if anything.
+def new_and_unfinished_log(folder: Path, name: str, text: str, resume: bool) -> tuple[Path, LoggedRun | None]:
+    """Path of the log to write, and with `resume` the log of an unfinished run of the same configuration, if any.
 
-    Raises ValueError where that run has ended, or had another configuration.
+    Raises ValueError if that run is complete or had another configuration.
     """
-    found = go_on_from(folder, name, text) if resume else None
-    return found or (free_path(folder, name), None)
+    unfinished = find_unfinished(folder, name, text) if resume else None
+    return unfinished or (free_path(folder, name), None)
 
 
-def carried_over(log: RunLog, before: OldLog | None) -> dict[int, Trial]:
-    """The trials of an earlier log, each once, copied into this one."""
+def copied_trials(log: RunLog, before: LoggedRun | None) -> dict[int, Trial]:
+    """The trials of an earlier log, copied into this one without duplicates."""
     trials: dict[int, Trial] = {}
     for message in before.messages([TRIAL]) if before else ():
         fields = message.payload
@@ -114,8 +116,8 @@ def carried_over(log: RunLog, before: OldLog | None) -> dict[int, Trial]:
     return trials
 
 
-def computed(plan: Plan, known: Mapping[int, Trial], cluster: str | None) -> Iterator[list[Trial]]:
-    """Blocks with a trial that is not known yet, as they get done."""
+def computed_trials(plan: Plan, known: Mapping[int, Trial], cluster: str | None) -> Iterator[list[Trial]]:
+    """Compute the blocks with missing trials, and yield the trials of each block when it is done."""
     blocks = [block for block in plan.blocks() if any(number not in known for number in block.numbers)]
     return run_blocks(plan, blocks) if cluster is None else run_on_cluster(plan, blocks, cluster)
 
@@ -128,14 +130,14 @@ def log_trials(log: RunLog, plan: Plan, trials: list[Trial]) -> None:
     log.flush()
 
 
-def progress(done: int, found: int, total: int, seconds: float) -> tuple[float, str]:
-    """How far, and how long it will take at the pace so far."""
-    left = seconds * (total - done) / max(done - found, 1)
-    return done / total, f"{done} of {total} trials, {left:.0f} s left"
+def progress(done: int, copied: int, total: int, seconds: float) -> tuple[float, str]:
+    """Share of completed trials, and a text with the estimated remaining time."""
+    remaining = seconds * (total - done) / max(done - copied, 1)
+    return done / total, f"{done} of {total} trials, {remaining:.0f} s left"
 
 
-def of_setting(plan: Plan, trials: Mapping[int, Trial]) -> Iterator[list[Trial]]:
-    """The trials of each setting in their order."""
+def trials_by_setting(plan: Plan, trials: Mapping[int, Trial]) -> Iterator[list[Trial]]:
+    """The trials of each setting, in order."""
     numbers: dict[int, list[int]] = {}
     for block in plan.blocks():
         numbers.setdefault(block.setting, []).extend(block.numbers)
@@ -143,22 +145,22 @@ def of_setting(plan: Plan, trials: Mapping[int, Trial]) -> Iterator[list[Trial]]
         yield [trials[number] for number in chosen]
 
 
-def summed_up(study: Study, trials: Mapping[int, Trial]) -> Iterator[Summary]:
-    for setting, own in zip(study.plan.settings, of_setting(study.plan, trials), strict=True):
+def summaries_of(study: Study, trials: Mapping[int, Trial]) -> Iterator[Summary]:
+    for setting, own in zip(study.plan.settings, trials_by_setting(study.plan, trials), strict=True):
         yield summarise(study.plan, setting, own, study.config.tolerance)
 
 
-def isolated(study: Study, trials: Mapping[int, Trial]) -> Isolation | None:
-    """Stated against true modes, where the study draws faults by mode and estimates them free of the box."""
+def isolation_of(study: Study, trials: Mapping[int, Trial]) -> Isolation | None:
+    """Isolated modes compared with the true ones; None unless faults are drawn by mode and estimated without bounds."""
     if study.config.faults != "modes" or "free" not in study.config.estimators:
         return None
     ordered = [trials[number] for number in sorted(trials)]
     return isolate(study.plan.fitting.space, ordered, study.run.config.estimate.confidence)
 
 
-def concluded(study: Study, trials: Mapping[int, Trial], log: RunLog) -> tuple[tuple[Summary, ...], Isolation | None]:
-    """What all trials together say, into the log."""
-    summaries, isolation = tuple(summed_up(study, trials)), isolated(study, trials)
+def log_summary(study: Study, trials: Mapping[int, Trial], log: RunLog) -> tuple[tuple[Summary, ...], Isolation | None]:
+    """Summarise all trials, and log the summary."""
+    summaries, isolation = tuple(summaries_of(study, trials)), isolation_of(study, trials)
     for summary in summaries:
         log.summary(summary.setting, summary.trials, summary.numbers())
     if isolation is not None:
@@ -168,10 +170,10 @@ def concluded(study: Study, trials: Mapping[int, Trial], log: RunLog) -> tuple[t
 
 
 def draw(study: Study, trials: Mapping[int, Trial], log: Path) -> tuple[Path, ...]:
-    """Figure 3 and Table 3 of the 2020 paper as distributions, where the study varies the noise of one fault."""
+    """Draw Figure 3 and Table 3 of the 2020 paper as distributions, if the study varies the noise for one fault."""
     if study.config.faults != "simulated" or None in study.config.snr_db:
         return ()
-    groups = list(of_setting(study.plan, trials))
+    groups = list(trials_by_setting(study.plan, trials))
     levels = [float(setting.snr_db or 0.0) for setting in study.plan.settings]
     figures = {"correlation": correlation_figure(levels, [[t.numbers["rho"] for t in own] for own in groups])}
     estimator = next((name for name in ("free", "boxed") if name in study.config.estimators), None)

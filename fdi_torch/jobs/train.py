@@ -1,4 +1,4 @@
-"""The main job: from a run file to a diagnosed fault, logged. `fdi train` calls it."""
+"""The train job: estimate and diagnose the faults of a run file, with a log and pictures, for `fdi train`."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
 from fdi_torch.estimate.levenberg_marquardt import Progress
-from fdi_torch.jobs.log_paths import RESUMES, free_path, left_behind
+from fdi_torch.jobs.log_paths import RESUMES, free_path, unfinished_search
 from fdi_torch.jobs.run_setup import (
     fitting_of,
     hybrid_settings,
     recordings_of,
+    requested_space,
     simulated_truth,
     tensors_on,
     usable_device,
-    wanted_space,
 )
 from fdi_torch.logbook import Listener, RunLog, Trickle, as_array
 from fdi_torch.parameters import ParameterSpace
@@ -40,7 +40,7 @@ GENERATION, ITERATION = "/estimator/de/generation", "/estimator/refine/iteration
 
 @dataclass(frozen=True, repr=False)
 class TrainResult(Shown):
-    """result: the estimate and its diagnosis. truth: the simulated values by name, empty for real data."""
+    """result: estimate and diagnosis. truth: simulated values by name, empty for real data."""
 
     result: HybridResult
     fitting: Fitting
@@ -50,17 +50,17 @@ class TrainResult(Shown):
 
     @property
     def headline(self) -> str:
-        """What the diagnosis says; a model that does not explain the recording first."""
+        """The diagnosis in one sentence; it begins with a warning if the model does not explain the recording."""
         diagnosis = self.result.diagnosis
         names = ", ".join(fault.name for fault in diagnosis.present)
-        found = f"{diagnosis.kind}: {names}" if names else diagnosis.kind
+        text = f"{diagnosis.kind}: {names}" if names else diagnosis.kind
         if diagnosis.explained:
-            return found
+            return text
         ratio = diagnosis.unexplained_ratio
-        return f"the model does not explain the recording (residuals {ratio:.2g} times the noise); {found}"
+        return f"the model does not explain the recording (residuals {ratio:.2g} times the noise); {text}"
 
     def table(self) -> Table:
-        """A row a parameter, SI."""
+        """One row per parameter, SI."""
         final = self.result.estimate
         low, high = final.interval()
         columns: dict[str, Sequence[Any]] = {"parameter": final.names, "unit": final.units}
@@ -73,8 +73,8 @@ class TrainResult(Shown):
 
     def picture(self) -> str:
         """Readings and fit of the first recording, as SVG."""
-        fitted = fit_figure(self.fitting.recordings[0], self.result.predicted[0], self.headline)
-        return str(inline_svg(fitted, self.log.stem, self.headline))
+        figure = fit_figure(self.fitting.recordings[0], self.result.predicted[0], self.headline)
+        return str(inline_svg(figure, self.log.stem, self.headline))
 
     def to_xarray(self, recording: int = 0) -> Any:
         """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
@@ -82,21 +82,20 @@ class TrainResult(Shown):
 
 
 def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Listener | None = None) -> TrainResult:
-    """Loads or simulates, estimates, diagnoses, logs and draws what a run file asks for.
+    """Carry out a run file: load or simulate the recordings, estimate, diagnose, log and draw.
 
-    tell(share, text) is called as work goes on. What was computed before an error or Ctrl-C stays readable in the log.
-    resume: goes on from the last generation that a killed or interrupted run of the same file logged, and ends as it
-    would have.
-    listener: hears every message of the log.
+    tell(share, text): progress. Results before an error or Ctrl-C stay readable in the log. resume: continue from the
+    last generation in the log of a killed or interrupted run of the same file; the result is the same as without the
+    interruption. listener: receives every log message.
     """
     tell = tell or (lambda share, text: None)
-    space = wanted_space(run)
+    space = requested_space(run)
     tell(0.0, "reading" if run.config.recordings else "simulating the recording")
     loaded = recordings_of(run)
     fitting = fitting_of(run, space, loaded)
     truth = simulated_truth(run)
     folder = Path(run.config.output.folder)
-    path, before, search = left_behind(folder, run) if resume else (free_path(folder, run.name), (), None)
+    path, before, search = unfinished_search(folder, run) if resume else (free_path(folder, run.name), (), None)
     with RunLog(path, "train", **origin_of(run, loaded), listener=listener, after_interruption=RESUMES) as log:
         if not log.carry_over(before):
             log_recordings(log, loaded, truth)
@@ -107,9 +106,9 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
 
 
 def estimate_logged(run: Run, fitting: Fitting, log: RunLog, tell: Tell, resume: Search | None = None) -> HybridResult:
-    """The estimate, each of its steps and its result in the log."""
+    """Estimate the parameters, and log each step and the result."""
     settings = hybrid_settings(run.config.estimate)
-    watch = Watch(log, fitting.space, settings, tell)
+    watch = SearchLogger(log, fitting.space, settings, tell)
     with tensors_on(usable_device(run.config.device)):
         result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, resume)
     log_result(log, result, fitting.space)
@@ -117,7 +116,7 @@ def estimate_logged(run: Run, fitting: Fitting, log: RunLog, tell: Tell, resume:
 
 
 def origin_of(run: Run, loaded: Sequence[LoadedRecording]) -> dict[str, Any]:
-    """What a log says of where its run comes from."""
+    """Configuration, seed and data of a run, as its log records them."""
     return {
         "config_text": run.text,
         "config": run.resolved,
@@ -126,8 +125,8 @@ def origin_of(run: Run, loaded: Sequence[LoadedRecording]) -> dict[str, Any]:
     }
 
 
-class Watch:
-    """Logs each generation and iteration as it comes, and tells how far the work is."""
+class SearchLogger:
+    """Logs the generations of the search and the iterations of the refinement, and reports progress."""
 
     def __init__(self, log: RunLog, space: ParameterSpace, settings: HybridSettings, tell: Tell) -> None:
         self.log, self.settings, self.tell = log, settings, tell
@@ -146,20 +145,20 @@ class Watch:
         self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {float(state.cost[0, 0]):.3g}")
 
     def write(self, search: Search) -> None:
-        """Into the log."""
+        """Log a generation."""
         state = search.state
         generation = state.generation
-        kept = generation, state.evaluations, state.cost, state.population  # the rest of a state need not be kept alive
+        kept = generation, state.evaluations, state.cost, state.population  # not the whole state, to free its memory
         if generation < self._next_state and not self.log.due:
             self._keep((self._generation, kept))
             return
         self.log.later(self._generation, kept)
         if state_is_due(generation):
             self.log.population(generation, search.to_dict())
-        self._next_state = next_state(generation)
+        self._next_state = next_logged_generation(generation)
 
     def _generations(self, kept: Sequence[tuple[int, int, Tensor, Tensor]]) -> Iterator[tuple[float, dict[str, Any]]]:
-        """What is logged of each generation, worked out when their messages are written: best first, one problem."""
+        """Log fields of the generations, computed only when their messages are written."""
         costs = as_array(torch.cat([cost for *_, cost, _ in kept], 1))[0]
         start = 0
         for generation, evaluations, cost, population in kept:
@@ -178,17 +177,19 @@ class Watch:
 
     def _iterations(self, steps: Sequence[tuple[int, Progress, int]]) -> Iterator[tuple[float, dict[str, Any]]]:
         for number, progress, k in steps:
-            told = {"problem": int(progress.lanes[k]), "iteration": progress.iteration, "cost": float(progress.cost[k])}
-            told |= {"damping": float(progress.damping[k]), "accepted": bool(progress.accepted[k])}
-            yield number, told | dict(zip(self.names, progress.theta[k].tolist(), strict=True))
+            row = {"problem": int(progress.lanes[k]), "iteration": progress.iteration, "cost": float(progress.cost[k])}
+            row |= {"damping": float(progress.damping[k]), "accepted": bool(progress.accepted[k])}
+            yield number, row | dict(zip(self.names, progress.theta[k].tolist(), strict=True))
 
 
 def state_is_due(generation: int) -> bool:
-    """Is the whole state of the search logged? So often that a resumed run repeats 32 generations or an eighth."""
+    """Whether the complete search state is logged: a resumed run repeats at most 32 generations, or an
+    eighth of all.
+    """
     return generation % _spacing(generation) == 0
 
 
-def next_state(generation: int) -> int:
+def next_logged_generation(generation: int) -> int:
     """The first generation after this one whose state is logged."""
     spacing = _spacing(generation + 1)
     return -(-(generation + 1) // spacing) * spacing
@@ -199,7 +200,7 @@ def _spacing(generation: int) -> int:
 
 
 def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[str, float]) -> None:
-    """Inputs and outputs of every recording, and what was simulated; then to disk."""
+    """Log every recording and the simulated truth, and flush them to disk."""
     for k, part in enumerate(loaded):
         r = part.recording
         log.recording(
@@ -220,7 +221,7 @@ def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[s
 
 
 def log_result(log: RunLog, result: HybridResult, space: ParameterSpace) -> None:
-    """The final estimate and every finding of the diagnosis."""
+    """Log the final estimate and the diagnosis of each fault."""
     final = result.estimate
     log.estimate(
         final.names,
@@ -235,8 +236,8 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace) -> None
     for fault in result.diagnosis.faults:
         location, _, effect = fault.name.partition(".")
         sizes = {"size": fault.value, "size_std": fault.std, "flow": fault.flow, "hole_diameter": fault.hole}
-        known: dict[str, Any] = {name: number for name, number in sizes.items() if number is not None}
-        log.fault(effect, location, fault.present, unit=fault.unit, **known)
+        present: dict[str, Any] = {name: number for name, number in sizes.items() if number is not None}
+        log.fault(effect, location, fault.present, unit=fault.unit, **present)
     several = len(result.predicted) > 1
     log.result_arrays(**{f"predicted_{k + 1}" if several else "predicted": p for k, p in enumerate(result.predicted)})
     log.result(final.to_dict() | {"kind": result.diagnosis.kind, "explained": result.diagnosis.explained})
@@ -245,7 +246,7 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace) -> None
 
 
 def draw(run: Run, fitting: Fitting, result: HybridResult, log: Path) -> tuple[Path, ...]:
-    """One picture a recording, beside the log."""
+    """Draw one picture per recording, next to the log."""
     paths = []
     for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
         suffix = "" if len(fitting.recordings) == 1 else f"_{k + 1}"

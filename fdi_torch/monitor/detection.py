@@ -1,4 +1,4 @@
-"""Detectors on white residuals: fixed threshold, CUSUM and GLR, held to a wished time between false alarms."""
+"""Detectors on white residuals: fixed threshold, CUSUM and GLR, designed for a mean time between false alarms."""
 
 from __future__ import annotations
 
@@ -10,71 +10,78 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.run_length import cusum_run_length, cusum_threshold, fixed_threshold, highest, threshold_of
+from fdi_torch.monitor.run_length import (
+    block_maxima,
+    cusum_run_length,
+    cusum_threshold,
+    fixed_threshold,
+    threshold_from_maxima,
+)
 from fdi_torch.monitor.whitening import Whitening
 
 Chart = Literal["fixed", "cusum", "glr"]
 CHARTS: tuple[Chart, ...] = ("fixed", "cusum", "glr")
 
-# CUSUM's drift: half the shift, in standard deviations of the white residual, that is to be found soonest.
+# CUSUM's drift: half the shift, in standard deviations of the white residual, for which the detection delay is least.
 DRIFT = 0.5
-LONGEST_WINDOW = 200
-MOST_MORE = 3.0
-NEVER = -1
+LONGEST_WINDOW = 200  # samples, of the GLR
+LARGEST_INFLATION = 3.0  # of the false-alarm rate, see `false_alarm_inflation`
+NO_ALARM = -1
 
 
 @dataclass(frozen=True)
 class Detector:
-    """A statistic of white residuals (*batch, S, C) -> (*batch, S), and the threshold it is held against.
+    """A statistic of white residuals (*batch, S, C) -> (*batch, S), and its threshold.
 
-    follow: the same sample by sample, (S, C) and what it remembers of the samples before (None at a start) -> (S,) and
-    what it then remembers; to the last bit the same however many samples come at once.
+    update: the recursive form, (samples (S, C), memory or None at the start) -> (statistic (S,), memory). Its result is
+    identical to the last bit for any division of the samples into calls.
     """
 
     chart: str
     statistic: Callable[[Tensor], Tensor]
     threshold: float
-    follow: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
+    update: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
     def shares(self, white: Tensor) -> Tensor:
-        """The share (C,) of each channel in the statistic at the last sample of white residuals (S, C)."""
-        alone = torch.eye(white.shape[-1], dtype=torch.bool).unsqueeze(1)
-        each = self.statistic(torch.where(alone, white, 0.0))[:, -1].clamp(min=0.0)
+        """Share (C,) of each channel in the statistic at the last sample of white residuals (S, C)."""
+        single = torch.eye(white.shape[-1], dtype=torch.bool).unsqueeze(1)
+        each = self.statistic(torch.where(single, white, 0.0))[:, -1].clamp(min=0.0)
         return each / each.sum().clamp(min=1e-300)
 
     def first_alarm(self, white: Tensor) -> Tensor:
-        """Index of the first sample above the threshold, (*batch); NEVER where there is none."""
+        """Index of the first sample above the threshold, (*batch); NO_ALARM if there is none."""
         above = self.statistic(white) > self.threshold
         first = above.to(torch.int8).argmax(dim=-1)
-        return torch.where(above.any(dim=-1), first, torch.full_like(first, NEVER))
+        return torch.where(above.any(dim=-1), first, torch.full_like(first, NO_ALARM))
 
-    def first_from(self, white: Tensor, since: Tensor) -> tuple[Tensor, Tensor]:
-        """Index of the first alarm at or after sample `since` (*batch), NEVER where there is none, and how many came
-        before it, after each of which the detector starts afresh; both (*batch).
+    def first_alarm_since(self, white: Tensor, since: Tensor) -> tuple[Tensor, Tensor]:
+        """Index of the first alarm at or after sample `since`, and the number of earlier alarms; all (*batch).
+
+        The index is NO_ALARM if there is none. The detector restarts after each alarm.
         """
-        rest = torch.nan_to_num(white, nan=0.0)
-        index = torch.arange(rest.shape[-2], device=rest.device)
+        remaining = torch.nan_to_num(white, nan=0.0)
+        index = torch.arange(remaining.shape[-2], device=remaining.device)
         early = torch.zeros_like(since)
         while True:
-            first = self.first_alarm(rest)
-            before = (first != NEVER) & (first < since)
+            first = self.first_alarm(remaining)
+            before = (first != NO_ALARM) & (first < since)
             if not bool(before.any()):
                 return first, early
             early = early + before
-            seen = before.unsqueeze(-1) & (index <= first.unsqueeze(-1))
-            rest = torch.where(seen.unsqueeze(-1), 0.0, rest)
+            processed = before.unsqueeze(-1) & (index <= first.unsqueeze(-1))
+            remaining = torch.where(processed.unsqueeze(-1), 0.0, remaining)
 
     def alarms(self, white: Tensor) -> Tensor:
-        """(*batch, S), True where an alarm is raised. After each the detector starts afresh with the next sample."""
-        rest = torch.nan_to_num(white, nan=0.0)
-        index = torch.arange(rest.shape[-2], device=rest.device)
-        found = torch.zeros(rest.shape[:-1], dtype=torch.bool, device=rest.device)
+        """(*batch, S), True where an alarm is raised. After each, the detector restarts with the next sample."""
+        remaining = torch.nan_to_num(white, nan=0.0)
+        index = torch.arange(remaining.shape[-2], device=remaining.device)
+        alarms = torch.zeros(remaining.shape[:-1], dtype=torch.bool, device=remaining.device)
         while True:
-            first = self.first_alarm(rest).unsqueeze(-1)
-            if not bool((first != NEVER).any()):
-                return found
-            found = found | (index == first)
-            rest = torch.where((index <= first).unsqueeze(-1), torch.zeros_like(rest), rest)
+            first = self.first_alarm(remaining).unsqueeze(-1)
+            if not bool((first != NO_ALARM).any()):
+                return alarms
+            alarms = alarms | (index == first)
+            remaining = torch.where((index <= first).unsqueeze(-1), torch.zeros_like(remaining), remaining)
 
 
 def make_detector(
@@ -88,87 +95,92 @@ def make_detector(
     learnt: Whitening | None = None,
     peaks: Tensor | None = None,
 ) -> Detector:
-    """A detector whose mean time between false alarms, all channels taken together, is the requested one (s).
+    """A detector with the given mean time between false alarms (s) over all channels together.
 
-    sampling: s between samples. drift: of the CUSUM. window: the longest of the GLR, in samples. learnt: what whitens
-    the residual, known no better than its recording allows: then as many false alarms are expected as asked
-    for in the mean over such recordings. peaks: of the GLR, where they have been simulated. Raises ValueError.
+    sampling: s between samples. drift: of the CUSUM. window: longest window of the GLR, in samples. learnt: whitening
+    estimated from a finite recording; the design then holds on average over such recordings. peaks: simulated block
+    maxima of the GLR, to save repeating the simulation. Raises ValueError.
     """
     run_length = time_between_false_alarms / sampling
     if learnt is not None:
-        run_length *= more_alarms(chart, run_length, channels, drift, learnt)
+        run_length *= false_alarm_inflation(chart, run_length, channels, drift, learnt)
     if chart == "fixed":
         threshold = fixed_threshold(run_length, channels)
-        return Detector(chart, largest, threshold, lambda e, before: (largest(e), e[:0]))
+        return Detector(chart, max_abs, threshold, lambda e, before: (max_abs(e), e[:0]))
     if chart == "cusum":
         if not drift > 0:
             raise ValueError(f"expected a positive drift of the CUSUM, got {drift}")
         threshold = cusum_threshold(run_length, channels, drift)
-        return Detector(chart, lambda e: cusum(e, drift), threshold, lambda e, before: cusum_on(e, drift, before))
+        return Detector(chart, lambda e: cusum(e, drift), threshold, lambda e, before: cusum_update(e, drift, before))
     if chart == "glr":
         lengths = window_lengths(window)
 
         def statistic(white: Tensor) -> Tensor:
             return glr(white, lengths)
 
-        peaks = highest(statistic, channels, generator) if peaks is None else peaks
-        return Detector(chart, statistic, threshold_of(peaks, run_length), lambda e, before: glr_on(e, lengths, before))
+        peaks = block_maxima(statistic, channels, generator) if peaks is None else peaks
+        return Detector(
+            chart, statistic, threshold_from_maxima(peaks, run_length), lambda e, before: glr_update(e, lengths, before)
+        )
     raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
 
 
-def more_alarms(chart: str, run_length: float, channels: int, drift: float, learnt: Whitening) -> float:
-    """How many more false alarms a detector raises in the mean over recordings that its noise may be learnt from.
+def false_alarm_inflation(chart: str, run_length: float, channels: int, drift: float, learnt: Whitening) -> float:
+    """Factor by which the mean false-alarm rate exceeds the design because the noise was estimated.
 
-    Its rate grows as exp(s d) with an error d of ln of the residual's standard deviation, s = 10 to 25, so that an
-    error with the variance v costs a factor exp(s^2 v / 2). Beyond MOST_MORE, which a few hundred samples of coloured
-    noise reach, the mean is that of rare recordings, and no threshold would serve.
+    The rate grows as exp(s d) with the error d of ln of the residual's standard deviation, s = 10 to 25; an error with
+    variance v raises its mean by exp(s^2 v / 2). The factor is limited to LARGEST_INFLATION, which a few hundred
+    samples of correlated noise reach: beyond it the mean is dominated by rare recordings, and no threshold would help.
     """
-    steep, variance = _steepness(chart, run_length, channels, drift, learnt)
+    slope, variance = _log_rate_slope(chart, run_length, channels, drift, learnt)
     if chart == "glr":
-        # The direction of a chance excess is any: E sum u^4 = 3 / (C + 2).
+        # A random excess has any direction u: E sum u^4 = 3 / (C + 2).
         variance = variance * 3.0 / (channels + 2.0)
-    return min(float(torch.exp(0.5 * steep**2 * variance).mean()), MOST_MORE)
+    return min(float(torch.exp(0.5 * slope**2 * variance).mean()), LARGEST_INFLATION)
 
 
-def rate_error(chart: str, run_length: float, channels: int, drift: float, learnt: Whitening) -> float:
-    """Standard error of ln of the rate of false alarms that one such recording leaves: s sqrt(v / C), for the channels
-    err each by itself and their alarms add.
+def log_rate_std(chart: str, run_length: float, channels: int, drift: float, learnt: Whitening) -> float:
+    """Standard error of ln of the false-alarm rate when the noise was learnt from one recording: s sqrt(v / C).
+
+    The channels' errors are independent, and their alarm rates add.
     """
-    steep, variance = _steepness(chart, run_length, channels, drift, learnt)
-    return float(steep * (variance.mean() / channels).sqrt())
+    slope, variance = _log_rate_slope(chart, run_length, channels, drift, learnt)
+    return float(slope * (variance.mean() / channels).sqrt())
 
 
-def _steepness(chart: str, run_length: float, channels: int, drift: float, learnt: Whitening) -> tuple[float, Tensor]:
-    """d ln rate / d ln of the residual's standard deviation, and the variance of the latter's error by channel."""
+def _log_rate_slope(
+    chart: str, run_length: float, channels: int, drift: float, learnt: Whitening
+) -> tuple[float, Tensor]:
+    """d ln(rate) / d ln(standard deviation of the residual), and the variance (C,) of the latter's error."""
     if chart == "fixed":
-        fast = learnt.slow_error.new_full((channels,), learnt.fast_error**2)
-        return fixed_threshold(run_length, channels) ** 2, fast
+        variance = learnt.slow_error.new_full((channels,), learnt.fast_error**2)
+        return fixed_threshold(run_length, channels) ** 2, variance
     if chart == "cusum":
-        threshold, change = cusum_threshold(run_length, channels, drift), 1.01
-        longer = cusum_run_length(threshold, drift) / cusum_run_length(threshold / change, drift / change)
-        return math.log(longer) / math.log(change), learnt.slow_error**2
-    # Of windows of n samples |sum e|^2 / n, chi-square of C channels, exceeds h as exp(-h / 2); h is about that of the
-    # largest of run_length such.
+        threshold, factor = cusum_threshold(run_length, channels, drift), 1.01
+        ratio = cusum_run_length(threshold, drift) / cusum_run_length(threshold / factor, drift / factor)
+        return math.log(ratio) / math.log(factor), learnt.slow_error**2
+    # |sum e|^2 / n over n samples is chi-square with C degrees of freedom and exceeds h with probability about
+    # exp(-h / 2); the threshold h is about the largest of run_length such values.
     return 2.0 * math.log(run_length), learnt.slow_error**2
 
 
-def largest(white: Tensor) -> Tensor:
+def max_abs(white: Tensor) -> Tensor:
     """max over channels of |e|, (*batch, S, C) -> (*batch, S)."""
     return torch.nan_to_num(white, nan=0.0).abs().amax(dim=-1)
 
 
 def cusum(white: Tensor, drift: float) -> Tensor:
-    """The highest of 2 C one-sided sums g = max(0, g +- e - drift) (Page 1954), as a sum less its running minimum.
+    """The largest of 2 C one-sided sums g = max(0, g +- e - drift) (Page 1954), as a sum minus its running minimum.
 
-    A missing reading changes none: a sensor that is read rarely would else never gather what its readings show.
+    A missing reading leaves its sums unchanged; otherwise the drift would reset the sums of a rarely read sensor.
     """
     sums = torch.cumsum(torch.nan_to_num(torch.cat([white, -white], dim=-1) - drift, nan=0.0), dim=-2)
     lowest = torch.cummin(sums, dim=-2).values.clamp(max=0.0)
     return (sums - lowest).amax(dim=-1)
 
 
-def cusum_on(white: Tensor, drift: float, before: Tensor | None) -> tuple[Tensor, Tensor]:
-    """`cusum` of the next samples (S, C); before (2, 2 C): the sums and their minima after the last one."""
+def cusum_update(white: Tensor, drift: float, before: Tensor | None) -> tuple[Tensor, Tensor]:
+    """`cusum` of the next samples (S, C). before (2, 2 C): the sums and their minima after the previous sample."""
     moves = torch.nan_to_num(torch.cat([white, -white], dim=-1) - drift, nan=0.0)
     before = torch.zeros(2, moves.shape[-1], dtype=moves.dtype) if before is None else before
     sums = torch.cumsum(torch.cat([before[:1], moves]), dim=0)
@@ -176,8 +188,8 @@ def cusum_on(white: Tensor, drift: float, before: Tensor | None) -> tuple[Tensor
     return (sums - lowest)[1:].amax(dim=-1), torch.stack([sums[-1], lowest[-1]])
 
 
-def glr_on(white: Tensor, lengths: tuple[int, ...], before: Tensor | None) -> tuple[Tensor, Tensor]:
-    """`glr` of the next samples (S, C); before (N, C): the last N cumulative sums, N the longest window at most."""
+def glr_update(white: Tensor, lengths: tuple[int, ...], before: Tensor | None) -> tuple[Tensor, Tensor]:
+    """`glr` of the next samples (S, C). before (N, C): the last N cumulative sums, N at most the longest window."""
     fresh = torch.nan_to_num(white, nan=0.0)
     before = torch.zeros(1, fresh.shape[-1], dtype=fresh.dtype) if before is None else before
     sums = torch.cat([before[:-1], torch.cumsum(torch.cat([before[-1:], fresh]), dim=0)])
@@ -192,8 +204,9 @@ def glr_on(white: Tensor, lengths: tuple[int, ...], before: Tensor | None) -> tu
 
 
 def glr(white: Tensor, lengths: tuple[int, ...]) -> Tensor:
-    """The largest over windows of the last n samples of |sum e|^2 / n: twice the log likelihood ratio of a changed mean
-    in any channels (Willsky & Jones 1976), n from `lengths`.
+    """The largest |sum e|^2 / n over windows of the last n samples, n from `lengths`.
+
+    It is twice the log-likelihood ratio of a change of the mean in any channels (Willsky & Jones 1976).
     """
     sums = torch.cumsum(torch.nan_to_num(white, nan=0.0), dim=-2)
     best = torch.zeros_like(sums[..., 0])

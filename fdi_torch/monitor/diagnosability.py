@@ -1,4 +1,4 @@
-"""What an experiment can tell at all: which faults show, which can be told apart, how small they may be.
+"""Diagnosability of an experiment: which faults are detectable and isolable, and their smallest sizes.
 
 Definitions 1 to 3 and Theorem 1 of the 2020 paper, from the sensitivities of the readings to the faults.
 """
@@ -17,28 +17,27 @@ from fdi_torch.effects import placements_for
 from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.uncertainty import undetermined_in_words
-from fdi_torch.monitor.structure import structure_of
+from fdi_torch.monitor.structural_analysis import structure_of
 from fdi_torch.plant.description import Pipe, PlantDescription, Tank
 from fdi_torch.recording import Recording
 
-# Signatures whose angle's sine is below this are one and the same.
+# Signatures are identical if the sine of their angle is below this.
 SAME = 1e-6
-ROUNDING = 1e-9  # what is left of a signature after less of it is none
-# A fault whose effect on a reading is this share of its largest effect on any does not show there.
-UNSEEN = 1e-9
+ROUNDING = 1e-9  # a projected signature below this share of the original counts as zero
+CONSTANT = 1e-9  # a reading whose range is below this share of its magnitude is constant
 STEP = 0.25
 
 
 @dataclass(frozen=True)
 class Diagnosability:
-    """Of faults f (names, in units) by sensors c, for one experiment and noise level.
+    """Diagnosability of F faults (names, units) with C sensors, for one experiment and noise level.
 
-    shows (F, C): noise standard deviations, summed over samples in squares, that a unit of the fault adds to a sensor.
-    apart (F, F): sine of the angle between two signatures; 0: inseparable. structurally_apart: the same from structure.
-    rank: how many combinations of faults are determined. std (F): Cramer-Rao bound of all together; infinite where
-    not determined. std_by_correlation: with each channel's gain and offset left open, as a correlation leaves them.
-    smallest_detectable (F): found with the wished rates if its time and kind are known. smallest_isolable (F): told
-    from any single other fault. groups: faults that cannot be told apart, and why.
+    shows (F, C): norm over the samples of the effect of a unit fault on a sensor, in noise standard deviations. apart
+    (F, F): sine of the angle between two signatures; 0: not separable. structurally_apart: structural isolability.
+    rank: number of determined combinations of faults. std (F): Cramer-Rao bound if all are estimated together; infinite
+    if not determined. std_by_correlation: the same if gain and offset of each channel are free, as for a correlation.
+    smallest_detectable (F): size detected with the given error rates if time and kind are known. smallest_isolable (F):
+    size that is distinguished from any other single fault. groups: faults that cannot be distinguished, and why.
     """
 
     faults: tuple[str, ...]
@@ -56,7 +55,7 @@ class Diagnosability:
     remarks: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values; what is infinite is None."""
+        """Plain values for JSON; infinite values become None."""
         return {key: _plain(value) for key, value in asdict(self).items()}
 
 
@@ -72,10 +71,10 @@ def diagnosability(
     miss: float = 0.05,
     step: float = STEP,
 ) -> Diagnosability:
-    """The report for the inputs and sample times of a recording; its readings are not looked at.
+    """Diagnosability for the inputs and sample times of a recording; its readings are not used.
 
     faults: parameters such as 'T1.leak.size'. noise_std (C,) in the sensors' units. at: values at which to linearise,
-    nominal where not named. calibrate: constants that are uncertain too, by their tolerance. Raises ValueError.
+    nominal by default. calibrate: constants that are uncertain by their tolerances. Raises ValueError.
     """
     if not faults:
         raise ValueError("expected at least one fault, got none; name some, such as T1.leak.size")
@@ -87,13 +86,15 @@ def diagnosability(
     scaled = slopes / noise_std[:, None]
     count = len(faults)
     information = scaled.flatten(0, 1).mT @ scaled.flatten(0, 1) + torch.diag(fitting.space.std(theta) ** -2)
-    blind = without_gain_and_offset(scaled, readings)
-    sure = certainty(information)
-    blind_sure = certainty(blind.flatten(0, 1).mT @ blind.flatten(0, 1) + torch.diag(fitting.space.std(theta) ** -2))
-    own = without_constants(scaled, count, fitting.space.std(theta))
-    apart = sines(own)
+    projected = without_gain_and_offset(scaled, readings)
+    joint = certainty(information)
+    correlation_certainty = certainty(
+        projected.flatten(0, 1).mT @ projected.flatten(0, 1) + torch.diag(fitting.space.std(theta) ** -2)
+    )
+    signatures = without_constants(scaled, count, fitting.space.std(theta))
+    apart = sines(signatures)
     reach = NormalDist().inv_cdf(1.0 - 0.5 * false_alarm) + NormalDist().inv_cdf(1.0 - miss)
-    length = torch.linalg.vector_norm(own, dim=0)
+    length = torch.linalg.vector_norm(signatures, dim=0)
     nearest = (apart + torch.eye(count, dtype=apart.dtype)).amin(dim=1) if count > 1 else torch.ones(1)
     structural = structure_of(plant, placements_for(faults)).isolable()
     prefixes = [name.rpartition(".")[0] for name in faults]
@@ -104,45 +105,50 @@ def diagnosability(
         shows=_rows(torch.linalg.vector_norm(scaled[..., :count], dim=0).mT),
         apart=_rows(apart),
         structurally_apart=tuple(tuple(structural[f].get(g, False) for g in prefixes) for f in prefixes),
-        rank=int((torch.linalg.svdvals(own / length.clamp(min=1e-300)) > SAME).sum()),
-        std=tuple(sure.std[:count].tolist()),
-        std_by_correlation=tuple(blind_sure.std[:count].tolist()),
+        rank=int((torch.linalg.svdvals(signatures / length.clamp(min=1e-300)) > SAME).sum()),
+        std=tuple(joint.std[:count].tolist()),
+        std_by_correlation=tuple(correlation_certainty.std[:count].tolist()),
         smallest_detectable=_limits(reach, length, length),
         smallest_isolable=_limits(reach, length * nearest, length),
         groups=tuple(_groups(plant, faults, apart)),
-        remarks=tuple(undetermined_in_words(fitting.space.names, sure)) + _remarks(readings, length, faults),
+        remarks=tuple(undetermined_in_words(fitting.space.names, joint)) + _remarks(readings, length, faults),
     )
 
 
 def without_gain_and_offset(slopes: Tensor, readings: Tensor) -> Tensor:
-    """Slopes (S, C, P) less what a channel's gain and offset could imitate: all that a correlation sees (erratum 6)."""
+    """Sensitivities (S, C, P) projected onto the complement of each channel's gain and offset.
+
+    A correlation objective is sensitive to this part only (erratum 6).
+    """
     projected = []
     for c in range(readings.shape[1]):
         basis = torch.stack([torch.ones_like(readings[:, c]), readings[:, c] - readings[:, c].mean()], dim=1)
         basis = basis / torch.linalg.vector_norm(basis, dim=0).clamp(min=1e-12)
         q = torch.linalg.qr(basis).Q
-        rest = slopes[:, c] - q @ (q.mT @ slopes[:, c])
-        nothing = torch.linalg.vector_norm(rest, dim=0) <= ROUNDING * torch.linalg.vector_norm(slopes[:, c], dim=0)
-        projected.append(torch.where(nothing, 0.0, rest))
+        part = slopes[:, c] - q @ (q.mT @ slopes[:, c])
+        zero = torch.linalg.vector_norm(part, dim=0) <= ROUNDING * torch.linalg.vector_norm(slopes[:, c], dim=0)
+        projected.append(torch.where(zero, 0.0, part))
     return torch.stack(projected, dim=1)
 
 
 def without_constants(scaled: Tensor, faults: int, std: Tensor) -> Tensor:
-    """Signatures (K, F) of the faults in noise standard deviations, less what uncertain constants could imitate."""
+    """Signatures (K, F) of the faults in noise standard deviations, without the part that uncertain
+    constants explain.
+    """
     flat = scaled.flatten(0, 1)
-    own, others = flat[:, :faults], flat[:, faults:]
-    if not others.shape[1]:
-        return own
-    # A prior is one more reading of the constant: rows of 1/std that no fault touches.
+    signatures, constants = flat[:, :faults], flat[:, faults:]
+    if not constants.shape[1]:
+        return signatures
+    # A prior acts as one more reading of the constant: rows of 1/std that no fault affects.
     prior = torch.diag(1.0 / std[faults:])
-    others = torch.cat([others, prior])
-    own = torch.cat([own, own.new_zeros(len(prior), faults)])
-    q = torch.linalg.qr(others).Q
-    return own - q @ (q.mT @ own)
+    constants = torch.cat([constants, prior])
+    signatures = torch.cat([signatures, signatures.new_zeros(len(prior), faults)])
+    q = torch.linalg.qr(constants).Q
+    return signatures - q @ (q.mT @ signatures)
 
 
 def sines(signatures: Tensor) -> Tensor:
-    """Sine of the angle between columns of (K, F), (F, F); small angles keep their digits."""
+    """Sine (F, F) of the angle between columns of (K, F), accurate for small angles too."""
     length = torch.linalg.vector_norm(signatures, dim=0)
     unit = signatures / torch.where(length > 0, length, 1.0)
     rows = []
@@ -154,16 +160,16 @@ def sines(signatures: Tensor) -> Tensor:
 
 
 def _groups(plant: PlantDescription, faults: Sequence[str], apart: Tensor) -> list[str]:
-    """Faults with one signature, each group once, with the reason."""
-    left, sentences = list(range(len(faults))), []
-    while left:
-        first, *others = left
-        twins = [j for j in others if float(apart[first, j]) < SAME]
-        left = [j for j in others if j not in twins]
-        if twins:
-            members = [faults[first], *(faults[j] for j in twins)]
-            sentences.append(f"{' and '.join(members)} cannot be told apart: {_reason(plant, members)}")
-    return sentences
+    """Texts about faults with identical signatures, one for each group."""
+    remaining, texts = list(range(len(faults))), []
+    while remaining:
+        first, *others = remaining
+        identical = [j for j in others if float(apart[first, j]) < SAME]
+        remaining = [j for j in others if j not in identical]
+        if identical:
+            members = [faults[first], *(faults[j] for j in identical)]
+            texts.append(f"{' and '.join(members)} cannot be told apart: {_reason(plant, members)}")
+    return texts
 
 
 def _reason(plant: PlantDescription, members: Sequence[str]) -> str:
@@ -180,18 +186,18 @@ def _reason(plant: PlantDescription, members: Sequence[str]) -> str:
 
 
 def _remarks(readings: Tensor, length: Tensor, faults: Sequence[str]) -> tuple[str, ...]:
-    unseen = [name for name, size in zip(faults, length.tolist(), strict=True) if not size > 0]
-    constant = (readings.amax(0) - readings.amin(0) <= UNSEEN * readings.abs().amax(0)).nonzero().flatten().tolist()
-    remarks = [f"{name} does not show in any reading" for name in unseen]
+    invisible = [name for name, size in zip(faults, length.tolist(), strict=True) if not size > 0]
+    constant = (readings.amax(0) - readings.amin(0) <= CONSTANT * readings.abs().amax(0)).nonzero().flatten().tolist()
+    remarks = [f"{name} does not show in any reading" for name in invisible]
     if constant:
         numbers = ", ".join(str(c + 1) for c in constant)
-        remarks.append(f"without a fault reading {numbers} stands still: its correlation is undefined")
+        remarks.append(f"without a fault reading {numbers} is constant: its correlation is undefined")
     return tuple(remarks)
 
 
 def _limits(reach: float, length: Tensor, whole: Tensor) -> tuple[float, ...]:
-    seen = length > SAME * whole
-    return tuple(torch.where(seen, reach / torch.where(seen, length, 1.0), torch.inf).tolist())
+    nonzero = length > SAME * whole
+    return tuple(torch.where(nonzero, reach / torch.where(nonzero, length, 1.0), torch.inf).tolist())
 
 
 def _rows(table: Tensor) -> tuple[tuple[float, ...], ...]:

@@ -1,4 +1,4 @@
-"""What a monitor says: typed events, and their text. Terminal, page, log and JSON show the same event."""
+"""Events of a monitor, and their text. Terminal, report page, log and JSON show the same event."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from fdi_torch.monitor.states import State
+from fdi_torch.monitor.alarm_state import State
 from fdi_torch.parameters import Parameter, display_unit
 
 Kind = Literal[
@@ -25,15 +25,15 @@ Kind = Literal[
     "notice",
 ]
 FORMAT = "fdi_torch.event/2"
-RIVAL = 0.05  # of the posterior: from here on a headline names an explanation
+SMALLEST_SHARE = 0.05  # headlines name explanations with at least this probability, and sensors with this share
 
 
 @dataclass(frozen=True)
 class Size:
-    """One parameter that an explanation changes. size, std: in `unit`, SI; shown: the same in a person's unit.
+    """One parameter that an explanation changes. size, std: in `unit`, SI; shown: text in a practical unit.
 
-    at_end: whether it ended at an end of its range, so that the true one may lie beyond. rate: of a fault that grows,
-    in `unit` per s.
+    at_end: whether the estimate stopped at an end of its range, so that the true value may lie beyond it. rate: growth
+    of an incipient fault, in `unit` per s.
     """
 
     name: str
@@ -47,8 +47,9 @@ class Size:
 
 @dataclass(frozen=True)
 class Explanation:
-    """One set of changes that may have raised an alarm, and its share of the posterior. Without sizes: nothing changed,
-    the alarm came by chance. onset, onset_std: s. gone: the faults went away.
+    """One possible cause of an alarm. mass: its posterior probability. Without sizes: a false alarm.
+
+    onset, onset_std: s. growing: an incipient fault. gone: the faults recovered.
     """
 
     mass: float
@@ -63,7 +64,7 @@ class Explanation:
         return tuple(s.name for s in self.sizes)
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         if not self.sizes:
             return "chance"
         shown = " + ".join(s.shown for s in self.sizes)
@@ -72,8 +73,10 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Limit:
-    """When a tank overflows or runs dry if nothing changes. time: s from the event, the median; low, high: between
-    which it lies with 90 % probability, infinite where it may never come. chance: that it comes at all.
+    """Forecast of when a tank overflows or runs dry if nothing changes.
+
+    time: median, s from the event; low, high: 90 % interval, infinite if it may never happen. chance: probability that
+    it happens at all.
     """
 
     tank: str
@@ -84,21 +87,21 @@ class Limit:
     chance: float
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         high = f"{self.high:.3g} s" if math.isfinite(self.high) else "never"
         return f"{self.tank} {self.what} in {self.time:.3g} s (90 %: {self.low:.3g} s to {high}) if nothing changes"
 
 
 @dataclass(frozen=True)
 class Event:
-    """time: when it became known, s. text: for people. alarm: the number of the alarm that it is about, 0 for none;
-    state: of that alarm, else of the monitor, after the event.
+    """Event of a monitor.
 
-    explanations: the fewest that hold 95 % of the posterior, likeliest first. shares: of each sensor in the statistic
-    that raised the alarm. limits: what comes if nothing changes. first, last, count: when the alarm was raised first
-    and last, s, and how often. delay: from onset to alarm, s. severity: from the plant file, empty where it says
-    nothing; announced: whether the fault is large enough to be said aloud. believed: every parameter that the monitor
-    then believes off nominal, with its value (SI).
+    time: of the sample that caused it, s. text: for people. alarm: number of the alarm, 0 for none; state: of that
+    alarm, else of the monitor, after the event. explanations: the fewest with 95 % of the posterior, likeliest first.
+    shares: of each sensor in the detector's statistic. limits: forecast of overflow and dry tanks. first, last, count:
+    first and last crossing of the threshold, s, and their number. delay: from onset to alarm, s. severity: urgency from
+    the plant file, or empty. announced: whether the fault is large enough to announce. believed: the parameters that
+    the observer uses with a value other than nominal (SI).
     """
 
     time: float
@@ -153,12 +156,12 @@ class Event:
 
     @property
     def masses(self) -> dict[str, float]:
-        """The probability that each parameter has changed, over the explanations that are told."""
-        found: dict[str, float] = {}
+        """The probability that each parameter has changed, summed over the explanations."""
+        total: dict[str, float] = {}
         for e in self.explanations:
             for name in e.names if not e.gone else ():
-                found[name] = found.get(name, 0.0) + e.mass
-        return found
+                total[name] = total.get(name, 0.0) + e.mass
+        return total
 
     @property
     def growing(self) -> bool:
@@ -166,46 +169,46 @@ class Event:
 
     @property
     def headline(self) -> str:
-        """Every explanation above 5 %, with its share where there are several."""
+        """The explanations above 5 %, with their probabilities if there are several."""
         return headline(self.explanations)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON and logs."""
-        told: dict[str, Any] = _plain(asdict(self))
+        fields: dict[str, Any] = _plain(asdict(self))
         likeliest = {"faults": self.faults, "sizes": self.sizes, "stds": self.stds, "onset": self.onset}
-        return {**told, **_plain({**likeliest, "onset_std": self.onset_std}), "headline": self.headline}
+        return {**fields, **_plain({**likeliest, "onset_std": self.onset_std}), "headline": self.headline}
 
 
 def headline(explanations: Sequence[Explanation]) -> str:
-    told = [e for k, e in enumerate(explanations) if k == 0 or e.mass >= RIVAL]
-    if len(told) == 1:
-        return told[0].words
-    return " or ".join(f"{e.words} ({percent(e.mass)})" for e in told)
+    named = [e for k, e in enumerate(explanations) if k == 0 or e.mass >= SMALLEST_SHARE]
+    if len(named) == 1:
+        return named[0].text
+    return " or ".join(f"{e.text} ({percent_text(e.mass)})" for e in named)
 
 
-def percent(mass: float) -> str:
+def percent_text(mass: float) -> str:
     return "over 99 %" if mass > 0.99 else f"{100.0 * mass:.0f} %" if mass >= 0.01 else "under 1 %"
 
 
-def amount(p: Parameter, size: float, std: float, at_end: bool = False) -> str:
-    """'Q1.pump_offset.offset = 23.1 ± 0.4 cm^3/s', in the unit in which people read it."""
+def amount_text(p: Parameter, size: float, std: float, at_end: bool = False) -> str:
+    """'Q1.pump_offset.offset = 23.1 ± 0.4 cm^3/s', in a practical unit."""
     unit, scale = display_unit(p.unit)
     error = f" ± {scale * std:.2g}" if std > 0.0 and not at_end else ""
     end = ", the end of its range" if at_end else ""
     return f"{p.name} = {scale * size:.4g}{error} {unit}".rstrip() + end
 
 
-def rate_words(p: Parameter, rate: float) -> str:
-    """'1.2 cm per hour', in the time that makes the number readable."""
+def rate_text(p: Parameter, rate: float) -> str:
+    """'1.2 cm per hour', or per day for slow changes."""
     unit, scale = display_unit(p.unit)
     span, name = (3600.0, "hour") if abs(rate) * 86400.0 > abs(p.high - p.low) * 0.01 else (86400.0, "day")
     return f"{scale * rate * span:.3g} {unit} per {name}".replace("  ", " ")
 
 
-def shares_words(shares: Sequence[tuple[str, float]]) -> str:
-    """'h1 81 %, h3 19 %': the sensors that hold most of an alarm."""
-    told = sorted((s for s in shares if s[1] >= RIVAL), key=lambda s: -s[1])
-    return ", ".join(f"{name} {percent(share)}" for name, share in told)
+def shares_text(shares: Sequence[tuple[str, float]]) -> str:
+    """'h1 81 %, h3 19 %': the sensors with the largest shares of an alarm."""
+    largest = sorted((s for s in shares if s[1] >= SMALLEST_SHARE), key=lambda s: -s[1])
+    return ", ".join(f"{name} {percent_text(share)}" for name, share in largest)
 
 
 def _plain(value: Any) -> Any:

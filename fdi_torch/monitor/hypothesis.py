@@ -1,4 +1,4 @@
-"""What may have changed, what a fit made of it, and the posterior over all that was fitted."""
+"""Hypotheses about a change of parameters, their fits, and the posterior over all fitted hypotheses."""
 
 from __future__ import annotations
 
@@ -9,39 +9,12 @@ from torch import Tensor
 
 from fdi_torch.estimate.evidence import posterior
 
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """Which columns of the space change together, and whether at once or little by little.
-
-    shape: those of them that say how (period and phase of an oscillation), not how much. gone: those that only go back
-    to nominal, which leaves nothing of them to be found but when.
-    """
-
-    columns: tuple[int, ...]
-    incipient: bool = False
-    shape: tuple[int, ...] = ()
-    gone: tuple[int, ...] = ()
-
-    @property
-    def free(self) -> list[int]:
-        """The columns whose values are to be found."""
-        return [c for c in self.columns if c not in self.gone]
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """The columns that say how much."""
-        return tuple(c for c in self.columns if c not in self.shape)
-
-    def beside(self, fault: Fault) -> Hypothesis:
-        """With another fault that comes at the same time."""
-        columns, shape = {*self.columns, *fault.columns}, {*self.shape, *fault.shape}
-        return Hypothesis(tuple(sorted(columns)), self.incipient, tuple(sorted(shape)), self.gone)
+SHAPE = ("period", "phase")  # fields that describe how an oscillation looks, not how large it is
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault of the list: the column of its size, and of its period and phase where it swings."""
+    """One fault of the list. size: column of its size. shape: columns of period and phase of an oscillation."""
 
     size: int
     shape: tuple[int, ...] = ()
@@ -51,14 +24,56 @@ class Fault:
         return (self.size, *self.shape)
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A hypothesis fitted: value and std (P,) of its columns (others as believed, 0), onset and its std in s.
+def faults_of(names: Sequence[str]) -> list[Fault]:
+    """Group parameters into faults: period and phase of an oscillation belong to its amplitude."""
+    faults = []
+    for column, name in enumerate(names):
+        effect, _, field = name.rpartition(".")
+        if field not in SHAPE:
+            shape = tuple(names.index(f"{effect}.{s}") for s in SHAPE if f"{effect}.{s}" in names)
+            faults.append(Fault(column, shape))
+    return faults
 
-    evidence: log of its evidence and prior odds over those of "no change", nats. mass: its share of the posterior over
-    everything fitted beside it. misfit: half the sum of squares of the white innovations; readings: what noise leaves
-    of twice that on average; expected: at most, to four standard deviations. at_end: columns whose value ended at an
-    end of their range.
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A set of parameters that change together at one onset.
+
+    columns: of the parameter space. incipient: whether they grow linearly from the onset instead of changing at once.
+    shape: those of the columns that are period or phase. recovered: those that return to nominal, so that only the
+    onset is estimated.
+    """
+
+    columns: tuple[int, ...]
+    incipient: bool = False
+    shape: tuple[int, ...] = ()
+    recovered: tuple[int, ...] = ()
+
+    @property
+    def free(self) -> list[int]:
+        """The columns whose values are estimated."""
+        return [c for c in self.columns if c not in self.recovered]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The columns that are sizes of faults."""
+        return tuple(c for c in self.columns if c not in self.shape)
+
+    def with_fault(self, fault: Fault) -> Hypothesis:
+        """The same with a further fault at the same onset."""
+        columns, shape = {*self.columns, *fault.columns}, {*self.shape, *fault.shape}
+        return Hypothesis(tuple(sorted(columns)), self.incipient, tuple(sorted(shape)), self.recovered)
+
+
+@dataclass(frozen=True)
+class HypothesisFit:
+    """A fitted hypothesis.
+
+    value, std (P,): all parameters after the change, and standard deviations of the hypothesis' own (0 elsewhere).
+    onset, onset_std: s. evidence: log of evidence times prior odds, relative to "no change", nats. misfit: half the sum
+    of squares of the white innovations. noise_level: twice the misfit that noise alone gives on average; noise_limit:
+    its upper limit, four standard deviations above. at_bound: columns whose estimate stopped at an end of its range.
+    probability: of the posterior over all hypotheses fitted together.
     """
 
     hypothesis: Hypothesis
@@ -68,74 +83,76 @@ class Finding:
     onset_std: float
     evidence: float
     misfit: float
-    readings: float
-    expected: float
-    at_end: tuple[int, ...] = ()
-    mass: float = 1.0
+    noise_level: float
+    noise_limit: float
+    at_bound: tuple[int, ...] = ()
+    probability: float = 1.0
 
     @property
     def fits(self) -> bool:
-        """Whether the white innovations are no larger than noise, and no value has run into the end of its range."""
-        return 2.0 * self.misfit <= self.expected and not self.at_end
+        """Whether the innovations are no larger than noise and no estimate stopped at an end of its range."""
+        return 2.0 * self.misfit <= self.noise_limit and not self.at_bound
 
     @property
-    def rest(self) -> float:
-        """What it leaves, as a multiple of noise; 1 where that is noise."""
-        return max(2.0 * self.misfit / self.readings, 1.0) if 2.0 * self.misfit > self.expected else 1.0
+    def misfit_ratio(self) -> float:
+        """Misfit over that of noise; 1 if noise can explain it."""
+        return max(2.0 * self.misfit / self.noise_level, 1.0) if 2.0 * self.misfit > self.noise_limit else 1.0
 
 
-NOTHING = Hypothesis(())
+NO_CHANGE = Hypothesis(())
 
 
-def ranked(found: Sequence[Finding]) -> list[Finding]:
-    """With their masses, likeliest first.
+def with_posterior(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
+    """The fits with their posterior probabilities, likeliest first.
 
-    Where even the closest explanation leaves more than noise, the laws themselves are off, and what one says for or
-    against another counts for less by the share of that rest: a quasi-likelihood (McCullagh and Nelder, 1989,
-    "Generalized linear models", chapter 9).
+    If even the closest fit leaves more than noise, the model is inexact. Then differences of misfit are divided by the
+    excess ratio, and standard deviations are widened by its square root: a quasi-likelihood (McCullagh and Nelder,
+    1989, "Generalized linear models", chapter 9).
     """
-    closest = min(found, key=lambda finding: finding.misfit)
-    excess, widened = closest.rest, closest.rest**0.5
+    closest = min(fits, key=lambda fit: fit.misfit)
+    excess, widening = closest.misfit_ratio, closest.misfit_ratio**0.5
     if excess > 1.0:
-        found = [
+        fits = [
             replace(
                 f,
-                std=f.std * widened,
-                onset_std=f.onset_std * widened,
+                std=f.std * widening,
+                onset_std=f.onset_std * widening,
                 evidence=f.evidence + (f.misfit - closest.misfit) * (1.0 - 1.0 / excess),
             )
-            for f in found
+            for f in fits
         ]
-    masses = posterior([f.evidence for f in found])
-    weighed = [replace(f, mass=mass) for f, mass in zip(found, masses, strict=True)]
-    return sorted(weighed, key=lambda finding: -finding.mass)
+    probabilities = posterior([f.evidence for f in fits])
+    weighted = [replace(f, probability=p) for f, p in zip(fits, probabilities, strict=True)]
+    return sorted(weighted, key=lambda fit: -fit.probability)
 
 
-def distinct(found: Sequence[Finding]) -> list[Finding]:
-    """One finding for each set of parameters that change, with the mass of all of them: whether a fault came at once or
-    little by little is no other explanation. Likeliest first.
+def merged(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
+    """One fit for each set of changed parameters, with the summed probability, likeliest first.
+
+    Sudden and incipient changes of the same parameters count as one explanation.
     """
-    groups: dict[tuple[tuple[int, ...], tuple[int, ...]], Finding] = {}
-    for f in sorted(found, key=lambda finding: -finding.mass):
-        key = f.hypothesis.columns, f.hypothesis.gone
-        groups[key] = replace(groups[key], mass=groups[key].mass + f.mass) if key in groups else f
-    return sorted(groups.values(), key=lambda finding: -finding.mass)
+    groups: dict[tuple[tuple[int, ...], tuple[int, ...]], HypothesisFit] = {}
+    for f in sorted(fits, key=lambda fit: -fit.probability):
+        key = f.hypothesis.columns, f.hypothesis.recovered
+        groups[key] = replace(groups[key], probability=groups[key].probability + f.probability) if key in groups else f
+    return sorted(groups.values(), key=lambda fit: -fit.probability)
 
 
-def content(found: Sequence[Finding], level: float = 0.95) -> list[Finding]:
-    """The fewest of distinct findings that hold so much of the posterior, and every exact twin of one of them: a set
-    of as many faults that leaves the same misfit.
+def credible_set(fits: Sequence[HypothesisFit], level: float = 0.95) -> list[HypothesisFit]:
+    """The fewest fits, likeliest first, that together have `level` of the probability.
+
+    Fits that no reading can distinguish from one of these are included as well.
     """
-    held = 0.0
-    kept: list[Finding] = []
-    for f in found:
-        if held >= level and not any(_twins(f, k) for k in kept):
+    total = 0.0
+    chosen: list[HypothesisFit] = []
+    for f in fits:
+        if total >= level and not any(_indistinguishable(f, c) for c in chosen):
             continue
-        kept.append(f)
-        held += f.mass
-    return kept
+        chosen.append(f)
+        total += f.probability
+    return chosen
 
 
-def _twins(a: Finding, b: Finding) -> bool:
-    """Whether no reading can tell the two apart; differences of a hundredth of a nat are those of unfinished fits."""
+def _indistinguishable(a: HypothesisFit, b: HypothesisFit) -> bool:
+    """Same number of faults and same misfit, up to 0.01 nat of incomplete convergence."""
     return len(a.hypothesis.sizes) == len(b.hypothesis.sizes) > 0 and abs(a.misfit - b.misfit) < 0.01

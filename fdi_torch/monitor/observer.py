@@ -1,4 +1,4 @@
-"""The Luenberger-like observer with nominal parameters and its residual, y - y_hat (2020 paper, eq. 14)."""
+"""The Luenberger-like observer with fixed parameters and its residual, y - y_hat (2020 paper, eq. 14)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.gain import Gain
-from fdi_torch.monitor.running import run_lanes
+from fdi_torch.monitor.observer_gain import Gain
+from fdi_torch.monitor.observer_run import run_observers
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
@@ -16,16 +16,18 @@ from fdi_torch.plant.behind import levels_behind
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.pace import length_scale
 
-FIRST_SAMPLES = 100  # among which a sensor that is read rarely tells its level at the start
-MOVED = 1e-5  # in units of the plant's length scale: an error of the start levels, to see whether it decays
-SHRUNK, GROWN = 1e-4, 1e3  # of it: far above rounding, and still small
+FIRST_SAMPLES = 100  # samples in which the first reading of a rarely read sensor gives its initial level
+LEVEL_OFFSET = 1e-5  # small change of the levels, in units of the plant's length scale
+DECAYED, DIVERGED = 1e-4, 1e3  # shares of that change at which the stability check stops
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What an observer saw: state (*batch, S, tanks + M) after each correction, levels in m and then what actuators and
-    sensors remember; residual (*batch, S, sensors) = reading less prediction, NaN where a reading is missing; and
-    inflation (S, *batch or 1, sensors), see `Gain`.
+    """States and residuals of an observer.
+
+    state (*batch, S, tanks + M) after each correction: levels in m, then the memory of actuators and sensors. residual
+    (*batch, S, sensors): reading minus prediction, NaN where a reading is missing. inflation (S, *batch or 1, sensors):
+    see `Gain`.
     """
 
     time: Tensor
@@ -41,7 +43,7 @@ class Observation:
 
     @property
     def steady_residual(self) -> Tensor:
-        """The residual with its first samples brought to the spread of the later ones."""
+        """The residual with its first samples scaled to the steady variance."""
         return self.residual / self.inflation
 
     def last(self, count: int) -> Observation:
@@ -56,9 +58,9 @@ class Observation:
 
 
 class Observer:
-    """x_hat' = f(x_hat, u; theta) + K (y - y_hat), sample by sample: predict exactly, then correct by L (y - y_hat).
+    """x_hat' = f(x_hat, u; theta) + K (y - y_hat): predict over each interval, then correct by L (y - y_hat).
 
-    theta (*batch, P) are values of `space`; what is not in it is nominal. A level is never corrected below zero.
+    theta (*batch, P): values of `space`; all other constants are nominal. Levels are never corrected below zero.
     """
 
     def __init__(
@@ -70,24 +72,24 @@ class Observer:
         longest_step: float | None = None,
     ) -> None:
         self.stepper, self.gain = Stepper(network, longest_step), gain
-        self.values = bound(network, space, theta)
+        self.values = bind_parameters(network, space, theta)
         self.space = space or ParameterSpace()
         self.theta = network.nominal.new_zeros(0) if theta is None else theta
         self._expect_shape(network)
 
     def run(self, samples: Samples, levels: Tensor | None = None) -> Observation:
-        """Along whole recordings. levels (*batch, tanks): before the first correction; the first readings' if None."""
+        """Run along recordings. levels (*batch, tanks): initial levels; from the first readings if None."""
         network = self.stepper.network
         lanes = self._lanes(samples)
         if levels is None:
-            levels = first_levels(network, samples, self.values)
+            levels = initial_levels(network, samples, self.values)
         if samples.inputs.dim() > 2:
             return self._one_by_one(samples, levels.expand(*lanes, -1))
         flat = lanes.numel()
         readings = samples.readings
         if samples.batch:
             readings = readings.expand(*lanes, *readings.shape[-2:]).reshape(flat, *readings.shape[-2:])
-        ran = run_lanes(
+        ran = run_observers(
             network,
             self.space,
             self.theta.expand(*lanes, -1).reshape(flat, -1),
@@ -102,7 +104,7 @@ class Observer:
         return Observation(samples.time, state, residual, self.gain.spread(0, len(samples)), levels.shape[-1])
 
     def _one_by_one(self, samples: Samples, levels: Tensor) -> Observation:
-        """Recordings each under inputs of its own."""
+        """Run recordings with different inputs one after the other."""
         rows = range(levels.shape[0])
         seen = [
             self.run(Samples(samples.time, samples.inputs[i], samples.readings[i], samples.hold), levels[i])
@@ -112,7 +114,7 @@ class Observer:
         return Observation(samples.time, state, residual, seen[0].inflation, seen[0].tanks)
 
     def _gains(self, count: int, lanes: torch.Size) -> Tensor:
-        """(S, tanks, sensors), or one such table for each lane."""
+        """Gains (S, tanks, sensors), or (L, S, tanks, sensors) if they differ by batch member."""
         table = self.gain.table(0, count)
         if table.dim() == 3:
             return table
@@ -121,19 +123,19 @@ class Observer:
         )
 
     def check_stable(self, samples: Samples) -> float:
-        """How far an error of the start levels has shrunk a sample later, in the (geometric) mean along samples.
+        """Decay factor of an initial error per sample, geometric mean.
 
-        From two runs along the same readings, whose difference is the observer's own error dynamics. Raises ValueError
-        where it does not shrink: the residual would grow by itself.
+        It compares two runs along the same readings with different initial levels. Raises ValueError if the error does
+        not decay.
         """
-        start = first_levels(self.stepper.network, samples, self.values)
-        moved = start + MOVED * length_scale(self.stepper.network.description)
+        start = initial_levels(self.stepper.network, samples, self.values)
+        moved = start + LEVEL_OFFSET * length_scale(self.stepper.network.description)
         steady, self.gain = self.gain, Gain(self.gain.steady, self.gain.opening[:0], self.gain.inflation[:0])
         one, other = (self.run(samples, levels).levels for levels in (start, moved))
         self.gain = steady
         rates = []
         for error in torch.linalg.vector_norm(other - one, dim=-1).reshape(-1, len(samples)):
-            decided = (~((error > SHRUNK * error[0]) & (error < GROWN * error[0]))).nonzero().flatten()
+            decided = (~((error > DECAYED * error[0]) & (error < DIVERGED * error[0]))).nonzero().flatten()
             last = int(decided[0]) if len(decided) else len(error) - 1
             rates.append(float(error[last] / error[0]) ** (1.0 / max(last, 1)))
         worst = max(rates, key=lambda rate: rate if rate == rate else float("inf"))
@@ -145,19 +147,21 @@ class Observer:
         return worst
 
     def _lanes(self, samples: Samples) -> torch.Size:
-        """Recordings, lanes of parameters and lanes of gains side by side."""
+        """Batch shape of recordings, parameters and gains together."""
         values = [v.shape for own in self.values.values() for v in own.values()]
         return torch.broadcast_shapes(samples.batch, self.gain.steady.shape[:-2], *values)
 
     def _expect_shape(self, network: TankNetwork) -> None:
-        wanted = (len(network.description.tanks), len(network.description.sensors))
-        if tuple(self.gain.steady.shape[-2:]) != wanted:
+        shape = (len(network.description.tanks), len(network.description.sensors))
+        if tuple(self.gain.steady.shape[-2:]) != shape:
             got = tuple(self.gain.steady.shape[-2:])
-            raise ValueError(f"expected a gain of {wanted[0]} tanks x {wanted[1]} sensors, got {got[0]} x {got[1]}")
+            raise ValueError(f"expected a gain of {shape[0]} tanks x {shape[1]} sensors, got {got[0]} x {got[1]}")
 
 
-def bound(network: TankNetwork, space: ParameterSpace | None, theta: Tensor | None) -> PlaceValues:
-    """Every constant of the plant, those of `space` from theta (*batch, P). ValueError for one without the other."""
+def bind_parameters(network: TankNetwork, space: ParameterSpace | None, theta: Tensor | None) -> PlaceValues:
+    """All constants of the plant, those of `space` from theta (*batch, P). Raises ValueError for
+    one without the other.
+    """
     if (space is None) != (theta is None):
         raise ValueError("expected a parameter space together with its values, got one of the two; give both or none")
     if space is None or theta is None:
@@ -166,17 +170,16 @@ def bound(network: TankNetwork, space: ParameterSpace | None, theta: Tensor | No
 
 
 def _first_readings(readings: Tensor) -> Tensor:
-    """The first that is there of each sensor, (*batch, S, sensors) -> (*batch, sensors); NaN where there is none."""
+    """First available reading of each sensor, (*batch, S, sensors) -> (*batch, sensors); NaN if there is none."""
     first = torch.isfinite(readings).to(torch.int8).argmax(dim=-2, keepdim=True)
     return readings.gather(-2, first).squeeze(-2)
 
 
-def first_levels(network: TankNetwork, samples: Samples, values: PlaceValues) -> Tensor:
-    """Levels (*batch, tanks) that the first reading of each sensor shows; the nominal start level where none does.
-
-    Where a sensor is not read at the first sample its next reading is taken, within FIRST_SAMPLES.
+def initial_levels(network: TankNetwork, samples: Samples, values: PlaceValues) -> Tensor:
+    """Levels (*batch, tanks) from the first reading of each sensor, within FIRST_SAMPLES; nominal
+    where none is read.
     """
     start = [level.expand(samples.batch) for level in network.start_levels(values)]
     readings = _first_readings(samples.readings[..., :FIRST_SAMPLES, :]).unbind(-1)
-    found = levels_behind(network, readings, start, samples.time[0], values)
-    return torch.stack(torch.broadcast_tensors(*found), dim=-1)
+    levels = levels_behind(network, readings, start, samples.time[0], values)
+    return torch.stack(torch.broadcast_tensors(*levels), dim=-1)

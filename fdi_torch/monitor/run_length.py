@@ -1,4 +1,4 @@
-"""Thresholds from a wished mean time between false alarms: run lengths of charts on white residuals of unit spread."""
+"""Run lengths of control charts on white residuals of unit variance, and thresholds for a given mean run length."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from torch import Tensor
 
 CHAIN_STATES = 400
 RAREST = 1.0 / (CHAIN_STATES * torch.finfo(torch.float64).eps)
-"""Samples to an alarm of one chart, beyond which rounding errors of the chain's equations are as large as its rate."""
-# Simulated blocks: the chance of an alarm within one is fitted over thresholds, which needs fewer draws than counting.
+"""Run length of one chart above which rounding errors in the Markov chain are as large as the alarm rate."""
+# Simulated blocks. The probability of an alarm in a block is fitted as a function of the threshold, which needs fewer
+# draws than counting alarms.
 BLOCKS, BLOCK, BURN_IN = 4000, 1500, 500
 
 
 def fixed_threshold(run_length: float, channels: int) -> float:
-    """h at which max |e| of white Gaussian channels crosses once in `run_length` samples: 1 - (1 - 2 Q(h))^C = 1/N."""
+    """h that max |e| of C white Gaussian channels exceeds once in N samples: 1 - (1 - 2 Q(h))^C = 1/N."""
     _expect_rare(run_length)
     one = -math.expm1(math.log1p(-1.0 / run_length) / channels)
     return -float(torch.special.ndtri(torch.tensor(0.5 * one, dtype=torch.float64)))
 
 
 def cusum_run_length(threshold: float, drift: float, states: int = CHAIN_STATES) -> float:
-    """Mean number of samples until max(0, g + e - drift) from g = 0 exceeds the threshold; e standard normal.
+    """Mean number of samples until g <- max(0, g + e - drift), from g = 0, exceeds the threshold; e standard normal.
 
-    Brook & Evans (1972): g on a grid as a Markov chain. Infinite where an alarm is too rare for double precision.
+    Brook & Evans (1972): g on a grid as a Markov chain. Infinite if an alarm is too rare for double precision.
     """
     width = threshold / (states - 0.5)
     centres = width * torch.arange(states, dtype=torch.float64)
@@ -40,7 +41,7 @@ def cusum_run_length(threshold: float, drift: float, states: int = CHAIN_STATES)
 
 
 def cusum_threshold(run_length: float, channels: int, drift: float) -> float:
-    """h of 2 C one-sided charts that alarm, taken together, once in `run_length` samples (their rates add)."""
+    """h of 2 C one-sided charts that together alarm once in `run_length` samples (their rates add)."""
     _expect_rare(run_length, 2 * channels)
     wanted = 2.0 * channels * run_length
     low, high = 1e-3, 1.0
@@ -52,20 +53,21 @@ def cusum_threshold(run_length: float, channels: int, drift: float) -> float:
     return 0.5 * (low + high)
 
 
-def highest(statistic: Callable[[Tensor], Tensor], channels: int, generator: torch.Generator) -> Tensor:
-    """The highest value of a statistic (*batch, S, C) -> (*batch, S) in each of many blocks of white residuals."""
-    found = []
+def block_maxima(statistic: Callable[[Tensor], Tensor], channels: int, generator: torch.Generator) -> Tensor:
+    """Sorted maxima of a statistic (*batch, S, C) -> (*batch, S) in simulated blocks of white residuals."""
+    maxima = []
     for _ in range(BLOCKS // 200):
         noise = torch.randn(200, BURN_IN + BLOCK, channels, generator=generator, dtype=torch.float64)
-        found.append(statistic(noise)[:, BURN_IN:].amax(dim=1))
-    return torch.cat(found).sort().values
+        maxima.append(statistic(noise)[:, BURN_IN:].amax(dim=1))
+    return torch.cat(maxima).sort().values
 
 
-def threshold_of(peaks: Tensor, run_length: float) -> float:
-    """h of any statistic, from its sorted peaks in blocks of white residuals.
+def threshold_from_maxima(peaks: Tensor, run_length: float) -> float:
+    """h of any statistic, from its sorted maxima in blocks of white residuals.
 
-    In stationarity the chance of an alarm within a block of B samples is 1 - exp(-B / N). log(-log P(no alarm)) is
-    fitted as a parabola in h, so that all blocks tell where a rare alarm begins. Raises ValueError below 20 samples.
+    In the steady state the probability of an alarm within a block of B samples is 1 - exp(-B / N). log(-log P(no
+    alarm)) is fitted by a parabola in h, so that all blocks contribute to the estimate of a rare alarm. Raises
+    ValueError for N below 20 samples.
     """
     _expect_rare(run_length)
     share = (torch.arange(len(peaks), dtype=torch.float64) + 0.5) / len(peaks)
@@ -78,7 +80,7 @@ def threshold_of(peaks: Tensor, run_length: float) -> float:
 
 
 def _falling_root(c0: float, c1: float, c2: float) -> float:
-    """Where c0 + c1 x + c2 x^2 passes zero on its falling side; the tangent's root where it never does."""
+    """The zero of c0 + c1 x + c2 x^2 at which it falls; the tangent's zero if there is none."""
     inside = c1 * c1 - 4.0 * c2 * c0
     if inside <= 0.0 or abs(c2) < 1e-12:
         return -c0 / c1

@@ -17,19 +17,19 @@ from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.signals import Clock
 
-# In units of the plant's time scale. RK4 at this step is right to 1e-3 cm on the paper's plant, far below what sensors
-# resolve.
+# In units of the plant's time scale. RK4 with this step has an error of 1e-3 cm on the paper's plant, far below sensor
+# resolution.
 _USUAL_STEP = 1.0
 
 
 def usual_step(plant: PlantDescription) -> float:
-    """The longest integration step of an observer where none is asked for, s."""
+    """Default of an observer's longest integration step, s."""
     return _USUAL_STEP * time_scale(plant)
 
 
 @dataclass(frozen=True)
 class PlantState:
-    """Levels (*batch, tanks) in m and what actuators and sensors remember."""
+    """Levels (*batch, tanks) in m, and the memory of actuators and sensors."""
 
     levels: Tensor
     commands: Memory = ()
@@ -37,23 +37,24 @@ class PlantState:
 
 
 class Stepper:
-    """One sampling interval of a plant by RK4 (3/8 rule) in steps no longer than `longest` s (None: `usual_step`).
+    """Integrator of a plant over a sampling interval by RK4 (3/8 rule), in steps up to `longest` s (None:
+    `usual_step`).
 
-    Held inputs are exact, linear ones are taken at their mean over each step. Raises ValueError for a plant whose
-    believed effects are late by a fixed time: their past is not a state.
+    Held inputs are exact; linearly interpolated ones are averaged over each step. Raises ValueError for a plant with
+    pure delays, whose past is not part of the state.
     """
 
     def __init__(self, network: TankNetwork, longest: float | None = None) -> None:
         longest = usual_step(network.description) if longest is None else longest
         if not longest > 0:
             raise ValueError(f"expected a positive integration step, got {longest} s")
-        late = [p.prefix for p in network.placements if p.effect.delays]
-        if late:
-            raise ValueError(f"expected a plant without pure delays, got {late[0]}; observe it without that effect")
+        delayed = [p.prefix for p in network.placements if p.effect.delays]
+        if delayed:
+            raise ValueError(f"expected a plant without pure delays, got {delayed[0]}; observe it without that effect")
         self.network, self.longest = network, longest
 
     def start(self, levels: Tensor, inputs: Tensor, values: PlaceValues) -> PlantState:
-        """The state after the inputs (*batch, channels) have long been what they are, at these levels."""
+        """The state at these levels with actuators and sensors settled under constant inputs (*batch, channels)."""
         clock = self._clock(levels, 0.0, self.longest, self.longest)
         channels = self._channels(inputs)
         seen = self._seen(levels)
@@ -76,7 +77,9 @@ class Stepper:
         return state
 
     def read(self, state: PlantState, end: float, span: float, values: PlaceValues) -> tuple[Tensor, PlantState]:
-        """Readings (*batch, sensors) at the end of an interval of `span` s, and the state with the sensors' memory."""
+        """Readings (*batch, sensors) at the end of an interval of `span` s, and the state with
+        updated sensor memory.
+        """
         clock = self._clock(state.levels, end - span, span, span)
         readings, memory = self.network.read(self._seen(state.levels), state.readings, clock, values)
         return torch.stack(torch.broadcast_tensors(*readings), dim=-1), replace(state, readings=memory)
@@ -84,7 +87,7 @@ class Stepper:
     def move(
         self, levels: Tensor, inputs: Tensor, memory: Memory, clock: Clock, values: PlaceValues
     ) -> tuple[Tensor, Memory]:
-        """One integration step: levels and what the actuators remember."""
+        """Levels and actuator memory after one integration step."""
         actual, memory = self.network.commands(self._channels(inputs), memory, clock, values)
         return self._runge_kutta(levels, actual, clock, values), memory
 

@@ -1,4 +1,4 @@
-"""The level and colour of fault-free residuals, and their removal: what is left is white and of unit spread."""
+"""Mean and autocorrelation of fault-free residuals, and the filter that makes them white with unit variance."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ FEWEST_BLOCKS, PRIOR_BLOCKS = 6, 5
 class Whitening:
     """e_k = W (r_k - m - sum_j A_j (r_(k-j) - m)): residuals as a vector autoregression driven by unit white noise.
 
-    mean m (C,) in the readings' units, zero where the recording shows none; coefficients A (order, C, C);
-    whitener W (C, C), lower triangular. samples: how many it was estimated from. slow_error (C,): standard error of
-    ln of the standard deviation that slow sums of e have, which is 1 where the colour is known. slow (C,): variance of
-    slow sums that the autoregression left, over that of white noise, which W makes up for: e has variance 1 / slow.
+    mean m (C,) in the readings' units, zero if not significant; coefficients A (order, C, C); whitener W (C, C), lower
+    triangular. samples: number that it was estimated from. slow_error (C,): standard error of ln of the standard
+    deviation of low-frequency sums of e (1 if the model is exact). slow_variance (C,): variance of low-frequency sums
+    of the autoregression's residual over that of white noise; W compensates for it, so that e has variance
+    1 / slow_variance.
     """
 
     mean: Tensor
@@ -29,12 +30,13 @@ class Whitening:
     whitener: Tensor
     samples: int
     slow_error: Tensor
-    slow: Tensor | None = None
+    slow_variance: Tensor | None = None
 
     @property
-    def level(self) -> float:
+    def mean_square(self) -> float:
         """Mean square of e without a fault."""
-        return 1.0 if self.slow is None else float((1.0 / self.slow).mean())
+
+        return 1.0 if self.slow_variance is None else float((1.0 / self.slow_variance).mean())
 
     @property
     def fast_error(self) -> float:
@@ -47,38 +49,39 @@ class Whitening:
 
     @property
     def offset(self) -> Tensor:
-        """What the mean alone adds to every white residual, W (I - sum A) m, (C,); known to 1 / sqrt(samples)."""
+        """Contribution of the mean to every white residual, W (I - sum A) m, (C,); standard error 1 / sqrt(samples)."""
         eye = torch.eye(len(self.mean), dtype=self.mean.dtype)
         return self.whitener @ (eye - self.coefficients.sum(0)) @ self.mean
 
     def __call__(self, residual: Tensor) -> Tensor:
-        """residual (*batch, S, C) -> white (*batch, S, C), NaN where it, or one before it that counts, is missing."""
+        """residual (*batch, S, C) -> white (*batch, S, C), NaN if a residual that it depends on is missing."""
         return self.filter(residual - self.mean)
 
     def filter(self, residual: Tensor) -> Tensor:
-        """The same without the mean: what a fault adds to the residual -> what it adds to the white residual.
-
-        Nothing is known before the first sample; it counts as zero there.
+        """Whiten without subtracting the mean, as for the effect of a fault. Residuals before the
+        first sample are 0.
         """
-        rest = residual
+        innovation = residual
         for lag, matrix in enumerate(self.coefficients, start=1):
             before = torch.zeros_like(residual)
             before[..., lag:, :] = residual[..., :-lag, :]
-            rest = rest - _apply(matrix, before)
-        return _apply(self.whitener, rest)
+            innovation = innovation - _apply(matrix, before)
+        return _apply(self.whitener, innovation)
 
 
 def fit_whitening(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> Whitening:
-    """From the residuals (S, C) of one fault-free recording; order and mean by the Bayesian information criterion."""
+    """Whitening of the residuals (S, C) of a fault-free recording; order and mean by the Bayesian information
+    criterion.
+    """
     return score_whitenings(residual, highest_order)[0][1]
 
 
 def with_slow_variance(whitening: Whitening, residual: Tensor) -> Whitening:
-    """With a whitener that allows for slow disturbances, as far as residuals (S, C) show them.
+    """The whitening with a whitener that allows for slow disturbances in residuals (S, C).
 
-    The variance of means over blocks of m samples, times m, is 1 where e is white and more where it varies slowly: what
-    an autoregression of a few samples cannot see. Of the block lengths BLOCKS the worst counts, each drawn towards 1 as
-    if PRIOR_BLOCKS blocks of white noise had been seen as well.
+    The variance of block means over m samples, times m, is 1 for white e and larger if e varies slowly, which a
+    low-order autoregression does not capture. The largest value over the block lengths BLOCKS counts; each is shrunk
+    towards 1 by PRIOR_BLOCKS virtual blocks of white noise.
     """
     white = whitening(residual)[whitening.order :]
     slow = torch.ones(white.shape[-1], dtype=white.dtype)
@@ -87,18 +90,17 @@ def with_slow_variance(whitening: Whitening, residual: Tensor) -> Whitening:
         if count < FEWEST_BLOCKS:
             break
         blocks = white[: count * length].reshape(count, length, -1)
-        seen = torch.isfinite(blocks).sum(1).clamp(min=1)
-        square = (torch.nan_to_num(blocks).sum(1).square() / seen).sum(0)
+        present = torch.isfinite(blocks).sum(1).clamp(min=1)
+        square = (torch.nan_to_num(blocks).sum(1).square() / present).sum(0)
         slow = torch.maximum(slow, (square + PRIOR_BLOCKS) / (count + PRIOR_BLOCKS))
-    return replace(whitening, whitener=whitening.whitener / slow.sqrt().unsqueeze(1), slow=slow)
+    return replace(whitening, whitener=whitening.whitener / slow.sqrt().unsqueeze(1), slow_variance=slow)
 
 
 def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> list[tuple[float, Whitening]]:
-    """Whitenings of residuals (S, C) of all orders with and without a mean, and their Bayesian information criterion,
-    best first.
+    """(Bayesian information criterion, whitening) for all orders, with and without a mean, best first.
 
-    Where the channels are hardly ever read together each is taken for itself, without colour.
-    Raises ValueError where the recording is too short, or a channel does not vary.
+    Channels that are hardly ever read together are modelled separately as white noise. Raises ValueError if the
+    recording is too short or a channel does not vary.
     """
     each, known = torch.isfinite(residual).sum(dim=0), torch.isfinite(residual).all(dim=1)
     if int(each.min()) < FEWEST_SAMPLES:
@@ -115,7 +117,7 @@ def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> li
         )
     if int(known.sum()) < FEWEST_SAMPLES:
         return sorted((_apart(residual, mean) for mean in (False, True)), key=lambda fit: fit[0])
-    # An order needs ten samples for each of its coefficients, and rows that follow each other.
+    # An order needs ten samples per coefficient, and enough complete consecutive rows.
     highest_order = min(highest_order, int(known.sum()) // (10 * residual.shape[1]))
     while highest_order and 4 * int(known.unfold(0, highest_order + 1, 1).all(dim=1).sum()) < int(known.sum()):
         highest_order -= 1
@@ -124,7 +126,7 @@ def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> li
 
 
 def _fit(residual: Tensor, order: int, highest: int, with_mean: bool) -> tuple[float, Whitening]:
-    """Least squares of r_k on its past, and its BIC over the samples that every order can use."""
+    """Least squares of r_k on its past, and the BIC over the samples that every order can use."""
     count, channels = residual.shape
     mean = residual.nanmean(dim=0) if with_mean else residual.new_zeros(channels)
     centred = residual - mean
@@ -145,7 +147,7 @@ def _fit(residual: Tensor, order: int, highest: int, with_mean: bool) -> tuple[f
 
 
 def _apart(residual: Tensor, with_mean: bool) -> tuple[float, Whitening]:
-    """Each channel's own spread, and the criterion over all readings."""
+    """White noise with a variance per channel, and the BIC over all readings."""
     count, channels = torch.isfinite(residual).sum(dim=0), residual.shape[1]
     mean = residual.nanmean(dim=0) if with_mean else residual.new_zeros(channels)
     variance = (residual - mean).square().nanmean(dim=0)
@@ -155,22 +157,26 @@ def _apart(residual: Tensor, with_mean: bool) -> tuple[float, Whitening]:
 
 
 def _slow_error(regressors: Tensor, matrices: Tensor, whitener: Tensor, count: int) -> Tensor:
-    """What errors of A do to slow sums of e: W dA(1) (I - A(1))^-1 W^-1 on its diagonal, rows of W dA having the least
-    squares covariance (X' X)^-1, beside 1 / (2 n) of the spread itself (delta method).
+    """Standard error (C,) of ln of the standard deviation of low-frequency sums of e (delta method).
+
+    It has two parts: 1 / (2 n) from the variance estimate, and the diagonal of W dA(1) (I - A(1))^-1 W^-1 from the
+    error of A, where the rows of W dA have the least-squares covariance (X' X)^-1.
     """
-    own = whitener.new_full((len(whitener),), 1.0 / (2.0 * count))
+    variance = whitener.new_full((len(whitener),), 1.0 / (2.0 * count))
     if not len(matrices):
-        return own.sqrt()
+        return variance.sqrt()
     eye = torch.eye(len(whitener), dtype=whitener.dtype)
     through = torch.linalg.solve(eye - matrices.sum(0), torch.linalg.inv(whitener))  # columns: one for each channel
     direction = through.repeat(len(matrices), 1)
-    spread = (direction * torch.linalg.solve(regressors.mT @ regressors, direction)).sum(0)
-    return (own + spread).sqrt()
+    coefficient_variance = (direction * torch.linalg.solve(regressors.mT @ regressors, direction)).sum(0)
+    return (variance + coefficient_variance).sqrt()
 
 
 def _apply(matrix: Tensor, values: Tensor) -> Tensor:
-    """matrix (C, C) times values (..., C) as explicit sums, so that a lane does not depend on its neighbours, nor a
-    channel on the missing reading of another that has no part in it.
+    """matrix (C, C) times values (..., C) by explicit sums.
+
+    A batch member then does not depend on its neighbours to the last bit, and a missing reading only affects channels
+    with a non-zero coefficient.
     """
     columns = ((matrix[:, c], values[..., c : c + 1]) for c in range(values.shape[-1]))
     return sum((torch.where(part == 0.0, 0.0, part * value) for part, value in columns), torch.zeros_like(values))

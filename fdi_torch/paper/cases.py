@@ -15,7 +15,7 @@ from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import estimate_parameters, information_std
 from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
-from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, simulated_truth, wanted_space
+from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space, simulated_truth
 from fdi_torch.paper.published import PARAMETERS
 
 BOUND_SNR = 50.0
@@ -53,7 +53,7 @@ def shipped_run(name: str) -> Run:
 
 def solve(run: Run) -> Case:
     """Simulates, searches, refines and bounds what one run file describes."""
-    space = wanted_space(run)
+    space = requested_space(run)
     if space.names != PARAMETERS:
         raise ValueError(
             f"{run.source}: expected the parameters {', '.join(PARAMETERS)}, got {', '.join(space.names)}; name these"

@@ -34,11 +34,11 @@ EQUATIONS = (
     Equation((13,), "fit by the sum of correlations within a box",
              ("estimate.objectives:Problem.cost", "estimate.hybrid:search")),
     Equation((14,), "Luenberger-like observer with nominal parameters",
-             ("monitor.observer:Observer", "monitor.noise:learn_noise")),
+             ("monitor.observer:Observer", "monitor.noise_model:learn_noise")),
     Equation((15,), "conventional adaptive observer: parameters integrate the residual",
-             ("monitor.adaptive:adaptive_observer", "monitor.adaptive:designed_rate")),
+             ("monitor.adaptive_observer:adaptive_observer", "monitor.adaptive_observer:adaptive_gain")),
     Equation((16,), "adaptive observer: the newest fitted parameters go back into it",
-             ("monitor.windows:WindowMonitor", "monitor.window_fit:evolution", "monitor.monitor:Monitor",
+             ("monitor.window_monitor:WindowMonitor", "monitor.window_estimators:evolution", "monitor.monitor:Monitor",
               "paper.online:follow")),
     Equation((17, 18), "Pearson's correlation of reading and prediction, from sums over the window",
              ("estimate.objectives:correlation_loss", "estimate.objectives:correlation_expansion")),
@@ -64,7 +64,7 @@ EQUATIONS = (
 
 STATEMENTS = (
     ("Definitions 1–3", "which faults can be seen, told apart and sized; from computed signatures and from structure",
-     ("monitor.diagnosability:diagnosability", "monitor.structure:structure_of")),
+     ("monitor.diagnosability:diagnosability", "monitor.structural_analysis:structure_of")),
     ("Theorem 1", "what must hold for that, and what correlation alone never sees",
      ("monitor.diagnosability:diagnosability", "monitor.diagnosability:without_gain_and_offset")),
 )  # fmt: skip

@@ -16,7 +16,7 @@ from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
 from fdi_torch.estimate.objectives import Objective, Problem, Term
-from fdi_torch.jobs.run_setup import hybrid_settings, simulated_truth, wanted_space
+from fdi_torch.jobs.run_setup import hybrid_settings, requested_space, simulated_truth
 from fdi_torch.simulate.engine import Readings
 
 SEARCH_STEP, FINE_STEP, DATA_STEP = 1.0, 0.05, 0.0125
@@ -81,7 +81,7 @@ def planned_fitting(run: Run) -> Fitting:
     """What the run estimates, on a recording that has inputs and no readings yet."""
     assert run.config.simulate is not None
     planned = planned_recording(run.config.simulate, run.plant)
-    return set_up(run.plant, [planned], wanted_space(run), run.config.simulate.start_levels, run.config.engine)
+    return set_up(run.plant, [planned], requested_space(run), run.config.simulate.start_levels, run.config.engine)
 
 
 def noisy(run: Run, fitting: Fitting, truth: Tensor, draws: int) -> Readings:

@@ -18,12 +18,12 @@ from fdi_torch.effects import build_network
 from fdi_torch.estimate.diagnosis import sample_noise
 from fdi_torch.estimate.fitting import set_up, start_levels
 from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
-from fdi_torch.jobs.run_setup import hybrid_settings, wanted_space
-from fdi_torch.monitor.detection import NEVER, Detector, make_detector
-from fdi_torch.monitor.gain import hand_gain
-from fdi_torch.monitor.noise import Noise, learn_noise
+from fdi_torch.jobs.run_setup import hybrid_settings, requested_space
+from fdi_torch.monitor.detection import NO_ALARM, Detector, make_detector
+from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observation, Observer
-from fdi_torch.monitor.samples import take
+from fdi_torch.monitor.observer_gain import hand_gain
+from fdi_torch.monitor.samples import samples_of_recording
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
@@ -73,14 +73,14 @@ def follow(runs: Sequence[Run]) -> OnLine:
     # Start levels are known, at rest as after a fit: no opening gain.
     gain = hand_gain(noise.gain.steady)
     believed, levels, since = space.nominal(), start_of(runs[0], network, recording), 0.0
-    nominal = Observer(network, gain).run(take(recording, network.description), levels).residual
+    nominal = Observer(network, gain).run(samples_of_recording(recording, network.description), levels).residual
     windows, predicted, adaptive, begin = [], [], [], 0.0
     for run in runs:
         assert run.config.simulate is not None
         end = begin + run.config.simulate.duration
         part = recording.window(begin, end)
         # The observer runs on until its parameters change.
-        observed = take(recording.window(since, end), network.description)
+        observed = samples_of_recording(recording.window(since, end), network.description)
         seen = Observer(network, gain, space, believed).run(observed, levels).last(len(part))
         alarm = first_alarm(seen, noise, detector)
         result = sized(part, space, runs[-1]) if varies(part) else None
@@ -104,7 +104,7 @@ def laid_end_to_end(runs: Sequence[Run]) -> tuple[Recording, Recording, TankNetw
     last = runs[-1]
     assert last.config.simulate is not None
     network = faulty_network(last)
-    space = wanted_space(last)
+    space = requested_space(last)
     pieces: list[Tensor] = []
     levels = None
     for run in runs:
@@ -149,19 +149,19 @@ def started_at(network: TankNetwork, levels: Tensor) -> TankNetwork:
     return build_network(replace(plant, tanks=tanks), network.placements)
 
 
-def learnt(network: TankNetwork, fault_free: Recording, seed: int) -> tuple[Noise, Detector]:
+def learnt(network: TankNetwork, fault_free: Recording, seed: int) -> tuple[NoiseModel, Detector]:
     """Noise and observer gain from a fault-free recording, and a detector of rare false alarms."""
-    noise, _ = learn_noise(network, take(fault_free, network.description))
+    noise, _ = learn_noise(network, samples_of_recording(fault_free, network.description))
     sampling = float(torch.diff(fault_free.time).median())
     generator = torch.Generator().manual_seed(seed)
     channels = len(network.description.sensors)
     return noise, make_detector("cusum", TIME_BETWEEN_FALSE_ALARMS, sampling, channels, generator)
 
 
-def first_alarm(seen: Observation, noise: Noise, detector: Detector) -> float | None:
+def first_alarm(seen: Observation, noise: NoiseModel, detector: Detector) -> float | None:
     """When the white residual first leaves its fault-free range, s."""
     index = int(detector.first_alarm(noise.whitening(seen.steady_residual)))
-    return None if index == NEVER else float(seen.time[index])
+    return None if index == NO_ALARM else float(seen.time[index])
 
 
 def varies(recording: Recording) -> bool:

@@ -1,7 +1,7 @@
-"""The options of each command: one module a command here, and below what several commands have in one form.
+"""The options of each command, one module per command, and options that several commands share.
 
 A command's module has its description (the docstring), EXAMPLES and `add_arguments(parser)`. None of them imports
-torch, so that help is shown at once.
+torch, so that help is shown immediately.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LIVE = "127.0.0.1:8765"
 
 
 class ShowKeys(argparse.Action):
-    """Prints what may stand in a file, and ends. models: as 'module:Model', imported when they are asked for."""
+    """Print the keys of a file and exit. models: 'module:Model', imported only when needed."""
 
     def __init__(self, models: Sequence[str], **settings: Any) -> None:
         super().__init__(nargs=0, **settings)
@@ -37,13 +37,13 @@ class ShowKeys(argparse.Action):
 
 
 def add_keys(parser: argparse.ArgumentParser, what: str, *models: str) -> None:
-    """--keys of a file, by its models as 'module:Model'."""
-    told = f"print every key of {what} with its default and meaning, and end"
-    parser.add_argument("--keys", action=ShowKeys, models=models, help=told)
+    """Add --keys, which prints the keys of a file. models: its models as 'module:Model'."""
+    text = f"print every key of {what} with its default and meaning, and exit"
+    parser.add_argument("--keys", action=ShowKeys, models=models, help=text)
 
 
 def add_config(parser: argparse.ArgumentParser, *models: str, required: bool = False) -> None:
-    """models: of what may stand in the file, as 'module:Model'."""
+    """Add --config and --set. models: models of the file as 'module:Model'."""
     parser.add_argument("--config", metavar="FILE", required=required, help="run file (YAML)")
     if models:
         add_keys(parser, "such a file", *models)
@@ -52,7 +52,7 @@ def add_config(parser: argparse.ArgumentParser, *models: str, required: bool = F
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="change one value of it, as in --set estimate.search.population=40; may be repeated",
+        help="change one value of the file, as in --set estimate.search.population=40; may be repeated",
     )
 
 
@@ -71,13 +71,13 @@ def seconds(text: str) -> float:
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", help="folder for what is written (default: logs)")
-    parser.add_argument("--device", metavar="cpu|cuda", help="where tensors live")
-    parser.add_argument("--seed", metavar="N", type=int, help="of everything drawn at random")
+    parser.add_argument("--out", metavar="DIR", help="output folder (default: logs)")
+    parser.add_argument("--device", metavar="cpu|cuda", help="device for the computation")
+    parser.add_argument("--seed", metavar="N", type=int, help="seed of all random numbers")
 
 
 def overrides(arguments: argparse.Namespace) -> list[str]:
-    """--set, and the short forms of what it can set, last ones winning."""
+    """--set and its short forms as overrides; later ones win."""
     short = {"output.folder": "out", "device": "device", "seed": "seed"}
     given = [(key, getattr(arguments, name, None)) for key, name in short.items()]
     return [*arguments.set, *(f"{key}={value}" for key, value in given if value is not None)]
@@ -89,21 +89,21 @@ def add_live(parser: argparse.ArgumentParser) -> None:
         metavar="[HOST:]PORT",
         nargs="?",
         const=LIVE,
-        help=f"serve the running job to Foxglove or Lichtblick (alone: {LIVE}, which only this machine "
-        "reaches; 0.0.0.0:PORT lets the whole network read, without a password; needs the extra live)",
+        help=f"stream the running job to Foxglove or Lichtblick (without a value: {LIVE}, reachable from this machine "
+        "only; 0.0.0.0:PORT opens it to the whole network without a password; needs the extra `live`)",
     )
 
 
-def who_may_read(host: str) -> str:
-    """The server asks nobody for a password."""
+def access_text(host: str) -> str:
+    """Who can read the stream; the server has no password."""
     if host.strip("[]") in ("127.0.0.1", "::1", "localhost"):
-        return "who works on this machine may read it, nobody else"
-    return "whoever reaches this machine may read it, without a password"
+        return "only users of this machine can read it"
+    return "everybody who reaches this machine can read it, without a password"
 
 
 @contextmanager
 def live(arguments: argparse.Namespace, name: str, screen: Screen) -> Iterator[Listener | None]:
-    """What --live asks for: a server that hears the log, whose address is told; None without --live."""
+    """The server that --live asks for, which streams the log; None without --live."""
     if arguments.live is None:
         yield None
         return
@@ -113,5 +113,5 @@ def live(arguments: argparse.Namespace, name: str, screen: Screen) -> Iterator[L
     if not (port.isdigit() and int(port) < 2**16):
         raise ValueError(f"--live: expected [HOST:]PORT such as {LIVE}, got {arguments.live}")
     with serve(name, host or LIVE.partition(":")[0], int(port)) as server:
-        screen.note(f"live: {server.address} ({who_may_read(host or LIVE.partition(':')[0])})")
+        screen.note(f"live: {server.address} ({access_text(host or LIVE.partition(':')[0])})")
         yield server

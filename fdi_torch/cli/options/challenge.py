@@ -1,8 +1,8 @@
-"""The blind benchmark of the gap diagnosis: hidden rigs of other equations and another integrator, causes sealed.
+"""Blind benchmark of the gap diagnosis on hidden rigs with other equations and another integrator.
 
-Recordings are made, their causes sealed (the hash of the key stands in each recording), every recording is diagnosed
-without the key, then the key is opened and the answers are judged: by kind of case, with 95 % intervals, beside
-baselines. All of it is kept in --out, where an interrupted benchmark goes on when it is started again.
+The benchmark simulates recordings and seals their causes (each recording contains the hash of the key). It diagnoses
+every recording without the key, then opens the key and scores the answers by kind of case, with 95 % intervals and
+baselines. Everything is written to --out; repeating the command resumes an interrupted benchmark.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ RIGS = ("cascaded_tanks", "quadruple_tank", "three_tank")
 
 EXAMPLES = """
 kinds of cases:
-  single    one effect of usual strength          pair      two effects
-  weak      a fifth of that                       messy     one full effect among three faint ones
-  coloured  noise that is not white               poor      inputs that excite little
-  null      nothing is wrong                      twins     one of a family that is nearly collinear
-  unknown   a law that no effect of the library has: `unknown` at its place is right
-  left_out  an effect that the diagnosis is denied (--leave-out)
-  dnull     nothing is wrong, the flows into the tanks are disturbed at random
-  dsingle   the same with one effect that shows
-and, with --plant network, on a random network of tanks in each case:
-  site      one or two effects                    law       a law that no effect of the library has
-  hidden    a third of the levels is unmeasured   mixed     one effect beside such a law elsewhere
+  single    one effect of usual size              pair      two effects
+  weak      one effect of a fifth of that size    messy     one full effect and three weak ones
+  coloured  correlated noise                      poor      inputs with little excitation
+  null      no discrepancy                        twins     one of several nearly collinear effects
+  unknown   a law outside the library: the right answer is `unknown` at its location
+  left_out  an effect that the diagnosis is not given (--leave-out)
+  dnull     no discrepancy, but random disturbance flows into the tanks
+  dsingle   the same with one effect
+on random networks of tanks (--plant network):
+  site      one or two effects                    law       a law outside the library
+  hidden    a third of the levels is unmeasured   mixed     one effect, and such a law elsewhere
   loop      a level is controlled                 null, dnull, dsingle as above
 
---out then holds rows.jsonl (a line an answer), scores.json, scores.md and challenge.mcap (`fdi report` makes the page).
-The workers of a --cluster have to see that folder.
+--out contains rows.jsonl (one line per answer), scores.json, scores.md and challenge.mcap (for `fdi report`).
+The workers of a --cluster need access to that folder.
 
 examples:
-  fdi challenge                                            22 cases, two a kind, about four minutes on one core
-  fdi challenge --cases 450 --seed 7 --out logs/seven      fifty a kind; Ctrl-C and the same words again go on
-  fdi challenge --cases 450 --seed 7 --out logs/seven --minutes 30      what is answered in half an hour is scored
+  fdi challenge                                            22 cases, two of each kind, four minutes on one core
+  fdi challenge --cases 450 --seed 7 --out logs/seven      fifty of each kind; the same command resumes after Ctrl-C
+  fdi challenge --cases 450 --seed 7 --out logs/seven --minutes 30      score what is diagnosed within half an hour
   fdi challenge --rig quadruple_tank --kinds single,pair --no-bic
-  fdi challenge --plant my_rig.yaml                        hidden rigs built as a plant file of yours describes
+  fdi challenge --plant my_rig.yaml                        hidden rigs built like your plant file
   fdi challenge --plant network --tanks 3..6 --cases 16    random networks of three to six tanks
   fdi challenge --leave-out all --cases 24 --out logs/denied
   fdi challenge --join logs/seven logs/denied --out docs/gap     one set of tables from several folders
@@ -43,23 +43,25 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--cases", metavar="N", type=int, help="recordings, spread over the kinds (22)")
-    parser.add_argument("--seed", metavar="S", type=int, help="of causes, places, noise and inputs (0)")
+    parser.add_argument("--cases", metavar="N", type=int, help="number of recordings over all kinds (22)")
+    parser.add_argument("--seed", metavar="S", type=int, help="seed of causes, places, noise and inputs (0)")
     parser.add_argument("--out", metavar="DIR", default="logs/challenge", help="folder (logs/challenge)")
     parser.add_argument(
-        "--rig", choices=("cascaded_tanks", "quadruple_tank", "three_tank"), help="which hidden rig (three_tank)"
+        "--rig", choices=("cascaded_tanks", "quadruple_tank", "three_tank"), help="hidden rig (three_tank)"
     )
-    parser.add_argument("--plant", metavar="NAME|FILE", help="instead: a rig as this file describes, or network")
-    parser.add_argument("--tanks", metavar="N..M", help="of random networks (3..12)")
+    parser.add_argument("--plant", metavar="NAME|FILE", help="instead of --rig: a rig like this plant file, or network")
+    parser.add_argument("--tanks", metavar="N..M", help="number of tanks of random networks (3..12)")
     parser.add_argument(
-        "--kinds", metavar="KIND,...", help="by default those listed first; on networks those listed for them"
+        "--kinds", metavar="KIND,...", help="kinds of cases (default: those of the first list; of networks, the second)"
     )
-    parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="deny these, one a case: 'all' in turn")
-    parser.add_argument("--no-bic", action="store_true", help="spare the one-at-a-time BIC winner, the dear baseline")
-    parser.add_argument("--minutes", metavar="M", type=float, default=math.inf, help="begin no case after so long")
+    parser.add_argument(
+        "--leave-out", metavar="EFFECT,...", default="", help="effects to remove from the library, or all, one per case"
+    )
+    parser.add_argument("--no-bic", action="store_true", help="skip the slow baseline, one effect at a time by BIC")
+    parser.add_argument("--minutes", metavar="M", type=float, default=math.inf, help="start no case after this time")
     parser.add_argument(
         "--cluster",
         metavar="local|ADDRESS",
-        help="diagnose on Dask: local, or tcp://host:8786, or tls://host:8786; what answers there is trusted",
+        help="diagnose on Dask: local, tcp://host:8786 or tls://host:8786; the scheduler must be trusted",
     )
-    parser.add_argument("--join", metavar="DIR", nargs="+", help="diagnose nothing: join the answers of these folders")
+    parser.add_argument("--join", metavar="DIR", nargs="+", help="no diagnosis: merge the answers of these folders")

@@ -12,12 +12,12 @@ examples:
   fdi check --plant rig.yaml --picture rig.png     and a drawing of it
   fdi check run.csv --plant rig.yaml               the plant and a recording
   fdi check --config own.yaml                      all recordings of a run file
-  fdi check --keys                                 what may stand in a plant file
+  fdi check --keys                                 the keys of a plant file
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", nargs="?", help="file whose columns are named as the plant's channels")
+    parser.add_argument("recording", nargs="?", help="file whose columns have the names of the plant's channels")
     parser.add_argument("--plant", metavar="NAME|FILE", help="a shipped plant such as three_tank, or a plant file")
     parser.add_argument("--picture", metavar="FILE", help="draw the rig (PNG or SVG)")
     add_config(parser)

@@ -1,4 +1,4 @@
-"""What differs between runs: configuration, versions, data, results with their errors, convergence and residuals."""
+"""Compare runs: configuration, versions, data, results with their errors, convergence and residuals."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("logs", nargs="+", metavar="RUN.mcap", help="two logs or more")
+    parser.add_argument("logs", nargs="+", metavar="RUN.mcap", help="two or more logs")
     parser.add_argument("--csv", metavar="FILE", help="also write the whole comparison as CSV")
     parser.add_argument("--pictures", metavar="DIR", help="also write convergence and residuals as PNG and SVG")

@@ -1,4 +1,4 @@
-"""What an experiment can tell: which faults show, which can be told apart, how small they may be."""
+"""Diagnosability of an experiment: which faults it can detect and distinguish, and from which size."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
-    parser.add_argument("--faults", metavar="NAME,NAME", help="such as T1.leak.size; by default the usual ones")
+    parser.add_argument("--faults", metavar="NAME,NAME", help="such as T1.leak.size (default: the usual faults)")
     parser.add_argument(
         "--input",
         metavar="FILE|AMOUNTS",
@@ -27,16 +27,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--duration",
         metavar="TIME",
         type=seconds,
-        help="of constant inputs, such as '2 h' (1000 s on a bench, longer on slower plants)",
+        help="duration of constant inputs, such as '2 h' (default: 1000 s for a bench plant, longer for slower ones)",
     )
     parser.add_argument(
         "--noise",
         metavar="AMOUNT",
         default="1 mm",
-        help="standard deviation of every reading: of the level ('1 mm', the default), or 'h1 = 1 mm, p2 = 2 mV'",
+        help="standard deviation of the readings: as a level ('1 mm', the default), or 'h1 = 1 mm, p2 = 2 mV'",
     )
     parser.add_argument(
-        "--false-alarm", metavar="SHARE", type=float, default=0.001, help="of tests without a fault (0.001)"
+        "--false-alarm", metavar="SHARE", type=float, default=0.001, help="rate of false alarms per test (0.001)"
     )
-    parser.add_argument("--miss", metavar="SHARE", type=float, default=0.05, help="of tests with the fault (0.05)")
-    parser.add_argument("--calibrate", metavar="NAME,NAME", default="", help="constants uncertain by their tolerance")
+    parser.add_argument("--miss", metavar="SHARE", type=float, default=0.05, help="rate of missed faults (0.05)")
+    parser.add_argument("--calibrate", metavar="NAME,NAME", default="", help="constants that are uncertain too")

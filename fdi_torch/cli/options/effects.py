@@ -1,4 +1,4 @@
-"""The catalogue of faults and unmodelled effects: places, parameters, when each begins, how it is written."""
+"""The catalogue of faults and unmodelled effects: locations, parameters, onset, and how to write them."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import argparse
 
 EXAMPLES = """
 examples:
-  fdi effects                                      all there are
-  fdi effects --plant rig.yaml                     those that this plant can have, and where
-  fdi effects leak pump_lag --plant rig.yaml       these in full: equation, parameters with units, how to write them
+  fdi effects                                      list all effects
+  fdi effects --plant rig.yaml                     list those that this plant can have, with their locations
+  fdi effects leak pump_lag --plant rig.yaml       show equation, parameters with units, and how to write them
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("names", nargs="*", metavar="EFFECT", help="to be told in full")
-    parser.add_argument("--plant", metavar="NAME|FILE", help="of which places and ranges are told")
+    parser.add_argument("names", nargs="*", metavar="EFFECT", help="effects to show in full")
+    parser.add_argument("--plant", metavar="NAME|FILE", help="plant whose locations and ranges are shown")

@@ -1,4 +1,4 @@
-"""What a log is about and whether it is sound; any MCAP file will do. With --topic, its messages for other tools."""
+"""Show what a log contains and whether it is intact (any MCAP file), or with --topic export its messages."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ import argparse
 
 EXAMPLES = """
 examples:
-  fdi inspect logs/own.mcap                        what it is about, and whether it is whole
+  fdi inspect logs/own.mcap                        contents and integrity
   fdi inspect logs/own.mcap --topic /plant/output --out output.csv
   fdi inspect logs/own.mcap --attachment config.yaml
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", metavar="RUN.mcap", help="a log, ours or any other, whole or not")
+    parser.add_argument("log", metavar="RUN.mcap", help="an MCAP file, complete or not")
     parser.add_argument("--topic", metavar="T", help="write the messages of this topic instead")
-    parser.add_argument("--format", choices=("csv", "ndjson", "npz"), default="csv", help="in this form (default: csv)")
+    parser.add_argument(
+        "--format", choices=("csv", "ndjson", "npz"), default="csv", help="output format (default: csv)"
+    )
     parser.add_argument("--attachment", metavar="NAME", help="write this attachment instead, such as config.yaml")
     parser.add_argument(
         "--out", metavar="FILE|DIR", help="file for the messages (default: standard output), folder for an attachment"

@@ -1,4 +1,4 @@
-"""Follow a recording: alarms, which fault since when and how large, and recoveries, one line an event."""
+"""Monitor a plant along a recording: alarms, faults with onset and size, and recoveries, one line per event."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ EXAMPLES = """
 examples:
   fdi monitor --config monitor.yaml                along a recording
   fdi monitor --config monitor.yaml --follow       along a CSV file that is still being written
-  fdi monitor --config monitor.yaml --resume       on where a killed run stopped
-  fdi monitor --config monitor.yaml --live         shown in Foxglove or Lichtblick meanwhile
+  fdi monitor --config monitor.yaml --resume       continue a killed run
+  fdi monitor --config monitor.yaml --live         with a live view in Foxglove or Lichtblick
 """
 
 
@@ -19,10 +19,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, "fdi_torch.config.monitor:MonitorConfig", required=True)
     parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
     parser.add_argument(
-        "--follow", action="store_true", help="the file is still being written: events as its samples come"
+        "--follow", action="store_true", help="the file is still being written; process its samples as they come"
     )
     parser.add_argument(
-        "--idle", metavar="TIME", type=seconds, default=60.0, help="--follow: end after so long without a sample (60 s)"
+        "--idle",
+        metavar="TIME",
+        type=seconds,
+        default=60.0,
+        help="--follow: end after this time without samples (60 s)",
     )
-    parser.add_argument("--resume", action="store_true", help="go on where a killed run of the same file stopped")
+    parser.add_argument("--resume", action="store_true", help="continue a killed run of the same file")
     add_live(parser)

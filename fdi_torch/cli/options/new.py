@@ -1,4 +1,4 @@
-"""Write a commented minimal file to begin with: a plant, or a run, monitor or study of a plant."""
+"""Write a commented minimal file: a plant, or a run, monitor or study of a plant."""
 
 from __future__ import annotations
 
@@ -14,6 +14,6 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kind", choices=("plant", "run", "monitor", "study"), help="of file")
-    parser.add_argument("--plant", metavar="NAME|FILE", default="three_tank", help="what it is about (three_tank)")
-    parser.add_argument("--out", metavar="FILE", help="the new file (KIND.yaml); one that is there is never replaced")
+    parser.add_argument("kind", choices=("plant", "run", "monitor", "study"), help="kind of file")
+    parser.add_argument("--plant", metavar="NAME|FILE", default="three_tank", help="its plant (three_tank)")
+    parser.add_argument("--out", metavar="FILE", help="the new file (KIND.yaml); existing files are never replaced")

@@ -1,4 +1,4 @@
-"""Make the 2020 paper's tables and figures again, ours and its numbers side by side, as one page with pictures."""
+"""Reproduce the tables and figures of the 2020 paper, with published and computed numbers side by side on one page."""
 
 from __future__ import annotations
 

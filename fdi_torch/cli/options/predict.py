@@ -1,7 +1,7 @@
-"""Run a plant file freely along recordings: of each only the first samples are used, for the start levels.
+"""Run a plant file freely along recordings; only the first samples of each are used, for the initial levels.
 
-What is printed is the error of the whole run, the first samples included, in each sensor's unit; with --settle, of what
-comes after that stretch. A run ends where an input becomes unknown, and begins anew where it is known again.
+The error of the whole run is printed in each sensor's unit; with --settle, the error after that time. A run ends where
+an input becomes unknown, and a new one starts where it is known again.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ START_SAMPLES = 50
 EXAMPLES = """
 examples:
   fdi predict run.csv --plant better.yaml                    one free run
-  fdi predict a.csv b.csv --plant rig.yaml --to 300          several, each for its first 300 s
-  fdi predict runs.yaml --plant rig.yaml                     stretches listed under `recordings`, as in a run file
+  fdi predict a.csv b.csv --plant rig.yaml --to 300          several recordings, the first 300 s of each
+  fdi predict runs.yaml --plant rig.yaml                     recordings listed under `recordings`, as in a run file
   fdi predict run.csv --plant better.yaml --beside rig.yaml --picture run.png
-  fdi predict run.csv --plant rig.yaml --settle 30           what varies from run to run is told by the first 30 s
-  fdi predict run.csv --plant rig.yaml --settle 60 --vary 'q?.gain'   the pumps' gains of this run too
+  fdi predict run.csv --plant rig.yaml --settle 30           estimate what varies by run from the first 30 s
+  fdi predict run.csv --plant rig.yaml --settle 60 --vary 'q?.gain'   and the pumps' gains of this run
   fdi predict run.csv --plant rig.yaml --constant q1_cmd=0   an input that was not recorded, or '20 cm^3/s'
 """
 
@@ -31,25 +31,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--recording", metavar="FILE", action="append", default=[], help="the same, as an option")
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
     parser.add_argument(
-        "--start-samples", metavar="N", type=int, default=START_SAMPLES, help=f"for the start levels ({START_SAMPLES})"
+        "--start-samples",
+        metavar="N",
+        type=int,
+        default=START_SAMPLES,
+        help=f"for the initial levels ({START_SAMPLES})",
     )
     parser.add_argument(
         "--settle",
         metavar="TIME",
         type=seconds,
-        help="take what the plant file says varies from run to run, and the levels to go on from, from all of so much "
-        "of each run ('30 s'), and count errors after it",
+        help="estimate levels and what varies by run from the first part of each run ('30 s'), and count errors after "
+        "it",
     )
     parser.add_argument(
         "--vary",
         metavar="NAME,...",
         default="",
-        help="constants with a tolerance that are taken from there too (* is any name)",
+        help="constants with a tolerance that are estimated there too (* matches any name)",
     )
     parser.add_argument("--from", metavar="TIME", dest="start", type=seconds, help="first time used of each file")
     parser.add_argument("--to", metavar="TIME", dest="stop", type=seconds, help="last time used: 300, or '2 h'")
     parser.add_argument("--picture", metavar="FILE", help="draw the run (PNG or SVG); of several, the last")
-    parser.add_argument("--beside", metavar="PLANT", help="another plant, drawn beside it, such as the one before")
+    parser.add_argument("--beside", metavar="PLANT", help="another plant in the same picture, such as the previous one")
     parser.add_argument(
         "--constant",
         metavar="INPUT=VALUE",

@@ -1,4 +1,4 @@
-"""Save everything that is whole of a broken or unfinished log as a new one; exit code 3 where something was lost."""
+"""Copy everything intact of a broken or unfinished log to a new one; exit code 3 if something was lost."""
 
 from __future__ import annotations
 

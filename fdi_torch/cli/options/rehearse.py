@@ -1,6 +1,6 @@
-"""Try a monitor out on simulated runs: false alarms, delays, faults named, estimators side by side.
+"""Validate a monitor on simulated runs: false alarms, detection delays, isolation, comparison of estimators.
 
-It is computed in pieces of seconds to minutes; Ctrl-C keeps those that are done, and --resume goes on.
+The work consists of tasks of seconds to minutes; Ctrl-C keeps those that are done, and --resume continues.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from fdi_torch.cli.options import add_config, add_live
 EXAMPLES = """
 examples:
   fdi rehearse --config rehearsal.yaml
-  fdi rehearse --config rehearsal.yaml --resume    go on where it was stopped
+  fdi rehearse --config rehearsal.yaml --resume    continue a stopped run
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, "fdi_torch.config.rehearsal:RehearsalConfig", required=True)
     parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
-    parser.add_argument("--resume", action="store_true", help="go on from what a stopped run left in its log")
+    parser.add_argument("--resume", action="store_true", help="continue from the log of a stopped run")
     add_live(parser)

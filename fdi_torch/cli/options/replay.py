@@ -1,8 +1,6 @@
-"""Run an estimation, a study, a gap diagnosis or a monitor again from its log alone, and compare event by event.
+"""Repeat an estimation, a study, a gap diagnosis or a monitor run from its log, and compare event by event.
 
-With --set, try another choice.
-
-Exit code 3 where an event differs by more than the tolerance.
+With --set, repeat it with another setting. Exit code 3 if an event differs by more than the tolerance.
 """
 
 from __future__ import annotations
@@ -11,8 +9,8 @@ import argparse
 
 EXAMPLES = """
 examples:
-  fdi replay logs/own.mcap                         the same again, compared
-  fdi replay logs/own.mcap --set seed=7            another seed
+  fdi replay logs/own.mcap                         repeat and compare
+  fdi replay logs/own.mcap --set seed=7            with another seed
   fdi replay logs/study.mcap --trial 12            one trial of a study
 """
 
@@ -27,9 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="what if: another objective, seed, library ...; may be repeated",
+        help="changed setting: another objective, seed, library ...; may be repeated",
     )
     parser.add_argument(
-        "--trial", metavar="N", type=int, action="append", default=[], help="of a study, only this; may be repeated"
+        "--trial", metavar="N", type=int, action="append", default=[], help="one trial of a study; may be repeated"
     )
     parser.add_argument("--out", metavar="FILE", help="the new log (with --set: NAME.what_if.mcap; otherwise not kept)")

@@ -1,6 +1,6 @@
 """Make one HTML page of one or more logs: verdict, rig, readings, convergence, uncertainty, configuration, provenance.
 
-The page needs no network and no scripts. It is written beside the (first) log, or where --out says.
+The page needs no network and no scripts. It is written next to the (first) log, or where --out says.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Many trials of one experiment, estimated and summed up: bias, error against the Cramer-Rao bound, coverage, failures.
+"""Repeat an experiment many times and summarise: bias, error against the Cramer-Rao bound, coverage, failures.
 
 The trials run in this process or, with --cluster, on a Dask cluster, with the same numbers.
 """
@@ -12,8 +12,8 @@ from fdi_torch.cli.options import add_config, add_live, add_run
 EXAMPLES = """
 examples:
   fdi study --config study.yaml
-  fdi study --config study.yaml --resume           go on where it was stopped
-  fdi study --config study.yaml --cluster local    on all cores, by Dask
+  fdi study --config study.yaml --resume           continue a stopped run
+  fdi study --config study.yaml --cluster local    on all cores, with Dask
 """
 
 
@@ -21,9 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, "fdi_torch.config.study:StudyFile", required=True)
     add_run(parser)
     add_live(parser)
-    parser.add_argument("--resume", action="store_true", help="go on from what a killed run left in its log")
+    parser.add_argument("--resume", action="store_true", help="continue from the log of a killed run")
     parser.add_argument(
         "--cluster",
         metavar="local|ADDRESS",
-        help="run on Dask: local, or tcp://host:8786 or tls://host:8786 of a trusted scheduler: it runs code here",
+        help="run on Dask: local, or tcp://host:8786 or tls://host:8786; it must be trusted, for it runs code here",
     )

@@ -1,4 +1,4 @@
-"""Estimate which faults are present in a recording, how large and how surely; logged, with a picture.
+"""Estimate which faults are present in a recording, how large and how certain; with a log and a picture.
 
 Without --config it runs the built-in example: the paper's Table 3 fault at an SNR of 30 dB, simulated and diagnosed.
 """
@@ -14,7 +14,7 @@ examples:
   fdi train                                        the built-in example: simulated, then diagnosed
   fdi train --config own.yaml                      a recording of your own
   fdi train --config own.yaml --set estimate.search.population=40 --seed 3
-  fdi train --config own.yaml --resume             go on where it was stopped
+  fdi train --config own.yaml --resume             continue a stopped run
 """
 
 
@@ -22,4 +22,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, "fdi_torch.config.run:RunConfig")
     add_run(parser)
     add_live(parser)
-    parser.add_argument("--resume", action="store_true", help="go on where a killed run of the same file stopped")
+    parser.add_argument("--resume", action="store_true", help="continue a killed run of the same file")

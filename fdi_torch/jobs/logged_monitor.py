@@ -1,0 +1,286 @@
+"""A monitor together with its log: samples, residuals, events and estimated faults are logged as they come."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import orjson
+import torch
+from torch import Tensor
+
+from fdi_torch.config.monitor import MonitorRun
+from fdi_torch.gap.acquisition import usable
+from fdi_torch.logbook import Listener, RunLog
+from fdi_torch.monitor.diagnosability import diagnosability
+from fdi_torch.monitor.events import FORMAT, Event
+from fdi_torch.monitor.monitor import Monitor, ResidualTrace
+from fdi_torch.monitor.monitor_setup import PreparedMonitor, fault_free_part, prepare_monitor
+from fdi_torch.monitor.samples import Samples, samples_of_recording
+from fdi_torch.monitor.window_monitor import WindowMonitor
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.check import doubts
+
+CHUNK = 2048  # samples of a recording that are processed at a time
+ALARM = "/observer/alarm"
+
+
+@dataclass(frozen=True)
+class MonitorCallbacks:
+    """Functions called during a run. tell(share, text): progress. event: each new event. ready: the prepared monitor.
+
+    log: receives every log message.
+    """
+
+    tell: Callable[[float, str], None]
+    event: Callable[[Event], None]
+    ready: Callable[[PreparedMonitor], None]
+    log: Listener | None = None
+
+
+class LoggedMonitor:
+    """A running monitor with its state and its log.
+
+    reported: count of each event in an earlier log of the same run; these events are not passed to the callback again.
+    """
+
+    monitor: Monitor | WindowMonitor
+    believed: Tensor
+
+    def __init__(
+        self,
+        run: MonitorRun,
+        log: RunLog,
+        callbacks: MonitorCallbacks,
+        reported: Counter[tuple[Any, ...]] | None = None,
+    ) -> None:
+        self.run, self.plant, self.log, self.callbacks = run, run.plant, log, callbacks
+        self._reported = Counter() if reported is None else reported
+        self.state: Any = None
+        self.events, self.spent = 0, 0.0
+        self._ever_suspected: dict[str, None] = {}
+        self._present_faults: tuple[tuple[str, float], ...] = ()
+        self._first_time: float | None = None
+        self._now = run.config.fault_free[0]
+
+    def process_recording(self, whole: Recording) -> None:
+        """Learn from the fault-free part of a complete recording, and process all of it."""
+        self.learn(whole)
+        samples = samples_of_recording(whole, self.run.plant)
+        duration, window = float(whole.time[-1] - whole.time[0]), self.run.config.window.longest
+        if window > duration and self.run.config.mode != "changes":
+            raise ValueError(
+                f"expected a recording of at least one window ({window:g} s) for the mode '{self.run.config.mode}', "
+                f"got {duration:g} s; shorten window.longest"
+            )
+        for first in range(0, len(samples), CHUNK):
+            last = min(first + CHUNK, len(samples))
+            self.process(samples.segment(first, last))
+            self.callbacks.tell(last / len(samples), f"{float(samples.time[last - 1]):g} s")
+
+    def learn(self, whole: Recording) -> None:
+        """Prepare the monitor from the fault-free part, and report what was learnt and any warnings."""
+        prepared, config = _prepare(self.run, whole), self.run.config
+        inner = prepared.monitor
+        self.monitor, self.believed = inner, prepared.believed
+        if config.mode != "changes":
+            window = config.window
+            self.monitor = WindowMonitor(
+                inner.observer,
+                inner.detector,
+                inner.watched,
+                config.mode,
+                window.longest,
+                window.stride,
+                inner.noise.interval,
+            )
+        self.callbacks.ready(prepared)
+        self._now = config.fault_free[1]
+        self._report(Event(self._now, "watching", prepared.false_alarm_text))
+        self.notice(self._watched_faults_text(prepared, whole))
+        part = fault_free_part(whole, *config.fault_free)
+        for warning in (*doubts(part, self.plant), *prepared.warnings):
+            self.notice(warning)
+
+    def process(self, samples: Samples) -> bool:
+        """Process further samples. Returns whether the observer had to restart."""
+        start = time.monotonic()
+        self._log_samples(samples)
+        if self.state is None:
+            self.state, self._first_time = self._start(samples), float(samples.time[0])
+            samples = samples.segment(1, len(samples))
+        events: list[Event] = []
+        if len(samples):
+            traces: list[ResidualTrace] = []
+            try:
+                self.state, events = self.monitor.advance(self.state, samples, traces.append)
+            finally:  # written in one call, which takes a third of the time
+                self._log_residuals(traces)
+            self._now = float(samples.time[-1])
+        for event in events:
+            self._report(event)
+        self.spent += time.monotonic() - start
+        return any(event.kind == "notice" for event in events)
+
+    def close(self) -> None:
+        """Report the summary of each alarm at the end."""
+        for event in self.monitor.close(self.state) if self.state is not None else []:
+            self._report(event)
+
+    def notice(self, text: str) -> None:
+        """Report a notice that is not caused by the plant."""
+        self._report(Event(self._now, "notice", text, believed=self._present_faults))
+
+    def faults(self) -> list[str]:
+        """Names of the parameters that are off nominal at present."""
+        return [name for name, _ in self._present_faults]
+
+    @property
+    def space(self) -> ParameterSpace:
+        return self.monitor.space
+
+    @property
+    def lasted(self) -> float:
+        """Time from the first sample to the last, s."""
+        return 0.0 if self._first_time is None else self._now - self._first_time
+
+    def _watched_faults_text(self, prepared: PreparedMonitor, whole: Recording) -> str:
+        """The watched faults, and which of them the inputs of the fault-free part cannot distinguish."""
+        names = [self.space.names[fault.size] for fault in prepared.monitor.faults]
+        text = f"watches for {', '.join(names)}"
+        part = fault_free_part(whole, *self.run.config.fault_free)
+        try:
+            report = diagnosability(self.plant, names, part, prepared.noise.reading_std, start="free")
+        except ValueError as error:
+            return f"{text}; which of them can be told apart is unknown: {error}"
+        return "; ".join([text, *report.groups])
+
+    def _start(self, samples: Samples) -> Any:
+        if isinstance(self.monitor, WindowMonitor):
+            return self.monitor.start(samples, self.believed)
+        return self.monitor.start(samples, self.believed, learning_until=self.run.config.fault_free[1])
+
+    def _report(self, event: Event) -> None:
+        """Log an event and the faults after it, and pass it on unless an earlier log of the run has it."""
+        self.events += 1
+        self.log.alarm(event.time, event.kind, " + ".join(event.faults), event.text, **event_fields(event))
+        self._present_faults = event.believed
+        if event.kind != "notice":
+            self._log_faults(event)
+        self.log.flush()
+        key = event.time, event.kind, event.text
+        if self._reported[key] > 0:
+            self._reported[key] -= 1
+        else:
+            self.callbacks.event(event)
+
+    def _log_faults(self, event: Event) -> None:
+        """Log each fault that is present, suspected or no longer present at an event."""
+        present, masses = dict(event.believed), event.masses
+        stds = dict(zip(event.faults, event.stds, strict=True))
+        for name in dict.fromkeys([*self._ever_suspected, *present, *masses]):
+            place, _, fault = name.partition(".")
+            size = present.get(name, self.space[name].nominal)
+            numbers: dict[str, Any] = {"size": size, "size_std": stds.get(name), "unit": self.space[name].unit}
+            self.log.fault(fault, place, name in present, t=event.time, probability=masses.get(name), **numbers)
+        self._ever_suspected.update(dict.fromkeys([*present, *masses]))
+
+    def _log_samples(self, samples: Samples) -> None:
+        plant = self.plant
+        sensors = plant.sensors
+        self.log.recording(
+            samples.time,
+            samples.inputs,
+            torch.nan_to_num(samples.readings, nan=float("nan")),
+            plant.channels(),
+            [s.column for s in sensors],
+            list(plant.channel_units().values()),
+            [s.unit for s in sensors],
+            mask=torch.isfinite(samples.readings),
+            hold=samples.hold,
+        )
+
+    def _log_residuals(self, traces: Sequence[ResidualTrace]) -> None:
+        """Log the residuals, the detector's statistic and its threshold."""
+        if not traces:
+            return
+        names, units = [s.column for s in self.plant.sensors], [s.unit for s in self.plant.sensors]
+        chart = self.monitor.detector.chart
+        time, residual, statistic = (
+            torch.cat(parts) for parts in zip(*((t.time, t.residual, t.statistic) for t in traces), strict=True)
+        )
+        threshold = torch.full_like(statistic, self.monitor.detector.threshold)
+        table = torch.cat([residual, torch.stack([statistic, threshold], dim=1)], dim=1)
+        names += [f"{chart}_statistic", f"{chart}_threshold"]
+        self.log.samples("/observer/residual", time, table, names, [*units, "", ""])
+
+
+def event_key(payload: dict[str, Any]) -> tuple[Any, ...]:
+    """Key by which a logged event is recognised in another log."""
+    return payload["t"], payload["event"], payload["message"]
+
+
+def event_fields(event: Event) -> dict[str, Any]:
+    """An event's fields for the log: numbers, texts and flat lists, and the whole event as JSON in `details`."""
+    fields: dict[str, Any] = {
+        "alarm": event.alarm or None,
+        "state": str(event.state),
+        "headline": event.headline if event.explanations else None,
+        "faults": list(event.faults) or None,
+        "sizes": list(event.sizes) or None,
+        "stds": list(event.stds) or None,
+        "units": list(event.units) or None,
+        "onset": event.onset,
+        "onset_std": event.onset_std,
+        "delay": event.delay,
+        "growing": event.growing if event.faults else None,
+        "explanations": [e.text for e in event.explanations] or None,
+        "masses": [e.mass for e in event.explanations] or None,
+        "sensors": [name for name, _ in event.shares] or None,
+        "shares": [share for _, share in event.shares] or None,
+        "first": event.first,
+        "last": event.last,
+        "count": event.count,
+        "severity": event.severity or None,
+        "announced": event.announced,
+        "format": FORMAT,
+        "details": orjson.dumps(event.to_dict()).decode(),
+    }
+    return fields
+
+
+def _prepare(run: MonitorRun, whole: Recording) -> PreparedMonitor:
+    c = run.config
+    part = _usable_part(run.plant, fault_free_part(whole, *c.fault_free))
+    # The configured initial levels are valid only if the fault-free part starts with the recording.
+    at_start = float(part.time[0]) == float(whole.time[0])
+    return prepare_monitor(
+        run.plant,
+        part,
+        c.faults,
+        c.calibrate,
+        c.detector,
+        c.false_alarms_every,
+        c.window.settings(),
+        c.step,
+        c.seed,
+        c.recording.start_levels if at_start else "free",
+        c.ranges,
+        c.observer.wish(),
+    )
+
+
+def _usable_part(plant: PlantDescription, part: Recording) -> Recording:
+    """The fault-free part. Raises ValueError for wrong units, channels or clocks, and for a stuck sensor."""
+    checked = usable(plant, part)
+    if checked.stuck:
+        raise ValueError(
+            f"{part.source}: expected a fault-free part in which every sensor reads its level, but "
+            f"{checked.stuck[0].text}; choose another part, or leave the sensor out of the plant file"
+        )
+    return checked.recording

@@ -1,0 +1,276 @@
+"""The commands as Python functions, for scripts and notebooks, with results that display themselves.
+
+A function accepts a file (run, monitor or study file) or the same content as a mapping, in which a `Plant` may replace
+the plant's name and a `Recording` the recording's file name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from fdi_torch.config.loaded_recordings import named_recordings, read_recording
+from fdi_torch.config.monitor import MonitorRun, build_monitor, load_monitor
+from fdi_torch.config.plant import load_plant
+from fdi_torch.config.run import Run, build_run, load_run
+from fdi_torch.config.study import Study, build_study, load_study
+from fdi_torch.gap.answer import Answer, adopted
+from fdi_torch.gap.diagnose import Settings
+from fdi_torch.gap.prediction import START_SAMPLES, Prediction
+from fdi_torch.gap.prediction import predict as run_freely
+from fdi_torch.gap.verdict_words import cause_words, explanation_words, verdict_sentence
+from fdi_torch.jobs import study as study_job
+from fdi_torch.jobs import train as train_job
+from fdi_torch.jobs.gap import one_thread, run_gap
+from fdi_torch.jobs.log_paths import free_path
+from fdi_torch.jobs.logged_monitor import MonitorCallbacks
+from fdi_torch.jobs.monitor import run_monitor
+from fdi_torch.jobs.run_setup import simulate_recording
+from fdi_torch.monitor.events import Event
+from fdi_torch.names import unknown
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.report.free_run_figure import free_run_figure
+from fdi_torch.report.style import inline_svg
+from fdi_torch.tables import Shown, Table
+
+Tell = Callable[[float, str], None]
+AnyPlant = PlantDescription | str | Path
+AnyRecording = Recording | str | Path
+HERE = "session"
+
+
+def silent(share: float, text: str) -> None:
+    """Ignore progress messages."""
+
+
+def simulate(
+    plant: AnyPlant = "three_tank",
+    *,
+    inputs: Mapping[str, Any],
+    duration: str = "1000 s",
+    sample_time: str = "1 s",
+    faults: Mapping[str, float | str] | None = None,
+    noise: Mapping[str, Any] | None = None,
+    start_levels: Any = "equilibrium",
+    hold: str = "zero_order",
+    seed: int = 0,
+) -> Recording:
+    """Simulate a recording, as `fdi simulate` does. The arguments are the keys of `simulate:` in a run file.
+
+    inputs: a value or steps for every channel, {"Q1": "50 cm^3/s", "Q2": {"steps": [["0 s", "50 cm^3/s"], ...]}}.
+    faults: {"T1.leak": 0.3}. noise: {"std": {"h1": "1 mm"}} or {"snr_db": 30}. The result is reproducible to the last
+    bit for a given seed. Raises ConfigError, which names the wrong key and the expected value.
+    """
+    keys = {"inputs": inputs, "duration": duration, "sample_time": sample_time, "hold": hold}
+    keys |= {"start_levels": start_levels, "faults": dict(faults or {}), "noise": dict(noise or {})}
+    return simulate_recording(build_run({"plant": plant, "simulate": keys, "seed": seed}, Path.cwd(), HERE))
+
+
+def train(
+    run: Run | Mapping[str, Any] | str | Path | None = None,
+    tell: Tell | None = None,
+    resume: bool = False,
+    listener: Any = None,
+) -> train_job.TrainResult:
+    """Estimate fault sizes and their uncertainty from recordings, as `fdi train` does, with a log and pictures.
+
+    run: a run file, or a mapping such as {"plant": plant, "recordings": [recording],
+    "estimate": {"parameters": ["T1.leak"]}}; None: the built-in example. tell(share, text): progress. resume: continue
+    a killed run of the same file. listener: receives every log message.
+    """
+    if run is None or isinstance(run, str | Path):
+        run = load_run(run)
+    elif not isinstance(run, Run):
+        run = build_run(run, Path.cwd(), HERE)
+    return train_job.train(run, tell, resume, listener)
+
+
+@dataclass(frozen=True, repr=False)
+class GapResult(Shown):
+    """answer: verdict, causes, explanations and closure. log: the MCAP log, for `report` and `fdi replay`."""
+
+    answer: Answer
+    plant: PlantDescription
+    log: Path
+
+    @property
+    def headline(self) -> str:
+        return verdict_sentence(self.answer.to_dict())
+
+    def table(self) -> Table:
+        """One row per parameter of each cause, SI; without a cause, the explanations and their probabilities."""
+        rows = [
+            (cause_words({"effect": c.effect, "location": c.location}), name, a.value, a.std, a.unit)
+            for c in self.answer.causes
+            for name, a in c.parameters.items()
+        ]
+        return (
+            Table.of_rows(("cause", "parameter", "value", "std error", "unit"), rows) if rows else self.explanations()
+        )
+
+    def explanations(self) -> Table:
+        """All explanations with their posterior probabilities, likeliest first."""
+        posterior = self.answer.to_dict()["posterior"]
+        rows = [(explanation_words(e["causes"]), e["probability"]) for e in posterior]
+        return Table.of_rows(("explanation", "probability"), rows)
+
+    def adopted(self, constants: bool = False) -> PlantDescription:
+        """The plant with the causes added as effects. constants: also use the constants fitted together with them."""
+        return adopted(self.plant, self.answer, constants)
+
+
+def gap(
+    plant: AnyPlant,
+    recordings: AnyRecording | Sequence[AnyRecording],
+    holdouts: AnyRecording | Sequence[AnyRecording] = (),
+    *,
+    out: str | Path = "logs",
+    tell: Tell = silent,
+    **settings: Any,
+) -> GapResult:
+    """Find where and by which effect the plant model deviates from recordings, as `fdi gap` does.
+
+    holdouts: recordings on which the corrected model is validated. out: folder of the log. settings: library, leave_out
+    (names of effects), step (s), most, named_only, as the options of `fdi gap`. Raises ValueError for other settings.
+    """
+    plant = plant_of(plant)
+    valid_settings = [field.name for field in fields(Settings)]
+    for name in settings:
+        if name not in valid_settings:
+            raise ValueError(f"gap: {unknown('a setting', name, valid_settings)}")
+    log = free_path(Path(out), "gap")
+    answer = run_gap(
+        log, plant, recordings_of(recordings, plant), recordings_of(holdouts, plant), Settings(**settings), tell
+    )
+    return GapResult(answer, plant, log)
+
+
+@dataclass(frozen=True, repr=False)
+class MonitorResult(Shown):
+    """events: in order of time. lasted: duration of the recording, s. spent: computing time, s."""
+
+    events: tuple[Event, ...]
+    lasted: float
+    spent: float
+    log: Path
+
+    @property
+    def headline(self) -> str:
+        alarms = sum(event.kind == "alarm" for event in self.events)
+        count = "no alarm" if not alarms else "1 alarm" if alarms == 1 else f"{alarms} alarms"
+        isolated = [event for event in self.events if event.kind in ("isolated", "revised")]
+        return f"{count} in {self.lasted:g} s" + (f"; {isolated[-1].headline}" if isolated else "")
+
+    def table(self) -> Table:
+        """One row per event; sizes in the units of the column `units`."""
+        names = ("time", "kind", "alarm", "text", "headline", "faults", "sizes", "stds", "units", "onset", "onset_std")
+        return Table({name: [getattr(event, name) for event in self.events] for name in names})
+
+
+def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = silent) -> MonitorResult:
+    """Run a monitor along a recording, as `fdi monitor` does.
+
+    run: a monitor file, or a mapping such as {"plant": plant, "recording": recording, "fault_free": ["0 s", "300 s"]}.
+    """
+    if isinstance(run, str | Path):
+        run = load_monitor(run)
+    elif not isinstance(run, MonitorRun):
+        run = build_monitor(run, Path.cwd(), HERE)
+    events: list[Event] = []
+    summary = run_monitor(run, MonitorCallbacks(tell, events.append, lambda prepared: None))
+    return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
+
+
+@dataclass(frozen=True, repr=False)
+class FreeRun(Shown):
+    """Free run of a plant along a recording, from initial levels estimated from the first samples."""
+
+    plant: PlantDescription
+    recording: Recording
+    prediction: Prediction
+
+    @property
+    def headline(self) -> str:
+        return f"free run of {self.plant.name} along {self.recording.source}"
+
+    def table(self) -> Table:
+        """One row per sensor: root mean square error, SI."""
+        rows = [(s.name, self.prediction.rmse[s.name], s.unit) for s in self.plant.sensors]
+        return Table.of_rows(("sensor", "RMSE", "unit"), rows)
+
+    def picture(self) -> str:
+        """Measured and predicted readings, as SVG."""
+        columns = [sensor.column for sensor in self.plant.sensors]
+        figure = free_run_figure(self.recording, columns, {self.plant.name: self.prediction.readings}, self.headline)
+        return str(inline_svg(figure, "free-run", self.headline))
+
+    def to_xarray(self) -> Any:
+        """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
+        columns = [sensor.column for sensor in self.plant.sensors]
+        return self.recording.selected((), columns).compared(self.prediction.readings)
+
+
+def predict(
+    plant: AnyPlant,
+    recording: AnyRecording,
+    *,
+    start_samples: int = START_SAMPLES,
+    step: float | None = None,
+    settle: float | None = None,
+    vary: Sequence[str] = (),
+) -> FreeRun:
+    """Simulate a plant freely along a recording and compare it with the readings, as `fdi predict` does.
+
+    start_samples: number of samples for estimating the initial levels; settle: the same as a time, s. step: of the
+    integration, s. vary: patterns of constants that are estimated from the start too. Raises ValueError if an input is
+    unknown for a time.
+    """
+    plant = plant_of(plant)
+    parts = recordings_of(recording, plant)
+    if len(parts) != 1:
+        raise ValueError(
+            f"{parts[0].source}: expected a recording whose inputs are known throughout, got {len(parts)} stretches; "
+            "cut one with Recording.known_stretches()"
+        )
+    with one_thread():
+        prediction = run_freely(plant, parts[0], start_samples, step, settle, vary)
+    return FreeRun(plant, parts[0], prediction)
+
+
+def study(
+    study: Study | Mapping[str, Any] | str | Path,
+    *,
+    resume: bool = False,
+    cluster: str | None = None,
+    tell: Tell | None = None,
+) -> study_job.StudyResult:
+    """Repeat an experiment many times and compare the estimates with their bounds, as `fdi study` does.
+
+    study: a study file, or the same as a mapping. resume: continue a killed run. cluster: address of a Dask scheduler,
+    or 'local'.
+    """
+    if isinstance(study, str | Path):
+        study = load_study(study)
+    elif not isinstance(study, Study):
+        study = build_study(study, Path.cwd(), HERE)
+    return study_job.run_study(study, resume, cluster, tell)
+
+
+def plant_of(plant: AnyPlant) -> PlantDescription:
+    """The plant itself, or the plant of a file or of a shipped name."""
+    return plant if isinstance(plant, PlantDescription) else load_plant(plant)
+
+
+def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDescription) -> list[Recording]:
+    """Recordings with the plant's channels, split into segments with known inputs; names are read as files."""
+    segments: list[Recording] = []
+    for each in [wanted] if isinstance(wanted, Recording | str | Path) else wanted:
+        if isinstance(each, Recording):
+            whole = read_recording(each.source, plant, given={each.source: each})
+            segments += [part for part in whole.known_stretches() if len(part) > 1]
+        else:
+            segments += named_recordings(str(each), plant, Path.cwd())
+    return segments

@@ -1,0 +1,104 @@
+"""Rows read from a growing file, converted to samples and to the recording from which a monitor learns its noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, pairwise
+
+import torch
+
+from fdi_torch.config.growing import Row
+from fdi_torch.config.monitor import MonitorRun
+from fdi_torch.logbook import Run as Log
+from fdi_torch.logbook import series
+from fdi_torch.monitor.samples import GAP, Samples
+from fdi_torch.recording import Recording
+
+
+def samples_of_rows(rows: Sequence[Row], run: MonitorRun) -> Samples:
+    """The rows as samples, in SI."""
+    time, inputs, readings = (torch.tensor(column, dtype=torch.float64) for column in zip(*rows, strict=True))
+    sensors = len(run.plant.sensors)
+    return Samples(time, inputs.reshape(len(time), -1), readings.reshape(-1, sensors), run.config.recording.hold)
+
+
+def rows_until(rows: Sequence[Row], until: float) -> list[Row]:
+    """The first segment of rows without a backward jump of the clock that reaches a time (s); empty if none does yet.
+
+    One row with a time far ahead does not count as reaching it; after a gap, GAP rows are required.
+    """
+    segment: list[Row] = []
+    steps: list[float] = []
+    beyond = 0
+    for row in rows:
+        step = row[0] - segment[-1][0] if segment else 0.0
+        if step == 0.0 and segment:
+            continue
+        if step < 0.0:
+            segment, steps, beyond = [], [], 0
+        elif segment:
+            steps.append(step)
+        segment.append(row)
+        if row[0] < until:
+            continue
+        beyond += 1
+        if beyond >= GAP or (beyond == 1 and steps and step <= GAP * sorted(steps)[len(steps) // 2]):
+            return segment
+    return []
+
+
+def recording_of_rows(rows: Sequence[Row], run: MonitorRun) -> Recording:
+    """The rows after the last jump of the clock, as a recording."""
+    if len(rows) < 2:
+        raise ValueError(f"{run.config.recording.file}: expected samples to follow, got {len(rows)}")
+    unique = [rows[0], *(after for before, after in pairwise(rows) if after[0] != before[0])]
+    jumps = [k for k in range(1, len(unique)) if unique[k][0] < unique[k - 1][0]]
+    samples = samples_of_rows(unique[jumps[-1] if jumps else 0 :], run)
+    plant = run.plant
+    return Recording(
+        samples.time,
+        samples.inputs,
+        samples.readings,
+        tuple(plant.channels()),
+        tuple(sensor.column for sensor in plant.sensors),
+        tuple(plant.channel_units().values()),
+        tuple(sensor.unit for sensor in plant.sensors),
+        hold=samples.hold,
+        source=run.config.recording.file,
+    )
+
+
+def logged_rows(log: Log, run: MonitorRun) -> list[Row]:
+    """The samples in a monitor's log, in their original order."""
+    inputs, outputs = series(log, "/plant/input"), series(log, "/plant/output")
+    count = min(len(inputs["t"]), len(outputs["t"]))  # a run may have been killed between the two messages
+    commands = [inputs[name][:count] for name in run.plant.channels()]
+    readings = [outputs[sensor.column][:count] for sensor in run.plant.sensors]
+    times = inputs["t"][:count].tolist()
+    return [(t, [float(c[k]) for c in commands], [float(r[k]) for r in readings]) for k, t in enumerate(times)]
+
+
+def resumed_rows(earlier: Sequence[Row], source: Iterable[Row | str]) -> Iterator[Row | str]:
+    """Rows of a growing file from its beginning, preceded by those of an earlier log that the file no longer has."""
+    rows = iter(source)
+    notices: list[Row | str] = []
+    for row in rows:
+        if not isinstance(row, str):
+            break
+        notices.append(row)
+    else:
+        yield from chain(earlier, notices)
+        return
+    if _equal_rows(row, earlier[0]):
+        yield from chain(notices, [row], rows)
+        return
+    yield from chain(earlier, notices)
+    for later in chain([row], rows):
+        if isinstance(later, str) or later[0] > earlier[-1][0]:
+            yield later
+
+
+def _equal_rows(a: Row, b: Row) -> bool:
+    """Whether two rows have equal values; NaN equals NaN."""
+    first, second = ([r[0], *r[1], *r[2]] for r in (a, b))
+    return len(first) == len(second) and all(x == y or (x != x and y != y) for x, y in zip(first, second, strict=True))

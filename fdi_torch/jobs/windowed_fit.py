@@ -1,0 +1,79 @@
+"""Fit of short windows of a recording, one by one, which shows when a temporary fault was present.
+
+`estimate.windows` of a run file requests it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from fdi_torch.config.loaded_recordings import LoadedRecording
+from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.recordings import StartLevel
+from fdi_torch.config.run import Run
+from fdi_torch.effects import once_run
+from fdi_torch.estimate.stretches import Stretch, stretches_of
+from fdi_torch.estimate.windows import Window, cut_up, noise_of, window_of, window_step
+from fdi_torch.jobs.log_paths import STARTS_OVER, free_path
+from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space
+from fdi_torch.jobs.train import log_recordings, origin_of
+from fdi_torch.logbook import RunLog
+
+
+@dataclass(frozen=True)
+class WindowedFit:
+    """windows: fitted windows. stretches: periods in which each fault was present. step: of the integration, s."""
+
+    windows: tuple[Window, ...]
+    stretches: tuple[Stretch, ...]
+    step: float
+    log: Path
+
+
+def fit_windows(run: Run, tell: Callable[[float, str], None] = lambda share, text: None) -> WindowedFit:
+    """Cut the recordings of a run file into windows of `estimate.windows` s, and fit the suspected faults in each.
+
+    The initial levels of each window are free, and constants to calibrate have their tolerances as priors in each
+    window. Effects of the plant that act only at the start of a run are left out, because windows start in mid-run.
+    """
+    run = replace(run, plant=once_run(run.plant, run.plant.channels()))
+    length = run.config.estimate.windows
+    assert length is not None
+    loaded = recordings_of(run)
+    space = requested_space(run)
+    suspects = {p.name for p in space if p.name.count(".") == 2}
+    free: dict[str, StartLevel] = dict.fromkeys((t.name for t in run.plant.tanks), "free")
+    path = free_path(Path(run.config.output.folder), run.name)
+    with RunLog(path, "train", **origin_of(run, loaded), after_interruption=STARTS_OVER) as log:
+        log_recordings(log, loaded, {})
+        noise = [noise_of(part.recording, run.plant) for part in loaded]
+        cuts = [(c, std) for part, std in zip(loaded, noise, strict=True) for c in cut_up(part.recording, length)]
+        _expect_windows(run, len(cuts))
+        fittings = [fitting_of(run, space, [LoadedRecording(cut, free)]) for cut, _ in cuts]
+        step = hybrid_settings(run.config.estimate).refine_step or window_step(fittings, noise[0])
+        windows = []
+        for k, (fitting, (cut, std)) in enumerate(zip(fittings, cuts, strict=True)):
+            tell(k / len(cuts), f"window at {float(cut.time[0]):g} s")
+            windows.append(window_of(fitting, std, suspects, step))
+        result = WindowedFit(tuple(windows), tuple(stretches_of(windows)), step, path)
+        stretches = [vars(s) for s in result.stretches]
+        log.result({"step": step, "windows": [_window_fields(w) for w in windows], "stretches": stretches})
+    tell(1.0, "done")
+    return result
+
+
+def _expect_windows(run: Run, count: int) -> None:
+    if not count:
+        got = f"{run.config.estimate.windows:g} s; shorten them"
+        raise ConfigError([f"{run.source}: estimate.windows: expected windows shorter than a recording, got {got}"])
+
+
+def _window_fields(window: Window) -> dict[str, object]:
+    return {
+        "start": window.start,
+        "stop": window.stop,
+        "misfit": window.misfit,
+        **{f.name: {"size": f.size, "std": f.std, "state": f.state} for f in window.faults},
+    }

@@ -1,0 +1,189 @@
+"""Events of a monitor made from its state: explanations with probabilities and sizes, and the text that people read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from fdi_torch.monitor.alarm_state import Alarm
+from fdi_torch.monitor.events import (
+    Event,
+    Explanation,
+    Kind,
+    Limit,
+    Size,
+    amount_text,
+    headline,
+    rate_text,
+    shares_text,
+)
+from fdi_torch.monitor.hypothesis import HypothesisFit
+from fdi_torch.monitor.level_forecast import forecast_limits
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState
+from fdi_torch.monitor.noise_model import NoiseModel
+from fdi_torch.monitor.observer_bank import ObserverBank
+
+FORECAST_WINDOWS = 4.0  # horizon of the level forecast, in longest windows
+
+
+class EventWriter:
+    """Writes the events of one monitor."""
+
+    def __init__(self, observer: ObserverBank, noise: NoiseModel, settings: MonitorSettings, watched: int) -> None:
+        self.observer, self.space, self.noise, self.settings = observer, observer.space, noise, settings
+        self.watched, self.matters = watched, {m.fault: m for m in observer.network.description.matters}
+
+    def notice(self, state: MonitorState, text: str) -> Event:
+        return self._event(state, "notice", text)
+
+    def raised(self, state: MonitorState, alarm: Alarm) -> Event:
+        """A new alarm, with the sensors that raised it."""
+        text = f"the residual leaves its fault-free range: {shares_text(alarm.shares)}"
+        return self._event(state, "alarm", text, alarm)
+
+    def answered(
+        self,
+        state: MonitorState,
+        change: DetectedChange,
+        fits: Sequence[HypothesisFit],
+        kind: Kind,
+        announce: bool,
+    ) -> Event:
+        """The explanation of an alarm. fits: the reported explanations, likeliest first."""
+        alarm, best = state.alarm(change.number), fits[0]
+        explanations = tuple(self.explanation(f, change, state.now) for f in fits)
+        text = f"{headline(explanations)}, {_onset_text(best)}"
+        if best.onset - state.reachable <= 2.0 * max(best.onset_std, 0.5):
+            text += ", where the observer starts: it may have been there before"
+        rates = [rate_text(self.space[s.name], s.rate) for s in explanations[0].sizes if s.rate is not None]
+        text += f"; grows by {', '.join(rates)}" if rates else ""
+        if best.misfit_ratio > 1.0:
+            text += "; does not explain all of the residual"
+        limits = self._limits(state, change, fits)
+        text += "".join(f"; {limit.text}" for limit in limits[:1] if limit.chance > 0.5)
+        delay, (urgency, large) = change.alarm_time - best.onset, self._severity(explanations)
+        text += f"; urgency: {urgency}" if urgency else ""
+        return self._event(
+            state, kind, text, alarm, explanations=explanations, delay=delay, limits=limits, severity=urgency,
+            announced=large and announce,
+        )  # fmt: skip
+
+    def unexplained(self, state: MonitorState, number: int, fits: Sequence[HypothesisFit]) -> Event:
+        """An alarm for which "no change" is among the likely explanations."""
+        explanations = tuple(self.explanation(f, None, state.now) for f in fits)
+        text = f"no fault of the list explains the alarm better than chance does: {headline(explanations)}"
+        return self._event(state, "cannot tell", text, state.alarm(number), explanations=explanations)
+
+    def retired(self, state: MonitorState, alarm: Alarm, reason: str, announced: bool) -> Event:
+        return self._event(state, "retired", f"alarm {alarm.number}: {reason}", alarm, announced=announced)
+
+    def ended(
+        self,
+        state: MonitorState,
+        change: DetectedChange,
+        fits: Sequence[HypothesisFit],
+        number: int,
+        names: Sequence[str],
+        observable: bool,
+    ) -> Event:
+        """Recovery of the faults of one alarm. observable: whether the readings would show them if still present."""
+        explanations = tuple(self.explanation(f, change, state.now) for f in fits)
+        text = f"{', '.join(names)}: back to nominal, {_onset_text(fits[0])}"
+        if " or " in headline(explanations):
+            text += f"; {headline(explanations)}"
+        if not observable:
+            text = (
+                f"{', '.join(names)}: the readings since {fits[0].onset:.1f} s would not show whether it still stands"
+            )
+        kind: Kind = "recovered" if observable else "cannot tell"
+        delay = change.alarm_time - fits[0].onset
+        return self._event(state, kind, text, state.alarm(number), explanations=explanations, delay=delay)
+
+    def followed(
+        self, state: MonitorState, tracks: Sequence[FaultTrack], announced: Sequence[FaultTrack]
+    ) -> list[Event]:
+        """New sizes of known faults, one event each."""
+        return [
+            self._event(
+                state,
+                "followed",
+                f"{self._track_text(t)}, since {t.onset:.1f} s",
+                state.alarm(t.number),
+                explanations=(self._track_explanation(t),),
+                announced=t in announced,
+            )
+            for t in tracks
+        ]
+
+    def summary(self, state: MonitorState, alarm: Alarm) -> Event:
+        """Summary of one alarm at the end of the recording."""
+        tracks = [t for t in state.tracks if t.number == alarm.number]
+        sizes = "; ".join(f"{self._track_text(t)}, since {t.onset:.1f} s" for t in tracks)
+        faults = sizes or ", ".join(alarm.faults)
+        if alarm.count > 1:
+            times = f"raised {alarm.count} times, {alarm.first:g} s to {alarm.last:g} s"
+        else:
+            times = f"raised at {alarm.first:g} s"
+        text = f"alarm {alarm.number}, {alarm.state}{': ' if faults else ''}{faults}; {times}"
+        explanations = tuple(self._track_explanation(t) for t in tracks)
+        return self._event(state, "summary", text, alarm, explanations=explanations)
+
+    def explanation(self, fit: HypothesisFit, change: DetectedChange | None, now: float) -> Explanation:
+        """A fit in the form that events report."""
+        h, sizes = fit.hypothesis, []
+        for c in h.columns:
+            p, size, std = self.space.parameters[c], float(fit.value[c]), float(fit.std[c])
+            at_bound = c in fit.at_bound
+            grows = change is not None and h.incipient and c in h.sizes and now > fit.onset
+            rate = (size - float(change.before[c])) / (now - fit.onset) if grows and change else None
+            sizes.append(Size(p.name, size, std, p.unit, amount_text(p, size, std, at_bound), at_bound, rate))
+        if not sizes:
+            return Explanation(fit.probability, ())
+        recovered = set(h.recovered) >= set(h.sizes)
+        return Explanation(fit.probability, tuple(sizes), fit.onset, fit.onset_std, h.incipient, recovered)
+
+    def _limits(self, state: MonitorState, change: DetectedChange, fits: Sequence[HypothesisFit]) -> tuple[Limit, ...]:
+        """Forecast of overflow and dry tanks. The random draws depend on the alarm's number only."""
+        faulty = [f for f in fits if f.hypothesis.columns]
+        generator = torch.Generator().manual_seed(change.number)
+        horizon, lookback = FORECAST_WINDOWS * self.settings.longest, self.settings.lookback
+        return forecast_limits(self.observer, self.noise, state, change, faulty, horizon, lookback, generator)
+
+    def _severity(self, explanations: Sequence[Explanation]) -> tuple[str, bool]:
+        """The plant file's urgency of the likeliest explanation, and whether one of its faults is large enough to
+        announce.
+        """
+        urgencies, announced = [], []
+        for s in explanations[0].sizes:
+            matter = self.matters.get(s.name)
+            large = matter is None or abs(s.size - self.space[s.name].nominal) >= matter.smallest
+            announced.append(large)
+            urgencies += [matter.urgency] if matter and large and matter.urgency else []
+        return ", ".join(dict.fromkeys(urgencies)), any(announced)
+
+    def _track_explanation(self, track: FaultTrack) -> Explanation:
+        p, (_, size, std) = self.space.parameters[track.column], track.last
+        shown = Size(p.name, size, std, p.unit, amount_text(p, size, std), rate=track.rate)
+        return Explanation(1.0, (shown,), track.onset, None, track.rate is not None)
+
+    def _track_text(self, track: FaultTrack) -> str:
+        p, (_, size, std) = self.space.parameters[track.column], track.last
+        growth = f", changes by {rate_text(p, track.rate)}" if track.rate is not None else ""
+        return amount_text(p, size, std) + growth
+
+    def _event(self, state: MonitorState, kind: Kind, text: str, alarm: Alarm | None = None, **more: object) -> Event:
+        off = (state.believed != state.healthy).nonzero().flatten().tolist()
+        believed = tuple((self.space.names[c], float(state.believed[c])) for c in off if c < self.watched)
+        if alarm is None:
+            return Event(state.now, kind, text, believed=believed)
+        return Event(
+            state.now, kind, text, alarm.number, alarm.state, shares=alarm.shares, first=alarm.first, last=alarm.last,
+            count=alarm.count, believed=believed, **more,  # type: ignore[arg-type]
+        )  # fmt: skip
+
+
+def _onset_text(fit: HypothesisFit) -> str:
+    manner = "growing since" if fit.hypothesis.incipient else "since"
+    return f"{manner} {fit.onset:.1f} ± {fit.onset_std:.2g} s"

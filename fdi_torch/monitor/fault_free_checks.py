@@ -1,0 +1,132 @@
+"""Checks of the fault-free part: signs of a fault in it, and how accurate the learnt false-alarm rate is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from fdi_torch.monitor.detection import DRIFT, Detector, log_rate_std
+from fdi_torch.monitor.events import amount_text, percent_text
+from fdi_torch.monitor.hypothesis import Fault
+from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.noise_model import NoiseModel, operating_point
+from fdi_torch.monitor.observer import Observation
+from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
+from fdi_torch.monitor.observer_gain import kalman_gain, start_uncertainty
+from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.whitening import Whitening
+from fdi_torch.parameters import ParameterSpace, display_unit
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.network import TankNetwork
+
+# Process noise over reading noise that counts as no process noise.
+NO_PROCESS_NOISE = 1e-3
+# Posterior probability from which a fault in the fault-free part is reported.
+CONVINCING = 0.99
+# Offset of the white residual that is reported, in standard deviations: half the drift that a CUSUM allows.
+OFFSET = 0.5 * DRIFT
+SIGNIFICANT = 4.0  # standard errors of an offset or a fault size
+NORMAL_COUNT = 30.0  # mean from which a Poisson number is treated as normal
+RATE_FACTOR = 2.0  # desired accuracy of the false-alarm rate, as a factor
+QUESTION = "does the recording start faulty? Name another fault_free part"
+
+
+def _largest_alarm_count(detector: Detector, noise: NoiseModel, channels: int, every: float, sampling: float) -> int:
+    """99 % quantile of the alarms in the fault-free part: a Poisson number at the upper limit of the rate."""
+    error = log_rate_std(detector.chart, every / sampling, channels, DRIFT, noise.whitening)
+    expected = noise.whitening.samples * sampling / every * math.exp(1.96 * error)
+    if expected > NORMAL_COUNT:
+        return math.ceil(expected + 2.33 * math.sqrt(expected))
+    count, term = 0, math.exp(-expected)
+    cumulative = term
+    while cumulative < 0.99:
+        count += 1
+        term *= expected / count
+        cumulative += term
+    return count
+
+
+def residual_warnings(
+    plant: PlantDescription, noise: NoiseModel, detector: Detector, seen: Observation, every: float
+) -> list[str]:
+    """Warnings about the residual: too many alarms in the fault-free part, or a significant constant offset."""
+    warnings = []
+    alarms = detector.alarms(noise.whitening(seen.steady_residual)).nonzero().flatten()
+    sampling = float(torch.diff(seen.time).median())
+    if len(alarms) > _largest_alarm_count(detector, noise, len(plant.sensors), every, sampling):
+        first = f"the first at {float(seen.time[alarms[0]]):g} s"
+        warnings.append(f"the part taken for fault-free raises {len(alarms)} alarms itself, {first}: {QUESTION}")
+    white, smallest = noise.whitening, max(OFFSET, SIGNIFICANT * noise.whitening.samples**-0.5)
+    for sensor, mean, offset in zip(plant.sensors, white.mean.tolist(), white.offset.tolist(), strict=True):
+        if abs(offset) > smallest:
+            unit, scale = display_unit(sensor.unit)
+            off = f"{sensor.name} lies {scale * mean:.3g} {unit} off the observer throughout"
+            warnings.append(f"in the fault-free part {off}; this is taken for the plant's own: calibrate a constant")
+    return warnings
+
+
+def fault_warnings(
+    network: TankNetwork,
+    space: ParameterSpace,
+    samples: Samples,
+    believed: Tensor,
+    step: float,
+    faults: Sequence[Fault],
+) -> list[str]:
+    """Warning about a single fault in the fault-free part that explains the readings down to their noise.
+
+    The learnt noise model would attribute the effect of such a fault to process noise. This check therefore assumes no
+    process noise, and takes the measurement noise from second differences.
+    """
+    linear = operating_point(network, samples, space, believed, step)
+    std = noise_std_from_differences(samples.readings)
+    if not bool((std > 0.0).all()):
+        return []
+    start = start_uncertainty(network.description, std)
+    gain = kalman_gain(linear, NO_PROCESS_NOISE * float(std.min()) * torch.ones_like(start), std, start)
+    zeros, count = torch.zeros_like(std), len(samples)
+    whitening = Whitening(zeros, std.new_zeros(0, len(std), len(std)), torch.diag(1.0 / std), count, zeros)
+    observer = ObserverBank(network, space, gain, whitening, step)
+    steady = [fault for fault in faults if not fault.shape]
+    first, _ = observer.first_state(samples, believed)
+    best = isolate(observer, ObserverWindow(samples, first, 1), believed, steady, incipient=False, deepest=1)[0]
+    columns = best.hypothesis.columns
+    if not best.fits or not columns or best.probability < CONVINCING or best.onset_std == 0.0:
+        return []
+    p, size, error = space.parameters[columns[0]], float(best.value[columns[0]]), float(best.std[columns[0]])
+    if abs(size - p.nominal) < SIGNIFICANT * error:
+        return []
+    fault = f"{amount_text(p, size, error)} since {best.onset:.0f} s, probability {percent_text(best.probability)}"
+    return [f"{fault}, explains the part taken for fault-free: {QUESTION}"]
+
+
+def false_alarm_rate_text(
+    plant: PlantDescription, noise: NoiseModel, detector: Detector, every: float, sampling: float
+) -> str:
+    """Text: accuracy of the time between false alarms, and the fault-free time that a better accuracy needs.
+
+    The standard error e of ln(rate) falls with the square root of the time. For a rate within a factor F = RATE_FACTOR
+    (95 %) the fault-free part must be (1.96 e / ln F)^2 times as long.
+    """
+    error = log_rate_std(detector.chart, every / sampling, len(plant.sensors), DRIFT, noise.whitening)
+    seconds = noise.whitening.samples * sampling
+    needed = seconds * (1.96 * error / math.log(RATE_FACTOR)) ** 2
+    text = (
+        f"learnt from {seconds:g} s: one false alarm in {every:g} s, to within a factor of {math.exp(1.96 * error):.2g}"
+    )
+    if needed <= seconds:
+        return text
+    return f"{text}; a factor of {RATE_FACTOR:g} takes {needed:.0f} s without a fault: lengthen fault_free"
+
+
+def noise_std_from_differences(readings: Tensor) -> Tensor:
+    """Standard deviation (sensors,) of the noise of readings (S, sensors), from their second differences.
+
+    The second difference of white noise with variance 1 has variance 6; that of a slow signal is negligible. NaN
+    readings are ignored.
+    """
+    second_difference = readings[2:] - 2.0 * readings[1:-1] + readings[:-2]
+    return second_difference.square().nanmean(dim=0).div(6.0).sqrt()

@@ -1,0 +1,29 @@
+"""Settings of a monitor: length of its windows and schedule of its fits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class MonitorSettings:
+    """lookback: how long before an alarm an onset is searched for, s. confirm: time from alarm to isolation, s. revise:
+    factor by which the time since the onset grows between fits. longest: length of the longest window, s. incipient:
+    whether faults may grow slowly. together: largest number of simultaneous faults. level: posterior probability of the
+    reported explanations together.
+    """
+
+    lookback: float = 300.0
+    confirm: float = 60.0
+    revise: float = 2.0
+    longest: float = 1000.0
+    incipient: bool = True
+    together: int = 2
+    level: float = 0.95
+
+    def __post_init__(self) -> None:
+        if not (self.lookback > 0 and self.confirm >= 0 and self.revise > 1 and self.longest >= self.lookback):
+            raise ValueError(
+                "expected lookback > 0, confirm >= 0, revise > 1 and longest >= lookback, "
+                f"got {self.lookback:g} s, {self.confirm:g} s, {self.revise:g}, {self.longest:g} s; change them"
+            )

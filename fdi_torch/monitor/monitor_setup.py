@@ -1,0 +1,174 @@
+"""Set-up of a monitor from a fault-free recording: calibrate constants, identify the noise, design the detector."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import build_network, once_run, placements_for
+from fdi_torch.estimate.fitting import StartLevels, set_up
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
+from fdi_torch.monitor.detection import Chart, make_detector
+from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text, fault_warnings, residual_warnings
+from fdi_torch.monitor.hypothesis import SHAPE, faults_of
+from fdi_torch.monitor.monitor import Monitor
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.noise_model import NoiseModel, learn_noise, noise_of_gain, operating_point
+from fdi_torch.monitor.observer import Observer
+from fdi_torch.monitor.observer_gain import Gain, hand_gain, start_beside_noise, timed_gain
+from fdi_torch.monitor.samples import Samples, samples_of_recording, usual_interval
+from fdi_torch.monitor.stepper import usual_step
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.recording import Recording
+
+
+@dataclass(frozen=True)
+class PreparedMonitor:
+    """A monitor ready to start.
+
+    believed: parameter values for the observer, including calibrated constants. calibrated: the constants' values by
+    name. radius: decay factor of the observer's error per sample. warnings: signs that the fault-free part is not fault
+    free. false_alarm_text: accuracy of the time between false alarms.
+    """
+
+    monitor: Monitor
+    believed: Tensor
+    noise: NoiseModel
+    calibrated: dict[str, float]
+    radius: float
+    warnings: tuple[str, ...] = ()
+    false_alarm_text: str = ""
+
+
+@dataclass(frozen=True)
+class GainSpecification:
+    """User-defined observer gain: a time constant in s, or a matrix (tanks x sensors, m per unit of the reading and
+    sample). Without it, the gain follows from the noise.
+    """
+
+    time_constant: float | None = None
+    by_hand: tuple[tuple[float, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.time_constant is None) == (not self.by_hand):
+            raise ValueError("expected either a time constant or a gain by hand, got both or none; give one")
+
+
+def prepare_monitor(
+    plant: PlantDescription,
+    fault_free: Recording,
+    faults: Sequence[str] = (),
+    calibrate: Sequence[str] = (),
+    chart: Chart = "cusum",
+    time_between_false_alarms: float = 20000.0,
+    settings: MonitorSettings | None = None,
+    step: float | None = None,
+    seed: int = 0,
+    start: StartLevels = "free",
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    gain: GainSpecification | None = None,
+) -> PreparedMonitor:
+    """A monitor for `faults` (parameters such as 'T1.leak.size'; the usual ones by default).
+
+    calibrate: constants that are first fitted to the fault-free recording, with their tolerances as priors. start:
+    knowledge of the initial levels. step: longest integration step, s. ranges: replace the usual ranges of faults.
+    Raises ValueError.
+    """
+    # The step is at most the usual sampling interval, because it also sets how sharply square roots and rims are
+    # resolved.
+    step = min(usual_step(plant) if step is None else step, 1.25 * usual_interval(fault_free.time))
+    watched = with_shapes(list(faults) or usual_faults(plant), plant)
+    network = build_network(plant, placements_for(watched))
+    running = once_run(plant, fault_free.ran)  # the fault-free part need not be the start of the run
+    learning = build_network(running, placements_for([*watched, *calibrate]))
+    values = calibration(running, fault_free, calibrate, step, start) if calibrate else {}
+    space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate)])
+    for name in watched:
+        if name.endswith(".phase"):  # a full turn either way, so that no fit stops at +-pi
+            space = space.with_changes(name, low=-2.0 * math.pi, high=2.0 * math.pi)
+    for name, (low, high) in (ranges or {}).items():
+        space = space.with_changes(name, low=low, high=high)
+    believed = space.vector(values)
+    samples = samples_of_recording(fault_free, plant)
+    if gain is None:
+        noise, seen = learn_noise(learning, samples, space, believed, longest_step=step)
+        radius = Observer(learning, noise.gain, space, believed, step).check_stable(samples)
+    else:
+        given = _specified_gain(learning, samples, space, believed, step, gain)
+        observer = Observer(learning, given, space, believed, step)
+        radius = observer.check_stable(samples)
+        noise, seen = noise_of_gain(learning, given, samples, space, believed, step)
+    sampling = float(torch.diff(samples.time).median())
+    generator = torch.Generator().manual_seed(seed)
+    every = time_between_false_alarms
+    detector = make_detector(chart, every, sampling, len(plant.sensors), generator, learnt=noise.whitening)
+    monitor = Monitor(network, space, noise, detector, settings, step, watched=len(watched))
+    warnings = (
+        *residual_warnings(plant, noise, detector, seen, every),
+        *fault_warnings(learning, space, samples, believed, step, faults_of(watched)),
+    )
+    text = false_alarm_rate_text(plant, noise, detector, every, sampling)
+    return PreparedMonitor(monitor, believed, noise, values, radius, warnings, text)
+
+
+def _specified_gain(
+    network: TankNetwork,
+    samples: Samples,
+    space: ParameterSpace,
+    believed: Tensor,
+    step: float,
+    specification: GainSpecification,
+) -> Gain:
+    if specification.by_hand:
+        return hand_gain(torch.tensor(specification.by_hand, dtype=network.nominal.dtype))
+    linear = operating_point(network, samples, space, believed, step)
+    unit = torch.linalg.vector_norm(linear.output, dim=-1)
+    span = float(torch.diff(samples.time).median())
+    assert specification.time_constant is not None
+    start_std = start_beside_noise(network.description, unit)
+    return timed_gain(linear, span, specification.time_constant, unit, start_std)
+
+
+def with_shapes(faults: Sequence[str], plant: PlantDescription) -> list[str]:
+    """The faults, each oscillation followed by its period and phase."""
+    constants = build_network(plant, placements_for(faults)).constants
+    names = []
+    for name in faults:
+        effect = name.rpartition(".")[0]
+        shape = [f"{effect}.{s}" for s in SHAPE if f"{effect}.{s}" in constants and f"{effect}.{s}" not in faults]
+        names += [name, *shape]
+    return names
+
+
+def calibration(
+    plant: PlantDescription, fault_free: Recording, names: Sequence[str], step: float, start: StartLevels = "free"
+) -> dict[str, float]:
+    """Constants that fit a fault-free recording best, by Levenberg-Marquardt from the nominal ones."""
+    fitting = set_up(plant, [fault_free], names, start)
+    space = fitting.space
+    problem = fitting.problem(step)
+    nominal = space.nominal().unsqueeze(0)
+    result = levenberg_marquardt(problem.linearise, nominal, space.low(), space.high(), RefineSettings(iterations=100))
+    return {name: float(result.theta[0, space.index(name)]) for name in names}
+
+
+def usual_faults(plant: PlantDescription) -> list[str]:
+    """A leak of each tank, plugging of each pipe, gain and offset of each pump, and bias, gain and freezing of each
+    sensor.
+    """
+    leaks = [f"{tank.name}.leak.size" for tank in plant.tanks]
+    plugged = [f"{pipe.name}.plugging.size" for pipe in plant.pipes]
+    pumps = [f"{pump.name}.{fault}" for fault in ("pump_gain.factor", "pump_offset.offset") for pump in plant.pumps]
+    wrong = ("sensor_bias.bias", "sensor_gain.factor", "sensor_stuck.size")
+    return leaks + plugged + pumps + [f"{sensor.name}.{fault}" for fault in wrong for sensor in plant.sensors]
+
+
+def fault_free_part(recording: Recording, start: float, stop: float) -> Recording:
+    """The part between two moments (s). Raises ValueError where the recording does not hold it."""
+    return replace(recording.window(start, stop), source=f"{recording.source} ({start:g} to {stop:g} s)")

@@ -1,0 +1,148 @@
+"""The state that a monitor carries from sample to sample: recent samples, observer, alarms and known faults."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from fdi_torch.monitor.alarm_state import Alarm
+from fdi_torch.monitor.hypothesis import HypothesisFit
+from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverBank, ObserverWindow
+from fdi_torch.monitor.samples import ClockState, Samples
+
+
+@dataclass(frozen=True)
+class FaultTrack:
+    """The size of a known fault over time.
+
+    column: of the parameter space. number: of its alarm. onset: s. first, last: (time in s, size, standard deviation)
+    of the first and the latest estimate. effect_rms: root mean square of what the fault adds to the white residuals.
+    announced: when its size was last announced, s. adjusted: onset of the latest change of size, s.
+    """
+
+    column: int
+    number: int
+    onset: float
+    first: tuple[float, float, float]
+    last: tuple[float, float, float]
+    effect_rms: float
+    announced: float
+    adjusted: float = LONG_AGO
+
+    @property
+    def rate(self) -> float | None:
+        """Growth between the two estimates, per s; None if they differ by less than three standard deviations."""
+        (t0, size0, std0), (t1, size1, std1) = self.first, self.last
+        significant = t1 > t0 and abs(size1 - size0) > 3.0 * math.hypot(std0, std1)
+        return (size1 - size0) / (t1 - t0) if significant else None
+
+
+@dataclass(frozen=True)
+class DetectedChange:
+    """The latest detected change of parameters.
+
+    number: of its alarm. before (P,): the parameters before the change, valid since `since` s. explanations: all with
+    more than 0.1 % of the posterior probability, likeliest first; the observer uses the first. alarm_time: s. next_fit:
+    when all explanations are fitted again, s. ended: tracks of the faults that recovered at this change. reported:
+    parameter names of each explanation in the last event.
+    """
+
+    number: int
+    before: Tensor
+    since: float
+    explanations: tuple[HypothesisFit, ...]
+    alarm_time: float
+    next_fit: float
+    ended: tuple[FaultTrack, ...] = ()
+    reported: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def best(self) -> HypothesisFit:
+        """The likeliest explanation that changes a parameter."""
+        return self.explanations[0]
+
+
+@dataclass(frozen=True)
+class PendingAlarm:
+    """An alarm that is not isolated yet. attempts: how often isolation has failed."""
+
+    number: int
+    attempts: int = 0
+
+
+@dataclass(frozen=True)
+class MonitorState:
+    """State of a monitor after a sample.
+
+    Recent samples, S of them:
+      samples; state (S, tanks + M): observer state after each, levels in m, then memory of actuators and sensors;
+      residual, white (S, sensors): residuals and whitened residuals; fault_effects (S, E, sensors): change of the
+      residual if each of the E effects were taken out of the observer's plant. number: samples since the observer's
+      start. reachable: when it started, s. earliest_start: no later window begins before it, s.
+    Parameters:
+      believed (P,): values that the observer uses; healthy (P,): the same with every fault at nominal.
+      states_without (E, tanks + M): states of parallel observers, each without one effect.
+      unexplained_rms (sensors,): root mean square of the white residuals that the known faults leave unexplained.
+    Bookkeeping:
+      clock: time of the last sample. detector_memory: None after a restart of the detector. alarms: all so far.
+      pending: the alarm that is not isolated yet. change: the latest. tracks: the known faults. learning_until: no
+      alarm is raised before it, s.
+    """
+
+    samples: Samples
+    state: Tensor
+    residual: Tensor
+    white: Tensor
+    fault_effects: Tensor
+    number: int
+    believed: Tensor
+    healthy: Tensor
+    states_without: Tensor
+    reachable: float
+    unexplained_rms: Tensor
+    clock: ClockState
+    earliest_start: float = LONG_AGO
+    detector_memory: Tensor | None = None
+    alarms: tuple[Alarm, ...] = ()
+    pending: PendingAlarm | None = None
+    change: DetectedChange | None = None
+    tracks: tuple[FaultTrack, ...] = ()
+    learning_until: float = LONG_AGO
+
+    @property
+    def adjusted(self) -> float:
+        """Onset of the latest change of a known fault's size, s."""
+        return max((t.adjusted for t in self.tracks), default=LONG_AGO)
+
+    def alarm(self, number: int) -> Alarm:
+        return self.alarms[number - 1]
+
+    def with_alarm(self, alarm: Alarm) -> MonitorState:
+        return replace(self, alarms=tuple(alarm if a.number == alarm.number else a for a in self.alarms))
+
+    @property
+    def now(self) -> float:
+        """Time of the last sample, s."""
+        return float(self.samples.time[-1])
+
+    def active_effects(self, observer: ObserverBank) -> list[int]:
+        """Indices of the observer's effects that have a value other than fault-free."""
+        off = (self.believed != self.healthy).tolist()
+        return [e for e, columns in enumerate(observer.effects) if any(off[c] for c in columns)]
+
+    def parameters_without_each(self, observer: ObserverBank) -> Tensor:
+        """The observer's parameters with one active effect removed at a time, (active effects, P)."""
+        active = self.active_effects(observer)
+        theta = self.believed.repeat(len(active), 1)
+        for lane, e in enumerate(active):
+            theta[lane, list(observer.effects[e])] = self.healthy[list(observer.effects[e])]
+        return theta
+
+    def window(self, start: float) -> ObserverWindow:
+        """The window from the last sample before `start` s; it holds at least two further samples."""
+        start = max(start, self.earliest_start)
+        first = max(min(int((self.samples.time < start).sum()) - 1, len(self.samples) - 3), 0)
+        processed = self.number - (len(self.samples) - 1 - first)
+        return ObserverWindow(self.samples.segment(first, len(self.samples)), self.state[first], processed)

@@ -1,0 +1,101 @@
+"""Alarms of detectors on simulated runs: rate of false alarms, detection delays and missed faults."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from fdi_torch.monitor.detection import CHARTS, LONGEST_WINDOW, NO_ALARM, Detector, glr, make_detector, window_lengths
+from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig, fault_free_schedule
+from fdi_torch.monitor.noise_model import NoiseModel
+from fdi_torch.monitor.observer import Observer
+from fdi_torch.monitor.run_length import block_maxima
+from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.whitening import Whitening
+
+
+def detectors(
+    every: float, sampling: float, channels: int, seed: int = 0, learnt: Whitening | None = None
+) -> list[Detector]:
+    """One detector of each kind, all with the mean time `every` s between false alarms."""
+    peaks = _peaks(channels, seed)
+    return [
+        make_detector(chart, every, sampling, channels, torch.Generator(), learnt=learnt, peaks=peaks)
+        for chart in CHARTS
+    ]
+
+
+@lru_cache(maxsize=8)
+def _peaks(channels: int, seed: int) -> Tensor:
+    """Simulated block maxima for the GLR's threshold, kept for further detectors."""
+    lengths = window_lengths(LONGEST_WINDOW)
+    return block_maxima(lambda white: glr(white, lengths), channels, torch.Generator().manual_seed(seed))
+
+
+def white_residuals(rig: SimulatedRig, noise: NoiseModel, samples: Samples) -> Tensor:
+    """White residuals (R, S, sensors) of an observer with nominal parameters, started at the equilibrium."""
+    seen = Observer(rig.network, noise.gain).run(samples, rig.levels)
+    return noise.whitening(seen.steady_residual)
+
+
+@dataclass(frozen=True)
+class FalseAlarms:
+    """counted: alarms in `seconds` s of fault-free runs; expected: number by design."""
+
+    chart: str
+    counted: int
+    expected: float
+    seconds: float
+
+
+def count_false_alarms(
+    rig: SimulatedRig,
+    noise: NoiseModel,
+    charts: Sequence[Detector],
+    every: float,
+    runs: int,
+    samples: int,
+    generator: torch.Generator,
+) -> list[FalseAlarms]:
+    """Alarms of each detector in fault-free runs. every: designed mean time between false alarms, s."""
+    seen = rig.run(fault_free_schedule(rig.space, runs), samples, generator)
+    white = white_residuals(rig, noise, seen)
+    seconds = runs * (samples - 1) * rig.sampling
+    return [FalseAlarms(d.chart, int(d.alarms(white).sum()), seconds / every, seconds) for d in charts]
+
+
+@dataclass(frozen=True)
+class Delays:
+    """delay (R,) s from onset to the first alarm, infinite if there is none; early (R,) bool: whether there was a false
+    alarm before the onset, after which the detector restarts.
+    """
+
+    chart: str
+    delay: Tensor
+    early: Tensor
+
+    def quantile(self, q: float) -> float:
+        """Quantile of the delay, s; missed faults count as infinite."""
+        order = self.delay.sort().values
+        return float(order[min(int(q * len(order)), len(order) - 1)])
+
+    def missed(self) -> int:
+        return int(torch.isinf(self.delay).sum())
+
+
+def delays(
+    rig: SimulatedRig, noise: NoiseModel, charts: Sequence[Detector], samples: Samples, schedule: FaultSchedule
+) -> list[Delays]:
+    """Detection delay of each detector."""
+    white = white_residuals(rig, noise, samples)
+    results = []
+    for detector in charts:
+        since = (samples.time < schedule.onset.unsqueeze(1)).sum(1)
+        first, early = detector.first_alarm_since(white, since)
+        when = torch.where(first == NO_ALARM, torch.inf, samples.time[first.clamp(min=0)])
+        results.append(Delays(detector.chart, when - schedule.onset, early > 0))
+    return results

@@ -1,0 +1,140 @@
+"""Monte Carlo plan: isolation of sudden and incipient faults of components, sensors and actuators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+
+from fdi_torch.estimate.proportion import wilson
+from fdi_torch.monitor.detection import Chart, make_detector
+from fdi_torch.monitor.monitor import Monitor
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monte_carlo.isolation_trials import FaultScenario, confusions, isolate_run, smallest_isolable
+from fdi_torch.monitor.monte_carlo.simulated_runs import (
+    FaultSchedule,
+    SimulatedRig,
+    fault_free_schedule,
+)
+from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, quantiles, seeded_generator
+from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
+from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.state_update import advance_observer
+
+RUNS_PER_TASK = 10
+NAME = "naming"
+LARGEST_SHARE = 0.9  # of a parameter's range; faults that need a larger size are left out
+PERIOD = 40.0  # s, of a simulated oscillation
+
+
+@dataclass(frozen=True)
+class IsolationPlan:
+    """The rig's space are the faults; all but stuck sensors and oscillations are simulated as incipient faults as well.
+    loop: name of the plan, "open" or "closed". times: fault size as a multiple of the smallest isolable size.
+    """
+
+    rig: SimulatedRig
+    loop: str
+    chart: Chart
+    monitor: MonitorSettings
+    runs: int
+    samples: int
+    onset: float
+    times: float
+    every: float
+    seed: int
+
+    def tasks(self) -> list[Task]:
+        firsts = range(0, self.runs, RUNS_PER_TASK)
+        return [Task(f"{NAME}/{self.loop}", lambda first=first: self._isolate(first)) for first in firsts]  # type: ignore[misc]
+
+    @cached_property
+    def _designed(self) -> tuple[NoiseModel, Monitor, list[FaultScenario], list[float]]:
+        """Noise model from a fault-free run, the monitor, and the simulated faults with their smallest
+        isolable sizes.
+        """
+        rig = self.rig
+        nominal = rig.space.nominal()
+        training = _one(rig.run(fault_free_schedule(rig.space, 1), 3600, seeded_generator(self.seed, 6)), 0)
+        noise, _ = learn_noise(rig.network, training, rig.space, nominal, levels=rig.levels)
+        sensors = training.readings.shape[-1]
+        detector = make_detector(
+            self.chart, self.every, rig.sampling, sensors, seeded_generator(self.seed, 7), learnt=noise.whitening
+        )
+        monitor = Monitor(rig.network, rig.space, noise, detector, self.monitor)
+        scenarios = self._scenarios(monitor)
+        free = training.segment(0, self.samples)
+        state = advance_observer(monitor.observer, monitor.start(free, levels=rig.levels), free.segment(1, len(free)))
+        smallest = smallest_isolable(monitor.observer, state.window(self.onset - 60.0), nominal, scenarios, self.onset)
+        isolable = [(k, s) for k, s in zip(scenarios, smallest, strict=True) if self._in_range(k, s)]
+        return noise, monitor, [k for k, _ in isolable], [s for _, s in isolable]
+
+    def _scenarios(self, monitor: Monitor) -> list[FaultScenario]:
+        scenarios = []
+        for fault in monitor.faults:
+            names = [self.rig.space.names[c].rpartition(".")[2] for c in fault.shape]
+            shape = tuple((c, PERIOD if n == "period" else 0.7) for c, n in zip(fault.shape, names, strict=True))
+            stuck = "stuck" in self.rig.space.names[fault.size]
+            manners = (False,) if shape or stuck else (False, True)
+            scenarios += [FaultScenario(fault, shape, incipient) for incipient in manners]
+        return scenarios
+
+    def _isolate(self, first: int) -> Numbers:
+        _, monitor, scenarios, smallest = self._designed
+        rig, count = self.rig, min(RUNS_PER_TASK, self.runs - first)
+        chosen = [(first + r) % len(scenarios) for r in range(count)]
+        nominal, end = rig.space.nominal(), (self.samples - 1) * rig.sampling
+        theta = torch.stack([scenarios[k].theta(nominal, self._size(scenarios[k], smallest[k])) for k in chosen])
+        onset = torch.full((count,), self.onset, dtype=theta.dtype)
+        ramp = torch.tensor([end - self.onset if scenarios[k].incipient else 0.0 for k in chosen], dtype=theta.dtype)
+        seen = rig.run(FaultSchedule(theta, onset, ramp), self.samples, seeded_generator(self.seed, 8, first))
+        results = [isolate_run(monitor, _one(seen, r), nominal, rig.levels, self.onset) for r in range(count)]
+        names = [rig.space.names[scenarios[k].fault.size] for k in chosen]
+        return {
+            "fault": [
+                f"{n} {'slow' if scenarios[k].incipient else 'sudden'}" for n, k in zip(names, chosen, strict=True)
+            ],
+            "named": [" + ".join(s.last) for s in results],
+            "delay": [-1.0 if s.alarm is None else s.alarm - self.onset for s in results],
+            "early": float(sum(s.early for s in results)),
+            "ways": float(len(scenarios)),
+        }
+
+    def _in_range(self, scenario: FaultScenario, smallest: float) -> bool:
+        """Whether the parameter's range allows the size; otherwise the fault is not isolable in this experiment."""
+        p = self.rig.space.parameters[scenario.fault.size]
+        return self.times * smallest <= LARGEST_SHARE * max(p.high - p.nominal, p.nominal - p.low)
+
+    def _size(self, scenario: FaultScenario, smallest: float) -> float:
+        p = self.rig.space.parameters[scenario.fault.size]
+        if "stuck" in p.name:
+            return p.high
+        up = p.high - p.nominal >= p.nominal - p.low
+        return p.nominal + (1.0 if up else -1.0) * self.times * smallest
+
+    def result_table(self, numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> ResultTable:
+        results = numbers.get(f"{NAME}/{self.loop}", ())
+        truth, named_faults = [t for n in results for t in n["fault"]], [s for n in results for s in n["named"]]
+        right = sum(t.partition(" ")[0] == s for t, s in zip(truth, named_faults, strict=True))
+        low, high = wilson(right, len(named_faults))
+        delay_values = [float("inf") if d < 0 else d for n in results for d in n["delay"]]
+        q, missed = quantiles(delay_values, (0.5, 0.95)), sum(d == float("inf") for d in delay_values)
+        first = (self.loop, str(len(named_faults)), f"{right} ({100 * low:.0f} .. {100 * high:.0f} %)", str(missed))
+        ways = f"{results[0]['ways']:.0f} ways" if results else ""
+        rows = [(*first, str(sum(int(n["early"]) for n in results)), f"{q[0]:.0f}, {q[1]:.0f}", ways)]
+        wrong = [(t, tuple(s.split(" + ")) if s else ()) for t, s in zip(truth, named_faults, strict=True)]
+        wrong = [(t, s) for t, s in wrong if s != (t.partition(" ")[0],)]
+        mistakes = confusions([t for t, _ in wrong], [s for _, s in wrong], 12)
+        rows += [("", "", "", "", "", "", f"{t} as {s}: {n}".replace(".size", "")) for t, s, n in mistakes]
+        summary = f"{right} of {len(named_faults)} faults named right in {self.loop} loop" if results else ""
+        header = ("loop", "runs", "named right", "missed", "false alarms", "delay, s (50, 95 %)", "wrong")
+        title = f"faults of {self.times:g} times the smallest isolable size"
+        return ResultTable(title, header, tuple(rows) if results else (), summary)
+
+
+def _one(samples: Samples, run: int) -> Samples:
+    inputs = samples.inputs[run] if samples.inputs.dim() > 2 else samples.inputs
+    return Samples(samples.time, inputs, samples.readings[run])

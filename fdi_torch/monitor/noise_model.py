@@ -1,0 +1,156 @@
+"""Process and measurement noise of a plant from one fault-free recording, and the Kalman gain for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, initial_levels
+from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, linearised, riccati, start_beside_noise
+from fdi_torch.monitor.samples import Samples, usual_interval
+from fdi_torch.monitor.stepper import Stepper
+from fdi_torch.monitor.whitening import Whitening, score_whitenings, with_slow_variance
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.network import TankNetwork
+
+# log10 of the process noise per sample over the measurement noise, both in m: from negligible to dominant.
+EXPONENTS = tuple(0.5 * i - 4.0 for i in range(11))
+FINE = tuple(0.125 * i for i in range(-4, 5))
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Noise model identified from a fault-free recording.
+
+    process_std (tanks,) m per sample; reading_std (sensors,) in the readings' units; ratio: process over measurement
+    noise, both as levels. whitening: autocorrelation of the observer's residual. gain: of the observer. interval: usual
+    time between samples, s.
+    """
+
+    process_std: Tensor
+    reading_std: Tensor
+    ratio: float
+    whitening: Whitening
+    gain: Gain
+    interval: float = 1.0
+
+
+def learn_noise(
+    network: TankNetwork,
+    fault_free: Samples,
+    space: ParameterSpace | None = None,
+    theta: Tensor | None = None,
+    levels: Tensor | None = None,
+    longest_step: float | None = None,
+) -> tuple[NoiseModel, Observation]:
+    """Identify the noise by maximum likelihood over the ratio of process to measurement noise, and run its observer.
+
+    fault_free: one recording. levels (tanks,): initial levels if known. All candidate ratios run in parallel.
+    """
+    if fault_free.batch:
+        raise ValueError(f"expected one fault-free recording, got a batch of {tuple(fault_free.batch)}")
+    linear = operating_point(network, fault_free, space, theta, longest_step)
+
+    def candidates(exponents: Sequence[float]) -> list[_Candidate]:
+        gain = _gain(network, linear, network.nominal.new_tensor(exponents))
+        lanes = fault_free.readings.expand(len(exponents), *fault_free.readings.shape)
+        seen = Observer(network, gain, space, theta, longest_step).run(replace(fault_free, readings=lanes), levels)
+        return [_candidate(seen, lane, exponent) for lane, exponent in enumerate(exponents)]
+
+    coarse = min(candidates(EXPONENTS), key=lambda candidate: candidate.score)
+    fine = candidates([coarse.exponent + offset for offset in FINE])
+    best = candidates([_minimizing_exponent(fine)])[0]
+    return replace(_noise(network, linear, best), interval=usual_interval(fault_free.time)), best.seen
+
+
+def noise_of_gain(
+    network: TankNetwork,
+    gain: Gain,
+    fault_free: Samples,
+    space: ParameterSpace | None = None,
+    theta: Tensor | None = None,
+    longest_step: float | None = None,
+) -> tuple[NoiseModel, Observation]:
+    """Noise model for a given observer gain: only the residual's autocorrelation; process noise is unknown (NaN)."""
+    seen = Observer(network, gain, space, theta, longest_step).run(fault_free)
+    settled = seen.last(max(len(fault_free) - len(gain.opening), len(fault_free) // 2))
+    whitening = with_slow_variance(score_whitenings(settled.steady_residual)[0][1], settled.steady_residual)
+    unknown = network.nominal.new_full((len(network.description.tanks),), torch.nan)
+    std = settled.steady_residual.square().nanmean(dim=0).sqrt()
+    return NoiseModel(unknown, std, float("nan"), whitening, gain, usual_interval(fault_free.time)), seen
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """An observer for the noise ratio 10^exponent. score: -2 log-likelihood plus the penalty for the whitening."""
+
+    exponent: float
+    score: float
+    whitening: Whitening
+    seen: Observation
+
+
+def _candidate(seen: Observation, lane: int, exponent: float) -> _Candidate:
+    single = Observation(seen.time, seen.state[lane], seen.residual[lane], seen.inflation[..., lane, :, :], seen.tanks)
+    score, whitening = score_whitenings(single.steady_residual)[0]
+    return _Candidate(exponent, score + 2.0 * float(torch.log(single.inflation).sum()), whitening, single)
+
+
+def _minimizing_exponent(candidates: Sequence[_Candidate]) -> float:
+    """The exponent at the minimum of the parabola through the best candidate and its neighbours."""
+    scores = [candidate.score for candidate in candidates]
+    i = min(range(1, len(candidates) - 1), key=lambda lane: scores[lane])
+    step, bend = candidates[i].exponent - candidates[i - 1].exponent, scores[i - 1] - 2.0 * scores[i] + scores[i + 1]
+    if bend <= 0.0:
+        return candidates[i].exponent
+    shift = 0.5 * step * (scores[i - 1] - scores[i + 1]) / bend
+    return candidates[i].exponent + min(max(shift, -step), step)
+
+
+def _gain(network: TankNetwork, linear: Linear, exponents: Tensor) -> Gain:
+    """Gains for the ratios 10^exponents, as a batch."""
+    unit = torch.linalg.vector_norm(linear.output, dim=-1)  # reading per metre of its tank's level
+    shares = (10.0**exponents).unsqueeze(-1)
+    start_std = start_beside_noise(network.description, unit)
+    return kalman_gain(linear, shares.expand(-1, len(start_std)), unit.expand(len(exponents), -1), start_std)
+
+
+def _noise(network: TankNetwork, linear: Linear, best: _Candidate) -> NoiseModel:
+    """Both noises from the innovations' covariance, H P H' + R, at the best ratio."""
+    unit, ratio = torch.linalg.vector_norm(linear.output, dim=-1), network.nominal.new_tensor(10.0**best.exponent)
+    tanks = len(network.description.tanks)
+    predicted = riccati(linear, torch.diag_embed(ratio.expand(tanks) ** 2), torch.diag(unit**2))
+    variance = torch.diagonal(linear.output @ predicted @ linear.output.mT) + unit**2
+    reading_std = torch.sqrt(best.seen.steady_residual.square().nanmean(dim=0) / variance) * unit
+    process_std = ratio * (reading_std / unit).mean().expand(tanks)
+    batch = _gain(network, linear, ratio.log10().unsqueeze(0))
+    gain = Gain(batch.steady[0], batch.opening[:, 0], batch.inflation[:, 0])
+    whitening = with_slow_variance(best.whitening, best.seen.steady_residual)
+    return NoiseModel(process_std, reading_std, float(ratio), whitening, gain)
+
+
+def operating_point(
+    network: TankNetwork,
+    samples: Samples,
+    space: ParameterSpace | None = None,
+    theta: Tensor | None = None,
+    longest_step: float | None = None,
+) -> Linear:
+    """The plant linearised over one sampling interval about the median readings and mean inputs of a recording."""
+    values = bind_parameters(network, space, theta)
+    inputs = torch.nan_to_num(samples.inputs, nan=0.0).mean(dim=-2)
+    median = Samples(
+        samples.time, samples.inputs, samples.readings.nanmedian(dim=-2, keepdim=True).values, samples.hold
+    )
+    levels = initial_levels(network, median, values)
+    lowest = 0.02 * tank_heights(network)  # the outflow law has no finite slope in an empty tank
+    span = float(torch.diff(samples.time).median())
+    return linearised(Stepper(network, longest_step), torch.maximum(levels, lowest), inputs, span, values)
+
+
+def tank_heights(network: TankNetwork) -> Tensor:
+    """Height of each tank, (tanks,) m."""
+    return network.nominal.new_tensor([tank.height for tank in network.description.tanks])

@@ -1,0 +1,180 @@
+"""Bank of observers, one for each hypothesis that some parameters changed at some time, and their innovations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from fdi_torch.monitor.observer import initial_levels
+from fdi_torch.monitor.observer_gain import Gain
+from fdi_torch.monitor.observer_run import run_observers
+from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.stepper import Stepper
+from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork
+from fdi_torch.monitor.whitening import Whitening
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.network import TankNetwork
+
+NEVER, LONG_AGO = 1e30, -1e30  # s
+# Readings of all hypotheses processed at once; limits the memory, and fits a processor's cache.
+LARGEST_BATCH = 2_000_000
+
+
+@dataclass(frozen=True)
+class ChangeHypotheses:
+    """L hypotheses, one lane each: the parameters change from their present values to `theta` (L, P) at `onset` (L,) s.
+
+    incipient (L,) bool: the change is linear from the onset to the last sample of the window instead of sudden.
+    """
+
+    theta: Tensor
+    onset: Tensor
+    incipient: Tensor
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def subset(self, first: int, last: int) -> ChangeHypotheses:
+        return ChangeHypotheses(self.theta[first:last], self.onset[first:last], self.incipient[first:last])
+
+    def ramp(self, end: float) -> Tensor:
+        """Duration of the change, (L,) s."""
+        return torch.where(self.incipient, (end - self.onset).clamp(min=0.0), 0.0)
+
+
+def no_change(believed: Tensor) -> ChangeHypotheses:
+    """The hypothesis that the parameters (P,) do not change, as one lane."""
+    return ChangeHypotheses(believed[None], believed.new_tensor([NEVER]), torch.tensor([False]))
+
+
+@dataclass(frozen=True)
+class ObserverWindow:
+    """A time window in which a change is searched for.
+
+    samples: the first one only sets the start; `state` (tanks + M,) is the observer's state after its correction and
+    `number` the count of samples that the observer had processed by then. The later samples are compared.
+    """
+
+    samples: Samples
+    state: Tensor
+    number: int
+
+    def __len__(self) -> int:
+        return len(self.samples) - 1
+
+    @property
+    def times(self) -> Tensor:
+        """Times of the compared samples, (S,) s."""
+        return self.samples.time[1:]
+
+    @property
+    def readings(self) -> int:
+        """Number of readings in the compared samples."""
+        return int(torch.isfinite(self.samples.readings[1:]).sum())
+
+
+class ObserverBank:
+    """Observers run along a window under many hypotheses in parallel.
+
+    Under the true hypothesis the innovations are white, and half their sum of squares is the negative log-likelihood
+    (prediction-error method; Ljung 1999, ch. 7). In all methods believed (P,) are the values of `space` before the
+    change.
+
+    effects: groups of columns of `space` that belong to one effect, such as amplitude, period and phase of an
+    oscillation. An effect with a memory and an onset parameter (a stuck sensor keeps its reading at the onset) gets the
+    onset of the change.
+    """
+
+    def __init__(
+        self,
+        network: TankNetwork,
+        space: ParameterSpace,
+        gain: Gain,
+        whitening: Whitening,
+        longest_step: float | None = None,
+    ) -> None:
+        self.stepper = Stepper(network, longest_step)
+        self.network, self.space, self.gain, self.whitening = network, space, gain, whitening
+        self.changing = SwitchedNetwork(network, space.names)
+        self._held = _with_own_onset(network, space)
+        onsets = [f"{name.rpartition('.')[0]}.onset" for name in self._held]
+        names = [*space.names, *(f"after {name}" for name in space.names), ONSET, RAMP, *onsets]
+        groups: dict[str, list[int]] = {}
+        for column, name in enumerate(space.names):
+            groups.setdefault(name.rpartition(".")[0], []).append(column)
+        self.effects = tuple(tuple(columns) for columns in groups.values())
+        self._columns = ParameterSpace(self.changing.constants[name] for name in names)
+
+    def white_innovations(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
+        """White innovations (L, S, sensors); zero where a reading, or one that the whitening needs, is missing."""
+        white = self.whitening(self.run(window, believed, changes)[1])
+        white[:, : self.whitening.order] = 0.0
+        return torch.nan_to_num(white, nan=0.0)
+
+    def in_blocks(self, window: ObserverWindow, changes: ChangeHypotheses, even: int = 1) -> list[ChangeHypotheses]:
+        """The hypotheses in blocks that fit into memory; each block's size is a multiple of `even`."""
+        size = even * max(LARGEST_BATCH // (even * len(window) * len(self.network.description.sensors)), 1)
+        return [changes.subset(first, first + size) for first in range(0, len(changes), size)]
+
+    def run(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> tuple[Tensor, Tensor]:
+        """States (L, S, tanks + M) after each sample, and residuals (L, S, sensors) scaled to the steady variance."""
+        samples, count = window.samples, len(window)
+        ran = run_observers(
+            self.changing,
+            self._columns,
+            self._lanes(believed, changes, float(samples.time[-1])),
+            samples,
+            window.state.expand(len(changes), -1),
+            self.gain.table(window.number, count),
+            self.stepper.longest,
+            from_first=False,
+        )
+        return ran.state, (samples.readings[1:] - ran.expected) / self.gain.spread(window.number, count)
+
+    def first_state(self, samples: Samples, believed: Tensor, levels: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """State (tanks + M,) after the first sample and the residual there. levels: from the readings if None."""
+        first = samples.segment(0, 1)
+        if levels is None:
+            levels = initial_levels(self.network, samples, self.network.bind(self.space, believed))
+        ran = run_observers(
+            self.changing,
+            self._columns,
+            self._lanes(believed, no_change(believed), float(first.time[0])),
+            first,
+            levels[None],
+            self.gain.table(0, 1),
+            self.stepper.longest,
+            from_first=True,
+        )
+        return ran.state[0, 0], (first.readings[0] - ran.expected[0, 0]) / self.gain.spread(0, 1)[0]
+
+    def space_width(self) -> Tensor:
+        """Width of each parameter's range, (P,); its nominal magnitude, or 1, where the range is infinite."""
+        low, high = self.space.low(), self.space.high()
+        typical = self.space.nominal().abs()
+        width = torch.where(torch.isfinite(high - low), high - low, torch.where(typical > 0, typical, 1.0))
+        return width
+
+    def _lanes(self, believed: Tensor, changes: ChangeHypotheses, end: float) -> Tensor:
+        """Parameter values of the switched plant for each hypothesis, (L, columns)."""
+        before = believed.expand(len(changes), -1)
+        timing = torch.stack([changes.onset, changes.ramp(end)], dim=1)
+        onsets = []
+        for name in self._held:
+            p = self.space.parameters[self.space.index(name)]
+            already = before[:, self.space.index(name)] != p.nominal
+            onsets.append(torch.where(already, LONG_AGO, changes.onset))
+        return torch.cat([before, changes.theta, timing, *(column.unsqueeze(1) for column in onsets)], dim=1)
+
+
+def _with_own_onset(network: TankNetwork, space: ParameterSpace) -> list[str]:
+    """Parameters of `space` that are sizes of effects with a memory and an onset parameter."""
+    named = []
+    for placement in network.placements:
+        size, *shape = placement.effect.parameters(placement.location, network.description)
+        name = f"{placement.prefix}.{size.name}"
+        if placement.effect.memory and any(p.name == "onset" for p in shape) and name in space:
+            named.append(name)
+    return named

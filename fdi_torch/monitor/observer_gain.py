@@ -1,0 +1,182 @@
+"""Gains of a Luenberger-like observer: the Kalman gain, a gain for a given time constant, or a gain given by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from fdi_torch.monitor.stepper import Stepper, slopes
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.network import PlaceValues
+from fdi_torch.plant.pace import length_scale
+
+DOUBLINGS = 60
+LONGEST_TRANSIENT = 2000  # samples until the gain must be steady
+# Standard deviation of an initial level known from the first reading only, as a share of the tank's height.
+START_SHARE = 1.0
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Observer gain at every sample, m per unit of the reading.
+
+    steady (*batch, tanks, sensors). opening (K, *batch, tanks, sensors): larger gains of the first K samples, while the
+    initial levels are uncertain. inflation (K, *batch, sensors): standard deviation of the residuals during these
+    samples over the steady one.
+    """
+
+    steady: Tensor
+    opening: Tensor
+    inflation: Tensor
+
+    def at(self, k: int) -> Tensor:
+        return self.opening[k] if k < len(self.opening) else self.steady
+
+    def table(self, first: int, count: int) -> Tensor:
+        """The gains of `count` samples from the `first` of a run on, (count, *batch, tanks, sensors)."""
+        opening = self.opening[first : first + count]
+        return torch.cat([opening, self.steady.expand(count - len(opening), *self.steady.shape)])
+
+    def spread(self, first: int, count: int) -> Tensor:
+        """The inflation at `count` samples from the `first` of a run on, (*batch, count, sensors)."""
+        opening = self.inflation[first : first + count]
+        steady = torch.ones_like(self.steady[..., 0, :]).expand(count - len(opening), *self.steady[..., 0, :].shape)
+        return torch.cat([opening, steady]).movedim(0, -2)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Linearised plant over one sampling interval: transition (*batch, tanks, tanks), output
+    (*batch, sensors, tanks).
+    """
+
+    transition: Tensor
+    output: Tensor
+
+
+def linearised(stepper: Stepper, levels: Tensor, inputs: Tensor, span: float, values: PlaceValues) -> Linear:
+    """The plant linearised about levels (*batch, tanks) under inputs (*batch, channels) held for `span` s."""
+
+    def moved(x: Tensor) -> Tensor:
+        return stepper.advance(stepper.start(x, inputs, values), lambda share: inputs, 0.0, span, values).levels
+
+    def read(x: Tensor) -> Tensor:
+        return stepper.read(stepper.start(x, inputs, values), span, span, values)[0]
+
+    return Linear(slopes(moved, levels), slopes(read, levels))
+
+
+def kalman_gain(linear: Linear, process_std: Tensor, reading_std: Tensor, start_std: Tensor) -> Gain:
+    """Kalman gain with its initial transient.
+
+    process_std (*batch, tanks) m per sample, reading_std (*batch, sensors) and start_std (tanks) m: standard deviations
+    of process noise, readings and initial levels; only their ratios matter. The steady gain solves the discrete
+    algebraic Riccati equation. Raises ValueError if a level is not observable.
+    """
+    process, reading = torch.diag_embed(process_std**2), torch.diag_embed(reading_std**2)
+    steady = riccati(linear, process, reading)
+    final, final_std = _filter_gain(linear, steady, reading)
+    gains, stds = [], []
+    batch = final.shape[:-2]
+    predicted = torch.diag_embed(start_std.expand(*batch, linear.transition.shape[-1]) ** 2)
+    for _ in range(LONGEST_TRANSIENT):
+        gain, std = _filter_gain(linear, predicted, reading)
+        if bool((((gain - final).abs() <= 1e-3 * final.abs().amax()) & torch.isfinite(gain)).all()):
+            break
+        gains.append(gain)
+        stds.append(std / final_std)
+        corrected = predicted - gain @ linear.output @ predicted
+        predicted = linear.transition @ corrected @ linear.transition.mT + process
+    opening = torch.stack(gains) if gains else final.new_zeros(0, *final.shape)
+    inflation = torch.stack(stds) if stds else final_std.new_zeros(0, *final_std.shape)
+    return Gain(final, opening, inflation)
+
+
+def riccati(linear: Linear, process: Tensor, reading: Tensor) -> Tensor:
+    """Steady covariance of the predicted levels, P = F (P - P H' (H P H' + R)^-1 H P) F' + Q.
+
+    Structure-preserving doubling (Chu, Fan, Lin & Wang 2004), which converges quadratically.
+    """
+    eye = torch.eye(linear.transition.shape[-1], dtype=process.dtype, device=process.device)
+    a = linear.transition.mT
+    g = linear.output.mT @ torch.linalg.solve(
+        reading, linear.output.expand(*reading.shape[:-2], *linear.output.shape[-2:])
+    )
+    h = process
+    for _ in range(DOUBLINGS):
+        inverse = torch.linalg.inv(eye + g @ h)
+        change = a.mT @ h @ inverse @ a
+        a, g, h = a @ inverse @ a, g + a @ inverse @ g @ a.mT, h + change
+        if bool((change.abs() <= 1e-13 * h.abs().amax()).all()):
+            return 0.5 * (h + h.mT)
+    raise ValueError(
+        "expected a plant whose levels can all be observed from its sensors, got one with an unobserved level that is "
+        "not stable by itself; add a sensor or give the gain by hand"
+    )
+
+
+def hand_gain(matrix: Tensor) -> Gain:
+    """A constant gain (tanks, sensors): K_obv of eq. 14 times the sampling interval."""
+    return Gain(matrix, matrix.new_zeros(0, *matrix.shape), matrix.new_zeros(0, matrix.shape[-1]))
+
+
+def timed_gain(linear: Linear, span: float, time_constant: float, reading_std: Tensor, start_std: Tensor) -> Gain:
+    """The Kalman gain whose slowest error mode decays with `time_constant` s, by bisection over the process noise.
+
+    span: s between samples. reading_std (sensors,) and start_std (tanks,) as in `kalman_gain`. Raises ValueError if no
+    gain is that slow, or that fast because a level is not measured.
+    """
+    if not time_constant > 0:
+        raise ValueError(f"expected a positive time constant of the observer, got {time_constant} s")
+    target = math.exp(-span / time_constant)
+    scale = float(reading_std.max())
+    process = torch.ones_like(start_std)
+
+    def at(exponent: float) -> Gain:
+        return kalman_gain(linear, process * scale * 10.0**exponent, reading_std, start_std)
+
+    low, high = -6.0, 4.0
+    slowest, fastest = _radius(linear, at(low).steady), _radius(linear, at(high).steady)
+    if not fastest <= target <= slowest:
+        raise ValueError(
+            f"expected a time constant between {-span / math.log(max(fastest, 1e-300)):.3g} s and "
+            f"{-span / math.log(slowest):.3g} s, which this plant and its sensors allow, got {time_constant:g} s"
+        )
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _radius(linear, at(middle).steady) > target else (low, middle)
+    return at(0.5 * (low + high))
+
+
+def spectral_radius(linear: Linear, gain: Tensor) -> Tensor:
+    """Spectral radius (*batch) of the error's transition F (I - L H). Below 1 the error decays."""
+    eye = torch.eye(linear.transition.shape[-1], dtype=gain.dtype, device=gain.device)
+    return torch.linalg.eigvals(linear.transition @ (eye - gain @ linear.output)).abs().amax(-1)
+
+
+def start_uncertainty(plant: PlantDescription, like: Tensor) -> Tensor:
+    """Standard deviation (tanks,) m of initial levels that are known from the first reading only."""
+    return like.new_tensor([START_SHARE * tank.height for tank in plant.tanks])
+
+
+def start_beside_noise(plant: PlantDescription, like: Tensor) -> Tensor:
+    """Standard deviation (tanks,) of initial levels relative to unknown reading noise.
+
+    About one, because the first reading has that noise too; it is larger for taller tanks, in units of the plant's
+    length scale.
+    """
+    return start_uncertainty(plant, like) / length_scale(plant)
+
+
+def _radius(linear: Linear, gain: Tensor) -> float:
+    return float(spectral_radius(linear, gain).max())
+
+
+def _filter_gain(linear: Linear, predicted: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:
+    """L = P H' (H P H' + R)^-1, and the standard deviation of the residuals (*batch, sensors)."""
+    covariance = linear.output @ predicted @ linear.output.mT + reading
+    gain = torch.linalg.solve(covariance, linear.output @ predicted).mT
+    return gain, torch.sqrt(torch.diagonal(covariance, dim1=-2, dim2=-1))

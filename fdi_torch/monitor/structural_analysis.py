@@ -1,0 +1,98 @@
+"""Structural analysis: which faults are detectable and isolable, from the structure of the equations alone.
+
+Equations and their unknowns form a bipartite graph. Residuals can be formed from its overdetermined part (Dulmage &
+Mendelsohn 1958). A fault is detectable if its equation lies there, and isolable from another fault if it still does
+after the other's equation is removed (Krysander & Frisk 2008; Definitions 1 and 2 of the 2020 paper).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.effect import Placement, Stage
+
+
+@dataclass(frozen=True)
+class Structure:
+    """equations: name -> its unknowns. faults: name -> the equations that the fault violates."""
+
+    equations: dict[str, frozenset[str]]
+    faults: dict[str, frozenset[str]]
+
+    def detectable(self) -> dict[str, bool]:
+        inside = overdetermined(self.equations)
+        return {fault: bool(violated & inside) for fault, violated in self.faults.items()}
+
+    def isolable(self) -> dict[str, dict[str, bool]]:
+        """[f][g]: whether f is isolable from g."""
+        table: dict[str, dict[str, bool]] = {fault: {} for fault in self.faults}
+        for other, removed in self.faults.items():
+            remaining = {name: unknowns for name, unknowns in self.equations.items() if name not in removed}
+            inside = overdetermined(remaining)
+            for fault, violated in self.faults.items():
+                table[fault][other] = fault != other and bool(violated & inside)
+        return table
+
+
+def structure_of(plant: PlantDescription, placements: Iterable[Placement]) -> Structure:
+    """Structure of a plant: balances, derivatives, flow laws and sensors, with known inputs and readings."""
+    equations: dict[str, frozenset[str]] = {}
+    for tank in plant.tanks:
+        through = [f"q {p.name}" for p in plant.pipes if tank.name in (p.source, p.target)]
+        through += [f"q {p.name}" for p in plant.pumps if p.target == tank.name]
+        equations[f"balance {tank.name}"] = frozenset([f"dh {tank.name}", *through])
+        equations[f"derivative {tank.name}"] = frozenset([f"dh {tank.name}", f"h {tank.name}"])
+    for pipe in plant.pipes:
+        ends = [pipe.source] if pipe.is_outlet else [pipe.source, pipe.target]
+        equations[f"law {pipe.name}"] = frozenset([f"q {pipe.name}", *(f"h {e}" for e in ends if e != OUTSIDE)])
+    for pump in plant.pumps:
+        equations[f"law {pump.name}"] = frozenset([f"q {pump.name}"])
+    for sensor in plant.sensors:
+        equations[f"sensor {sensor.name}"] = frozenset([f"h {sensor.tank}"])
+    return Structure(equations, {p.prefix: frozenset(_violated(plant, p)) for p in placements})
+
+
+def _violated(plant: PlantDescription, placement: Placement) -> list[str]:
+    if placement.effect.stage is Stage.BALANCE and "-" in placement.location:
+        return [f"balance {tank}" for tank in placement.location.split("-")]
+    kinds = {Tank: "balance", Pipe: "law", Pump: "law", Sensor: "sensor"}
+    return [f"{kinds[type(plant.component(placement.location))]} {placement.location}"]
+
+
+def overdetermined(equations: dict[str, frozenset[str]]) -> set[str]:
+    """The equations of the overdetermined part: those that an alternating path connects to an unmatched equation."""
+    matched = matching(equations)  # unknown -> equation
+    inside = set(equations) - set(matched.values())
+    queue = list(inside)
+    while queue:
+        for unknown in equations[queue.pop()]:
+            partner = matched.get(unknown)
+            if partner is not None and partner not in inside:
+                inside.add(partner)
+                queue.append(partner)
+    return inside
+
+
+def matching(equations: dict[str, frozenset[str]]) -> dict[str, str]:
+    """A maximum matching, unknown -> equation, by augmenting paths."""
+    matched: dict[str, str] = {}
+
+    def augment(equation: str, tried: set[str]) -> bool:
+        for unknown in _ordered(equations[equation]):
+            if unknown in tried:
+                continue
+            tried.add(unknown)
+            if unknown not in matched or augment(matched[unknown], tried):
+                matched[unknown] = equation
+                return True
+        return False
+
+    for equation in equations:
+        augment(equation, set())
+    return matched
+
+
+def _ordered(names: Iterable[str]) -> Sequence[str]:
+    return sorted(names)

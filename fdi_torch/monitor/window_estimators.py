@@ -1,0 +1,166 @@
+"""Parameter estimators for one window of readings: the search of the 2020 paper (eq. 16) and alternatives.
+
+All take the same window and the previous estimate, and process a batch of runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.diagnosis import sample_noise
+from fdi_torch.estimate.draws import problem_seeds
+from fdi_torch.estimate.evolution import evolve
+from fdi_torch.estimate.evolution_settings import EvolutionSettings
+from fdi_torch.estimate.fitting import Fitting
+from fdi_torch.estimate.information import certainty
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.objectives import Objective, Problem, Term, spread_of
+from fdi_torch.plant.pace import time_scale
+from fdi_torch.simulate.engine import Readings
+
+# Integration steps of search and refinement, in units of the plant's time scale; their error over a window is far below
+# measurement noise of 30 dB.
+SEARCH_STEP, REFINE_STEP = 5.0, 0.5
+SEARCH = EvolutionSettings(population=40, evaluations=2000)
+REFINE = RefineSettings(iterations=60, decrease_tolerance=1e-6)
+STARTS = 8  # random starts of the multi-start refinement, in addition to the previous estimate
+# Number of members of the search that are refined; members within this share of the box count as identical.
+REFINED, APART = 3, 0.05
+# A channel is constant if its standard deviation is less than this multiple of its sample-to-sample noise.
+CONSTANT_RATIO = 1.2
+
+
+@dataclass(frozen=True)
+class WindowData:
+    """fitting: plant and inputs of the window, faults first. readings (R, S, C) of R runs; std (R, C): their noise if
+    known.
+    """
+
+    fitting: Fitting
+    readings: Tensor
+    std: Tensor | None = None
+
+    @property
+    def runs(self) -> int:
+        return len(self.readings)
+
+    @property
+    def box(self) -> tuple[Tensor, Tensor]:
+        """low, high (R, P)."""
+        space = self.fitting.space
+        return space.low().expand(self.runs, -1), space.high().expand(self.runs, -1)
+
+    @property
+    def data(self) -> Readings:
+        return Readings(torch.nan_to_num(self.readings), torch.isfinite(self.readings).to(self.readings.dtype))
+
+    def problem(self, step: float, objective: Objective) -> Problem:
+        std = self.std if objective == "likelihood" else None
+        return Problem(self.fitting.space, [Term(self.fitting.engines(step)[0], self.data, None, std)], objective)
+
+    def moves(self) -> bool:
+        """Whether every channel of every run varies by more than its noise, so that its correlation is defined."""
+        data = self.data
+        std = torch.sqrt(spread_of(data) / data.count.clamp(min=1.0))
+        noise = [sample_noise(values, weight) for values, weight in zip(data.values, data.weight, strict=True)]
+        return bool((std > CONSTANT_RATIO * torch.stack(noise)).all())
+
+
+@dataclass(frozen=True)
+class WindowEstimate:
+    """value and std (R, P); std is infinite for an undetermined parameter, NaN if the method gives none."""
+
+    value: Tensor
+    std: Tensor
+
+
+Estimator = Callable[[WindowData, Tensor, int], WindowEstimate]
+"""(window, previous estimate (R, P), seed) -> estimate of each run."""
+
+
+def evolution(window: WindowData, before: Tensor, seed: int) -> WindowEstimate:
+    """Differential evolution on the sum of correlations, started at the previous estimate (2020 paper, eq. 16)."""
+    members, _ = _searched(window, before, seed)
+    return WindowEstimate(members[:, 0], torch.full_like(before, torch.nan))
+
+
+def hybrid(window: WindowData, before: Tensor, seed: int) -> WindowEstimate:
+    """Differential evolution, then likelihood refinement of its best distant members and of the previous estimate."""
+    members, _ = _searched(window, before, seed)
+    return _refined(window, torch.cat([members, before.unsqueeze(1)], dim=1))
+
+
+def least_squares(window: WindowData, before: Tensor, seed: int) -> WindowEstimate:
+    """Levenberg-Marquardt on the likelihood, from the previous estimate."""
+    return _refined(window, before.unsqueeze(1))
+
+
+def multi_start(window: WindowData, before: Tensor, seed: int) -> WindowEstimate:
+    """Levenberg-Marquardt from the previous estimate and from random points of the box."""
+    low, high = window.box
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.rand(window.runs, STARTS, before.shape[1], generator=generator, dtype=before.dtype)
+    starts = low.unsqueeze(1) + drawn * (high - low).unsqueeze(1)
+    return _refined(window, torch.cat([starts, before.unsqueeze(1)], dim=1))
+
+
+ESTIMATORS: dict[str, Estimator] = {
+    "hybrid": hybrid,
+    "evolution": evolution,
+    "least_squares": least_squares,
+    "multi_start": multi_start,
+}
+
+
+def _searched(window: WindowData, before: Tensor, seed: int) -> tuple[Tensor, Tensor]:
+    """Distant members of the search (R, K, P), best first, and the best cost (R,)."""
+    low, high = window.box
+    objective: Objective = "correlation" if window.moves() else "likelihood"
+    span = float(window.fitting.recordings[0].time[-1] - window.fitting.recordings[0].time[0])
+    longest = SEARCH_STEP * time_scale(window.fitting.plant)
+    problem = window.problem(min(longest, span / 20.0), objective)
+    seeds = problem_seeds(seed, (window.runs,), low.device)
+    result = evolve(problem.cost, low, high, SEARCH, seeds, first_guess=before.clamp(low, high).unsqueeze(1))
+    return _distant(result.population, result.cost, (high - low)[0]), result.best_cost
+
+
+def _distant(population: Tensor, cost: Tensor, width: Tensor) -> Tensor:
+    """The best member of each population (R, N, P), sorted by cost, and the next best ones that differ
+    from the chosen.
+    """
+    usable = torch.isfinite(cost) & torch.isfinite(population).all(-1)
+    chosen = [population[:, 0]]
+    for _ in range(REFINED - 1):
+        near = torch.stack([((population - c[:, None]) / width).abs().amax(-1) <= APART for c in chosen]).any(0)
+        distant = usable & ~near
+        index = distant.to(torch.int8).argmax(-1)
+        next_best = population[torch.arange(len(population)), index]
+        chosen.append(torch.where(distant.any(-1)[:, None], next_best, chosen[0]))
+    return torch.stack(chosen, dim=1)
+
+
+def _refined(window: WindowData, starts: Tensor) -> WindowEstimate:
+    """The best refinement over the starts (R, K, P)."""
+    starts_per_run, (low, high) = starts.shape[1], window.box
+    problem = window.problem(REFINE_STEP * time_scale(window.fitting.plant), "likelihood")
+    refined = levenberg_marquardt(
+        lambda theta, members: problem.linearise(theta, members // starts_per_run),
+        starts,
+        low.unsqueeze(1),
+        high.unsqueeze(1),
+        REFINE,
+    )
+    cost = torch.where(torch.isfinite(refined.cost), refined.cost, torch.inf)
+    rows, best = torch.arange(window.runs), cost.argmin(-1)
+    assert refined.curvature is not None
+    held = None if refined.held is None else refined.held[rows, best]
+    return WindowEstimate(refined.theta[rows, best], certainty(refined.curvature[rows, best], held=held).std)
+
+
+def cut(fitting: Fitting, samples: int) -> Fitting:
+    """The same problem on the first samples of its recording."""
+    return replace(fitting, recordings=(fitting.recordings[0].stretch(0, samples),))
