@@ -24,7 +24,7 @@ from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import length_scale, time_scale
+from fdi_torch.plant.scales import length_scale, time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import lay_out

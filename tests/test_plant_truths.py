@@ -10,11 +10,12 @@ import torch
 from rigs import REST, blank_recording, constant_inputs, paper_network, random_steps, three_tank
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from torch import Tensor
 
 from fdi_torch.effects import build_network
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.plant.lpv import lpv_form
+from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.orifice import rim_strength, weir_flow
 from fdi_torch.plant.signals import Clock, CumulativeSignal
 from fdi_torch.simulate.equilibrium import equilibrium
@@ -139,9 +140,9 @@ def test_volume_is_conserved() -> None:
     values = network.bind(space, theta[0])
     levels = torch.tensor([0.9, 1.02, 0.5], dtype=torch.float64)
     commands = torch.tensor([40e-6, 90e-6], dtype=torch.float64)
-    now = network.moment(levels.unbind(), commands.unbind(), clock(), values)
+    now = network.operating_point(levels.unbind(), commands.unbind(), clock(), values)
     pumps, pipes = network.pump_flows(now), network.pipe_flows(now)
-    net = torch.stack(network.spilled(now, network.gathered(now, pumps, pipes)))
+    net = torch.stack(network.less_overflow(now, network.net_inflows(now, pumps, pipes)))
     k = 0.6 * 0.6e-4 * math.sqrt(2 * 9.81)
     leaks = 0.2 * k * math.sqrt(0.9) + 0.3 * k * math.sqrt(0.5)
     crest = 2.0 * math.sqrt(math.pi * 160e-4)
@@ -163,6 +164,21 @@ def test_gradients_pass_gradcheck_off_and_on_equal_levels() -> None:
         levels = torch.tensor(special, dtype=torch.float64, requires_grad=True)
         gradients = torch.autograd.grad(scaled(levels, theta).sum(), (levels, theta))
         assert all(bool(torch.isfinite(g).all()) for g in gradients)
+
+
+def lpv_form(
+    network: TankNetwork, space: ParameterSpace, levels: Tensor, commands: Tensor, step: Clock
+) -> tuple[Tensor, Tensor]:
+    """F (tanks, P) and B (tanks, actuators) of x' = F(x) theta + B u (2020 paper, eq. 32, 33), at one operating point.
+
+    The right-hand side is affine in the sizes of leaks, net outlets and openness, and in commands within the pumps'
+    limits, unless a tank is empty or at its rim.
+    """
+
+    def rates(theta: Tensor, u: Tensor) -> Tensor:
+        return network(levels, u, step, network.bind(space, theta))
+
+    return torch.autograd.functional.jacobian(rates, (space.nominal(levels), commands))
 
 
 def test_lpv_form_is_the_papers() -> None:

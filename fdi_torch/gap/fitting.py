@@ -21,7 +21,7 @@ from fdi_torch.gap.subject import Part, Subject, between
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint import Joint, own_name
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from fdi_torch.gap.fitting import Fit, Fitter
 from fdi_torch.gap.subject import subject_of
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import lay_out
 

@@ -19,7 +19,7 @@ from fdi_torch.gap.screening import options_of, screen
 from fdi_torch.gap.subject import subject_of
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import reach_of
+from fdi_torch.plant.operating_range import operating_range_of
 from fdi_torch.recording import Recording
 
 
@@ -32,8 +32,8 @@ def plan(
     fitter = _noise_free(plant, believed, recording, step, noise)
     null = fitter.fit(Candidate())
     seen = replace(fitter.subject.recording, outputs=null.near.readings[0])
-    placements = [p for p in library_of(plant, library) if not p.effect.rounds]
-    options = options_of(placements, fitter, reach_of(seen, plant))
+    placements = [p for p in library_of(plant, library) if not p.effect.quantizes]
+    options = options_of(placements, fitter, operating_range_of(seen, plant))
     return excitation(screen(fitter, null, options), plant)
 
 

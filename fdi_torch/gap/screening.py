@@ -18,7 +18,7 @@ from fdi_torch.gap.forcing import Forcing
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint import Joint, with_blanks
 from fdi_torch.simulate.scan import scan_in_time
@@ -88,7 +88,7 @@ class Screen:
         return torch.where((self.score > 0) & (strength > 1e-6), self.score**2 / strength.clamp(min=1e-300), 0.0)
 
 
-def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Reach) -> list[Option]:
+def options_of(placements: Sequence[Placement], fitter: Fitter, reach: OperatingRange) -> list[Option]:
     """All starts of all placements."""
     plant = fitter.subject.plant
     return [

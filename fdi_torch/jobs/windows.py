@@ -12,7 +12,7 @@ from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recordings import StartLevel
 from fdi_torch.config.run import Run
-from fdi_torch.effects import once_run
+from fdi_torch.effects import without_startup_effects
 from fdi_torch.estimate.stretches import Stretch, stretches_of
 from fdi_torch.estimate.windows import Window, cut_up, noise_of, window_of, window_step
 from fdi_torch.jobs.log_paths import STARTS_ANEW, free_path
@@ -38,7 +38,7 @@ def windows_of(run: Run, tell: Callable[[float, str], None] = lambda share, text
     What the plant believes to act at first only does not: windows begin in the midst of a run, and what shows of it in
     the first is for a suspect to say.
     """
-    run = replace(run, plant=once_run(run.plant, run.plant.channels()))
+    run = replace(run, plant=without_startup_effects(run.plant, run.plant.channels()))
     length = run.config.estimate.windows
     assert length is not None
     loaded = recordings_of(run)

@@ -13,7 +13,7 @@ from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import PlantState, Stepper, slopes
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 
 FORGET = 1e-3  # share of a parameter's deviation that the design of (15) forgets in a sample
 WANDER = 1e-6  # of a level in a sample, in units of the plant's length scale

@@ -21,7 +21,7 @@ from fdi_torch.monitor.hypothesis import Finding
 from fdi_torch.monitor.noise import Noise
 from fdi_torch.monitor.observer import MOVED
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 
 DRAWS = 40
 POINTS = 200  # instants at which levels are looked at

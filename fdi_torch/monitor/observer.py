@@ -12,9 +12,9 @@ from fdi_torch.monitor.running import run_lanes
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.behind import levels_behind
+from fdi_torch.plant.inverted_sensor import levels_from_readings
 from fdi_torch.plant.network import PlaceValues, TankNetwork
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 
 FIRST_SAMPLES = 100  # among which a sensor that is read rarely tells its level at the start
 MOVED = 1e-5  # in units of the plant's length scale: an error of the start levels, to see whether it decays
@@ -178,5 +178,5 @@ def first_levels(network: TankNetwork, samples: Samples, values: PlaceValues) ->
     """
     start = [level.expand(samples.batch) for level in network.start_levels(values)]
     readings = _first_readings(samples.readings[..., :FIRST_SAMPLES, :]).unbind(-1)
-    found = levels_behind(network, readings, start, samples.time[0], values)
+    found = levels_from_readings(network, readings, start, samples.time[0], values)
     return torch.stack(torch.broadcast_tensors(*found), dim=-1)

@@ -75,7 +75,7 @@ class _Stage:
     def first(self, signals: Signals, theta: Signals) -> Memory:
         clock = self.of.clock
         at_first = Clock(clock.start[:1], clock.step[:1], clock.resolution)
-        return self.of.network.remember_commands(signals, at_first, moved(self.values, self.of.names, theta))
+        return self.of.network.steady_command_memory(signals, at_first, moved(self.values, self.of.names, theta))
 
 
 def moved(values: PlaceValues, names: Sequence[str], theta: Signals) -> PlaceValues:

@@ -9,7 +9,7 @@ import torch
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import length_scale, time_scale
+from fdi_torch.plant.scales import length_scale, time_scale
 from fdi_torch.simulate.build import BuildError
 from fdi_torch.simulate.compiled import CompiledEngine
 from fdi_torch.simulate.engine import Engine

@@ -21,7 +21,7 @@ from torch import Tensor
 from fdi_torch.capacity import expect_room
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import PlaceValues, TankNetwork
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.actuation import Actuation, moved
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.midpoint import newton_step
@@ -71,7 +71,7 @@ class Collocation:
         tanks = [f"{t.name}.start_level" for t in network.description.tanks]
         self._start_columns = {space.index(name): i for i, name in enumerate(tanks) if name in space}
         self._moving = [j for j in range(len(space)) if j not in self._start_columns]
-        self._below_rims = network.below_rims()
+        self._below_rims = network.without_overflow()
         self._rims = [t.height for t in network.description.tanks]
         self._length = length_scale(network.description)
         self._names = [space.names[j] for j in self._moving]

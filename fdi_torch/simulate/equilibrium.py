@@ -7,7 +7,7 @@ from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import length_scale, time_scale
+from fdi_torch.plant.scales import length_scale, time_scale
 from fdi_torch.plant.signals import Clock
 
 # In units of the plant's time and length scales.
@@ -26,7 +26,7 @@ def equilibrium(network: TankNetwork, inputs: Tensor, start: Tensor | None = Non
     pace, still = time_scale(plant), AT_REST * length_scale(plant) / time_scale(plant)
     clock = Clock(inputs.new_zeros(()), inputs.new_tensor(pace), inputs.new_tensor(RESOLUTION * pace))
     channels = [inputs[channel] for _, channel in network.actuators()]
-    actual, _ = network.commands(channels, network.remember_commands(channels, clock, values), clock, values)
+    actual, _ = network.commands(channels, network.steady_command_memory(channels, clock, values), clock, values)
     commands = torch.stack(list(actual)) if actual else inputs.new_zeros(0)
 
     def rates(levels: Tensor) -> Tensor:

@@ -12,8 +12,8 @@ from torch.autograd import forward_ad
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Memory
-from fdi_torch.plant.moment import Constants
 from fdi_torch.plant.network import PlaceValues, TankNetwork
+from fdi_torch.plant.operating_point import Constants
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
@@ -164,7 +164,7 @@ class ReferenceEngine:
             clock = self._clock(starts.unsqueeze(1), steps.unsqueeze(1))
             actual, _ = self.network.commands(channels.unbind(-1), (), clock, values)
             return torch.stack([a.expand(channels.shape[:-1]) for a in actual], dim=-1)
-        memory = self.network.remember_commands(channels[0].unbind(-1), self._clock(starts[0], steps[0]), values)
+        memory = self.network.steady_command_memory(channels[0].unbind(-1), self._clock(starts[0], steps[0]), values)
         rows = []
         for k in range(len(steps)):
             actual, memory = self.network.commands(
@@ -201,7 +201,7 @@ class ReferenceEngine:
             readings, _ = self.network.read(seen, (), clock, values)
             return torch.stack([r.expand(levels.shape[:2]) for r in readings], dim=-1)
         clock = self._clock(times[0] - intervals[0], intervals[0])
-        memory: Memory = self.network.remember_readings([s[0] for s in seen], clock, values)
+        memory: Memory = self.network.steady_reading_memory([s[0] for s in seen], clock, values)
         rows = []
         for k in range(len(times)):
             clock = self._clock(times[k] - intervals[k], intervals[k])

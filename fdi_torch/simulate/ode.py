@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Recording
 

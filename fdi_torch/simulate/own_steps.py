@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import length_scale, time_scale
+from fdi_torch.plant.scales import length_scale, time_scale
 
 # A step over a root's kink is wrong by step^1.5, and so is a root drawn smooth for that step: by 1 m for one so long,
 # in units of the plant's time and length scales. From the largest error of fixed steps over random faults of three

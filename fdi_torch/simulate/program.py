@@ -164,7 +164,7 @@ class _Builder:
         ]
         memory = self._inputs("command_memory", network.command_memory())
         with self.tracer:
-            settled = network.remember_commands([tensor(c) for c in channels], self.clock, self.values)
+            settled = network.steady_command_memory([tensor(c) for c in channels], self.clock, self.values)
             actions, kept = network.commands(
                 [tensor(c) for c in channels], tuple(tensor(m) for m in memory), self.clock, self.values
             )
@@ -220,7 +220,7 @@ class _Builder:
         seen = self._inputs("seen", len(network.description.sensors))
         memory = self._inputs("reading_memory", network.reading_memory())
         with self.tracer:
-            settled = network.remember_readings([tensor(s) for s in seen], self.clock, self.values)
+            settled = network.steady_reading_memory([tensor(s) for s in seen], self.clock, self.values)
             readings, kept = network.read(
                 [tensor(s) for s in seen], tuple(tensor(m) for m in memory), self.clock, self.values
             )

@@ -11,7 +11,7 @@ from torch import Tensor
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import length_scale, time_scale
+from fdi_torch.plant.scales import length_scale, time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.build import BuildError
 from fdi_torch.simulate.compiled import CompiledEngine
@@ -70,7 +70,7 @@ def rounded(readings: Tensor, network: TankNetwork) -> Tensor:
     values = network.bind(ParameterSpace(), readings.new_zeros(0))
     columns = list(readings.unbind(-1))
     for placement in network.placements:
-        if placement.effect.stage is Stage.READING and placement.effect.rounds:
+        if placement.effect.stage is Stage.READING and placement.effect.quantizes:
             i = [sensor.name for sensor in network.description.sensors].index(placement.location)
             width = placement.effect.resolution(values[placement.prefix])
             if float(width) > 0.0:

@@ -122,7 +122,7 @@ class _Stage:
     def first(self, signals: Signals, theta: Signals) -> Memory:
         clock = self.of.clock
         at_first = Clock(clock.start[:1], clock.step[:1], clock.resolution)
-        return self.of.network.remember_readings(signals, at_first, moved(self.values, self.of.names, theta))
+        return self.of.network.steady_reading_memory(signals, at_first, moved(self.values, self.of.names, theta))
 
 
 class Samples:

@@ -19,7 +19,7 @@ from fdi_torch.gap.subject import between
 from fdi_torch.gap.where.components import Component, Ends, Signals, component_at, of_reading
 from fdi_torch.gap.where.forms import courses
 from fdi_torch.plant.description import OUTSIDE, Sensor
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint import Joint, with_blanks
 from fdi_torch.simulate.scan import product, scan_in_time

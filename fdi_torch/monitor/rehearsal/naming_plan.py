@@ -21,7 +21,7 @@ from fdi_torch.monitor.rehearsal.runs import Controller, Course, LevelControl, R
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.settings import MonitorSettings
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import area_scale, time_scale
+from fdi_torch.plant.scales import area_scale, time_scale
 
 PART = 10  # runs of a piece
 NAME = "naming"

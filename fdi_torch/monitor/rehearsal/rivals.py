@@ -15,7 +15,7 @@ from fdi_torch.monitor.adaptive import WANDER, JointModel, adaptive_observer, de
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.window_fit import ESTIMATORS, WindowData, cut
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.record import noise_level
 
 # Integration steps (s) of the data, and of the bounds: fine, so that their error is nobody's.
