@@ -29,7 +29,7 @@ RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
 # Outside library -> where it may be imported.
 DOORS = {
     "pint": ("units.py",),
-    "torchdiffeq": ("simulate/integrate.py",),
+    "torchdiffeq": ("simulate/reference_engine.py",),
     "pyarrow": ("recordings/parquet.py",),
     "openpyxl": ("recordings/excel.py",),
     "h5py": ("recordings/hdf5.py",),

@@ -19,10 +19,10 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.build import BuildError
-from fdi_torch.simulate.choose import make_engine
+from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
-from fdi_torch.simulate.traced import TracedEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.traced_engine import TracedEngine
 
 SAMPLES, SAMPLE = 40, 5.0  # s
 

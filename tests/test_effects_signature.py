@@ -15,8 +15,8 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
-from fdi_torch.simulate.choose import make_engine
 from fdi_torch.simulate.engine import Engine
+from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
 
 STRONG = 0.95

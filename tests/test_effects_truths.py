@@ -18,7 +18,7 @@ from fdi_torch.plant.effect import Effect, Local, Memory
 from fdi_torch.plant.operating_range import bounded_by_recording, interior_points, operating_range_of
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
 
 
 def number(value: float) -> Tensor:

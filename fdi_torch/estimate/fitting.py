@@ -18,11 +18,11 @@ from fdi_torch.plant.inverted_sensor import levels_from_readings
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.choose import adaptive_engine, make_engine
 from fdi_torch.simulate.engine import Engine, Readings
+from fdi_torch.simulate.engine_choice import adaptive_engine, make_engine
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.own_steps import OwnSteps
+from fdi_torch.simulate.step_control import StepControl
 
 StartLevel = Literal["equilibrium", "free"] | float
 StartLevels = StartLevel | Mapping[str, StartLevel]
@@ -106,9 +106,9 @@ class Fitting:
         return Problem(self.space, terms, objective)
 
 
-def _own_steps(step: float, recording: Recording, plant: PlantDescription) -> OwnSteps:
+def _own_steps(step: float, recording: Recording, plant: PlantDescription) -> StepControl:
     try:
-        return OwnSteps.like(step, plant)
+        return StepControl.for_fixed_step(step, plant)
     except ValueError as error:
         span = float(recording.time[-1] - recording.time[0])
         raise ValueError(f"{span / step:.3g} integration steps of {step:g} s through {span:g} s: {error}") from error

@@ -17,8 +17,8 @@ from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.operating_point import OperatingPoint
 from fdi_torch.simulate.actuation import Actuation
 from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.output_map import OutputMap
 from fdi_torch.simulate.pointwise import Row, partials
-from fdi_torch.simulate.seen import Sight
 
 Starts = Mapping[str, Tensor]
 
@@ -55,7 +55,7 @@ class Forcing:
         self._gathered = [net.expand(self.levels[0].shape) for net in gathered]
         self._net = network.less_overflow(now, self._gathered)
         self.still, self._by_inflow = self._inflow_slopes(network)
-        self._readings = Sight(network, experiment, []).read(self._path, values)[0]
+        self._readings = OutputMap(network, experiment, []).read(self._path, values)[0]
 
     def rates(self, placement: Placement, starts: Starts) -> Tensor:
         """How the rates change with an effect, (tanks, M, K) in m/s. starts: its parameters, short names, (M, 1)."""
@@ -89,7 +89,7 @@ class Forcing:
     def readings(self, placement: Placement, starts: Starts) -> Tensor:
         """How the readings change with an effect, (C, M, S) in each sensor's unit."""
         network, values, lanes = self._with(placement, starts)
-        seen = Sight(network, self.experiment, []).read(self._path.expand(lanes, -1, -1), values)
+        seen = OutputMap(network, self.experiment, []).read(self._path.expand(lanes, -1, -1), values)
         return (seen - self._readings).movedim(0, 1)
 
     def _with(self, placement: Placement, starts: Starts) -> tuple[TankNetwork, PlaceValues, int]:

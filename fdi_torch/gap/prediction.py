@@ -123,7 +123,7 @@ def _run(subject: Subject, start_samples: int, counted: int) -> Prediction:
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     fitter = Fitter(replace(subject, mask=early), Noise(1e-2 * spread, torch.zeros_like(spread)))
     engine, theta, levels = _by_stretch(fitter, counted) if counted else _by_samples(fitter, subject)
-    run = engine.settle(theta, levels, CORRECTIONS)
+    run = engine.converge(theta, levels, CORRECTIONS)
     readings = run.readings[0]
     residuals = torch.where(subject.mask, subject.readings - readings, torch.zeros_like(readings))
     rmse = torch.sqrt((residuals[counted:] ** 2).sum(dim=0) / subject.mask[counted:].sum(dim=0))

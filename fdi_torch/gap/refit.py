@@ -26,7 +26,7 @@ from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.joint import own_name
+from fdi_torch.simulate.joint_collocation import name_in_recording
 
 TURNS = 3  # of the noise and the fit under it
 WIDE = 0.5  # of a range
@@ -138,7 +138,7 @@ def _own(fitter: Fitter, fit: Fit) -> tuple[Own, ...]:
     """What varies from recording to recording, by name and then in the recordings' order."""
     errors, parts = _all_errors(fitter, fit), fitter.subject.parts
     return tuple(
-        Own(name, part.recording.source, float(part.recording.time[0]), *errors[own_name(name, k)])
+        Own(name, part.recording.source, float(part.recording.time[0]), *errors[name_in_recording(name, k)])
         for name in fitter.subject.plant.varying
         for k, part in enumerate(parts)
     )

@@ -21,7 +21,7 @@ from fdi_torch.gap.acquisition import usable
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.operating_range import bounded_by_recording
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.record import clean_readings, with_noise
+from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
 
 
 def recordings_of(run: Run) -> list[LoadedRecording]:

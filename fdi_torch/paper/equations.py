@@ -49,7 +49,7 @@ EQUATIONS = (
     Equation((23,), "the better of parent and candidate survives", ("estimate.generation:tell",)),
     Equation((24,), "levels of three tanks: inflow less outflow over area", ("plant.network:TankNetwork.level_rates",)),
     Equation((25,), "states, readings and pump flows", ("plant.network:TankNetwork.read", "config.plant:load_plant")),
-    Equation((26,), "the fault-free plant from known start levels", ("simulate.record:clean_readings",)),
+    Equation((26,), "the fault-free plant from known start levels", ("simulate.simulated_recording:clean_readings",)),
     Equation((27,), "a leak: Torricelli's law through a hole", ("effects.leak:Leak.inflow",)),
     Equation((28,), "plugging: a share of a pipe's flow is lost", ("effects.plugging:Plugging.flow",)),
     Equation((29,), "the balance of each tank with all faults", ("plant.network:TankNetwork.net_inflows",)),

@@ -16,7 +16,7 @@ from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.window_fit import ESTIMATORS, WindowData, cut
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.scales import length_scale
-from fdi_torch.simulate.record import noise_level
+from fdi_torch.simulate.simulated_recording import noise_level
 
 # Integration steps (s) of the data, and of the bounds: fine, so that their error is nobody's.
 DATA_STEP = 0.05

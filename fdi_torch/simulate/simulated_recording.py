@@ -1,4 +1,4 @@
-"""Simulated recordings: a plant run tightly under planned inputs, and read with noise."""
+"""Simulated recordings: an accurate simulation under planned inputs, and measurement noise."""
 
 from __future__ import annotations
 
@@ -14,41 +14,42 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import length_scale, time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.build import BuildError
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
-from fdi_torch.simulate.own_steps import OwnSteps
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.step_control import StepControl
 
-# In units of the plant's time scale. Roots and rims are drawn as for steps far shorter than any estimator's.
+# In units of the plant's time scale. The smoothing suits steps far shorter than those of any estimator.
 RESOLUTION = 0.01
 LONGEST_STEP = 1.0
 TOLERANCE = 1e-10  # of levels, in units of the plant's length scale
 
 
 def clean_readings(network: TankNetwork, planned: Recording, values: Mapping[str, float]) -> Tensor:
-    """Noise-free readings (T, N) with some constants changed by name, in L-stable steps right to 1e-10.
+    """Noise-free readings (T, N) with some constants changed by name, by L-stable steps with a tolerance of 1e-10.
 
-    Where there is no compiler, and so no fast engine, an adaptive solver does it in a thousand times as long.
+    Without a compiler, an adaptive solver does the same a thousand times slower.
     """
     space = ParameterSpace(network.constants[name] for name in values)
     theta = torch.tensor([[float(value) for value in values.values()]], dtype=planned.time.dtype)
     plant = network.description
-    pace, exact = time_scale(plant), TOLERANCE * length_scale(plant)
-    own = OwnSteps.within(exact, plant, RESOLUTION * pace)
-    engine = CompiledEngine(network, space, lay_out(planned, plant.channels(), LONGEST_STEP * pace, own))
+    scale, tolerance = time_scale(plant), TOLERANCE * length_scale(plant)
+    step_control = StepControl.for_tolerance(tolerance, plant, RESOLUTION * scale)
+    engine = CompiledEngine(network, space, lay_out(planned, plant.channels(), LONGEST_STEP * scale, step_control))
     try:
         return engine.readings(theta)[0]
     except BuildError:
-        experiment = lay_out(planned, plant.channels(), LONGEST_STEP * pace)
-        sharp = replace(experiment, resolution=theta.new_tensor(RESOLUTION * pace))
-        slow = ReferenceEngine(network, space, sharp, method="dopri5", rtol=TOLERANCE, atol=0.01 * exact)
-        return slow.readings(theta)[0]
+        experiment = lay_out(planned, plant.channels(), LONGEST_STEP * scale)
+        sharp = replace(experiment, resolution=theta.new_tensor(RESOLUTION * scale))
+        reference = ReferenceEngine(network, space, sharp, method="dopri5", rtol=TOLERANCE, atol=0.01 * tolerance)
+        return reference.readings(theta)[0]
 
 
 def noise_level(clean: Tensor, snr_db: float, definition: str = "variance") -> Tensor:
-    """Standard deviation (*batch, N) of the noise that makes clean readings (*batch, T, N) have this SNR in dB.
+    """Standard deviation (*batch, N) of the noise that gives clean readings (*batch, T, N) this signal-to-noise ratio
+    in dB.
 
-    sqrt(P 10^(-SNR/10)); P is each output's variance, or under 'power' its mean square.
+    sqrt(P 10^(-SNR/10)), with P each output's variance, or its mean square under the definition 'power'.
     """
     power = clean.var(dim=-2, correction=0) if definition == "variance" else clean.square().mean(dim=-2)
     return (power * 10.0 ** (-snr_db / 10.0)).sqrt()
@@ -57,16 +58,16 @@ def noise_level(clean: Tensor, snr_db: float, definition: str = "variance") -> T
 def with_noise(
     planned: Recording, clean: Tensor, std: Tensor, generator: torch.Generator, network: TankNetwork
 ) -> Recording:
-    """The recording that sensors with white noise of standard deviation std (N,) make of clean readings (T, N).
+    """The recording of clean readings (T, N) by sensors with white noise of standard deviation std (N,).
 
-    A sensor that rounds does so after the noise, in steps of its nominal size.
+    A quantizing sensor rounds after the noise, with its nominal step.
     """
     noise = torch.randn(clean.shape, generator=generator, dtype=clean.dtype) * std
-    return replace(planned, outputs=rounded(clean + noise, network), mask=torch.isfinite(clean), source="simulated")
+    return replace(planned, outputs=quantized(clean + noise, network), mask=torch.isfinite(clean), source="simulated")
 
 
-def rounded(readings: Tensor, network: TankNetwork) -> Tensor:
-    """Readings (T, N) in the steps that the plant's rounding sensors have."""
+def quantized(readings: Tensor, network: TankNetwork) -> Tensor:
+    """Readings (T, N) rounded by the plant's quantizing sensors."""
     values = network.bind(ParameterSpace(), readings.new_zeros(0))
     columns = list(readings.unbind(-1))
     for placement in network.placements:
