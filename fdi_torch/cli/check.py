@@ -15,8 +15,8 @@ from fdi_torch.gap.acquisition import examined
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.check import ChannelSummary, RecordingCheck, check_recording
-from fdi_torch.recordings.finding import Finding
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -43,9 +43,11 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
     """What is odd about each channel; first of all what would be refused or masked."""
     check, found = check_recording(whole, plant), [examined(plant, part) for part in whole.known_stretches()]
-    wrong = [Finding("slip", ", ".join(f.slip.channels), f.slip.text) for f in found if f.slip]
+    wrong = [ChannelFinding("slip", ", ".join(f.slip.channels), f.slip.text) for f in found if f.slip]
     wrong += [
-        Finding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop}) for f in found for s in f.stuck
+        ChannelFinding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})
+        for f in found
+        for s in f.stuck
     ]
     return replace(check, findings=(*wrong, *check.findings))
 

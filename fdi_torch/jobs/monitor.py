@@ -36,7 +36,7 @@ from fdi_torch.monitor.windows import WindowMonitor
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.check import doubts
+from fdi_torch.recordings.check import data_warnings
 
 CHUNK = 2048  # samples of a recording that are taken at a time
 ALARM = "/observer/alarm"
@@ -202,7 +202,7 @@ class Watcher:
         self._tell(Event(self._now, "watching", prepared.learnt))
         self.say(self._suspects(prepared, whole))
         part = fault_free_part(whole, *config.fault_free)
-        for doubt in (*doubts(part, self.plant), *prepared.doubts):
+        for doubt in (*data_warnings(part, self.plant), *prepared.doubts):
             self.say(doubt)
 
     def _suspects(self, prepared: Prepared, whole: Recording) -> str:
