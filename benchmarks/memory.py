@@ -23,7 +23,7 @@ from fdi_torch.effects import placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.experiment import Experiment, lay_out
 
 STEP, STEPS, MAX_FLOW = 10.0, 100, 90e-6

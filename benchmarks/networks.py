@@ -15,9 +15,9 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.recording import Recording
 from fdi_torch.simulate import compiled
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.record import clean_readings
+from fdi_torch.simulate.simulated_recording import clean_readings
 
 SIZES = (3, 10, 30)
 Row = tuple[int, float, float, float]

@@ -9,7 +9,7 @@ import torch
 from benchmarks import memory
 from benchmarks.simulators import experiment, plant
 from benchmarks.timing import seconds_in_rounds
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings
 
 STEP = 10.0

@@ -13,7 +13,7 @@ from benchmarks.simulators import experiment, plant
 from fdi_torch.estimate.evolution import EvolutionSettings, evolve
 from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
 from fdi_torch.estimate.objectives import Problem, Term
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings
 
 TRUTH = np.array([0.1, 0.6, 0.5, 0.7, 0.9])

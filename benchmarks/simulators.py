@@ -20,10 +20,10 @@ from fdi_torch.effects import placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.experiment import Experiment, lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
-from fdi_torch.simulate.own_steps import OwnSteps
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.step_control import StepControl
 
 NAMES = ("T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size")
 SAMPLES, INTERVAL = 11, 100.0
@@ -44,7 +44,7 @@ def experiment(step: float, tolerance: float | None = None) -> Experiment:
     nothing = torch.zeros(SAMPLES, 3, dtype=torch.float64)
     units = ("m^3/s", "m^3/s"), ("m", "m", "m")
     recording = Recording(time, flows, nothing, ("Q1", "Q2"), ("h1", "h2", "h3"), *units)
-    own = None if tolerance is None else OwnSteps.within(tolerance, plant()[0].description)
+    own = None if tolerance is None else StepControl.for_tolerance(tolerance, plant()[0].description)
     return lay_out(recording, ("Q1", "Q2"), step, own)
 
 

@@ -7,7 +7,7 @@ import time
 import torch
 
 from benchmarks.simulators import experiment, plant, random_faults
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings
 
 STEP, LANES, RUNS = 10.0, (1_024, 16_384, 1_000_000), 8

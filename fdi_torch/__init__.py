@@ -39,7 +39,7 @@ _HOMES = {
     "fdi_torch.plant.description": ("Pipe", "PlacedEffect", "PlantDescription", "Pump", "Sensor", "Tank"),
     "fdi_torch.plant.network": ("TankNetwork",),
     "fdi_torch.recording": ("Recording",),
-    "fdi_torch.simulate.choose": ("make_engine",),
+    "fdi_torch.simulate.engine_choice": ("make_engine",),
     "fdi_torch.simulate.equilibrium": ("equilibrium",),
     "fdi_torch.simulate.experiment": ("Experiment", "lay_out"),
 }

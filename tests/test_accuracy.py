@@ -10,7 +10,7 @@ from rigs import constant_inputs, paper_network, three_tank
 
 from fdi_torch.config.run import load_run
 from fdi_torch.jobs.train import train
-from fdi_torch.simulate.choose import make_engine
+from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
 
 CONFIGS = Path(__file__).parent.parent / "configs" / "paper"

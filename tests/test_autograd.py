@@ -15,10 +15,10 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.simulate.choose import adaptive_engine, make_engine
 from fdi_torch.simulate.engine import Engine, Readings
+from fdi_torch.simulate.engine_choice import adaptive_engine, make_engine
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.own_steps import OwnSteps
+from fdi_torch.simulate.step_control import StepControl
 
 NAMES = ("T1.leak.size", "P13.plugging.size", "Q1.pump_lag.time_constant", "h2.sensor_bias.bias", "P32.area")
 THETA = torch.tensor([[0.2, 0.1, 6.0, 0.01, 5e-5], [0.05, 0.3, 12.0, -0.02, 6.5e-5]], dtype=torch.float64)
@@ -37,7 +37,7 @@ def recording(samples: int = 21, interval: float = 10.0) -> Recording:
 def engine_of(kind: str, samples: int = 13) -> Engine:
     network = TankNetwork(load_plant("three_tank"), placements_for(n for n in NAMES if n.count(".") == 2))
     space = ParameterSpace(network.constants[name] for name in NAMES)
-    own = OwnSteps.within(1e-8, network.description, 1.0) if kind.startswith("own ") else None
+    own = StepControl.for_tolerance(1e-8, network.description, 1.0) if kind.startswith("own ") else None
     experiment = lay_out(recording(samples), network.description.channels(), 10.0 if own else 1.0, own)
     if kind == "adaptive":
         return adaptive_engine(network, space, experiment, 0.5)
@@ -141,7 +141,7 @@ def test_an_ode_takes_constant_inputs_functions_and_batches() -> None:
 
 def test_an_ode_refuses_what_it_cannot_be() -> None:
     plant = load_plant("three_tank")
-    with pytest.raises(ValueError, match=r"command is a function of time alone, got Q1\.pump_lag"):
+    with pytest.raises(ValueError, match=r"actuators without memory or dead time, got Q1\.pump_lag"):
         plant.ode(torch.zeros(2), {"Q1.pump_lag.time_constant": 5.0})
     with pytest.raises(ValueError, match="expected inputs of Q1, Q2, got a tensor of shape"):
         plant.ode(torch.zeros(3))

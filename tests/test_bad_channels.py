@@ -11,7 +11,7 @@ from torch import Tensor
 from fdi_torch.gap.acquisition import examined, usable
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.held import Scatter, held, scatter
+from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 from tests.test_gap import SMALL, believed, noise, recorded
 
 
@@ -36,12 +36,12 @@ def from_sample(recording: Recording, column: int, first: int, value: float | No
 
 def test_readings_that_repeat_longer_than_noise_lets_them_are_held() -> None:
     x = 0.3 + 0.1 * torch.sin(torch.arange(2000, dtype=torch.float64) / 90) + noise(2000, 0.0, 0.001, 1)[:, 0]
-    assert held(x) == []
+    assert stuck_runs(x) == []
     stuck = x.clone()
     stuck[400:430], stuck[1000:] = stuck[400], stuck[1000]
-    assert held(stuck) == [(400, 430), (1000, 2000)]
+    assert stuck_runs(stuck) == [(400, 430), (1000, 2000)]
     fine = (stuck / 1e-4).round() * 1e-4
-    assert held(fine)[-1] == (1000, 2000)
+    assert stuck_runs(fine)[-1] == (1000, 2000)
 
 
 @pytest.mark.parametrize("step", [3e-3, 1e-2, 3e-2])
@@ -50,7 +50,7 @@ def test_a_rounded_channel_is_not_held(step: float, slow: float) -> None:
     for seed in range(5):
         level = 0.3 + 0.1 * torch.sin(torch.arange(4000, dtype=torch.float64) / slow)
         x = level + noise(4000, 0.0, 0.001, seed)[:, 0]
-        assert held((x / step).round() * step) == []
+        assert stuck_runs((x / step).round() * step) == []
 
 
 def test_a_run_is_called_too_long_in_one_recording_of_a_thousand() -> None:
@@ -59,15 +59,15 @@ def test_a_run_is_called_too_long_in_one_recording_of_a_thousand() -> None:
     calls = 0
     for _ in range(300):
         x = torch.randn(500, generator=generator, dtype=torch.float64)
-        calls += bool(held((x / 0.8).round() * 0.8))
+        calls += bool(stuck_runs((x / 0.8).round() * 0.8))
     assert calls <= 3
 
 
 def test_a_sensor_that_never_moves_is_held_against_its_neighbours_noise() -> None:
     still = torch.full((500,), 0.3, dtype=torch.float64)
-    assert held(still) == []
-    assert held(still, Scatter(1e-3, 1e-5)) == [(0, 500)]
-    assert held(still, Scatter(1e-5, 1e-2)) == []
+    assert stuck_runs(still) == []
+    assert stuck_runs(still, Scatter(1e-3, 1e-5)) == [(0, 500)]
+    assert stuck_runs(still, Scatter(1e-5, 1e-2)) == []
     told = scatter((noise(5000, 0.0, 1e-3, 2)[:, 0] / 5e-4).round() * 5e-4)
     assert told.noise == pytest.approx(1e-3, rel=0.2) and told.step == pytest.approx(5e-4)
 

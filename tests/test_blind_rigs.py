@@ -36,7 +36,7 @@ from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescri
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
 
 AREA = 0.016
 

@@ -22,7 +22,7 @@ from fdi_torch.jobs.run_setup import fitting_of, recordings_of, requested_space
 from fdi_torch.monitor.stepper import substeps
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import grid_nodes
-from fdi_torch.simulate.own_steps import ADDED_UP, OwnSteps
+from fdi_torch.simulate.step_control import ADDED_UP, StepControl
 
 
 @pytest.fixture
@@ -106,8 +106,8 @@ def test_steps_below_the_rounding_of_levels_are_refused(fitting: Fitting) -> Non
     with pytest.raises(ValueError, match="expected a positive integration step, got 0 s"):
         fitting.engines(0.0)
     plant = load_plant("three_tank")
-    shortest = OwnSteps.within(ADDED_UP * 2.0**-52 * 1.001, replace(plant)).resolution
-    assert OwnSteps.like(1.01 * shortest, plant).resolution == pytest.approx(1.01 * shortest)
+    shortest = StepControl.for_tolerance(ADDED_UP * 2.0**-52 * 1.001, replace(plant)).resolution
+    assert StepControl.for_fixed_step(1.01 * shortest, plant).resolution == pytest.approx(1.01 * shortest)
 
 
 def test_windows_shorter_than_a_sampling_interval(fitting: Fitting) -> None:

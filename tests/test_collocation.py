@@ -12,8 +12,8 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
 from fdi_torch.simulate.midpoint import newton_step
+from fdi_torch.simulate.reference_engine import ReferenceEngine
 from fdi_torch.simulate.scan import linear_scan, scan_in_time
 from tests.rigs import constant_inputs, three_tank
 
@@ -100,12 +100,12 @@ def test_levels_and_slopes_are_those_of_the_reference_and_of_finite_differences(
     space = ParameterSpace(network.constants[n] for n in names)
     theta = space.vector(values).unsqueeze(0)
     engine = Collocation(network, space, lay_out(recording, network.description.channels(), 1.0))
-    found = engine.settle(theta, engine.constant_guess(theta))
+    found = engine.converge(theta, engine.constant_guess(theta))
     exact = ReferenceEngine(network, space, lay_out(recording, network.description.channels(), 0.25)).readings(theta)
     assert float((found.readings - exact).abs().max()) < 1e-5  # m
     for j, name in enumerate(names):
         step = 1e-5 * max(abs(float(theta[0, j])), 0.1)
-        ends = [engine.settle(theta + sign * step * torch.eye(len(names))[j], found.levels) for sign in (1.0, -1.0)]
+        ends = [engine.converge(theta + sign * step * torch.eye(len(names))[j], found.levels) for sign in (1.0, -1.0)]
         slope = (ends[0].readings - ends[1].readings) / (2 * step)
         error = (slope - found.jacobian[..., j]).norm() / slope.norm()
         assert float(error) < 1e-3, name
@@ -118,7 +118,7 @@ def test_what_runs_over_a_rim_is_the_references() -> None:
     space = ParameterSpace([network.constants["T1.start_level"]])
     theta = space.nominal().unsqueeze(0)
     engine = Collocation(network, space, lay_out(recording, low.channels(), 1.0))
-    found = engine.settle(theta, engine.constant_guess(theta), rounds=40)
+    found = engine.converge(theta, engine.constant_guess(theta), rounds=40)
     exact = ReferenceEngine(network, space, lay_out(recording, low.channels(), 0.25)).readings(theta)
     assert float(exact.max()) > 0.4
     assert float((found.readings - exact).abs().max()) < 1e-3  # m

@@ -16,13 +16,13 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.reach import Reach, reach_of
+from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.build import BuildError
-from fdi_torch.simulate.choose import make_engine
+from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
-from fdi_torch.simulate.traced import TracedEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.traced_engine import TracedEngine
 
 SAMPLES, SAMPLE = 40, 5.0  # s
 
@@ -168,9 +168,9 @@ def bare_reading(plant: str) -> Tensor:
 
 
 @cache
-def bare_reach(plant: str) -> Reach:
+def bare_reach(plant: str) -> OperatingRange:
     recording = replace(random_inputs(PLANTS[plant]), outputs=bare_reading(plant), mask=None)
-    return reach_of(recording, PLANTS[plant])
+    return operating_range_of(recording, PLANTS[plant])
 
 
 @everywhere
@@ -197,7 +197,7 @@ def test_starts_lie_in_the_box_and_one_of_them_shows(plant: str, place: str) -> 
         for name, value in start.items():
             assert r.space[name].low <= value <= r.space[name].high, name
     shown = (first_starts(plant)[place] - bare_reading(plant)).abs().max()
-    assert shown > 0 or r.placement(place).effect.rounds
+    assert shown > 0 or r.placement(place).effect.quantizes
     assert bool(torch.isfinite(first_starts(plant)[place]).all())
 
 

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import pytest
 import torch
 from rigs import random_steps, three_tank
+from torch import Tensor
 
 from fdi_torch.effects import all_placements, build_network, placements_for
-from fdi_torch.effects.signature import signatures
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import reach_of
-from fdi_torch.simulate.choose import make_engine
+from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
+from fdi_torch.simulate.engine import Engine
+from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
 
 STRONG = 0.95
 
 
-def likeness_of(placements: tuple[Placement, ...], kind: str) -> torch.Tensor:
+def likeness_of(placements: tuple[Placement, ...], kind: str) -> Tensor:
     """|cosines| on the three tanks under random steps over 40 min, coefficients and start levels calibrated away."""
     plant = three_tank((0.3, 0.25, 0.28))
     network = build_network(plant, placements)
@@ -28,9 +31,9 @@ def likeness_of(placements: tuple[Placement, ...], kind: str) -> torch.Tensor:
     space = ParameterSpace(p for p in network.constants if p.name.rpartition(".")[0] in wanted or p.name in nuisance)
     recording = random_steps(plant, 2400.0, sample=20.0)
     engine = make_engine(network, space, lay_out(recording, plant.channels(), 20.0), kind)
-    reach = reach_of(replace(recording, outputs=engine.readings(space.nominal()), mask=None), plant)
+    operating_range = operating_range_of(replace(recording, outputs=engine.readings(space.nominal()), mask=None), plant)
     noise = torch.full((3,), 1e-3, dtype=torch.float64)
-    directions = signatures(engine, space, placements, plant, reach, noise, nuisance)
+    directions = signatures(engine, space, placements, plant, operating_range, noise, nuisance)
     return torch.abs(directions @ directions.T)
 
 
@@ -55,3 +58,58 @@ def test_each_effect_names_its_strongest_rival() -> None:
             named = rival.name in one.effect.mistaken_for or one.effect.name in rival.mistaken_for
             unnamed |= set() if named else {(one.prefix, rival.name)}
     assert not unnamed
+
+
+def signatures(
+    engine: Engine,
+    space: ParameterSpace,
+    placements: Sequence[Placement],
+    plant: PlantDescription,
+    operating_range: OperatingRange,
+    noise: Tensor,
+    nuisance: Iterable[str] = (),
+) -> Tensor:
+    """Direction of each placement's effect on the whitened readings, (N, S * sensors); zero without any effect.
+
+    A smooth effect's signature is the Jacobian's column of its size at nominal, any other's its largest change over
+    its starting points. noise (sensors,): standard deviations. nuisance: names of calibration constants, whose effects
+    are projected out.
+    """
+    nominal = space.nominal()
+    readings, jacobian = engine.linearise(nominal)
+    rows = []
+    for placement in placements:
+        size = placement.effect.parameters(placement.location, plant)[0].name
+        if placement.effect.smooth:
+            rows.append(jacobian[..., space.index(f"{placement.prefix}.{size}")])
+        else:
+            rows.append(_largest_change(engine, space, placement, plant, operating_range, readings))
+    absorbed = [jacobian[..., space.index(name)] for name in nuisance]
+    whitened = [torch.flatten(row / noise) for row in (*rows, *absorbed)]
+    return _directions(torch.stack(whitened[: len(rows)]), whitened[len(rows) :])
+
+
+def _largest_change(
+    engine: Engine,
+    space: ParameterSpace,
+    placement: Placement,
+    plant: PlantDescription,
+    operating_range: OperatingRange,
+    readings: Tensor,
+) -> Tensor:
+    starts = placement.effect.starts(placement.location, plant, operating_range)
+    full = [{f"{placement.prefix}.{name}": value for name, value in start.items()} for start in starts]
+    changes = engine.readings(torch.stack([space.vector(start) for start in full])) - readings
+    return changes[int(changes.abs().flatten(1).sum(1).argmax())]
+
+
+def _directions(rows: Tensor, absorbed: list[Tensor]) -> Tensor:
+    """rows with the span of `absorbed` projected out, scaled to unit length; zero where the remainder is negligible."""
+    remainder = rows
+    if absorbed:
+        basis, strength, _ = torch.linalg.svd(torch.stack(absorbed, dim=1), full_matrices=False)
+        basis = basis[:, strength > 1e-10 * strength[0]]
+        remainder = rows - (rows @ basis) @ basis.T
+    length = remainder.norm(dim=1, keepdim=True)
+    visible = length > 1e-9 * rows.norm(dim=1, keepdim=True)
+    return torch.where(visible, remainder / torch.where(visible, length, 1.0), 0.0)

@@ -15,10 +15,10 @@ from fdi_torch.effects import build_network, effect, placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect, Sensor, Tank
 from fdi_torch.plant.effect import Effect, Local, Memory
-from fdi_torch.plant.reach import bounded, inside, reach_of
+from fdi_torch.plant.operating_range import bounded_by_recording, interior_points, operating_range_of
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
 
 
 def number(value: float) -> Tensor:
@@ -38,7 +38,7 @@ def local(head: float, level: float = 0.5) -> Local:
 
 def through(actuator: Effect, commands: list[float], step: float, p: dict[str, Tensor]) -> list[float]:
     """What a chain of held commands, each one step long, becomes."""
-    memory: Memory = actuator.remember(number(commands[0]), p)
+    memory: Memory = actuator.steady_memory(number(commands[0]), p)
     out = []
     for k, u in enumerate(commands):
         clock = Clock(number(k * step), number(step), number(step))
@@ -48,7 +48,7 @@ def through(actuator: Effect, commands: list[float], step: float, p: dict[str, T
 
 
 def read(sensor: Effect, seen: list[float], step: float, p: dict[str, Tensor]) -> list[float]:
-    memory: Memory = sensor.remember(number(seen[0]), p)
+    memory: Memory = sensor.steady_memory(number(seen[0]), p)
     out = []
     for k, y in enumerate(seen):
         clock = Clock(number((k - 1) * step), number(step), number(step))
@@ -282,20 +282,22 @@ def test_reach_of_a_recording() -> None:
     flows = torch.tensor([[1e-5, 0.0], [3e-5, 2e-5], [0.0, 0.0]], dtype=torch.float64)
     recording = blank_recording(plant, flows, torch.arange(3, dtype=torch.float64))
     seen = replace(recording, outputs=torch.tensor([[8.0], [8.4], [math.nan]], dtype=torch.float64), mask=None)
-    reach = reach_of(seen, plant)
+    reach = operating_range_of(seen, plant)
     assert (reach.duration, reach.commands["Q1"]) == (2.0, (0.0, 3e-5))
     assert reach.readings["d1"] == pytest.approx((8.0, 8.4))
     assert reach.levels["T1"] == pytest.approx((0.3, 0.5)), "a sensor that looks down"
     assert reach.levels["T4"] == (0.0, 0.7), "a tank without a sensor"
-    assert reach_of(recording, plant).readings["d1"] == (7.0, 9.0), "nothing read: from floor to rim"
-    assert inside((0.0, 4.0), 3) == [1.0, 2.0, 3.0]
+    assert operating_range_of(recording, plant).readings["d1"] == (7.0, 9.0), "nothing read: from floor to rim"
+    assert interior_points((0.0, 4.0), 3) == [1.0, 2.0, 3.0]
 
 
 def test_times_that_may_be_endless_are_bounded_by_the_recording() -> None:
     network = build_network(three_tank(), placements_for(["T1.unmetered_flow.flow", "Q1.pump_lag.time_constant"]))
-    space = bounded(network.constants, 900.0)
+    space = bounded_by_recording(network.constants, 900.0)
     assert space["T1.unmetered_flow.begin"].high == 900.0
-    assert bounded(network.constants, 60.0)["T1.unmetered_flow.duration"].high == 600.0, "never below nominal"
+    assert bounded_by_recording(network.constants, 60.0)["T1.unmetered_flow.duration"].high == 600.0, (
+        "never below nominal"
+    )
     assert space["Q1.pump_lag.time_constant"].high == 60.0
 
 

@@ -19,14 +19,14 @@ from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Hold, Recording
 from fdi_torch.simulate import build
 from fdi_torch.simulate.build import BuildError
-from fdi_torch.simulate.choose import adaptive_engine, make_engine
-from fdi_torch.simulate.compiled import CompiledEngine, _kernel
+from fdi_torch.simulate.compiled_engine import CompiledEngine, _kernel
 from fdi_torch.simulate.engine import Readings, gram_of, moments_of
+from fdi_torch.simulate.engine_choice import adaptive_engine, make_engine
 from fdi_torch.simulate.experiment import Experiment, lay_out
 from fdi_torch.simulate.expression import Graph
-from fdi_torch.simulate.integrate import ReferenceEngine
-from fdi_torch.simulate.trace import Tracer
-from fdi_torch.simulate.traced import TracedEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.traced_engine import TracedEngine
+from fdi_torch.simulate.tracer import Tracer
 
 PAPER = ("T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size")
 
@@ -42,7 +42,7 @@ class SlowPump(Effect):
     def delay(self, p: Values) -> Tensor:
         return p["dead_time"]
 
-    def remember(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: Tensor, p: Values) -> Memory:
         return (value,)
 
     def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
@@ -62,7 +62,7 @@ class SlowSensor(Effect):
     def delay(self, p: Values) -> Tensor:
         return p["dead_time"]
 
-    def remember(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: Tensor, p: Values) -> Memory:
         return (value,)
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:

@@ -149,7 +149,7 @@ def test_an_unknown_input_is_refused_in_one_sentence() -> None:
     recording = recorded(LAMINAR, 3, samples=200)
     inputs = recording.inputs.clone()
     inputs[50:60, 1] = torch.nan
-    with pytest.raises(ValueError, match="expected known inputs, got an unknown one at 50 s"):
+    with pytest.raises(ValueError, match="expected a value of every input, got a missing one at 50 s"):
         diagnose(believed(), replace(recording, inputs=inputs))
 
 

@@ -6,7 +6,7 @@ import torch
 from fdi_torch.config.plant import load_plant
 from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.floor import estimate_noise
-from fdi_torch.plant.reach import reach_of, with_levels
+from fdi_torch.plant.operating_range import operating_range_of, with_simulated_levels
 from fdi_torch.recording import Recording
 from tests.test_gap import believed, recorded
 
@@ -30,10 +30,10 @@ def test_a_tank_without_a_sensor_reaches_as_far_as_the_model_has_it() -> None:
     time = torch.arange(3, dtype=torch.float64)
     readings = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
     recording = Recording(time, readings, readings, ("u_pump",), ("y_lower_level",), ("V",), ("V",))
-    plain = reach_of(recording, plant)
+    plain = operating_range_of(recording, plant)
     assert plain.levels["upper"] == (0.0, pytest.approx(0.14))
     levels = torch.tensor([[0.05, 0.5], [0.08, 0.6]], dtype=torch.float64)
-    found = with_levels(plain, plant, levels)
+    found = with_simulated_levels(plain, plant, levels)
     assert found.levels["upper"] == (0.05, 0.08)
     assert found.levels["lower"] == plain.levels["lower"]
 

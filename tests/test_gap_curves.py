@@ -11,7 +11,7 @@ from fdi_torch.gap.curves import curves_at
 from fdi_torch.gap.fitting import Candidate, Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import reach_of
+from fdi_torch.plant.operating_range import operating_range_of
 from tests.test_gap import believed, recorded
 
 
@@ -34,7 +34,7 @@ def test_the_free_curve_agrees_with_the_effect_that_is_there(
     white = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     fitter = Fitter(laid_out(believed(), (), [recording], None), white)
     fit = fitter.fit(Candidate((Placement(effect(name), place),), (truth,)))
-    first, *_, last = curves_at(fitter, fit, place, reach_of(recording, believed()))
+    first, *_, last = curves_at(fitter, fit, place, operating_range_of(recording, believed()))
     assert (first.quantity, first.variable, last.variable) == (quantity, variable, "time")
     for curve in (first, last):
         assert curve.effect is not None

@@ -11,13 +11,13 @@ from fdi_torch.effects import EFFECTS, build_network
 from fdi_torch.gap.forcing import Forcing
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement, Stage, fits
-from fdi_torch.plant.reach import reach_of
+from fdi_torch.plant.operating_range import operating_range_of
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import lay_out
 from tests.rigs import constant_inputs, three_tank
 
 PLANT = three_tank()
-TRIED = [Placement(e, p) for e in EFFECTS if not e.rounds for p in PLANT.locations() if fits(e, PLANT, p)]
+TRIED = [Placement(e, p) for e in EFFECTS if not e.quantizes for p in PLANT.locations() if fits(e, PLANT, p)]
 
 
 @pytest.mark.parametrize("placement", TRIED, ids=lambda p: p.prefix)
@@ -32,7 +32,7 @@ def test_an_effect_forces_the_levels_and_moves_the_readings_as_the_whole_plant_s
     levels = torch.stack([0.3 + 0.1 * torch.sin(time / 20.0 + k) for k in range(len(PLANT.tanks))])
     starts = [
         {f"{placement.prefix}.{n}": v for n, v in s.items()}
-        for s in placement.effect.starts(placement.location, PLANT, reach_of(recording, PLANT))
+        for s in placement.effect.starts(placement.location, PLANT, operating_range_of(recording, PLANT))
     ]
     for start in starts:
         space = ParameterSpace(network.constants[n] for n in start)

@@ -13,10 +13,10 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.where.forms import memories, slews
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
 from tests.test_gap import SMALL, believed, recorded
-from tests.test_pace import scaled as similar
+from tests.test_scales import scaled as similar
 
 SLOWER, WIDER = 20.0, 1000.0
 FLOWS = WIDER / SLOWER  # A dh/dt = q

@@ -13,7 +13,7 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import build_network
 from fdi_torch.interruption import UNDISTURBED, SteadyLock, Terminated, catch_signals
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.choose import make_engine
+from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
 
 

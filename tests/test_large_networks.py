@@ -15,13 +15,13 @@ from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, S
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.build import BuildError
-from fdi_torch.simulate.compiled import MOST_UNROLLED, CompiledEngine
+from fdi_torch.simulate.compiled_engine import MOST_UNROLLED, CompiledEngine
 from fdi_torch.simulate.elimination import eliminate
 from fdi_torch.simulate.engine import Readings, gram_of
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
-from fdi_torch.simulate.record import clean_readings
-from fdi_torch.simulate.traced import TracedEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.simulated_recording import clean_readings
+from fdi_torch.simulate.traced_engine import TracedEngine
 
 TANKS = MOST_UNROLLED + 2
 NAMES = ("T1.leak.size", "P1.plugging.size", "T2.area", "T1.start_level", "Q1.pump_lag.time_constant")
@@ -104,7 +104,7 @@ def test_a_clean_recording_needs_no_compiler(monkeypatch: pytest.MonkeyPatch) ->
     def refuse(*_: object) -> None:
         raise BuildError("expected a C++ compiler, got none")
 
-    monkeypatch.setattr("fdi_torch.simulate.compiled._kernel", refuse)
+    monkeypatch.setattr("fdi_torch.simulate.compiled_engine._kernel", refuse)
     found = clean_readings(network, recording, {"T1.leak.size": 0.2})
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-7)
 

@@ -20,13 +20,13 @@ from fdi_torch.monitor.stepper import PlantState, Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.injection import Injection, expect_injectable, lay_out_samples
-from fdi_torch.simulate.integrate import ReferenceEngine
-from fdi_torch.simulate.traced import TracedEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.traced_engine import TracedEngine
 
 PLANT = load_plant("three_tank")
 NETWORK = build_network(PLANT)
@@ -197,7 +197,7 @@ def test_a_correction_within_a_step_is_refused() -> None:
     inside = replace(experiment, sample_share=torch.tensor([0.0, 0.5, 1.0, 1.0], dtype=torch.float64))
     with pytest.raises(ValueError, match="every sample at the end of a step"):
         expect_injectable(inside, Injection(torch.zeros(4, 3, 3), REST[None]), 0)
-    with pytest.raises(ValueError, match="expected 3 remembered numbers a lane, got 2"):
+    with pytest.raises(ValueError, match="expected 3 memory states per lane, got 2"):
         expect_injectable(experiment, Injection(torch.zeros(4, 3, 3), REST[None], REST[None, :2]), 3)
 
 

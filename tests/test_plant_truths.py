@@ -10,16 +10,17 @@ import torch
 from rigs import REST, blank_recording, constant_inputs, paper_network, random_steps, three_tank
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from torch import Tensor
 
 from fdi_torch.effects import build_network
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.plant.lpv import lpv_form
+from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.orifice import rim_strength, weir_flow
 from fdi_torch.plant.signals import Clock, CumulativeSignal
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import grid_nodes, lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
 
 
 def clock(resolution: float = 1e-6) -> Clock:
@@ -139,9 +140,9 @@ def test_volume_is_conserved() -> None:
     values = network.bind(space, theta[0])
     levels = torch.tensor([0.9, 1.02, 0.5], dtype=torch.float64)
     commands = torch.tensor([40e-6, 90e-6], dtype=torch.float64)
-    now = network.moment(levels.unbind(), commands.unbind(), clock(), values)
+    now = network.operating_point(levels.unbind(), commands.unbind(), clock(), values)
     pumps, pipes = network.pump_flows(now), network.pipe_flows(now)
-    net = torch.stack(network.spilled(now, network.gathered(now, pumps, pipes)))
+    net = torch.stack(network.less_overflow(now, network.net_inflows(now, pumps, pipes)))
     k = 0.6 * 0.6e-4 * math.sqrt(2 * 9.81)
     leaks = 0.2 * k * math.sqrt(0.9) + 0.3 * k * math.sqrt(0.5)
     crest = 2.0 * math.sqrt(math.pi * 160e-4)
@@ -163,6 +164,21 @@ def test_gradients_pass_gradcheck_off_and_on_equal_levels() -> None:
         levels = torch.tensor(special, dtype=torch.float64, requires_grad=True)
         gradients = torch.autograd.grad(scaled(levels, theta).sum(), (levels, theta))
         assert all(bool(torch.isfinite(g).all()) for g in gradients)
+
+
+def lpv_form(
+    network: TankNetwork, space: ParameterSpace, levels: Tensor, commands: Tensor, step: Clock
+) -> tuple[Tensor, Tensor]:
+    """F (tanks, P) and B (tanks, actuators) of x' = F(x) theta + B u (2020 paper, eq. 32, 33), at one operating point.
+
+    The right-hand side is affine in the sizes of leaks, net outlets and openness, and in commands within the pumps'
+    limits, unless a tank is empty or at its rim.
+    """
+
+    def rates(theta: Tensor, u: Tensor) -> Tensor:
+        return network(levels, u, step, network.bind(space, theta))
+
+    return torch.autograd.functional.jacobian(rates, (space.nominal(levels), commands))
 
 
 def test_lpv_form_is_the_papers() -> None:
@@ -270,7 +286,7 @@ def test_a_pump_delivers_nothing_for_a_negative_command_and_no_more_than_it_can(
 
 def test_no_steady_state_is_said() -> None:
     plant = PlantDescription("closed", (Tank("T", 0.02, 1e9, None),), (), (Pump("Q", "T", 1e-4),), (Sensor("h", "T"),))
-    with pytest.raises(ValueError, match="tank T still moving; give its start_level"):
+    with pytest.raises(ValueError, match="level of tank T keeps changing; give its start_level"):
         equilibrium(build_network(plant), torch.tensor([5e-5], dtype=torch.float64))
 
 
@@ -278,6 +294,6 @@ def test_unknown_inputs_must_be_masked() -> None:
     plant = three_tank()
     recording = constant_inputs(plant, 10.0)
     recording.inputs[4, 1] = float("nan")
-    with pytest.raises(ValueError, match="unknown one at 4 s; mask that stretch"):
+    with pytest.raises(ValueError, match="missing one at 4 s; mask that segment"):
         lay_out(recording, plant.channels(), 1.0)
     assert [len(r) for r in recording.known_stretches()] == [4, 6]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.simulate.build import load_library
-from fdi_torch.simulate.emit import primitives
+from fdi_torch.simulate.cpp_source import primitives
 from fdi_torch.simulate.operations import OPERATIONS
 
 PROCESSORS = {

@@ -29,7 +29,7 @@ from fdi_torch.interruption import Terminated
 from fdi_torch.jobs.blind_results import LOG, write_plants, write_results
 from fdi_torch.logbook.provenance import git_state
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import area_scale, length_scale, time_scale
+from fdi_torch.plant.scales import area_scale, length_scale, time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.study.cluster import connected, each_on
 

@@ -15,8 +15,8 @@ from fdi_torch.gap.acquisition import examined
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.check import ChannelSummary, RecordingCheck, check_recording
-from fdi_torch.recordings.finding import Finding
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -44,9 +44,9 @@ def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
     """The check of a recording, with refused or masked channels first."""
     check = check_recording(whole, plant)
     examinations = [examined(plant, part) for part in whole.known_stretches()]
-    problems = [Finding("slip", ", ".join(e.slip.channels), e.slip.text) for e in examinations if e.slip]
+    problems = [ChannelFinding("slip", ", ".join(e.slip.channels), e.slip.text) for e in examinations if e.slip]
     problems += [
-        Finding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})
+        ChannelFinding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})
         for e in examinations
         for s in e.stuck
     ]

@@ -17,7 +17,7 @@ from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
 from fdi_torch.monitor.monitor_setup import usual_faults
 from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
 
 

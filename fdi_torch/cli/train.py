@@ -15,7 +15,7 @@ from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.parameters import display_unit
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.check import doubts
+from fdi_torch.recordings.check import data_warnings
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -63,7 +63,9 @@ def in_words(done: TrainResult) -> list[str]:
     """The diagnosis, one sentence per line."""
     diagnosis, final = done.result.diagnosis, done.result.estimate
     recordings = done.fitting.recordings
-    lines = not_counted(recordings) + list(dict.fromkeys(s for r in recordings for s in doubts(r, done.fitting.plant)))
+    lines = not_counted(recordings) + list(
+        dict.fromkeys(s for r in recordings for s in data_warnings(r, done.fitting.plant))
+    )
     if diagnosis.faults:
         present = (
             ", ".join(f.name for f in diagnosis.present) or "no suspected fault differs significantly from nominal"

@@ -24,7 +24,7 @@ from fdi_torch.recording import Recording
 
 
 class WindowConfig(Strict):
-    """Times that are not given are those of a bench, by ten longer or shorter for other plants (`plant.pace`)."""
+    """Times that are not given are those of a bench, by ten longer or shorter for other plants (`plant.scales`)."""
 
     lookback: BenchSeconds = Field(300.0, description="how far before an alarm a change is sought, s")
     confirm: BenchSeconds = Field(60.0, description="how long after an alarm the faults are told apart, s")

@@ -15,7 +15,16 @@ from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Share, Strict, quantity
 from fdi_torch.names import unknown
 from fdi_torch.outside import MOST_COMPONENTS
-from fdi_torch.plant.description import MOST_DISCHARGE, OUTSIDE, Matter, Pipe, PlacedEffect, Pump, Sensor, Tank
+from fdi_torch.plant.description import (
+    LARGEST_DISCHARGE_COEFFICIENT,
+    OUTSIDE,
+    FaultPriority,
+    Pipe,
+    PlacedEffect,
+    Pump,
+    Sensor,
+    Tank,
+)
 
 
 def _start_level(value: Any) -> float | None:
@@ -36,7 +45,7 @@ class PipeConfig(Strict):
     source: str = Field(description="the tank it starts from")
     target: str = Field(OUTSIDE, description="the tank it leads to, or outside")
     area: Area = Field(description="of the orifice, m^2")
-    discharge_coefficient: Share = Field(le=MOST_DISCHARGE, description="of the orifice, without unit")
+    discharge_coefficient: Share = Field(le=LARGEST_DISCHARGE_COEFFICIENT, description="of the orifice, without unit")
     elevation: Length = Field(0.0, description="of the orifice above both floors, m")
     free_fall: bool = Field(False, description="whether it pours into its target from above")
     valve: str | None = Field(None, description="the input channel with its measured opening, 0 to 1")
@@ -130,7 +139,7 @@ def _plant(config: PlantConfig) -> Plant:
     return replace(plant, tolerances=tolerances, varying=tuple(config.varying), matters=matters)
 
 
-def _matter(name: str, matter: MatterConfig, plant: Plant) -> Matter:
+def _matter(name: str, matter: MatterConfig, plant: Plant) -> FaultPriority:
     """'T1.leak' stands for the leak's size."""
     location, _, rest = name.partition(".")
     effect, _, field = rest.partition(".")
@@ -144,7 +153,7 @@ def _matter(name: str, matter: MatterConfig, plant: Plant) -> Matter:
     smallest = settled(f"matters.{name}.smallest", matter.smallest, size.unit, quantity)
     if smallest < 0.0:
         raise ValueError(f"matters.{name}.smallest: expected no negative size, got {matter.smallest}")
-    return Matter(f"{location}.{effect}.{size.name}", smallest, matter.urgency)
+    return FaultPriority(f"{location}.{effect}.{size.name}", smallest, matter.urgency)
 
 
 def _sensor(name: str, config: SensorConfig) -> Sensor:

@@ -14,7 +14,7 @@ from fdi_torch.config.strict import quantity
 from fdi_torch.effects import build_network, effect, placements_for
 from fdi_torch.names import matching, unknown
 from fdi_torch.parameters import Parameter, ParameterSpace
-from fdi_torch.plant.description import Matter, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import FaultPriority, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Effect, fits, place_kind
 from fdi_torch.simulate.ode import Inputs, PlantOde
 
@@ -55,7 +55,7 @@ class Plant(PlantDescription):
         tolerances: Mapping[str, float | str] | None = None,
         varying: Iterable[str] = (),
         gravity: float | str = 9.81,
-        matters: Iterable[Matter] = (),
+        matters: Iterable[FaultPriority] = (),
         name: str = "plant",
     ) -> None:
         parts = (tuple(tanks), tuple(pipes), tuple(pumps), tuple(sensors))

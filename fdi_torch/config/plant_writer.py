@@ -10,7 +10,7 @@ from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import (
     OUTSIDE,
     READING_UNITS,
-    Matter,
+    FaultPriority,
     Pipe,
     PlacedEffect,
     PlantDescription,
@@ -55,7 +55,7 @@ def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
     return {key: value for key, value in data.items() if value}
 
 
-def _matter_mapping(matter: Matter, plant: PlantDescription) -> dict[str, Any]:
+def _matter_mapping(matter: FaultPriority, plant: PlantDescription) -> dict[str, Any]:
     location, effect, field = matter.fault.split(".")
     units = {p.name: p.unit for p in effect_at(effect, location, plant).parameters(location, plant)}
     smallest = _text(matter.smallest, units[field]) if matter.smallest else None

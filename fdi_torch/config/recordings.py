@@ -13,7 +13,7 @@ from pydantic import AllowInfNan, BeforeValidator, Field, model_validator
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
 from fdi_torch.outside import MOST_SAMPLES
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.stamps import expect_zone
+from fdi_torch.recordings.time_stamps import expect_zone
 
 StartLevel = Literal["free", "equilibrium"] | float
 """How a tank's level at the start is known: to be estimated, at rest under the first inputs, or so many metres."""

@@ -16,7 +16,7 @@ from fdi_torch.config.strict import Amount, Decibel, Seconds, Strict, quantity
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.record import noise_level
+from fdi_torch.simulate.simulated_recording import noise_level
 
 
 class InputConfig(Strict):

@@ -25,8 +25,8 @@ from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.names import unknown
 from fdi_torch.outside import MOST_SETTINGS, MOST_TRIALS
-from fdi_torch.plant.pace import time_scale
-from fdi_torch.plant.reach import bounded
+from fdi_torch.plant.operating_range import bounded_by_recording
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.study.plan import (
     ESTIMATORS,
     Estimator,
@@ -128,7 +128,7 @@ def _fitting(run: Run) -> Fitting:
         raise ConfigError([f"{run.source}: estimate.parameters: expected at least one, got none"])
     network = build_network(run.plant, placements_of([p.name for p in estimate.parameters], run.plant))
     space = estimated_space(estimate, network.constants, run.plant, real_data=False)
-    space = bounded(space, simulated.duration)
+    space = bounded_by_recording(space, simulated.duration)
     unbounded = [p.name for p in space if not (abs(p.low) < torch.inf and abs(p.high) < torch.inf)]
     if unbounded:
         raise ConfigError(

@@ -15,7 +15,7 @@ from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.reference import keys
 from fdi_torch.config.strict import Config, at_pace
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 
 
 def values_in(path: str | Path, overrides: Iterable[str] = ()) -> tuple[dict[str, Any], Path]:

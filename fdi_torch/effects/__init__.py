@@ -1,4 +1,4 @@
-"""The plugs: faults and unmodelled effects alike, one file each. A new one is one file and one line in the tuple."""
+"""The effects: faults and unmodelled effects, one file each. A new effect needs its file and one entry in `EFFECTS`."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ EFFECTS: tuple[Effect, ...] = (
 
 
 def effect(name: str) -> Effect:
-    """The effect of that name. Raises ValueError naming the nearest known one."""
+    """The effect of that name. Raises ValueError, with the nearest known name, for an unknown one."""
     by_name = {e.name: e for e in EFFECTS}
     if name not in by_name:
         near = get_close_matches(name, by_name, n=1, cutoff=0.0)[0]
@@ -113,39 +113,46 @@ def effect(name: str) -> Effect:
 
 
 def place(name: str, location: str) -> Placement:
-    """('leak', 'T1') -> the effect at that place, absent until its size leaves nominal."""
+    """An effect at a location: place("leak", "T1"). It is absent until its size leaves the nominal value."""
     return Placement(effect(name), location)
 
 
 def all_placements(plant: PlantDescription, effects: Iterable[Effect] = EFFECTS) -> tuple[Placement, ...]:
-    """Every effect at every place where it can sit."""
+    """Every effect at every place where it can be placed."""
     return tuple(Placement(e, place) for e in effects for place in plant.locations() if fits(e, plant, place))
 
 
 def build_network(plant: PlantDescription, placements: Iterable[Placement] = ()) -> TankNetwork:
-    """The plant with the effects that it is believed to have, and further ones to be estimated."""
-    own = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
-    known = {p.prefix for p in own}
-    return TankNetwork(plant, [*own, *(p for p in placements if p.prefix not in known)])
+    """The network of a plant with its known effects, and with further ones to be estimated.
 
-
-def once_run(plant: PlantDescription, channels: Collection[str]) -> PlantDescription:
-    """The plant in the midst of a run in which these inputs were on before: what acts at first only no longer does,
-    nor does it vary.
+    A further placement is ignored if the plant already has that effect at that place.
     """
-    ran = {p.name for p in plant.pumps if p.channel in channels}
-    ran |= {p.name for p in plant.pipes if p.valve in channels}
-    over = {f"{e.location}.{e.effect}" for e in plant.effects if e.location in ran and effect(e.effect).at_first}
+    known = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    prefixes = {p.prefix for p in known}
+    return TankNetwork(plant, [*known, *(p for p in placements if p.prefix not in prefixes)])
+
+
+def without_startup_effects(plant: PlantDescription, channels: Collection[str]) -> PlantDescription:
+    """The plant without its start-up effects, for data from the middle of a run in which the pumps of `channels` have
+    run.
+
+    The tolerances and varying constants of those effects are removed too.
+    """
+    running = {p.name for p in plant.pumps if p.channel in channels}
+    running |= {p.name for p in plant.pipes if p.valve in channels}
+    ended = {
+        f"{e.location}.{e.effect}" for e in plant.effects if e.location in running and effect(e.effect).startup_only
+    }
     return replace(
         plant,
-        effects=tuple(e for e in plant.effects if f"{e.location}.{e.effect}" not in over),
-        tolerances={n: v for n, v in plant.tolerances.items() if n.rpartition(".")[0] not in over},
-        varying=tuple(n for n in plant.varying if n.rpartition(".")[0] not in over),
+        effects=tuple(e for e in plant.effects if f"{e.location}.{e.effect}" not in ended),
+        tolerances={n: v for n, v in plant.tolerances.items() if n.rpartition(".")[0] not in ended},
+        varying=tuple(n for n in plant.varying if n.rpartition(".")[0] not in ended),
     )
 
 
 def placements_for(names: Iterable[str]) -> tuple[Placement, ...]:
-    """The effects that parameter names such as 'T1.leak.size' speak of, each once; names of constants speak of none."""
-    split = (name.split(".") for name in names)
-    pairs = dict.fromkeys((parts[1], parts[0]) for parts in split if len(parts) == 3)
+    """The distinct effects behind parameter names such as 'T1.leak.size'; names of component constants are ignored."""
+    parts = (name.split(".") for name in names)
+    pairs = dict.fromkeys((p[1], p[0]) for p in parts if len(p) == 3)
     return tuple(place(effect_name, location) for effect_name, location in pairs)

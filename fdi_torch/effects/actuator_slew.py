@@ -1,4 +1,4 @@
-"""A pump or valve that moves at a limited rate."""
+"""A pump or valve with a limited slew rate."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription, Pump
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 
 SLOWNESS_UNITS = {"m^3/s": "s^2/m^3", "V": "s/V", "A": "s/A", "1/s": "s^2", "1": "s"}
 
 
 class ActuatorSlew(Effect):
-    """|dv/dt| <= 1/s: motor valves, ramps in a drive. Exact for a command held over a step, of which the mean is
-    passed on.
+    """|dv/dt| <= 1/s, with the slowness s: motor-driven valves, ramps in a drive. The mean over each step is exact for
+    a command held over the step.
 
-    slowness: seconds for a command of one unit (a valve: for its whole stroke). Typical: a whole stroke in 2 to 60 s.
-    Nearly the same as a lag where all steps are alike.
+    slowness: time to move by one unit of the command (a valve: by its whole stroke). Typical: a whole stroke in 2 to 60
+    s. Nearly the same as a lag if all steps of the command are equally large.
     """
 
     name = "actuator_slew"
@@ -35,12 +35,12 @@ class ActuatorSlew(Effect):
         slowest = 120.0 * time_scale(plant) / full
         return (Parameter("slowness", SLOWNESS_UNITS[unit], 0.0, 0.0, slowest, meaning="time to move by one unit"),)
 
-    def remember(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: Tensor, p: Values) -> Memory:
         return (value,)
 
     def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
         gap = memory[0] - value
         needed = torch.abs(gap) * p["slowness"] / clock.step
         moving = torch.clamp(needed, max=1.0)  # share of the step in which it moves
-        left = gap * (1.0 - 1.0 / torch.clamp(needed, min=1.0))
-        return value + left + 0.5 * moving * (gap - left), (value + left,)
+        remaining = gap * (1.0 - 1.0 / torch.clamp(needed, min=1.0))
+        return value + remaining + 0.5 * moving * (gap - remaining), (value + remaining,)

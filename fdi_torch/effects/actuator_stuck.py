@@ -1,4 +1,4 @@
-"""A pump or valve that no longer moves."""
+"""A pump or valve that is stuck."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from fdi_torch.plant.signals import Clock
 
 
 class ActuatorStuck(Stuck):
-    """From an onset on it stays where it then is (Isermann, 2006, "Fault-Diagnosis Systems", ch. 5).
+    """From the onset on, the actuator holds its position: v(t) = v(onset) (Isermann, 2006, "Fault-Diagnosis Systems",
+    ch. 5).
 
-    size: 1 where it is stuck, 0 where it follows; between them the share of its stroke that is lost. A recording must
-    go on with a moving command, or nothing shows.
+    size: 1 for fully stuck, 0 for free; in between, the share of the command's change that is lost. Only a command that
+    changes after the onset shows it.
     """
 
     name = "actuator_stuck"
@@ -22,4 +23,4 @@ class ActuatorStuck(Stuck):
     mistaken_for = ("pump_gain", "pump_saturation", "valve_dead_zone", "valve_leak", "actuator_slew")
 
     def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
-        return self.held(value, memory, clock.share_after(p["onset"]), p)
+        return self.hold(value, memory, clock.share_after(p["onset"]), p)

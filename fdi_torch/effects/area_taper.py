@@ -1,4 +1,4 @@
-"""A tank that widens or narrows towards its rim."""
+"""A tank whose cross-section widens or narrows towards its rim."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 
 
 class AreaTaper(Effect):
-    """The cross-section is A (1 + s (h/H - r)): s is its change from floor to rim as a share of A, which holds at the
-    level r H: at half height, unless A was measured elsewhere, as at the floor.
+    """The cross-section is A (1 + s (h/H - r)): s is its change from floor to rim relative to A, and A is the area at
+    the level r H (half height by default; r = 0 if it was measured at the floor).
 
-    Typical: s of -0.5 to 0.5, r of 0 or 1/2. It changes how fast levels move, never where they come to rest, like an
-    internal body.
+    Typical: s of -0.5 to 0.5, r of 0 or 1/2. Like an internal body, it changes how fast levels move but no steady
+    state.
     """
 
     name = "area_taper"
@@ -26,13 +26,13 @@ class AreaTaper(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
-            Parameter("taper", "1", 0.0, -1.6, 1.6, meaning="change of area from floor to rim, as a share of it"),
+            Parameter("taper", "1", 0.0, -1.6, 1.6, meaning="change of area from floor to rim, relative"),
             Parameter(
-                "reference", "1", 0.5, 0.0, 1.0, meaning="level at which the area is as believed, over the height"
+                "reference", "1", 0.5, 0.0, 1.0, meaning="level at which the area is nominal, relative to the height"
             ),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         return [{"taper": s, "reference": r} for r in (0.5, 0.0) for s in (0.16, -0.16)]
 
     def area(self, area: Tensor, local: Local, p: Values) -> Tensor:

@@ -1,4 +1,4 @@
-"""The catalogue of effects: what each is, where it can sit, its parameters, when it begins, and how it is written."""
+"""The catalogue of effects: the meaning, equation, places and parameters of each, and its notation in files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, S
 from fdi_torch.plant.effect import Effect, fits
 from fdi_torch.tables import Shown, Table
 
-# A rig with every kind of place, for what is asked without a plant.
+# A rig with every kind of place, the default if no plant is given.
 _ANY = PlantDescription(
     "any plant",
     (Tank("T1", 0.02, 1.0), Tank("T2", 0.02, 1.0)),
@@ -25,9 +25,10 @@ _ONSETS = ("onset", "begin")
 
 @dataclass(frozen=True)
 class Entry:
-    """An effect of the library. meaning: in one sentence; law: its equation and source; at: the plant's places.
+    """One effect of the catalogue.
 
-    parameters: with unit, nominal value, range and meaning, the size first; SI.
+    meaning: one sentence. law: equation and source. kinds: kinds of component. at: the places of the plant. parameters:
+    size first, with unit, nominal value, range and meaning, in SI.
     """
 
     name: str
@@ -41,7 +42,7 @@ class Entry:
 
     @property
     def begins(self) -> str:
-        """When it acts."""
+        """When the effect starts to act, in words."""
         for parameter in self.parameters:
             if parameter.name in _ONSETS:
                 return f"at `{parameter.name}` (0 s: from the start)"
@@ -49,17 +50,17 @@ class Entry:
 
     @property
     def in_a_run_file(self) -> str:
-        """How `simulate.faults` has it; `estimate.parameters` has the name alone."""
+        """The fault as an entry of `simulate.faults` in a run file."""
         return f"{self.at[0]}.{self.name}.{self.parameters[0].name}: {_amount(self.parameters[0])}"
 
     @property
     def in_a_plant_file(self) -> str:
-        """How a plant that is known to have it says so, under `effects`."""
+        """The effect as an entry of `effects` in a plant file."""
         given = ", ".join(f"{p.name}: {_amount(p)}" for p in self.parameters)
         return f"- {{effect: {self.name}, location: {self.at[0]}, parameters: {{{given}}}}}"
 
     def table(self) -> Table:
-        """A row a parameter, SI."""
+        """One row per parameter, SI."""
         rows = [(p.name, p.unit, p.nominal, p.low, p.high, p.meaning) for p in self.parameters]
         return Table.of_rows(("parameter", "unit", "nominal", "lowest", "highest", "meaning"), rows)
 
@@ -72,12 +73,12 @@ class Catalogue(Shown):
     entries: tuple[Entry, ...]
 
     def __getitem__(self, name: str) -> Entry:
-        """Raises ValueError for an effect that is not among them."""
-        found = next((entry for entry in self.entries if entry.name == name), None)
-        if found is None:
-            known = effect(name)
-            raise ValueError(f"{name}: expected a plant with a {' or a '.join(known.places)}, got {self.plant}")
-        return found
+        """Raises ValueError for an unknown effect, or one that the plant has no place for."""
+        entry = next((e for e in self.entries if e.name == name), None)
+        if entry is None:
+            requested = effect(name)
+            raise ValueError(f"{name}: expected a plant with a {' or a '.join(requested.places)}, got {self.plant}")
+        return entry
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -87,7 +88,7 @@ class Catalogue(Shown):
         return f"{len(self.entries)} effects of {self.plant}"
 
     def table(self) -> Table:
-        """A row an effect."""
+        """One row per effect."""
         rows = [
             (e.name, e.meaning, list(e.kinds), list(e.at), ", ".join(_named(p) for p in e.parameters), e.begins)
             for e in self.entries
@@ -98,15 +99,15 @@ class Catalogue(Shown):
 def effects(plant: PlantDescription | None = None) -> Catalogue:
     """The catalogue of faults and unmodelled effects.
 
-    plant: of which places and ranges are told; None: of any plant, where ranges are those of a rig of 1 m height.
+    plant: determines places and parameter ranges; None for a generic rig with tanks of 1 m.
     """
-    described = plant or _ANY
-    entries = (_entry(each, described) for each in EFFECTS)
-    return Catalogue(described.name, tuple(entry for entry in entries if entry is not None))
+    subject = plant or _ANY
+    entries = (_entry(each, subject) for each in EFFECTS)
+    return Catalogue(subject.name, tuple(entry for entry in entries if entry is not None))
 
 
 def _entry(each: Effect, plant: PlantDescription) -> Entry | None:
-    """None where the plant has no place for it."""
+    """The catalogue entry of an effect; None if the plant has no place for it."""
     at = tuple(place for place in plant.locations() if fits(each, plant, place))
     if not at:
         return None
@@ -127,7 +128,9 @@ def _named(parameter: Parameter) -> str:
 
 
 def _amount(parameter: Parameter) -> str:
-    """A value as a file has it: a tenth of the range for what is nominal at zero, its nominal value otherwise."""
+    """An example value for a file: a tenth of the range for parameters that are zero at nominal, else the nominal
+    value.
+    """
     value = parameter.nominal
     if value == 0.0 and parameter.name not in (*_ONSETS, "ramp"):
         value = 0.1 * (parameter.high if abs(parameter.high) < 1e6 else 1.0)

@@ -1,4 +1,4 @@
-"""What sensors that end at a limit have in common: where the rig clips readings, noise is clipped with the level."""
+"""Clipping of noisy readings, for sensors with a lower or upper limit."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ LEAST = 1e-12
 
 
 def noise_parameters(unit: str) -> tuple[Parameter, Parameter]:
-    """What is clipped with the level, and where it enters."""
+    """The standard deviation of the clipped noise, and the share of it that is added after the first limit."""
     return (
         Parameter("noise", unit, 0.0, 0.0, meaning="standard deviation of the noise that is clipped with the level"),
-        Parameter("behind", "1", 0.0, 0.0, 1.0, meaning="share of it that comes behind the limit and meets it again"),
+        Parameter("behind", "1", 0.0, 0.0, 1.0, meaning="share of the noise added after a first limit"),
     )
 
 
-def lost_to_noise(beyond: Tensor, p: Values) -> Tensor:
-    """By how much the mean of a clipped noisy reading lies inside of the clipped level, in the reading's unit.
+def clipping_bias(beyond: Tensor, p: Values) -> Tensor:
+    """Distance of the mean of a clipped noisy reading from the clipped level, towards the inside, in the reading's
+    unit.
 
-    E[max(x + e, 0)] - max(x, 0) = s log(1 + exp(-|x|/s)) for a logistic e of scale s, in closed form; for a normal one
-    of the same deviation it is less than 2 % of that deviation away. Where a transmitter's range clips the level, and
-    the logger's what the line adds, it stays beyond the limit what it is there. beyond: x, from the limit outwards.
+    E[max(x + e, 0)] - max(x, 0) = s log(1 + exp(-|x|/s)) for logistic noise e of scale s; for normal noise of the same
+    standard deviation the error is below 2 % of that. `p["behind"]` is the share of the noise that enters between two
+    limits (transmitter, then logger); its contribution stays constant beyond the limit. beyond: x, positive outside.
     """
     scale = LOGISTIC * p["noise"]
-    least = torch.clamp(scale, min=LEAST)
-    before = torch.log(1.0 + torch.exp(-torch.abs(beyond) / least))
-    behind = torch.log(1.0 + torch.exp(torch.clamp(beyond, max=0.0) / least))
-    return scale * (before + p["behind"] * (behind - before))
+    positive_scale = torch.clamp(scale, min=LEAST)
+    one_limit = torch.log(1.0 + torch.exp(-torch.abs(beyond) / positive_scale))
+    two_limits = torch.log(1.0 + torch.exp(torch.clamp(beyond, max=0.0) / positive_scale))
+    return scale * (one_limit + p["behind"] * (two_limits - one_limit))

@@ -8,30 +8,29 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 
 SMALL = 1e-4
 
 
 class CoefficientDrift(Effect):
-    """The flow is q (1 + r (1 - exp(-b t))/b), which is q (1 + r t) for b = 0; t on the recording's own clock: growth
-    of deposits, warming water, at a steady pace, coming to rest (b > 0) or gathering speed.
+    """The flow is q (1 + r (1 - exp(-b t))/b), or q (1 + r t) for b = 0, with t since the recording's start: deposits
+    that grow, water that warms up. The change slows down for b > 0 and accelerates for b < 0.
 
-    Typical: r of 2 to 30 % an hour, either sign; b up to a few over the recording's length. Over a short recording the
-    same as plugging.
+    Typical: r of 2 to 30 % per hour, either sign; b up to a few over the recording's length. Nearly the same as
+    plugging in a short recording.
     """
 
     name = "coefficient_drift"
     stage = Stage.FLOW
     places = ("pipe", "outlet")
-    on_clock = ("rate",)
     mistaken_for = ("unmetered_flow", "plugging", "sensor_drift", "flow_exponent")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         rate, slowing, settled = (share / time_scale(plant) for share in (3e-4, -5e-4, 1e-2))
         return (
-            Parameter("rate", "1/s", 0.0, -rate, rate, meaning="share of the flow gained each second, at first"),
-            Parameter("settling", "1/s", 0.0, slowing, settled, meaning="how fast the change comes to rest"),
+            Parameter("rate", "1/s", 0.0, -rate, rate, meaning="initial relative growth of the flow per second"),
+            Parameter("settling", "1/s", 0.0, slowing, settled, meaning="rate at which the change settles"),
         )
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
@@ -39,7 +38,7 @@ class CoefficientDrift(Effect):
 
 
 def _elapsed(time: Tensor, settling: Tensor) -> Tensor:
-    """(1 - exp(-b t))/b, s; t (1 - b t/2 + (b t)^2/6) where b t is so small that the difference would cancel."""
+    """(1 - exp(-b t))/b, s; the series t (1 - b t/2 + (b t)^2/6) for small b t, where the difference would cancel."""
     x = settling * time
     small = x.abs() < SMALL
     safe = torch.where(small, torch.ones_like(x), x)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.effects.laminar_flow import kept
+from fdi_torch.effects.laminar_flow import torricelli_share
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.reach import Reach, inside
+from fdi_torch.plant.operating_range import OperatingRange, interior_points
 
 VISCOUS = 0.75  # softness of a transition where viscous and inertial losses add up
 NARROWEST = 0.1  # largest transition head, as a share of the height
@@ -17,10 +17,10 @@ NARROWEST = 0.1  # largest transition head, as a share of the height
 
 class CrossFlow(Effect):
     """s C sqrt(2 g) sqrt(max(h_1 - z, 0) - max(h_2 - z, 0)) from the first tank to the second, signed: a valve left
-    open, a gap in a wall, a hose; near equal levels less, linear in the head, where the gap is narrow (`laminar_flow`).
+    open, a gap in a wall, a hose. A narrow gap is linear in the head at low heads (`laminar_flow`).
 
-    size: its capacity as a share of the first tank's leak reference. Typical: 0.02 to 0.5; transition head of 0 to a
-    few mm. Between two tanks that a pipe joins it is the same as a wider pipe.
+    size: capacity relative to the first tank's leak reference. Typical: 0.02 to 0.5, transition head of 0 to a few mm.
+    The same as a wider pipe if a pipe joins the two tanks.
     """
 
     name = "cross_flow"
@@ -30,19 +30,24 @@ class CrossFlow(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
-            Parameter("size", "1", 0.0, 0.0, 1.0, meaning="capacity as a share of the first tank's reference pipe"),
+            Parameter("size", "1", 0.0, 0.0, 1.0, meaning="capacity relative to the first tank's reference pipe"),
             Parameter(
                 "height", "m", 0.0, 0.0, _lowest_rim(place, plant), meaning="height of the path above the floors"
             ),
             Parameter(
-                "transition_head", "m", 0.0, 0.0, NARROWEST * _lowest_rim(place, plant), meaning="below it, linear"
+                "transition_head",
+                "m",
+                0.0,
+                0.0,
+                NARROWEST * _lowest_rim(place, plant),
+                meaning="head below which the flow is linear",
             ),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
-        first, second = (reach.levels[tank] for tank in place.split("-"))
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
+        first, second = (operating_range.levels[tank] for tank in place.split("-"))
         highest = min(max(first[1], second[1]), _lowest_rim(place, plant))
-        heights = inside((0.0, highest), 2)
+        heights = interior_points((0.0, highest), 2)
         narrow = {"size": 0.1, "transition_head": 0.05 * NARROWEST * _lowest_rim(place, plant)}
         return [narrow, *({"size": 0.1, "height": height} for height in heights)]
 
@@ -50,10 +55,10 @@ class CrossFlow(Effect):
         near = torch.clamp(local.level - p["height"], min=0.0)
         far = torch.clamp(local.far_level - p["height"], min=0.0)
         head = near - far
-        share = kept(p["transition_head"] / local.magnitude(head), VISCOUS)
+        share = torricelli_share(p["transition_head"] / local.magnitude(head), VISCOUS)
         return p["size"] * local.capacity * share * local.root(head)
 
 
 def _lowest_rim(place: str, plant: PlantDescription) -> float:
-    """The highest that the path can be, m: just below the lower one of both rims."""
+    """Upper limit of the path's height, m: just below the lower of both rims."""
     return 0.95 * min(t.height for t in plant.tanks if t.name in place.split("-"))

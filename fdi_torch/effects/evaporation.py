@@ -1,4 +1,4 @@
-"""Water that evaporates."""
+"""Evaporation from a tank."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.pace import length_scale, time_scale
+from fdi_torch.plant.scales import length_scale, time_scale
 
 
 class Evaporation(Effect):
-    """The tank loses r A whatever its level, A its believed cross-section.
+    """The tank loses the flow r A at every level, with its nominal cross-section A.
 
-    Typical: r of 0.05 to 0.5 mm/h (1e-8 to 1e-7 m/s); hot or blown surfaces more. The same as a constant draw that
-    never ends, and as a dead zone of the tank's pump.
+    Typical: r of 0.05 to 0.5 mm/h (1e-8 to 1e-7 m/s), more from hot or ventilated surfaces. The same as a constant draw
+    without end, or as a dead zone of the tank's pump.
     """
 
     name = "evaporation"

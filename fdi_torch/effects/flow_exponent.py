@@ -1,4 +1,4 @@
-"""A pipe whose flow is another power of the head than 1/2."""
+"""A pipe whose flow is not proportional to the square root of the head."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ REFERENCE_SHARE = 0.2
 
 
 class FlowExponent(Effect):
-    """The flow is q (|x| / x_r)^n, so that the head x enters with the power 1/2 + n (pipes with friction: 4/7 after
-    Blasius, 1913; laminar: 1). x_r, a fifth of the tank's height, keeps n and the discharge coefficient apart.
+    """The flow is q (|x| / x_r)^n, so that the head x has the exponent 1/2 + n (pipe friction: 4/7, Blasius, 1913;
+    laminar flow: 1). The reference x_r, a fifth of the tank's height, decorrelates n from the discharge coefficient.
 
     Typical: n of -0.1 to 0.3. Nearly the same as laminar flow or an outlet at another height.
     """

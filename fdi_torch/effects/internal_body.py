@@ -1,4 +1,4 @@
-"""Something in a tank that takes up volume between two levels."""
+"""A body inside a tank that takes up volume between two levels."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 
 EDGE_SHARE = 0.01
 LEAST_SHARE = 0.05
 
 
 class InternalBody(Effect):
-    """The cross-section is A - a between the body's bottom and top: a displacer, a float, a pump housing; or, of a heap
-    that narrows (widens) upwards, A - a (1 - s x) at the share x of its height. Its edges are rounded over a hundredth
-    of the tank's height, so that a step across them stays accurate and has a slope.
+    """The cross-section is A - a between the body's bottom and top (a displacer, a float, a pump housing), or A - a (1
+    - s x) at the relative height x of a body that narrows (s > 0) or widens upwards. Its edges are smoothed over 1 % of
+    the tank's height to keep steps accurate and gradients finite.
 
-    Typical: a of 10 to 50 % of A over 5 to 30 cm. Outside its levels nothing shows.
+    Typical: a of 10 to 50 % of A over 5 to 30 cm. No effect at levels outside the body.
     """
 
     name = "internal_body"
@@ -32,15 +32,15 @@ class InternalBody(Effect):
         assert isinstance(tank, Tank)
         return (
             Parameter("area", "m^2", 0.0, 0.0, 0.9 * tank.area, meaning="cross-section of the body"),
-            Parameter("bottom", "m", 0.2 * tank.height, 0.0, tank.height, meaning="level at which it begins"),
-            Parameter("height", "m", 0.2 * tank.height, 0.0, tank.height, meaning="how far it rises above that"),
-            Parameter("narrowing", "1", 0.0, -1.0, 1.0, meaning="share by which its top is narrower"),
+            Parameter("bottom", "m", 0.2 * tank.height, 0.0, tank.height, meaning="level of the body's bottom"),
+            Parameter("height", "m", 0.2 * tank.height, 0.0, tank.height, meaning="height of the body"),
+            Parameter("narrowing", "1", 0.0, -1.0, 1.0, meaning="relative narrowing towards the top"),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         tank = plant.component(place)
         assert isinstance(tank, Tank)
-        low, high = reach.levels[place]
+        low, high = operating_range.levels[place]
         span = high - low
         sections = [(k / 4, 1 / 4) for k in range(4)] + [(k / 4, 1 / 2) for k in range(3)]
         return [

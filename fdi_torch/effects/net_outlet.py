@@ -1,4 +1,4 @@
-"""Plugging of an outlet and a leak of its tank, taken together."""
+"""Plugging of an outlet and a leak of its tank in one parameter."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from fdi_torch.plant.effect import Effect, Local, Stage, Values
 class NetOutlet(Effect):
     """The outflow is theta times the outlet's law; nominal 1 (theta_2 of the 2020 paper, eq. 31, as an outflow).
 
-    Plugging b and a floor leak rho k of the same tank act through the same sqrt(2 g h), so that only theta = 1 - b +
-    rho k can be found: below 1 plugging prevails, above 1 the leak.
+    Plugging b of an outlet and a floor leak k of its tank (relative to a pipe of rho times the outlet's capacity) act
+    through the same sqrt(2 g h). Only theta = 1 - b + rho k is identifiable: below 1 plugging prevails, above 1 the
+    leak.
     """
 
     name = "net_outlet"
@@ -22,7 +23,7 @@ class NetOutlet(Effect):
     mistaken_for = ("plugging", "leak")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("size", "1", 1.0, -1.0, 2.0, meaning="net outflow as a share of the outlet's law"),)
+        return (Parameter("size", "1", 1.0, -1.0, 2.0, meaning="net outflow relative to the outlet's law"),)
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
         return flow * p["size"]

@@ -1,4 +1,4 @@
-"""How open a pipe or outlet is: the paper's own coordinates for plugging."""
+"""The open share of a pipe: plugging in the coordinates of the 2020 paper."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from fdi_torch.plant.effect import Effect, Local, Stage, Values
 
 
 class Openness(Effect):
-    """The flow is theta times its law; nominal 1. At a pipe theta_4 = 1 - b_1, theta_5 = 1 - b_3 (2020 paper, eq. 31).
+    """The flow is theta times the pipe's law; nominal 1: theta_4 = 1 - b_1, theta_5 = 1 - b_3 (2020 paper, eq. 31).
 
-    It is plugging counted from the other end; use one of the two at a place.
+    The same as plugging of 1 - theta; use only one of the two at a place.
     """
 
     name = "openness"

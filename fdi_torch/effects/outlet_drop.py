@@ -1,18 +1,18 @@
-"""An outlet that does not lie at the zero of the level."""
+"""An outlet above or below the zero of the level."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.constants import height_before
+from fdi_torch.plant.constants import source_height
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
 
 
 class OutletDrop(Effect):
-    """The head is x + d: Torricelli's law with the orifice d below the zero (negative: above, and dry when the level
-    is lower), as at the end of a drain hose.
+    """The head is x + d: Torricelli's law with the orifice d below the zero of the level, as at the end of a drain
+    hose; negative: above it, without flow at lower levels.
 
     Typical: d of -3 to 10 cm. Nearly the same as another exponent of the head or laminar flow.
     """
@@ -23,8 +23,8 @@ class OutletDrop(Effect):
     mistaken_for = ("laminar_flow", "flow_exponent", "evaporation", "pump_offset", "sensor_bias")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        far = 0.3 * height_before(plant, place)
-        return (Parameter("drop", "m", 0.0, -far, far, meaning="how far it lies below the zero of the level"),)
+        far = 0.3 * source_height(plant, place)
+        return (Parameter("drop", "m", 0.0, -far, far, meaning="distance below the zero of the level"),)
 
     def head(self, head: Tensor, local: Local, p: Values) -> Tensor:
         return head + p["drop"]

@@ -9,23 +9,21 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.operating_range import OperatingRange, interior_points
 from fdi_torch.plant.orifice import rim_strength, weir_flow
-from fdi_torch.plant.reach import Reach, inside
 
 
 class Overflow(Effect):
-    """What the plant's weir law gives over a crest at H - b, less what it gives over the rim itself, times the
-    crest's length as a share of the rim's. A share of it may land in other tanks; the rest leaves the plant, or goes
-    where the rim's overflow goes.
+    """The weir law with a crest at H - b, less the law at the rim, times the length of the crest relative to the rim.
+    Shares of the overflow can go to other tanks; the rest leaves the plant, or goes where the rim's overflow goes.
 
-    Typical: an overflow pipe 5 to 20 cm below the rim, a crest of 1 to 100 % of it. Below its level nothing shows.
+    Typical: an overflow pipe 5 to 20 cm below the rim, a crest of 1 to 100 % of it. No effect below the crest.
     """
 
     name = "overflow"
     stage = Stage.BALANCE
     places = ("tank",)
     smooth = False
-    of_build = True
     mistaken_for = ("pump_cut_out", "sensor_saturation", "leak", "pump_saturation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
@@ -33,22 +31,27 @@ class Overflow(Effect):
         assert isinstance(tank, Tank)
         into = [
             Parameter(
-                f"to_{t.name}", "1", float(t.name == tank.overflow_to), 0.0, 1.0, meaning=f"share that {t.name} gets"
+                f"to_{t.name}",
+                "1",
+                float(t.name == tank.overflow_to),
+                0.0,
+                1.0,
+                meaning=f"share that {t.name} receives",
             )
             for t in plant.tanks
             if t.name != place
         ]
         return (
-            Parameter("below_rim", "m", 0.0, 0.0, 0.95 * tank.height, meaning="how far below the rim it runs over"),
-            Parameter("crest", "1", 1.0, 1e-2, 1.0, meaning="length of the crest as a share of the rim"),
+            Parameter("below_rim", "m", 0.0, 0.0, 0.95 * tank.height, meaning="depth of the crest below the rim"),
+            Parameter("crest", "1", 1.0, 1e-2, 1.0, meaning="length of the crest relative to the rim"),
             *into,
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         tank = plant.component(place)
         assert isinstance(tank, Tank)
-        low, high = reach.levels[place]
-        depths = [tank.height - level for level in (*inside((0.5 * (low + high), high), 3), high)]
+        low, high = operating_range.levels[place]
+        depths = [tank.height - level for level in (*interior_points((0.5 * (low + high), high), 3), high)]
         above = _above(place, plant)
         others = [t.name for t in plant.tanks if t.name not in (place, tank.overflow_to, *above)]
         shares = [{}, *({f"to_{name}": 0.7} for name in others)]
@@ -58,7 +61,7 @@ class Overflow(Effect):
         over_rim = local.level - local.height
         return self._weir(over_rim, local, p["crest"]) - self._weir(over_rim + p["below_rim"], local, p["crest"])
 
-    def caught(self, p: Values) -> Mapping[str, Tensor]:
+    def recipients(self, p: Values) -> Mapping[str, Tensor]:
         return {name.removeprefix("to_"): share for name, share in p.items() if name.startswith("to_")}
 
     def _weir(self, above: Tensor, local: Local, crest: Tensor) -> Tensor:
@@ -68,8 +71,8 @@ class Overflow(Effect):
 
 
 def _above(place: str, plant: PlantDescription) -> set[str]:
-    """The tanks that pour into this one in free fall, by way of others or not: nothing that runs over gets there."""
-    found: set[str] = set()
-    while new := {p.source for p in plant.pipes if p.free_fall and p.target in {place, *found}} - found:
-        found |= new
-    return found
+    """The tanks that drain into this one in free fall, directly or through others; they cannot receive its overflow."""
+    upstream: set[str] = set()
+    while new := {p.source for p in plant.pipes if p.free_fall and p.target in {place, *upstream}} - upstream:
+        upstream |= new
+    return upstream

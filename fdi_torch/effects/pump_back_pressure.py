@@ -13,10 +13,10 @@ DRY = 1e-6  # share of the height below which a tank counts as empty
 
 
 class PumpBackPressure(Effect):
-    """The flow is q (1 - c (h / H)^n): a centrifugal pump's curve, about its working point linear or drooping (Gülich,
-    2014, "Centrifugal Pumps", ch. 4), for a pump that feeds its tank from below.
+    """The flow is q (1 - c (h / H)^n): the characteristic of a centrifugal pump about its working point, linear or
+    drooping (Gülich, 2014, "Centrifugal Pumps", ch. 4), for a pump that feeds its tank from below.
 
-    Typical: c of 0.05 to 0.5 at the rim, n of 1 to 2. While the level hardly moves it is the same as a lower gain.
+    Typical: c of 0.05 to 0.5 at the rim, n of 1 to 2. The same as a lower gain while the level hardly moves.
     """
 
     name = "pump_back_pressure"
@@ -26,8 +26,8 @@ class PumpBackPressure(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
-            Parameter("loss", "1", 0.0, -0.5, 1.0, meaning="share of the flow that is lost when the tank is full"),
-            Parameter("droop", "1", 1.0, 1.0, 3.0, meaning="power of the level with which it is lost"),
+            Parameter("loss", "1", 0.0, -0.5, 1.0, meaning="share of the flow lost when the tank is full"),
+            Parameter("droop", "1", 1.0, 1.0, 3.0, meaning="exponent of the level"),
         )
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:

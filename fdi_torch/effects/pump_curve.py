@@ -1,4 +1,4 @@
-"""A pump whose delivery is a curve of its command, not a line."""
+"""A pump whose delivery is a nonlinear function of its command."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from fdi_torch.plant.effect import Effect, Local, Stage, Values
 
 
 class PumpCurve(Effect):
-    """q (1 + c (1 - q / q_max)): nothing changes at rest and at the limit, most in between, c q_max / 4.
+    """The flow is q (1 + c (1 - q / q_max)): unchanged at zero and at the limit, with the largest deviation c q_max / 4
+    between.
 
-    Typical: c of -0.4 to 0.4. Between two commands it is the same as a gain and an offset.
+    Typical: c of -0.4 to 0.4. The same as a gain and an offset if the command takes only two values.
     """
 
     name = "pump_curve"
@@ -21,7 +22,7 @@ class PumpCurve(Effect):
     mistaken_for = ("pump_offset", "pump_dead_zone", "pump_gain", "pump_saturation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("bend", "1", 0.0, -0.95, 0.95, meaning="extra flow at small commands, as a share of it"),)
+        return (Parameter("bend", "1", 0.0, -0.95, 0.95, meaning="relative extra flow at small commands"),)
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
         return flow * (1.0 + p["bend"] * (1.0 - flow / local.constants["max_flow"]))

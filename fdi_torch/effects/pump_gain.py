@@ -1,4 +1,4 @@
-"""A pump that delivers more or less than it is believed to."""
+"""A pump that delivers more or less than its nominal flow."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 
 
 class PumpGain(Effect):
-    """The flow is k times the believed one, from an onset on, at once or rising over a ramp (loss of effectiveness;
-    Zhang and Jiang, 2008, "Bibliographical review on reconfigurable fault-tolerant control systems").
+    """The flow is k times the nominal one from an onset on, at once or over a ramp (loss of effectiveness; Zhang and
+    Jiang, 2008, "Bibliographical review on reconfigurable fault-tolerant control systems").
 
-    Typical: k of 0.7 to 1.2. At a command that hardly moves it is the same as an offset, a dead zone or a constant
-    draw.
+    Typical: k of 0.7 to 1.2. The same as an offset, a dead zone or a constant draw while the command hardly moves.
     """
 
     name = "pump_gain"
@@ -32,12 +31,12 @@ class PumpGain(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
-            Parameter("factor", "1", 1.0, 0.0, 2.0, meaning="delivered over believed flow", extremes=(0.0,)),
-            Parameter("onset", "s", 0.0, 0.0, meaning="when it begins"),
-            Parameter("ramp", "s", 0.0, 0.0, meaning="how long it takes to come in full"),
+            Parameter("factor", "1", 1.0, 0.0, 2.0, meaning="delivered / nominal flow", extremes=(0.0,)),
+            Parameter("onset", "s", 0.0, 0.0, meaning="time at which it begins"),
+            Parameter("ramp", "s", 0.0, 0.0, meaning="time until full size"),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         return [{"factor": 0.9}, {"factor": 1.1}]
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:

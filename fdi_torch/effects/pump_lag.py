@@ -1,4 +1,4 @@
-"""A pump that follows its command with a lag."""
+"""A pump that follows its command with a first-order lag."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 
 
 class PumpLag(Effect):
-    """First-order response tau dv/dt = u - v (any textbook on linear systems); exact for a command held over a step,
-    of which the mean is passed on: u + (v_0 - u) (tau/dt) (1 - exp(-dt/tau)).
+    """tau dv/dt = u - v (any textbook on linear systems). The mean over a step is exact for a command held over it: u +
+    (v_0 - u) (tau/dt) (1 - exp(-dt/tau)).
 
-    Typical: tau of 2 to 30 s. Nearly the same as a delay of tau while tau is short beside the tanks' time constants.
+    Typical: tau of 2 to 30 s. Nearly the same as a delay of tau if tau is far below the tanks' time constants.
     """
 
     name = "pump_lag"
@@ -30,7 +30,7 @@ class PumpLag(Effect):
         slowest = 60.0 * time_scale(plant)
         return (Parameter("time_constant", "s", 0.0, 0.0, slowest, meaning="time to 63 % of a step"),)
 
-    def remember(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: Tensor, p: Values) -> Memory:
         return (value,)
 
     def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:

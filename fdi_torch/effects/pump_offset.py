@@ -11,10 +11,10 @@ from fdi_torch.plant.effect import Effect, Local, Stage, Values
 
 
 class PumpOffset(Effect):
-    """q + c, never below zero: a siphon, a bypass, a command whose zero is wrong.
+    """The flow is max(q + c, 0): a siphon, a bypass, a command with a wrong zero.
 
-    Typical: 1 to 10 % of the full flow, either sign. Negative, it is the same as a dead zone while the pump runs;
-    either way the same as a constant inflow that never ends.
+    Typical: 1 to 10 % of the full flow, either sign. The same as a constant inflow without end; a negative one is the
+    same as a dead zone while the pump runs.
     """
 
     name = "pump_offset"
@@ -26,7 +26,7 @@ class PumpOffset(Effect):
         pump = plant.component(place)
         assert isinstance(pump, Pump)
         far = 0.5 * pump.max_flow
-        return (Parameter("offset", "m^3/s", 0.0, -far, far, meaning="flow beside the commanded one"),)
+        return (Parameter("offset", "m^3/s", 0.0, -far, far, meaning="additional flow"),)
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
         return torch.clamp(flow + p["offset"], min=0.0)

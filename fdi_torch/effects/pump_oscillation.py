@@ -1,4 +1,4 @@
-"""A pump whose delivery swings."""
+"""A pump whose delivery oscillates."""
 
 from __future__ import annotations
 
@@ -9,31 +9,30 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.pace import time_scale
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
+from fdi_torch.plant.scales import time_scale
 
 
 class PumpOscillation(Effect):
-    """q (1 + a sin(2 pi t / T + phi)): a hunting controller, a worn diaphragm. The swing is averaged over each step.
+    """The flow is q (1 + a sin(2 pi t / T + phi)), averaged over each step: a hunting controller, a worn diaphragm.
 
-    Typical: a of 0.05 to 0.3, T of 10 to 300 s; tanks smooth away anything faster.
+    Typical: a of 0.05 to 0.3, T of 10 to 300 s; the tanks filter out faster oscillations.
     """
 
     name = "pump_oscillation"
     stage = Stage.FLOW
     places = ("pump",)
-    on_clock = ("phase",)
     mistaken_for = ("sensor_oscillation", "pump_gain")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        pace = time_scale(plant)
+        scale = time_scale(plant)
         return (
-            Parameter("amplitude", "1", 0.0, 0.0, 1.0, meaning="swing as a share of the flow"),
-            Parameter("period", "s", 60.0 * pace, 2.0 * pace, 3600.0 * pace, meaning="of the swing"),
-            Parameter("phase", "1", 0.0, -math.pi, math.pi, meaning="of the swing at t = 0, in radians"),
+            Parameter("amplitude", "1", 0.0, 0.0, 1.0, meaning="amplitude relative to the flow"),
+            Parameter("period", "s", 60.0 * scale, 2.0 * scale, 3600.0 * scale, meaning="period of the oscillation"),
+            Parameter("phase", "1", 0.0, -math.pi, math.pi, meaning="phase at t = 0, rad"),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         periods = [time_scale(plant) * seconds for seconds in (10.0, 30.0, 60.0, 120.0, 300.0)]
         return [{"amplitude": 0.1, "period": period, "phase": phase} for period in periods for phase in (-1.5, 1.5)]
 

@@ -1,4 +1,4 @@
-"""A pump that delivers less at most than it is believed to."""
+"""A pump whose greatest flow is below its nominal limit."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription, Pump
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.reach import Reach, inside
+from fdi_torch.plant.operating_range import OperatingRange, interior_points
 
-DRY = 1e-12  # m^3/s, or as a share: no flow
+DRY = 1e-12  # m^3/s, or relative: counts as no flow
 SHARPEST = 1e-3  # rounding below which the limit is a kink
 
 
 class PumpSaturation(Effect):
-    """The flow is min(q, q_max), or rounded off towards it: q / (1 + (q/q_max)^(1/r))^r with r = k (1 - q_max/q_full);
-    nominal is the limit of the plant file, where it changes nothing.
+    """The flow is min(q, q_max), or smoothly limited: q / (1 + (q/q_max)^(1/r))^r with r = k (1 - q_max/q_full). The
+    nominal limit is the plant file's q_full, where the effect is absent.
 
-    Typical: 60 to 90 % of the believed limit, a knee k of 0 to 0.3. Nothing shows while the commands stay below it.
+    Typical: 60 to 90 % of the nominal limit, a knee k of 0 to 0.3. No effect while the flow stays below the limit.
     """
 
     name = "pump_saturation"
@@ -32,15 +32,15 @@ class PumpSaturation(Effect):
         assert isinstance(pump, Pump)
         full = pump.max_flow
         return (
-            Parameter("limit", "m^3/s", full, 0.0, full, meaning="the most that the pump delivers"),
-            Parameter("knee", "1", 0.0, 0.0, 1.0, meaning="how far the limit is rounded off"),
+            Parameter("limit", "m^3/s", full, 0.0, full, meaning="greatest flow of the pump"),
+            Parameter("knee", "1", 0.0, 0.0, 1.0, meaning="smoothness of the limit"),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         pump = plant.component(place)
         assert isinstance(pump, Pump)
-        commanded = tuple(min(max(pump.gain * u, 0.0), pump.max_flow) for u in reach.commands[pump.channel])
-        return [{"limit": limit, "knee": 0.1} for limit in inside((commanded[0], commanded[1]), 7)]
+        commanded = tuple(min(max(pump.gain * u, 0.0), pump.max_flow) for u in operating_range.commands[pump.channel])
+        return [{"limit": limit, "knee": 0.1} for limit in interior_points((commanded[0], commanded[1]), 7)]
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
         least = torch.minimum(flow, p["limit"])

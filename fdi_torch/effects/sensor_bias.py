@@ -1,4 +1,4 @@
-"""A sensor that reads too much or too little by a constant."""
+"""A sensor that reads too high or too low by a constant."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.plant.signals import Clock
 
 
 class SensorBias(Effect):
-    """y + b, from an onset on, at once or rising over a ramp (abrupt and incipient bias; Isermann, 2006, "Fault-
-    Diagnosis Systems", ch. 5).
+    """The reading is y + b from an onset on, at once or over a ramp (abrupt and incipient bias; Isermann, 2006,
+    "Fault-Diagnosis Systems", ch. 5).
 
-    Typical: 0.2 to 5 % of the range. From the start on it is the same as another offset of the sensor; with one
-    sensor in a plant at rest, as a leak or plugging.
+    Typical: 0.2 to 5 % of the range. The same as another sensor offset if it acts from the start; the same as a leak or
+    plugging if the plant has one sensor and is at rest.
     """
 
     name = "sensor_bias"
@@ -28,14 +28,14 @@ class SensorBias(Effect):
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         sensor = plant.component(place)
         assert isinstance(sensor, Sensor)
-        reach = 0.5 * reading_span(plant, sensor)
+        largest = 0.5 * reading_span(plant, sensor)
         return (
-            Parameter("bias", sensor.unit, 0.0, -reach, reach, meaning="what it reads too much"),
-            Parameter("onset", "s", 0.0, 0.0, meaning="when it begins"),
-            Parameter("ramp", "s", 0.0, 0.0, meaning="how long it takes to come in full"),
+            Parameter("bias", sensor.unit, 0.0, -largest, largest, meaning="constant error of the reading"),
+            Parameter("onset", "s", 0.0, 0.0, meaning="time at which it begins"),
+            Parameter("ramp", "s", 0.0, 0.0, meaning="time until full size"),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         sensor = plant.component(place)
         assert isinstance(sensor, Sensor)
         bias = 0.02 * reading_span(plant, sensor)

@@ -1,4 +1,4 @@
-"""A sensor whose characteristic is bent."""
+"""A sensor with a curved characteristic."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_at, reading_span
 from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.plant.signals import Clock
 
 
 class SensorCurvature(Effect):
-    """y + c (y - y_m)^2: a sensor linearised at the middle of its range, y_m, and used over all of it.
+    """The reading is y + c (y - y_m)^2: a sensor linearised at the middle y_m of its range.
 
-    Typical: c times the range of 0.01 to 0.1 for pressure cells, to 0.5 for capacitive and float sensors. Over a
-    narrow range of levels the same as another gain.
+    Typical: c times the range of 0.01 to 0.1 for pressure cells, up to 0.5 for capacitive and float sensors. The same
+    as another gain over a narrow range of levels.
     """
 
     name = "sensor_curvature"
@@ -27,15 +27,17 @@ class SensorCurvature(Effect):
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         sensor = plant.component(place)
         assert isinstance(sensor, Sensor)
-        far = 1.0 / reading_span(plant, sensor)  # beyond, two levels would read the same
+        far = 1.0 / reading_span(plant, sensor)  # beyond it, two levels would have the same reading
         unit = "1" if sensor.unit == "1" else f"1/{sensor.unit}"
         middle = reading_at(plant, sensor, 0.5)
         return (
-            Parameter("bend", unit, 0.0, -far, far, meaning="share it reads too much, so far from the middle"),
-            Parameter("middle", sensor.unit, middle, meaning="reading at which it reads right"),
+            Parameter(
+                "bend", unit, 0.0, -far, far, meaning="relative error of the reading per distance from the middle"
+            ),
+            Parameter("middle", sensor.unit, middle, meaning="reading without error"),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         sensor = plant.component(place)
         assert isinstance(sensor, Sensor)
         return [{"bend": share / reading_span(plant, sensor)} for share in (0.1, -0.1)]

@@ -1,4 +1,4 @@
-"""A sensor that reads late."""
+"""A sensor with dead time."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Stage, Values
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 
 
 class SensorDelay(Effect):
-    """y(t) = the reading of the level at t - d, straight between samples: filters, slow buses, stamps made on
+    """y(t) is the reading of the level at t - d, linear between samples: filters, slow buses, time stamps made on
     arrival.
 
-    Typical: d of 1 to 20 s. On levels, which move slowly, nearly the same as a lag of d.
+    Typical: d of 1 to 20 s. Nearly the same as a lag of d, because levels move slowly.
     """
 
     name = "sensor_delay"
@@ -24,7 +24,7 @@ class SensorDelay(Effect):
     mistaken_for = ("sensor_lag", "pump_delay", "sensor_hysteresis")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("delay", "s", 0.0, 0.0, 60.0 * time_scale(plant), meaning="how late it reads"),)
+        return (Parameter("delay", "s", 0.0, 0.0, 60.0 * time_scale(plant), meaning="dead time of the reading"),)
 
     def delay(self, p: Values) -> Tensor:
         return p["delay"]

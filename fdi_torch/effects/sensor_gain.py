@@ -1,4 +1,4 @@
-"""A sensor whose scale is wrong."""
+"""A sensor with a wrong gain."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.plant.signals import Clock
 
 
 class SensorGain(Effect):
-    """k y, from an onset on, at once or over a ramp (a span error; Isermann, 2006, "Fault-Diagnosis Systems", ch. 5).
+    """The reading is k y from an onset on, at once or over a ramp (span error; Isermann, 2006, "Fault-Diagnosis
+    Systems", ch. 5).
 
-    Typical: k of 0.9 to 1.1. While the level hardly moves it is the same as a bias.
+    Typical: k of 0.9 to 1.1. The same as a bias while the level hardly moves.
     """
 
     name = "sensor_gain"
@@ -24,12 +25,12 @@ class SensorGain(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
-            Parameter("factor", "1", 1.0, 0.2, 1.8, meaning="reading over true reading"),
-            Parameter("onset", "s", 0.0, 0.0, meaning="when it begins"),
-            Parameter("ramp", "s", 0.0, 0.0, meaning="how long it takes to come in full"),
+            Parameter("factor", "1", 1.0, 0.2, 1.8, meaning="reading / true reading"),
+            Parameter("onset", "s", 0.0, 0.0, meaning="time at which it begins"),
+            Parameter("ramp", "s", 0.0, 0.0, meaning="time until full size"),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         return [{"factor": 0.95}, {"factor": 1.05}]
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:

@@ -1,4 +1,4 @@
-"""A sensor that sticks within a band when the level turns."""
+"""A sensor with backlash when the level turns."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from fdi_torch.plant.signals import Clock
 
 
 class SensorHysteresis(Effect):
-    """Backlash (play operator; Visintin, 1994, "Differential Models of Hysteresis"): the reading stays until the
-    level has moved by b away from it, and then follows b behind.
+    """Play operator (Visintin, 1994, "Differential Models of Hysteresis"): the reading holds until the level is b away
+    from it, and then follows at the distance b.
 
-    Typical: b of 0.1 to 2 % of the range. Near turning points it is the same as a lag.
+    Typical: b of 0.1 to 2 % of the range. Nearly the same as a lag near turning points.
     """
 
     name = "sensor_hysteresis"
@@ -31,11 +31,11 @@ class SensorHysteresis(Effect):
         high = 0.1 * reading_span(plant, sensor)
         return (Parameter("play", sensor.unit, 0.0, 0.0, high, meaning="half the width of the band"),)
 
-    def remember(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: Tensor, p: Values) -> Memory:
         return (value,)
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
-        behind = memory[0] - value
-        # Not a clamp between -play and play: at a play of 0 its ends meet and their slopes cancel.
-        kept = torch.sign(behind) * torch.minimum(torch.abs(behind), p["play"])
-        return value + kept, (value + kept,)
+        distance = memory[0] - value
+        # A clamp to -play..play would lose its slope at a play of 0, where both limits coincide.
+        lag = torch.sign(distance) * torch.minimum(torch.abs(distance), p["play"])
+        return value + lag, (value + lag,)

@@ -1,4 +1,4 @@
-"""A sensor that follows the level with a lag."""
+"""A sensor that follows the level with a first-order lag."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 
 
 class SensorLag(Effect):
-    """First-order response tau dv/dt = y - v, exact for a reading that runs straight from sample to sample (at the
-    rate s): v_1 = y_1 - s tau (1 - exp(-dt/tau)) + (v_0 - y_0) exp(-dt/tau).
+    """tau dv/dt = y - v, exact for a reading that is linear between samples with slope s: v_1 = y_1 - s tau (1 -
+    exp(-dt/tau)) + (v_0 - y_0) exp(-dt/tau).
 
-    Typical: tau of 2 to 30 s. On levels, which move slowly, nearly the same as a delay of tau.
+    Typical: tau of 2 to 30 s. Nearly the same as a delay of tau, because levels move slowly.
     """
 
     name = "sensor_lag"
@@ -28,12 +28,12 @@ class SensorLag(Effect):
         slowest = 60.0 * time_scale(plant)
         return (Parameter("time_constant", "s", 0.0, 0.0, slowest, meaning="time to 63 % of a step"),)
 
-    def remember(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: Tensor, p: Values) -> Memory:
         return value, value
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
-        seen, before = memory
+        last_output, last_input = memory
         decay = clock.decay(p["time_constant"])
-        behind = (value - before) * (p["time_constant"] / clock.step) * (1.0 - decay)
-        lagged = value - behind + (seen - before) * decay
+        slope_lag = (value - last_input) * (p["time_constant"] / clock.step) * (1.0 - decay)
+        lagged = value - slope_lag + (last_output - last_input) * decay
         return lagged, (lagged, value)

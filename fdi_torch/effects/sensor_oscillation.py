@@ -1,4 +1,4 @@
-"""A sensor on whose reading a sine is superimposed."""
+"""A sensor with a sine superimposed on its reading."""
 
 from __future__ import annotations
 
@@ -11,36 +11,35 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.pace import time_scale
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 
 
 class SensorOscillation(Effect):
-    """y + a sin(2 pi t / T + phi): waves on the surface, hum, a beat with the sampling (Isermann, 2006, "Fault-
-    Diagnosis Systems", ch. 5).
+    """The reading is y + a sin(2 pi t / T + phi): surface waves, mains hum, aliasing with the sampling (Isermann, 2006,
+    "Fault-Diagnosis Systems", ch. 5).
 
-    Typical: a of 0.2 to 2 % of the range. Faster than two samples it looks slower than it is.
+    Typical: a of 0.2 to 2 % of the range. Periods below two samples appear as slower oscillations (aliasing).
     """
 
     name = "sensor_oscillation"
     stage = Stage.READING
     places = ("sensor",)
-    on_clock = ("phase",)
     mistaken_for = ("pump_oscillation", "sensor_bias")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         sensor = plant.component(place)
         assert isinstance(sensor, Sensor)
         high = 0.3 * reading_span(plant, sensor)
-        pace = time_scale(plant)
+        scale = time_scale(plant)
         return (
-            Parameter("amplitude", sensor.unit, 0.0, 0.0, high, meaning="half the swing"),
-            Parameter("period", "s", 60.0 * pace, 2.0 * pace, 3600.0 * pace, meaning="of the swing"),
-            Parameter("phase", "1", 0.0, -math.pi, math.pi, meaning="of the swing at t = 0, in radians"),
+            Parameter("amplitude", sensor.unit, 0.0, 0.0, high, meaning="amplitude"),
+            Parameter("period", "s", 60.0 * scale, 2.0 * scale, 3600.0 * scale, meaning="period of the oscillation"),
+            Parameter("phase", "1", 0.0, -math.pi, math.pi, meaning="phase at t = 0, rad"),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         sensor = plant.component(place)
         assert isinstance(sensor, Sensor)
         amplitude = 0.01 * reading_span(plant, sensor)

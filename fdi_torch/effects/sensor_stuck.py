@@ -1,4 +1,4 @@
-"""A sensor that no longer moves."""
+"""A sensor that is stuck."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from fdi_torch.plant.signals import Clock
 
 
 class SensorStuck(Stuck):
-    """From an onset on it keeps reading what it read last (Isermann, 2006, "Fault-Diagnosis Systems", ch. 5).
+    """From the onset on, the sensor holds its last reading (Isermann, 2006, "Fault-Diagnosis Systems", ch. 5).
 
-    size: 1 where it is stuck, 0 where it follows the level; between them the share of its stroke that is lost. Noise
-    that is added behind the sensor remains.
+    size: 1 for fully stuck, 0 for free; in between, the share of the level's change that is lost. Noise that is added
+    after the sensor remains.
     """
 
     name = "sensor_stuck"
@@ -22,4 +22,4 @@ class SensorStuck(Stuck):
     mistaken_for = ("sensor_gain", "sensor_curvature", "sensor_saturation", "sensor_hysteresis")
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
-        return self.held(value, memory, clock.risen_by_end(p["onset"], clock.step * 0.0), p)
+        return self.hold(value, memory, clock.risen_by_end(p["onset"], clock.step * 0.0), p)

@@ -1,4 +1,4 @@
-"""What a stuck actuator and a stuck sensor have in common: from an onset on they stay where they then are."""
+"""Base of the stuck actuator and the stuck sensor, which hold their value from an onset on."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Memory, Values
-from fdi_torch.plant.reach import Reach, inside
+from fdi_torch.plant.operating_range import OperatingRange, interior_points
 
 
 class Stuck(Effect):
-    """value <- value + size s (held - value), s the share of the step after the onset (Isermann, 2006, ch. 5).
+    """value <- value + size s (held - value), with the share s of the step after the onset (Isermann, 2006, ch. 5).
 
-    size: 1 where it is stuck, 0 where it follows; between them the share of its stroke that is lost.
+    size: 1 for fully stuck, 0 for free; in between, the share of the signal's change that is lost.
     """
 
     memory = 1
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
-            Parameter("size", "1", 0.0, 0.0, 1.0, meaning="share of its stroke that it has lost", extremes=(1.0,)),
-            Parameter("onset", "s", 0.0, 0.0, meaning="when it gets stuck"),
+            Parameter("size", "1", 0.0, 0.0, 1.0, meaning="share of the signal's change that is lost", extremes=(1.0,)),
+            Parameter("onset", "s", 0.0, 0.0, meaning="time at which it sticks"),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
-        return [{"size": 0.9, "onset": onset} for onset in (0.0, *inside((0.0, reach.duration), 5))]
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
+        return [{"size": 0.9, "onset": onset} for onset in (0.0, *interior_points((0.0, operating_range.duration), 5))]
 
-    def remember(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: Tensor, p: Values) -> Memory:
         return (value,)
 
-    def held(self, value: Tensor, memory: Memory, share: Tensor, p: Values) -> tuple[Tensor, Memory]:
-        """share: of the step, after the onset."""
+    def hold(self, value: Tensor, memory: Memory, share: Tensor, p: Values) -> tuple[Tensor, Memory]:
+        """The partly held value and the new memory; share: of the step, after the onset."""
         held = value + share * (memory[0] - value)
         return value + p["size"] * share * (held - value), (held,)

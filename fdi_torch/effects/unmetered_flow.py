@@ -1,4 +1,4 @@
-"""Water that is drawn or added unseen for a while."""
+"""A temporary unmeasured inflow or draw."""
 
 from __future__ import annotations
 
@@ -8,36 +8,39 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import flow_scale
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.pace import time_scale
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
+from fdi_torch.plant.scales import time_scale
 
 
 class UnmeteredFlow(Effect):
-    """A constant inflow q (negative: a draw) between an instant and another one; steps need not hit them.
+    """A constant inflow q (negative: a draw) that begins at one instant and lasts for a duration; exact for any step.
 
-    Typical: 5 to 50 % of a pump's flow over minutes. One that never ends is the same as an offset or dead zone of the
-    tank's pump.
+    Typical: 5 to 50 % of a pump's flow over minutes. The same as an offset or dead zone of the tank's pump if it never
+    ends.
     """
 
     name = "unmetered_flow"
     stage = Stage.BALANCE
     places = ("tank",)
-    on_clock = ("begin",)
     mistaken_for = ("leak", "evaporation", "pump_offset", "pump_dead_zone", "coefficient_drift")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         flow = flow_scale(plant, place)
         return (
-            Parameter("flow", "m^3/s", 0.0, -flow, flow, meaning="what flows in (negative: what is drawn)"),
-            Parameter("begin", "s", 0.0, 0.0, meaning="when it begins"),
-            Parameter("duration", "s", 600.0 * time_scale(plant), 0.0, meaning="how long it lasts"),
+            Parameter("flow", "m^3/s", 0.0, -flow, flow, meaning="inflow (negative: draw)"),
+            Parameter("begin", "s", 0.0, 0.0, meaning="time at which it begins"),
+            Parameter("duration", "s", 600.0 * time_scale(plant), 0.0, meaning="duration"),
         )
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         flow = 0.1 * flow_scale(plant, place)
         shares = [(k / 4, 1 / 4) for k in range(4)] + [(k / 8, 1 / 2) for k in range(5)]
         return [
-            {"flow": sign * flow, "begin": begin * reach.duration, "duration": lasting * reach.duration}
+            {
+                "flow": sign * flow,
+                "begin": begin * operating_range.duration,
+                "duration": lasting * operating_range.duration,
+            }
             for begin, lasting in shares
             for sign in (-1.0, 1.0)
         ]

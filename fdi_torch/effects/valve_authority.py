@@ -1,4 +1,4 @@
-"""A valve that is not the only resistance of its pipe."""
+"""A valve in series with other flow resistances of its pipe."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.plant.signals import Clock
 
 
 class ValveAuthority(Effect):
-    """The opening o acts as o / sqrt(1 - s + s o^2): of the head across the pipe a share s is lost outside the valve
-    when that is fully open (installed characteristic, authority 1 - s; IEC 60534-2-1). The flow rises steeply at first
-    and hardly any more near the end; closed and fully open nothing changes.
+    """The opening o acts as o / sqrt(1 - s + s o^2): when fully open, a share s of the pipe's head is lost outside the
+    valve (installed characteristic, authority 1 - s; IEC 60534-2-1). The flow rises steeply at first and hardly near
+    the end; closed and fully open positions are unchanged.
 
-    Typical: s of 0.3 to 0.95, pipes no wider than their valve. At one opening it is the same as plugging.
+    Typical: s of 0.3 to 0.95, for pipes no wider than their valve. The same as plugging if the opening is constant.
     """
 
     name = "valve_authority"
@@ -28,7 +28,7 @@ class ValveAuthority(Effect):
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("series", "1", 0.0, 0.0, 0.99, meaning="share of the head lost outside the open valve"),)
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         return [{"series": share} for share in (0.5, 0.9)]
 
     def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:

@@ -1,4 +1,4 @@
-"""A valve whose passage is a power of its opening."""
+"""A valve whose capacity is a power of its opening."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ LEAST_OPENING = 1e-6
 
 
 class ValveCharacteristic(Effect):
-    """The opening o acts as o^(1 + c): linear at c = 0, quick opening below, like an equal-percentage valve above
-    (IEC 60534-2-1 on inherent flow characteristics). Closed and fully open nothing changes.
+    """The opening o acts as o^(1 + c): linear for c = 0, quick-opening for c < 0, similar to equal-percentage for c > 0
+    (IEC 60534-2-1, inherent flow characteristics). Closed and fully open positions are unchanged.
 
-    Typical: c of -0.4 to 2. At one opening it is the same as plugging; together with a dead zone it is what ball
-    valves do.
+    Typical: c of -0.4 to 2. The same as plugging if the opening is constant; ball valves combine it with a dead zone.
     """
 
     name = "valve_characteristic"

@@ -1,4 +1,4 @@
-"""A valve that is still closed at small openings."""
+"""A valve that stays closed at small openings."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.plant.signals import Clock
 
 
 class ValveDeadZone(Effect):
-    """The opening o acts as max(o - d, 0) / (1 - d): ball and gate valves pass nothing over the first part of their
+    """The opening o acts as max(o - d, 0) / (1 - d): ball and gate valves pass nothing in the first part of their
     stroke.
 
-    Typical: d of 0.05 to 0.4. At one opening it is the same as plugging.
+    Typical: d of 0.05 to 0.4. The same as plugging if the opening is constant.
     """
 
     name = "valve_dead_zone"
@@ -25,9 +25,9 @@ class ValveDeadZone(Effect):
     mistaken_for = ("valve_leak", "actuator_stuck", "valve_characteristic", "valve_authority", "plugging")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("dead_zone", "1", 0.0, 0.0, 0.9, meaning="opening at which it begins to pass"),)
+        return (Parameter("dead_zone", "1", 0.0, 0.0, 0.9, meaning="opening below which the valve is closed"),)
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         return [{"dead_zone": opening} for opening in (0.05, 0.15, 0.3, 0.5)]
 
     def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:

@@ -1,4 +1,4 @@
-"""A valve that follows its opening with a lag."""
+"""A valve that follows its command with a first-order lag."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from fdi_torch.effects.pump_lag import PumpLag
 
 
 class ValveLag(PumpLag):
-    """What a lag is to a pump: the passage follows the opening as a first-order response.
+    """tau dv/dt = u - v, as for a pump (`pump_lag`), with the opening v.
 
-    Typical: tau of 2 to 20 s. Nearly the same as a limited rate.
+    Typical: tau of 2 to 20 s. Nearly the same as a limited slew rate.
     """
 
     name = "valve_lag"

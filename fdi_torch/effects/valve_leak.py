@@ -1,4 +1,4 @@
-"""A valve that does not close."""
+"""A valve that does not close fully."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fdi_torch.plant.signals import Clock
 class ValveLeak(Effect):
     """The opening o acts as o + s (1 - o): worn seats, dirt, a position sensor that reads closed too early.
 
-    Typical: s of 0.005 to 0.1. At one opening it is the same as a wider pipe.
+    Typical: s of 0.005 to 0.1. The same as a wider pipe if the opening is constant.
     """
 
     name = "valve_leak"
@@ -22,7 +22,7 @@ class ValveLeak(Effect):
     mistaken_for = ("valve_dead_zone", "actuator_stuck", "valve_characteristic", "leak", "cross_flow", "plugging")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("size", "1", 0.0, 0.0, 1.0, meaning="what it passes when closed, as a share of fully open"),)
+        return (Parameter("size", "1", 0.0, 0.0, 1.0, meaning="flow when closed relative to fully open"),)
 
     def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
         return value + p["size"] * (1.0 - value), memory

@@ -12,7 +12,7 @@ from torch import Tensor
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.equilibrium import RESOLUTION
 
@@ -136,9 +136,9 @@ def _inflows(
     pace = time_scale(network.description)
     clock = Clock(late, levels.new_tensor(pace), levels.new_tensor(RESOLUTION * pace))
     wanted = [channels[channel] for _, channel in network.actuators()]
-    commands, _ = network.commands(wanted, network.remember_commands(wanted, clock, values), clock, values)
-    now = network.moment(levels.unbind(), commands, clock, values)
-    return network.spilled(now, network.gathered(now, network.pump_flows(now), network.pipe_flows(now)))
+    commands, _ = network.commands(wanted, network.steady_command_memory(wanted, clock, values), clock, values)
+    now = network.operating_point(levels.unbind(), commands, clock, values)
+    return network.less_overflow(now, network.net_inflows(now, network.pump_flows(now), network.pipe_flows(now)))
 
 
 def sample_noise(values: Tensor, weight: Tensor) -> Tensor:

@@ -12,17 +12,17 @@ from torch import Tensor
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.objectives import Objective, Problem, Term
 from fdi_torch.parameters import Parameter, ParameterSpace, display_unit
-from fdi_torch.plant.behind import levels_behind
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.effect import Stage
+from fdi_torch.plant.inverted_sensor import levels_from_readings
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.choose import adaptive_engine, make_engine
 from fdi_torch.simulate.engine import Engine, Readings
+from fdi_torch.simulate.engine_choice import adaptive_engine, make_engine
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.own_steps import OwnSteps
+from fdi_torch.simulate.step_control import StepControl
 
 StartLevel = Literal["equilibrium", "free"] | float
 StartLevels = StartLevel | Mapping[str, StartLevel]
@@ -106,9 +106,9 @@ class Fitting:
         return Problem(self.space, terms, objective)
 
 
-def _own_steps(step: float, recording: Recording, plant: PlantDescription) -> OwnSteps:
+def _own_steps(step: float, recording: Recording, plant: PlantDescription) -> StepControl:
     try:
-        return OwnSteps.like(step, plant)
+        return StepControl.for_fixed_step(step, plant)
     except ValueError as error:
         span = float(recording.time[-1] - recording.time[0])
         raise ValueError(f"{span / step:.3g} integration steps of {step:g} s through {span:g} s: {error}") from error
@@ -194,7 +194,9 @@ def levels_shown_first(plant: PlantDescription, network: TankNetwork, recording:
         seen |= {sensor.tank} if len(valid) else set()
         readings.append(valid.median() if len(valid) else network.nominal.new_tensor(torch.nan))
     values = network.bind(ParameterSpace(), network.nominal.new_zeros(0))
-    levels = levels_behind(network, readings, network.start_levels(values), network.nominal.new_zeros(()), values)
+    levels = levels_from_readings(
+        network, readings, network.start_levels(values), network.nominal.new_zeros(()), values
+    )
     return [float(h) if tank.name in seen else None for tank, h in zip(plant.tanks, levels, strict=True)]
 
 

@@ -16,9 +16,9 @@ from fdi_torch.estimate.levenberg_marquardt import Progress, RefineSettings, lev
 from fdi_torch.estimate.objectives import Objective, Problem
 from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.uncertainty import Estimate, make_estimate
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.engine import Engine
-from fdi_torch.simulate.steps import choose_step, probe_points
+from fdi_torch.simulate.step_length import choose_step, probe_points
 
 # A refinement that stopped at the last digits of its cost is converged when this few standard errors are left to go.
 LEFT_TO_GO = 0.1

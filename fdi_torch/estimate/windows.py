@@ -18,10 +18,10 @@ from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_mar
 from fdi_torch.estimate.objectives import Problem, Term
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.engine import Engine, Readings
-from fdi_torch.simulate.steps import choose_step, probe_points
+from fdi_torch.simulate.step_length import choose_step, probe_points
 
 REFINE = RefineSettings(iterations=40, decrease_tolerance=1e-6)
 START = 0.3  # of a fault, between nominal and the end of its range

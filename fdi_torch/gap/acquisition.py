@@ -20,7 +20,7 @@ from fdi_torch.gap.slips import SURE, Slip, slip_of
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.held import Scatter, held, scatter
+from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 
 FEWEST = 20
 """Samples below which nothing is told: they hold fewer means than it takes for odds of 95 %."""
@@ -164,7 +164,7 @@ def _held(plant: PlantDescription, recording: Recording, sensor: Sensor) -> list
             float(time[rows[beyond - 1]]),
             beyond == len(values),
         )
-        for first, beyond in held(values, usual)
+        for first, beyond in stuck_runs(values, usual)
     ]
 
 

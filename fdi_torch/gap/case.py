@@ -15,7 +15,7 @@ from fdi_torch.gap.strays import Stray, Strays, strays_of, without
 from fdi_torch.gap.subject import Subject, subject_of
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
 
 LEAST = 60

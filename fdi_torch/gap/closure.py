@@ -113,9 +113,9 @@ def free_run(subject: Subject, noise: Noise, model: Model, guess: Tensor | None 
     if guess is None:  # what all readings show leads to the model's own trajectory; it does not tell where that is
         levels = Fitter(subject, noise).first_trajectory(engine, theta)
     else:
-        levels = engine.settle(theta, guess).levels
+        levels = engine.converge(theta, guess).levels
     start = fitter.descend(engine, theta, levels)
-    settled = engine.settle(start.theta, start.near.levels)
+    settled = engine.converge(start.theta, start.near.levels)
     return settled.readings[0], settled.levels
 
 

@@ -17,7 +17,7 @@ from fdi_torch.gap.freeform import UNIT
 from fdi_torch.gap.screening import Option, effect_columns, options_of
 from fdi_torch.gap.standard_errors import covariance
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 
 AMPLITUDES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 
@@ -38,7 +38,7 @@ def coefficients_of(
     fitter: Fitter,
     fit: Fit,
     free: Sequence[Placement],
-    reach: Reach,
+    reach: OperatingRange,
     returned: Sequence[Placement] = (),
 ) -> Coefficients:
     """What free forms take up of what a fit leaves, and of what its causes `returned` do.

@@ -21,7 +21,7 @@ from fdi_torch.gap.fitting import Candidate, Fit, Fitter
 from fdi_torch.gap.freeform import UNIT, free_form
 from fdi_torch.plant.description import Pipe, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement, Stage
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 
 BINS = 24
 
@@ -50,7 +50,7 @@ class Curve:
         return told | ({"effect": self.effect.tolist()} if self.effect is not None else {})
 
 
-def curves_at(fitter: Fitter, fit: Fit, place: str, reach: Reach) -> list[Curve]:
+def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> list[Curve]:
     """One curve for each variable that a place can know. fit: its causes there are given back to the free form; where
     it is a free form itself, that is shown."""
     here = tuple(p for p in fit.candidate.placements if p.location == place)

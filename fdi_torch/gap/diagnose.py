@@ -23,7 +23,7 @@ from fdi_torch.gap.search import Judged, search
 from fdi_torch.gap.strays import most_astray
 from fdi_torch.gap.subject import Subject
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.reach import Reach, reach_of_all, with_levels
+from fdi_torch.plant.operating_range import OperatingRange, operating_range_of_all, with_simulated_levels
 from fdi_torch.recording import Recording
 
 CONTENT = 0.95
@@ -51,10 +51,10 @@ def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
     subject, library, plant = case.subject, case.library, case.subject.plant
     tell(0.05, "noise and recalibration")
     fitter, null, lattice = _recalibrated(subject)
-    reach = with_levels(reach_of_all(case.recordings, plant), plant, null.near.levels[0])
+    reach = with_simulated_levels(operating_range_of_all(case.recordings, plant), plant, null.near.levels[0])
     tell(0.2, "which effects")
     known = {p.prefix for p in case.told} | {name.rpartition(".")[0] for name in subject.nuisance}
-    options = options_of([p for p in library if not p.effect.rounds and p.prefix not in known], fitter, reach)
+    options = options_of([p for p in library if not p.effect.quantizes and p.prefix not in known], fitter, reach)
     judged = Judged(fitter, len(library))
     found = search(judged, null, options, case.most)
     tell(0.6, "where")
@@ -84,7 +84,7 @@ def _verdict(content: Sequence[Hypothesis], sure: bool, rounded: bool, straying:
     return "named" if sure else "ambiguous"
 
 
-def _free_form(believed: Posterior, reach: Reach) -> Fit | None:
+def _free_form(believed: Posterior, reach: OperatingRange) -> Fit | None:
     """The discrepancy of the likeliest hypothesis as functions of its place's variables, if it has one."""
     best = believed.best
     if best.place is None:

@@ -12,7 +12,7 @@ from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.fitting import Fit, Fitter
 from fdi_torch.gap.subject import between
 from fdi_torch.simulate.collocation import Collocation, Linearised
-from fdi_torch.simulate.joint import Joint, with_blanks
+from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
 
 
 def with_own_noise(
@@ -78,7 +78,7 @@ def propagation_of(fitter: Fitter, fit: Fit, near: Linearised) -> Propagation:
     subject = fitter.subject
     own = fitter.engine(fit.candidate, list(fit.effect_values))
     theta = fit.theta.unsqueeze(0)
-    pieces = own.apart(theta, near) if isinstance(own, Joint) else [(own, theta, near)]
+    pieces = own.apart(theta, near) if isinstance(own, JointCollocation) else [(own, theta, near)]
     found = [_between_samples(engine, theta, piece, _areas(fitter)) for engine, theta, piece in pieces]
     transition, forcing, output = (with_blanks(each, dim=0) for each in zip(*found, strict=True))
     fresh = torch.zeros(len(subject.mask), dtype=torch.bool)

@@ -12,7 +12,7 @@ from fdi_torch.gap.posterior import Hypothesis, Posterior
 from fdi_torch.gap.search import Search
 from fdi_torch.gap.strays import Strays
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 
 UNEXPLAINED = 0.1  # share of the gap left open at which nothing has been explained
 
@@ -27,7 +27,7 @@ class Finding:
 
     sensors: Fitter
     library: tuple[Placement, ...]
-    reach: Reach
+    reach: OperatingRange
     search: Search
     posterior: Posterior
     content: Sequence[Hypothesis]

@@ -21,9 +21,9 @@ from fdi_torch.gap.subject import Part, Subject, between
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
-from fdi_torch.simulate.joint import Joint, own_name
+from fdi_torch.simulate.joint_collocation import JointCollocation, name_in_recording
 
 # What the model still predicts to gain where a fit has converged, in units of chi-square per reading, or of one where
 # that is more: parameters a tenth of a standard error away, by the noise or by the residuals if they are larger.
@@ -101,7 +101,7 @@ class Fitter:
             return self.disturbed.log_det
         return float((2.0 * torch.log(self.noise.innovation) * self.subject.mask.sum(dim=0)).sum())
 
-    def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation | Joint:
+    def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation | JointCollocation:
         """The plant with the candidate's effects; its space holds the nuisances and what is free."""
         network = self.network(candidate.placements)
         names = tuple(dict.fromkeys([*self.subject.nuisance, *free]))
@@ -109,7 +109,7 @@ class Fitter:
         if not self.subject.further:
             return Collocation(network, space, self.subject.experiment)
         parts = [Collocation(network, space, part.experiment) for part in self.subject.parts]
-        return Joint(parts, ParameterSpace(replace(space[n.partition("@")[0]], name=n) for n in names))
+        return JointCollocation(parts, ParameterSpace(replace(space[n.partition("@")[0]], name=n) for n in names))
 
     def network(self, placements: Sequence[Placement]) -> TankNetwork:
         """The plant with further effects beside those it is believed to have, or in their stead."""
@@ -153,7 +153,7 @@ class Fitter:
         )
 
     def _begin(
-        self, engine: Collocation | Joint, starts: Sequence[Mapping[str, float]], base: Fit | None
+        self, engine: Collocation | JointCollocation, starts: Sequence[Mapping[str, float]], base: Fit | None
     ) -> tuple[Tensor, Tensor]:
         known = base.values if base else self.first_levels()
         rows = [engine.space.vector({n: v for n, v in {**known, **s}.items() if n in engine.space}) for s in starts]
@@ -162,7 +162,7 @@ class Fitter:
             return theta, self.first_trajectory(engine, theta)
         return theta, base.near.levels.expand(len(starts), -1, -1)
 
-    def first_trajectory(self, engine: Collocation | Joint, theta: Tensor) -> Tensor:
+    def first_trajectory(self, engine: Collocation | JointCollocation, theta: Tensor) -> Tensor:
         """The model's levels (L, K+1, n) at theta (L, P), found from what the sensors show of them.
 
         Newton's steps from levels that stay where they start miss the trajectory where levels become equal, or meet a
@@ -170,11 +170,11 @@ class Fitter:
         """
         constant = engine.constant_guess(theta)
         shown = torch.cat([self._shown(part) for part in self.subject.parts])
-        found = engine.settle(theta, torch.where(shown.isfinite(), shown, constant))
+        found = engine.converge(theta, torch.where(shown.isfinite(), shown, constant))
         lost = (~(found.defect <= self.far)).nonzero().flatten()
         if not len(lost):
             return found.levels
-        second = engine.settle(theta[lost], constant[lost])
+        second = engine.converge(theta[lost], constant[lost])
         better = second.defect < found.defect[lost].nan_to_num(nan=torch.inf)
         return found.levels.index_copy(0, lost[better], second.levels[better])
 
@@ -199,12 +199,12 @@ class Fitter:
                 seen = part.readings[:5, i][part.mask[:5, i]]
                 if len(seen):
                     level = max(float(seen.mean() - sensor.offset) / sensor.gain, 0.0)
-                    found[own_name(f"{sensor.tank}.start_level", k)] = level
+                    found[name_in_recording(f"{sensor.tank}.start_level", k)] = level
         return found
 
     def descend(
         self,
-        engine: Collocation | Joint,
+        engine: Collocation | JointCollocation,
         theta: Tensor,
         levels: Tensor,
         target: float = math.inf,
@@ -271,7 +271,7 @@ class Fitter:
 class _OnTrajectories:
     """Half of chi-square as a problem for least squares; every point keeps its trajectory's neighbourhood."""
 
-    def __init__(self, fitter: Fitter, engine: Collocation | Joint, levels: Tensor) -> None:
+    def __init__(self, fitter: Fitter, engine: Collocation | JointCollocation, levels: Tensor) -> None:
         self.fitter, self.engine, self.levels = fitter, engine, levels
         self.box = fitter.box(engine.space)
 
@@ -316,7 +316,9 @@ def left_open(fitter: Fitter, fit: Fit) -> float:
     return max(slow_excess(fitter.white(fit.near)[0][0]), 0.0)
 
 
-def _followed(engine: Collocation | Joint, theta: Tensor, guess: Tensor, shift: Tensor, far: float) -> Linearised:
+def _followed(
+    engine: Collocation | JointCollocation, theta: Tensor, guess: Tensor, shift: Tensor, far: float
+) -> Linearised:
     """The neighbourhood of trajectories that are guessed to be `shift` from known ones; slopes are worked out once a
     guess is good.
     """
@@ -335,7 +337,7 @@ def _followed(engine: Collocation | Joint, theta: Tensor, guess: Tensor, shift: 
 
 
 def _settled(
-    engine: Collocation | Joint, theta: Tensor, near: Linearised, far: float, lost: Tensor | None = None
+    engine: Collocation | JointCollocation, theta: Tensor, near: Linearised, far: float, lost: Tensor | None = None
 ) -> Linearised:
     """The lanes whose trajectories were still far from the model's corrected until they are not, or no more."""
     lost = torch.zeros_like(near.defect, dtype=torch.bool) if lost is None else lost

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.plant.effect import Placement, Stage
-from fdi_torch.plant.moment import Moment
 from fdi_torch.plant.network import PlaceValues, TankNetwork
+from fdi_torch.plant.operating_point import OperatingPoint
 from fdi_torch.simulate.actuation import Actuation
 from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.output_map import OutputMap
 from fdi_torch.simulate.pointwise import Row, partials
-from fdi_torch.simulate.seen import Sight
 
 Starts = Mapping[str, Tensor]
 
@@ -44,18 +44,18 @@ class Forcing:
         self.union, self.present, self.values, self.experiment = union, frozenset(present), values, experiment
         self._path = levels.unsqueeze(0)
         self.levels = list((0.5 * (levels[:, 1:] + levels[:, :-1])).unsqueeze(1).unbind(0))
-        network = union.showing(self.present)
+        network = union.restricted_to(self.present)
         actuation = Actuation(network, experiment, [])
         self._clock = actuation.clock
         self.commands = actuation.commands(values, 1)
         now = self._now(network, values, self.commands)
         self.pumps = network.pump_flows(now)
         self.pipes = network.pipe_flows(now)
-        gathered = network.gathered(now, self.pumps, self.pipes)
+        gathered = network.net_inflows(now, self.pumps, self.pipes)
         self._gathered = [net.expand(self.levels[0].shape) for net in gathered]
-        self._net = network.spilled(now, self._gathered)
+        self._net = network.less_overflow(now, self._gathered)
         self.still, self._by_inflow = self._inflow_slopes(network)
-        self._readings = Sight(network, experiment, []).read(self._path, values)[0]
+        self._readings = OutputMap(network, experiment, []).read(self._path, values)[0]
 
     def rates(self, placement: Placement, starts: Starts) -> Tensor:
         """How the rates change with an effect, (tanks, M, K) in m/s. starts: its parameters, short names, (M, 1)."""
@@ -89,23 +89,23 @@ class Forcing:
     def readings(self, placement: Placement, starts: Starts) -> Tensor:
         """How the readings change with an effect, (C, M, S) in each sensor's unit."""
         network, values, lanes = self._with(placement, starts)
-        seen = Sight(network, self.experiment, []).read(self._path.expand(lanes, -1, -1), values)
+        seen = OutputMap(network, self.experiment, []).read(self._path.expand(lanes, -1, -1), values)
         return (seen - self._readings).movedim(0, 1)
 
     def _with(self, placement: Placement, starts: Starts) -> tuple[TankNetwork, PlaceValues, int]:
-        network = self.union.showing({*self.present, placement.prefix})
+        network = self.union.restricted_to({*self.present, placement.prefix})
         values = {**self.values, placement.prefix: {**self.values[placement.prefix], **starts}}
         return network, values, max(len(s) for s in starts.values())
 
-    def _now(self, network: TankNetwork, values: PlaceValues, commands: Sequence[Tensor]) -> Moment:
-        return network.moment(self.levels, commands, self._clock, values)
+    def _now(self, network: TankNetwork, values: PlaceValues, commands: Sequence[Tensor]) -> OperatingPoint:
+        return network.operating_point(self.levels, commands, self._clock, values)
 
     def _inflows(self, network: TankNetwork, placement: Placement, values: PlaceValues, lanes: int) -> Sequence[Tensor]:
         """By how much more flows into each tank, (M, K) or (1, K) m^3/s."""
         plant, place, commands = network.description, placement.location, self.commands
         if placement.effect.stage is Stage.BALANCE:
             net = list(self._gathered)
-            network.move_by_effect(net, placement, self._now(network, values, commands))
+            network.transfer_by_effect(net, placement, self._now(network, values, commands))
             return [a - b for a, b in zip(net, self._gathered, strict=True)]
         if placement.effect.stage is Stage.COMMAND:
             commands = Actuation(network, self.experiment, []).commands(values, lanes)
@@ -114,11 +114,11 @@ class Forcing:
         for i, pump in enumerate(plant.pumps):
             if pump.name == place:
                 flow = network.pump_flow(now, pump)
-                network.move(more, OUTSIDE, pump.target, flow - self.pumps[i])
+                network.transfer(more, OUTSIDE, pump.target, flow - self.pumps[i])
         for j, pipe in enumerate(plant.pipes):
             if pipe.name == place:
                 flow = network.pipe_flow(now, pipe)
-                network.move(more, pipe.source, pipe.target, flow - self.pipes[j])
+                network.transfer(more, pipe.source, pipe.target, flow - self.pipes[j])
         return more
 
     def _inflow_slopes(self, network: TankNetwork) -> tuple[list[Tensor], list[Row]]:
@@ -127,6 +127,6 @@ class Forcing:
         now = self._now(network, self.values, self.commands)
 
         def rates(net: Sequence[Tensor]) -> Sequence[Tensor]:
-            return network.level_rates(now, network.spilled(now, net))
+            return network.level_rates(now, network.less_overflow(now, net))
 
         return partials(rates, self._gathered, self.levels[0].shape)

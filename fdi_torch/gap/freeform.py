@@ -18,8 +18,8 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor
 from fdi_torch.plant.effect import Effect, Local, Memory, Placement, Stage, Values, place_kind
-from fdi_torch.plant.pace import area_scale, length_scale, time_scale
-from fdi_torch.plant.reach import Range, Reach
+from fdi_torch.plant.operating_range import OperatingRange, Range
+from fdi_torch.plant.scales import area_scale, length_scale, time_scale
 from fdi_torch.plant.signals import Clock
 
 LOCAL_NODES, TIME_NODES = 8, 16
@@ -45,7 +45,7 @@ class _Free(Effect):
         names += [f"{wave}_{j}" for j in range(len(self.periods)) for wave in ("cosine", "sine")]
         return tuple(Parameter(name, "1", 0.0, std=self.prior) for name in names)
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, reach: OperatingRange) -> list[dict[str, float]]:
         """One for each coefficient, all of one form, so that they make one batch."""
         names = [p.name for p in self.parameters(place, plant)]
         return [{name: UNIT if name == one else 0.0 for name in names} for one in names]
@@ -124,14 +124,14 @@ class FreeReading(_Free):
 
 
 def free_form(
-    place: str, plant: PlantDescription, reach: Reach, periods: Sequence[float] = ()
+    place: str, plant: PlantDescription, reach: OperatingRange, periods: Sequence[float] = ()
 ) -> tuple[Placement, ...]:
     """The free discrepancy of a place; periods (s): of what comes and goes by itself."""
     return tuple(Placement(e, place) for e in _free_at(place, plant, reach, periods))
 
 
 def fitted_free_form(
-    fitter: Fitter, fit: Fit, kept: Sequence[Placement], place: str, periods: Sequence[float], reach: Reach
+    fitter: Fitter, fit: Fit, kept: Sequence[Placement], place: str, periods: Sequence[float], reach: OperatingRange
 ) -> Fit:
     """The free discrepancy of one place beside the effects that are kept of a fit, about the moving trajectory."""
     plant = fitter.subject.plant
@@ -161,7 +161,7 @@ def shape_of(fit: Fit) -> dict[str, object]:
     return {"location": free[0].location, "tables": tables}
 
 
-def _free_at(place: str, plant: PlantDescription, reach: Reach, periods: Sequence[float]) -> list[Effect]:
+def _free_at(place: str, plant: PlantDescription, reach: OperatingRange, periods: Sequence[float]) -> list[Effect]:
     kind, length = place_kind(plant, place), length_scale(plant)
     time = _grid((0.0, reach.duration), TIME_NODES, time_scale(plant))
     if kind == "tank_pair":

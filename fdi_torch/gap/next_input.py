@@ -17,7 +17,7 @@ from torch import Tensor
 from fdi_torch.gap.fitting import Fit, Fitter
 from fdi_torch.gap.subject import subject_of
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import lay_out
 
@@ -131,7 +131,7 @@ def _run(there: Fitter, fit: Fit) -> tuple[Tensor, Tensor, Tensor]:
     engine = there.engine(fit.candidate, list(fit.effect_values))
     known = {n: v for n, v in fit.values.items() if n in engine.space}
     theta = engine.space.vector(known).unsqueeze(0)
-    near = engine.settle(theta, engine.constant_guess(theta), rounds=30)
+    near = engine.converge(theta, engine.constant_guess(theta), rounds=30)
     columns = [engine.space.index(n) for n in _in_one_run(fit)]
     return near.readings[0], near.jacobian[0][..., columns], near.levels[0]
 

@@ -22,7 +22,7 @@ from fdi_torch.gap.screening import Option, Screen, options_of, screen
 from fdi_torch.gap.subject import subject_of
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import reach_of
+from fdi_torch.plant.operating_range import operating_range_of
 from fdi_torch.recording import Recording
 
 FITTED, STARTS = 14, 2
@@ -44,7 +44,7 @@ def one_at_a_time(
     residual = torch.where(subject.mask, subject.readings - null.near.readings[0], 0.0)
     fitter = Fitter(subject, _white(residual.std(dim=0).clamp(min=1e-12)))
     null = fitter.fit(Candidate(), null)
-    options = options_of([p for p in found if not p.effect.rounds], fitter, reach_of(recording, plant))
+    options = options_of([p for p in found if not p.effect.quantizes], fitter, operating_range_of(recording, plant))
     fits = [null, *(fitter.fit(c, null) for c in _singles(screen(fitter, null, options, pairs=False)))]
     winner = min(fits, key=lambda fit: _bic(fitter, fit))
     return _named([(p.effect.name, p.location) for p in winner.candidate.placements])

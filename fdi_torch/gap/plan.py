@@ -19,7 +19,7 @@ from fdi_torch.gap.screening import options_of, screen
 from fdi_torch.gap.subject import subject_of
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import reach_of
+from fdi_torch.plant.operating_range import operating_range_of
 from fdi_torch.recording import Recording
 
 
@@ -32,8 +32,8 @@ def plan(
     fitter = _noise_free(plant, believed, recording, step, noise)
     null = fitter.fit(Candidate())
     seen = replace(fitter.subject.recording, outputs=null.near.readings[0])
-    placements = [p for p in library_of(plant, library) if not p.effect.rounds]
-    options = options_of(placements, fitter, reach_of(seen, plant))
+    placements = [p for p in library_of(plant, library) if not p.effect.quantizes]
+    options = options_of(placements, fitter, operating_range_of(seen, plant))
     return excitation(screen(fitter, null, options), plant)
 
 
@@ -52,5 +52,5 @@ def _noise_free(
     white = Noise(torch.full((sensors,), noise, dtype=torch.float64), torch.zeros(sensors, dtype=torch.float64))
     engine = Fitter(subject, white).engine(Candidate(), ())
     theta = engine.space.nominal().unsqueeze(0)
-    readings = engine.settle(theta, engine.constant_guess(theta), rounds=30).readings[0]
+    readings = engine.converge(theta, engine.constant_guess(theta), rounds=30).readings[0]
     return Fitter(replace(subject, readings=readings, recording=replace(planned, outputs=readings)), white)

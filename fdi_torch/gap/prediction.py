@@ -16,7 +16,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import effect, once_run
+from fdi_torch.effects import effect, without_startup_effects
 from fdi_torch.gap.fitting import Fitter
 from fdi_torch.gap.floor import Noise
 from fdi_torch.gap.settling import settle
@@ -25,7 +25,7 @@ from fdi_torch.names import matching
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
 
@@ -78,7 +78,7 @@ def predict(
         start_samples = counted = _samples_within(recording, settle)
     if start_samples < 1:
         raise ValueError(f"expected at least 1 sample for the start levels, got {start_samples}")
-    plant = once_run(_varying(plant, vary), recording.ran)
+    plant = without_startup_effects(_varying(plant, vary), recording.ran)
     believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     span = float(recording.time[-1] - recording.time[0])
     step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), span / MOST_STEPS)
@@ -123,7 +123,7 @@ def _run(subject: Subject, start_samples: int, counted: int) -> Prediction:
     spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     fitter = Fitter(replace(subject, mask=early), Noise(1e-2 * spread, torch.zeros_like(spread)))
     engine, theta, levels = _by_stretch(fitter, counted) if counted else _by_samples(fitter, subject)
-    run = engine.settle(theta, levels, CORRECTIONS)
+    run = engine.converge(theta, levels, CORRECTIONS)
     readings = run.readings[0]
     residuals = torch.where(subject.mask, subject.readings - readings, torch.zeros_like(readings))
     rmse = torch.sqrt((residuals[counted:] ** 2).sum(dim=0) / subject.mask[counted:].sum(dim=0))

@@ -24,9 +24,9 @@ from fdi_torch.gap.standard_errors import standard_errors
 from fdi_torch.names import matching
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.effect import Placement
-from fdi_torch.plant.reach import reach_of_all
+from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.joint import own_name
+from fdi_torch.simulate.joint_collocation import name_in_recording
 
 TURNS = 3  # of the noise and the fit under it
 WIDE = 0.5  # of a range
@@ -138,7 +138,7 @@ def _own(fitter: Fitter, fit: Fit) -> tuple[Own, ...]:
     """What varies from recording to recording, by name and then in the recordings' order."""
     errors, parts = _all_errors(fitter, fit), fitter.subject.parts
     return tuple(
-        Own(name, part.recording.source, float(part.recording.time[0]), *errors[own_name(name, k)])
+        Own(name, part.recording.source, float(part.recording.time[0]), *errors[name_in_recording(name, k)])
         for name in fitter.subject.plant.varying
         for k, part in enumerate(parts)
     )
@@ -148,11 +148,11 @@ def _start(
     kept: Collection[PlacedEffect], plant: PlantDescription, recordings: Sequence[Recording]
 ) -> dict[str, float]:
     """Where each effect has what a fit may move of it; a limit that the values themselves tell is not fitted."""
-    reach = reach_of_all(recordings, plant)
+    reach = operating_range_of_all(recordings, plant)
     start: dict[str, float] = {}
     for placed in kept:
         movable = {n for s in effect(placed.effect).starts(placed.location, plant, reach) for n in s}
-        if not effect(placed.effect).rounds and not any(_told(placed, plant, r) for r in recordings):
+        if not effect(placed.effect).quantizes and not any(_told(placed, plant, r) for r in recordings):
             values = {n: v for n, v in placed.parameters.items() if n in movable}
             start |= {f"{placed.location}.{placed.effect}.{n}": v for n, v in values.items()}
     return start

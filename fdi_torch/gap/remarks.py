@@ -18,7 +18,7 @@ from fdi_torch.gap.same_rig import other_rig
 from fdi_torch.gap.strays import Strays
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recordings.check import doubts
+from fdi_torch.recordings.check import data_warnings
 
 AT_END = 1e-3  # of a parameter's range
 SHOWN_TIMES = 5  # of strays
@@ -30,7 +30,7 @@ def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
     """Of the inputs, the plant file, the parameters found, and the hold-outs."""
     subject = found.fitter.subject
     remarks: list[str] = []
-    remarks += dict.fromkeys(s for part in subject.parts for s in doubts(part.recording, subject.plant))
+    remarks += dict.fromkeys(s for part in subject.parts for s in data_warnings(part.recording, subject.plant))
     inputs = [column for part in subject.parts for column in part.recording.inputs.T]
     if all(float(torch.diff(column).abs().max()) == 0.0 for column in inputs):
         remarks.append(

@@ -18,9 +18,9 @@ from fdi_torch.gap.forcing import Forcing
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.reach import Reach
+from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.simulate.collocation import Collocation, Linearised
-from fdi_torch.simulate.joint import Joint, with_blanks
+from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
 from fdi_torch.simulate.scan import scan_in_time
 
 Start = Mapping[str, float]
@@ -88,7 +88,7 @@ class Screen:
         return torch.where((self.score > 0) & (strength > 1e-6), self.score**2 / strength.clamp(min=1e-300), 0.0)
 
 
-def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Reach) -> list[Option]:
+def options_of(placements: Sequence[Placement], fitter: Fitter, reach: OperatingRange) -> list[Option]:
     """All starts of all placements."""
     plant = fitter.subject.plant
     return [
@@ -160,7 +160,11 @@ class _Beside:
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:
     """(S, C, M): whitened changes of the readings at the size of each start."""
     own = fitter.engine(fit.candidate, list(fit.effect_values))
-    pieces = own.apart(fit.theta.unsqueeze(0), fit.near) if isinstance(own, Joint) else [(own, fit.theta, fit.near)]
+    pieces = (
+        own.apart(fit.theta.unsqueeze(0), fit.near)
+        if isinstance(own, JointCollocation)
+        else [(own, fit.theta, fit.near)]
+    )
     columns = with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
     return fitter.whiten(columns)
 

@@ -26,7 +26,7 @@ from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.held import scatter
+from fdi_torch.recordings.repeated_readings import scatter
 
 SAMPLES = 1200
 """A recording is thinned to at most so many: slips show as slowly as the plant moves."""

@@ -23,7 +23,7 @@ from fdi_torch.gap.screening import Option, options_of, screen
 from fdi_torch.gap.slip_evidence import Run, laid_out, noise_of, run, thinned
 from fdi_torch.gap.subject import between
 from fdi_torch.plant.description import PlantDescription, Sensor
-from fdi_torch.plant.reach import reach_of_all, with_levels
+from fdi_torch.plant.operating_range import operating_range_of_all, with_simulated_levels
 from fdi_torch.recording import Recording
 
 DECADES = (-3, -2, -1, 1, 2, 3)
@@ -300,13 +300,13 @@ def _with_effects(as_is: Run, elsewhere: set[str]) -> Iterator[float]:
     elsewhere: places that have none.
     """
     case, plant = as_is.case, as_is.case.plant
-    library = [p for p in library_of(plant) if not p.effect.rounds and p.location not in elsewhere]
+    library = [p for p in library_of(plant) if not p.effect.quantizes and p.location not in elsewhere]
     known = {p.prefix for p in case.subject.believed}
     placements = [p for p in library if p.prefix not in known]
     parent = as_is
     for _ in range(TOGETHER):
         fit = parent.fit
-        reach = with_levels(reach_of_all([case.recording], plant), plant, fit.near.levels[0])
+        reach = with_simulated_levels(operating_range_of_all([case.recording], plant), plant, fit.near.levels[0])
         fitter = _fitter(parent)
         beside = [p for p in placements if (p.effect.name, p.location) not in fit.key]
         shown = screen(fitter, fit, options_of(beside, fitter, reach), pairs=False)

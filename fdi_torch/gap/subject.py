@@ -15,7 +15,7 @@ from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import Experiment, lay_out
-from fdi_torch.simulate.joint import own_name
+from fdi_torch.simulate.joint_collocation import name_in_recording
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Subject:
         """Constants and effects' parameters with a tolerance, and start levels: refitted with every candidate."""
         constants = TankNetwork(self.plant, self.believed).constants
         common = [p.name for p in constants if math.isfinite(p.std) and p.name not in self.own]
-        own = [own_name(n, k) for k in range(len(self.further) + 1) for n in self.own]
+        own = [name_in_recording(n, k) for k in range(len(self.further) + 1) for n in self.own]
         return (*common, *own)
 
 

@@ -24,7 +24,7 @@ from fdi_torch.monitor.window_monitor import WindowMonitor
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.check import doubts
+from fdi_torch.recordings.check import data_warnings
 
 CHUNK = 2048  # samples of a recording that are processed at a time
 ALARM = "/observer/alarm"
@@ -104,7 +104,7 @@ class LoggedMonitor:
         self._report(Event(self._now, "watching", prepared.false_alarm_text))
         self.notice(self._watched_faults_text(prepared, whole))
         part = fault_free_part(whole, *config.fault_free)
-        for warning in (*doubts(part, self.plant), *prepared.warnings):
+        for warning in (*data_warnings(part, self.plant), *prepared.warnings):
             self.notice(warning)
 
     def process(self, samples: Samples) -> bool:

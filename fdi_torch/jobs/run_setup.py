@@ -19,9 +19,9 @@ from fdi_torch.estimate.hybrid import HybridSettings
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.gap.acquisition import usable
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.reach import bounded
+from fdi_torch.plant.operating_range import bounded_by_recording
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.record import clean_readings, with_noise
+from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
 
 
 def recordings_of(run: Run) -> list[LoadedRecording]:
@@ -118,7 +118,7 @@ def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording
     """The estimation problem of parameters and recordings, with all tensors on the configured device."""
     device = usable_device(run.config.device)
     recordings = [part.recording.to(device) for part in loaded]
-    space = bounded(space, max(float(r.time[-1]) for r in recordings))
+    space = bounded_by_recording(space, max(float(r.time[-1]) for r in recordings))
     with tensors_on(device):
         fitting = set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
     expect_enough_samples(recordings, fitting.space)

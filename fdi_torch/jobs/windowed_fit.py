@@ -13,7 +13,7 @@ from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recordings import StartLevel
 from fdi_torch.config.run import Run
-from fdi_torch.effects import once_run
+from fdi_torch.effects import without_startup_effects
 from fdi_torch.estimate.stretches import Stretch, stretches_of
 from fdi_torch.estimate.windows import Window, cut_up, noise_of, window_of, window_step
 from fdi_torch.jobs.log_paths import STARTS_OVER, free_path
@@ -38,7 +38,7 @@ def fit_windows(run: Run, tell: Callable[[float, str], None] = lambda share, tex
     The initial levels of each window are free, and constants to calibrate have their tolerances as priors in each
     window. Effects of the plant that act only at the start of a run are left out, because windows start in mid-run.
     """
-    run = replace(run, plant=once_run(run.plant, run.plant.channels()))
+    run = replace(run, plant=without_startup_effects(run.plant, run.plant.channels()))
     length = run.config.estimate.windows
     assert length is not None
     loaded = recordings_of(run)

@@ -13,7 +13,7 @@ from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import PlantState, Stepper, slopes
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 
 FORGETTING = 1e-3  # decay of a parameter's deviation per sample in the design of (15)
 LEVEL_NOISE = 1e-6  # standard deviation of a level's process noise per sample, in units of the plant's length scale

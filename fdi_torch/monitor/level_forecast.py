@@ -22,7 +22,7 @@ from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer import LEVEL_OFFSET
 from fdi_torch.monitor.observer_bank import NEVER, ChangeHypotheses, ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 
 DRAWS = 40
 POINTS = 200  # times at which levels are computed

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import build_network, once_run, placements_for
+from fdi_torch.effects import build_network, placements_for, without_startup_effects
 from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.monitor.detection import Chart, make_detector
@@ -85,7 +85,7 @@ def prepare_monitor(
     step = min(usual_step(plant) if step is None else step, 1.25 * usual_interval(fault_free.time))
     watched = with_shapes(list(faults) or usual_faults(plant), plant)
     network = build_network(plant, placements_for(watched))
-    running = once_run(plant, fault_free.ran)  # the fault-free part need not be the start of the run
+    running = without_startup_effects(plant, fault_free.ran)  # the fault-free part need not be the start of the run
     learning = build_network(running, placements_for([*watched, *calibrate]))
     values = calibration(running, fault_free, calibrate, step, start) if calibrate else {}
     space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate)])

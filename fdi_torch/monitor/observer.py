@@ -12,9 +12,9 @@ from fdi_torch.monitor.observer_run import run_observers
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.behind import levels_behind
+from fdi_torch.plant.inverted_sensor import levels_from_readings
 from fdi_torch.plant.network import PlaceValues, TankNetwork
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 
 FIRST_SAMPLES = 100  # samples in which the first reading of a rarely read sensor gives its initial level
 LEVEL_OFFSET = 1e-5  # small change of the levels, in units of the plant's length scale
@@ -181,5 +181,5 @@ def initial_levels(network: TankNetwork, samples: Samples, values: PlaceValues) 
     """
     start = [level.expand(samples.batch) for level in network.start_levels(values)]
     readings = _first_readings(samples.readings[..., :FIRST_SAMPLES, :]).unbind(-1)
-    levels = levels_behind(network, readings, start, samples.time[0], values)
+    levels = levels_from_readings(network, readings, start, samples.time[0], values)
     return torch.stack(torch.broadcast_tensors(*levels), dim=-1)

@@ -11,7 +11,7 @@ from torch import Tensor
 from fdi_torch.monitor.stepper import Stepper, slopes
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import PlaceValues
-from fdi_torch.plant.pace import length_scale
+from fdi_torch.plant.scales import length_scale
 
 DOUBLINGS = 60
 LONGEST_TRANSIENT = 2000  # samples until the gain must be steady

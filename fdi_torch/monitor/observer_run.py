@@ -12,10 +12,10 @@ from fdi_torch.monitor.samples import Samples
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.build import BuildError
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings
 from fdi_torch.simulate.injection import Injection, lay_out_samples
-from fdi_torch.simulate.traced import TracedEngine
+from fdi_torch.simulate.traced_engine import TracedEngine
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from fdi_torch.capacity import expect_room
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 
 # In units of the plant's time scale. RK4 with this step has an error of 1e-3 cm on the paper's plant, far below sensor
@@ -58,8 +58,8 @@ class Stepper:
         clock = self._clock(levels, 0.0, self.longest, self.longest)
         channels = self._channels(inputs)
         seen = self._seen(levels)
-        commands = self.network.remember_commands(channels, clock, values) if channels else ()
-        return PlantState(levels, commands, self.network.remember_readings(seen, clock, values))
+        commands = self.network.steady_command_memory(channels, clock, values) if channels else ()
+        return PlantState(levels, commands, self.network.steady_reading_memory(seen, clock, values))
 
     def advance(
         self,

@@ -27,7 +27,7 @@ from fdi_torch.monitor.samples import samples_of_recording
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.record import clean_readings, with_noise
+from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
 
 TIME_BETWEEN_FALSE_ALARMS = 20_000.0
 STILL_RATIO = 1.2

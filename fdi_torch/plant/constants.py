@@ -1,4 +1,4 @@
-"""The numbers of a plant that can be estimated: one Parameter for each constant of each component."""
+"""The constants of a plant that can be estimated: one Parameter for each constant of each component."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Sensor
 
 
 def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
-    """Every constant of the plant; std from its tolerances, box of a tenth to ten times where it must be positive."""
+    """Every constant of the plant as a Parameter.
+
+    The standard deviation comes from the plant's tolerances (infinite where there is none). A constant that must be
+    positive may vary from a tenth to ten times its nominal value. Raises ValueError for a tolerance of an unknown name.
+    """
     tolerances = {name: std for name, std in plant.tolerances.items() if name.count(".") == 1}
     for tank in plant.tanks:
         yield _positive(tank.name, "area", "m^2", tank.area, tolerances)
@@ -18,7 +22,7 @@ def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
         start = 0.5 * tank.height if tank.start_level is None else tank.start_level
         low, high = min(0.0, start), max(tank.height, start)
         name = f"{tank.name}.start_level"
-        std = tolerances.pop(name, math.inf)  # as far as it is known at all; m
+        std = tolerances.pop(name, math.inf)  # absolute, m
         yield Parameter(name, "m", start, low, high, std, "level at t = 0")
         capacity = nominal_capacity(plant, leak_pipe(plant, tank.name))
         yield Parameter(f"{tank.name}.leak_capacity", "m^2.5/s", capacity, meaning="flow of a leak of size 1 at 1 m")
@@ -54,51 +58,51 @@ def _positive(component: str, field: str, unit: str, value: float, tolerances: d
 
 
 def leak_pipe(plant: PlantDescription, tank: str) -> Pipe:
-    """The pipe or outlet whose capacity a leak of the tank is a share of: the named one, or else the first attached."""
+    """The pipe or outlet that defines a leak of size 1: the tank's `leak_reference`, or else the first one attached."""
     reference = plant.component(tank).leak_reference  # type: ignore[union-attr]
     attached = [p for p in plant.pipes if p.name == reference or (reference is None and tank in (p.source, p.target))]
     if attached:
         return attached[0]
-    # A tank without pipes: a hole of a thousandth of its floor is as good a unit as any.
+    # A tank without pipes: the reference is a hole of a thousandth of the floor's area.
     area = next(t.area for t in plant.tanks if t.name == tank)
     return plant.pipes[0] if plant.pipes else Pipe(f"{tank}.hole", tank, OUTSIDE, 1e-3 * area, 0.6)
 
 
 def nominal_capacity(plant: PlantDescription, pipe: Pipe) -> float:
-    """C_d a sqrt(2 g) as the plant file has it, m^2.5/s."""
+    """Nominal C_d a sqrt(2 g) of a pipe: its flow at 1 m of head, m^2.5/s."""
     return pipe.discharge_coefficient * pipe.area * math.sqrt(2.0 * plant.gravity)
 
 
 def inverse_areas(plant: PlantDescription, pipe: Pipe) -> float:
-    """1/A of the tanks at both ends, 1/m^2: how fast a flow through the pipe changes the head across it."""
+    """Sum of 1/A over the tanks at both ends, 1/m^2: d(head)/dt per unit of flow through the pipe."""
     areas = {tank.name: tank.area for tank in plant.tanks}
     return sum(1.0 / areas[end] for end in (pipe.source, pipe.target) if end in areas)
 
 
-def height_before(plant: PlantDescription, pipe: str) -> float:
-    """Height of the tank that a pipe starts from, m."""
+def source_height(plant: PlantDescription, pipe: str) -> float:
+    """Height of the tank from which the pipe draws, m."""
     source = plant.component(pipe).source  # type: ignore[union-attr]
     return next(t.height for t in plant.tanks if t.name == source)
 
 
 def target_height(plant: PlantDescription, pump: str) -> float:
-    """Height of the tank that a pump feeds, m."""
+    """Height of the tank that the pump feeds, m."""
     target = plant.component(pump).target  # type: ignore[union-attr]
     return next(t.height for t in plant.tanks if t.name == target)
 
 
 def flow_scale(plant: PlantDescription, tank: str) -> float:
-    """What runs out of a full tank through its leak reference, m^3/s: a flow to measure others against."""
+    """Characteristic flow of a tank: outflow of the full tank through its leak reference, C sqrt(H), m^3/s."""
     height = next(t.height for t in plant.tanks if t.name == tank)
     return nominal_capacity(plant, leak_pipe(plant, tank)) * math.sqrt(height)
 
 
 def reading_at(plant: PlantDescription, sensor: Sensor, share: float) -> float:
-    """The reading when the level stands at a share of the tank's height, in the reading's unit."""
+    """The reading at a level of `share` times the tank's height, in the sensor's unit."""
     height = next(t.height for t in plant.tanks if t.name == sensor.tank)
     return sensor.gain * share * height + sensor.offset
 
 
 def reading_span(plant: PlantDescription, sensor: Sensor) -> float:
-    """By how much the reading changes from floor to rim, without sign."""
+    """Absolute change of the reading between an empty and a full tank, in the sensor's unit."""
     return abs(reading_at(plant, sensor, 1.0) - sensor.offset)

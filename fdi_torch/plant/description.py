@@ -1,171 +1,47 @@
-"""What a rig is made of: tanks, pipes, outlets, pumps and sensors, as plain data in SI.
+"""PlantDescription: a rig as plain data in SI, and the checks of its names, references and numbers.
 
-The physics that reads it is `TankNetwork`. A component's name is a location for faults and unmodelled effects.
-A quantity may be given as text with its unit, as in Tank("A", area="200 cm^2", height="60 cm"); a number is SI.
+`TankNetwork` holds the physics. A component's name is also a location for faults and unmodelled effects.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 
-from fdi_torch.parameters import parse_quantity
-from fdi_torch.recording import LARGEST as MOST
+from fdi_torch.plant.components import (
+    COMMAND_UNITS,
+    OUTSIDE,
+    READING_UNITS,
+    Pipe,
+    Pump,
+    Sensor,
+    Tank,
+    describe,
+)
 
-OUTSIDE = "outside"
-COMMAND_UNITS = {"1": "m^3/s", "m^3/s/V": "V", "m^3/s/A": "A", "m^3": "1/s", "m^3/s": "1"}
-"""Unit of a pump's gain -> SI unit of its command: a flow, volts, amperes, revolutions or cycles, a share (duty)."""
-READING_UNITS = {"1": "m", "Pa/m": "Pa", "V/m": "V", "A/m": "A", "1/m": "1"}
-"""Unit of a sensor's gain -> SI unit of its reading."""
-MOST_DISCHARGE = 10.0
-"""A larger discharge coefficient is no orifice's, effective or not, but per cent without their sign."""
+__all__ = [
+    "COMMAND_UNITS",
+    "OUTSIDE",
+    "READING_UNITS",
+    "FaultPriority",
+    "Pipe",
+    "PlacedEffect",
+    "PlantDescription",
+    "Pump",
+    "Sensor",
+    "Tank",
+    "describe",
+]
 
-
+LARGEST_DISCHARGE_COEFFICIENT = 10.0
+"""Orifices have about 0.6 and wide pipes somewhat more; a larger number is probably in per cent."""
 SMALLEST, LARGEST = 1e-12, 1e9
-"""Between these, in SI, lies every area, height and flow of a rig: beyond is a slip of the unit or the exponent."""
-
-
-def _of(unit: str, **given: Any) -> Any:
-    """A field that holds a quantity of that unit."""
-    return field(metadata={"unit": unit}, **given)
-
-
-class Component:
-    """A part of a rig. Where a field that has a unit is text, such as '200 cm^2', it becomes its SI value.
-
-    Raises ValueError, naming component and field, for text that is no such quantity.
-    """
-
-    name: str
-
-    def __post_init__(self) -> None:
-        for each in fields(self):  # type: ignore[arg-type]
-            if "unit" in each.metadata:
-                self._settle(each.name, [each.metadata["unit"]])
-
-    def _settle(self, field_name: str, units: Sequence[str]) -> str | None:
-        """Turns a field into SI by the first unit that its text converts to; returns that, or None for a number."""
-        text = getattr(self, field_name)
-        if not isinstance(text, str):
-            return None
-        for unit in units:
-            try:
-                number = parse_quantity(text, unit)
-            except ValueError:
-                continue
-            if abs(number) <= MOST:
-                object.__setattr__(self, field_name, number)
-                return unit
-        place = f"{type(self).__name__.lower()}s.{self.name}.{field_name}"
-        raise ValueError(f"{place}: expected a quantity in {' or '.join(units)}, got '{text}'")
-
-
-@dataclass(frozen=True)
-class Tank(Component):
-    """area m^2; height m (the rim); start_level m, or None where it is the equilibrium of the first inputs.
-
-    overflow_to: the tank that catches what runs over the rim, or outside.
-    leak_reference: the pipe or outlet whose capacity a leak's size is a share of.
-    """
-
-    name: str
-    area: float = _of("m^2")
-    height: float = _of("m")
-    start_level: float | None = _of("m", default=None)
-    overflow_to: str = OUTSIDE
-    leak_reference: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.start_level == "equilibrium":  # as a plant file has it
-            object.__setattr__(self, "start_level", None)
-        super().__post_init__()
-
-
-@dataclass(frozen=True)
-class Pipe(Component):
-    """An orifice from one tank into another tank or the outside.
-
-    area m^2; elevation m above both floors. free_fall: it pours into `target` from above, so that only the
-    source's level drives it (always so into the outside). valve: the input channel with its measured opening (0..1);
-    unrecorded: its opening in recordings that lack the channel, None where every recording has to have it.
-    """
-
-    name: str
-    source: str
-    target: str
-    area: float = _of("m^2")
-    discharge_coefficient: float = _of("1")
-    elevation: float = _of("m", default=0.0)
-    free_fall: bool = False
-    valve: str | None = None
-    unrecorded: float | None = None
-
-    @property
-    def is_outlet(self) -> bool:
-        return self.target == OUTSIDE or self.free_fall
-
-
-@dataclass(frozen=True)
-class Pump(Component):
-    """Delivers gain x command into `target`, between 0 and max_flow (m^3/s).
-
-    command: the input channel, where that is not its name. gain: m^3/s per SI unit of the command (1 where the command
-    is a flow); as text ('2 l/min/V') it tells gain_unit, one of `COMMAND_UNITS`.
-    """
-
-    name: str
-    target: str
-    max_flow: float = _of("m^3/s")
-    gain: float = 1.0
-    command: str | None = None
-    gain_unit: str = "1"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "gain_unit", self._settle("gain", [*COMMAND_UNITS]) or self.gain_unit)
-
-    @property
-    def channel(self) -> str:
-        return self.command or self.name
-
-    @property
-    def command_unit(self) -> str:
-        """SI unit of the command."""
-        return COMMAND_UNITS[self.gain_unit]
-
-
-@dataclass(frozen=True)
-class Sensor(Component):
-    """reading = gain x level + offset, never below low nor above high. unit: SI unit of the reading ('m', 'Pa', 'V',
-    'A' or '1'), which a gain as text ('98.1 mbar/m') tells. channel: the output channel, where that is not its name.
-    """
-
-    name: str
-    tank: str
-    unit: str = "m"
-    gain: float = 1.0
-    offset: float = 0.0
-    channel: str | None = None
-    low: float | None = None
-    high: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        gain_unit = self._settle("gain", [*READING_UNITS])
-        if gain_unit is not None:
-            object.__setattr__(self, "unit", READING_UNITS[gain_unit])
-        for name in ("offset", "low", "high"):
-            self._settle(name, [self.unit])
-
-    @property
-    def column(self) -> str:
-        return self.channel or self.name
+"""Range of every plausible area, height and flow of a rig, SI; a number outside has a wrong unit or exponent."""
 
 
 @dataclass(frozen=True)
 class PlacedEffect:
-    """An effect that the plant is believed to have, with its parameters (SI); what `--adopt` adds."""
+    """A known effect of the plant, with its parameters (SI); `fdi gap --adopt` adds these."""
 
     effect: str
     location: str
@@ -173,9 +49,11 @@ class PlacedEffect:
 
 
 @dataclass(frozen=True)
-class Matter:
-    """What a fault means to who runs the rig. fault: a parameter ('T1.leak.size'). smallest: deviation from nominal
-    from which on it is said aloud, SI. urgency: a word of the plant's own, such as high.
+class FaultPriority:
+    """The importance of a fault to the operators of the rig.
+
+    fault: its size parameter ('T1.leak.size'). smallest: least deviation from nominal that the monitor reports, SI.
+    urgency: a free word such as high.
     """
 
     fault: str
@@ -185,10 +63,12 @@ class Matter:
 
 @dataclass(frozen=True)
 class PlantDescription:
-    """A rig. tolerances: one standard deviation of a constant ('P13.discharge_coefficient'), as a share of it; of an
-    offset or of an effect's parameter ('Q1.pump_lag.time_constant'), in its unit. varying: constants that are others
-    in each recording, such as the offset of a sensor that is zeroed before each run. matters: which faults a monitor
-    says aloud, and how urgent they are.
+    """A rig: its components, known effects and prior knowledge; gravity m/s^2.
+
+    tolerances: prior standard deviations, of a constant ('P13.discharge_coefficient') relative to its value, of an
+    offset, a start level or an effect's parameter ('Q1.pump_lag.time_constant') in its unit. varying: constants that
+    differ between recordings, such as the offset of a sensor that is zeroed before each run. matters: least
+    reported size and urgency of single faults; the monitor reports any other fault at any size.
     """
 
     name: str
@@ -199,7 +79,7 @@ class PlantDescription:
     effects: tuple[PlacedEffect, ...] = ()
     tolerances: dict[str, float] = field(default_factory=dict)
     varying: tuple[str, ...] = ()
-    matters: tuple[Matter, ...] = ()
+    matters: tuple[FaultPriority, ...] = ()
     gravity: float = 9.81
 
     def __post_init__(self) -> None:
@@ -220,7 +100,7 @@ class PlantDescription:
         raise ValueError(f"plant {self.name}: expected one of {', '.join(self.locations())}, got {name}")
 
     def tank_pairs(self) -> tuple[tuple[str, str], ...]:
-        """All unordered pairs of tanks; the location of an unknown path between two is 'T1-T2'."""
+        """All unordered pairs of tanks; the location of an effect between two tanks is 'T1-T2'."""
         names = [t.name for t in self.tanks]
         return tuple((a, b) for i, a in enumerate(names) for b in names[i + 1 :])
 
@@ -228,12 +108,12 @@ class PlantDescription:
         return tuple(c.name for c in self.components()) + tuple(f"{a}-{b}" for a, b in self.tank_pairs())
 
     def channels(self) -> tuple[str, ...]:
-        """The input channels that a recording must have: pump commands, then valve openings, each once."""
-        wanted = [p.channel for p in self.pumps] + [p.valve for p in self.pipes if p.valve]
-        return tuple(dict.fromkeys(wanted))
+        """The required input channels of a recording: pump commands, then valve openings, without repetition."""
+        channels = [p.channel for p in self.pumps] + [p.valve for p in self.pipes if p.valve]
+        return tuple(dict.fromkeys(channels))
 
     def channel_units(self) -> dict[str, str]:
-        """SI unit of each input channel: of the pump's command, or 1 for a valve's opening."""
+        """SI unit of each input channel: the unit of the pump's command, or 1 for a valve's opening."""
         units = {p.valve: "1" for p in self.pipes if p.valve} | {p.channel: p.command_unit for p in self.pumps}
         return {channel: units[channel] for channel in self.channels()}
 
@@ -271,7 +151,7 @@ def _check_references(plant: PlantDescription) -> None:
         expect_tank(f"tanks.{tank.name}.overflow_to", tank.overflow_to, (OUTSIDE,))
         pipes = [p.name for p in plant.pipes]
         if tank.leak_reference is not None and tank.leak_reference not in pipes:
-            known = ", ".join(pipes) or "none there are"
+            known = ", ".join(pipes) or "(the plant has none)"
             raise ValueError(
                 f"plant {plant.name}: tanks.{tank.name}.leak_reference: expected one of the pipes {known}, "
                 f"got '{tank.leak_reference}'"
@@ -298,17 +178,17 @@ def _check_numbers(plant: PlantDescription) -> None:
             )
     for pipe in plant.pipes:
         place = f"plant {plant.name}: pipes.{pipe.name}"
-        if not pipe.discharge_coefficient <= MOST_DISCHARGE:
+        if not pipe.discharge_coefficient <= LARGEST_DISCHARGE_COEFFICIENT:
             raise ValueError(
-                f"{place}.discharge_coefficient: expected at most {MOST_DISCHARGE:g}, got "
+                f"{place}.discharge_coefficient: expected at most {LARGEST_DISCHARGE_COEFFICIENT:g}, got "
                 f"{pipe.discharge_coefficient:g}; is it in per cent?"
             )
         if pipe.unrecorded is not None and not 0 <= pipe.unrecorded <= 1:
             raise ValueError(f"{place}.unrecorded: expected an opening from 0 to 1, got {pipe.unrecorded:g}")
         if not 0 <= pipe.elevation <= LARGEST:
             raise ValueError(
-                f"plant {plant.name}: pipes.{pipe.name}.elevation: expected a height above both floors, got "
-                f"{pipe.elevation:g} m; shift the zero of its tanks"
+                f"plant {plant.name}: pipes.{pipe.name}.elevation: expected at least 0 m above both floors, got "
+                f"{pipe.elevation:g} m; move the zero of the tanks' levels below the pipe"
             )
     for sensor in plant.sensors:
         place = f"plant {plant.name}: sensors.{sensor.name}"
@@ -318,9 +198,3 @@ def _check_numbers(plant: PlantDescription) -> None:
             raise ValueError(
                 f"{place}: expected low < high, got {sensor.low:g} and {sensor.high:g} {sensor.unit}; swap them"
             )
-
-
-def describe(component: Any) -> str:
-    """'tank T1', 'pipe P13' ...: a component in words."""
-    kind = "outlet" if isinstance(component, Pipe) and component.is_outlet else type(component).__name__.lower()
-    return f"{kind} {component.name}"

@@ -1,7 +1,7 @@
-"""The socket: what a fault or an unmodelled effect is to the plant.
+"""The interface of an effect: a fault or an unmodelled effect of one component.
 
-Both are a deviation of one component, with an equation and parameters that vanish at their nominal value.
-An effect overrides the one hook of its stage; every other hook passes its value on unchanged.
+Both are a deviation of one component from the nominal model, with an equation and with parameters that vanish at their
+nominal value. An effect overrides the hook of its stage; every other hook passes its value on unchanged.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from torch import Tensor
 
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.plant.orifice import signed_root
-from fdi_torch.plant.reach import Reach
 from fdi_torch.plant.signals import Clock
 
 Memory = tuple[Tensor, ...]
@@ -25,7 +25,7 @@ Values = Mapping[str, Tensor]
 
 
 class Stage(Enum):
-    """Where water meets the effect, in the order it takes."""
+    """The part of the model in which an effect acts, in the order in which `TankNetwork` computes them."""
 
     COMMAND = "command"
     FLOW = "flow"
@@ -36,12 +36,12 @@ class Stage(Enum):
 
 @dataclass(frozen=True)
 class Local:
-    """What holds at a place at one instant. All (*batch), SI.
+    """The conditions at one place at one instant. All (*batch), SI.
 
-    level: of the tank (pump: its target; pipe: its source); far_level: at the other end; head: what drives the flow;
-    capacity: flow at 1 m of head through the place's orifice (tank: through its leak reference), m^2.5/s;
-    command: of the pump or the valve's opening; net: what flows into the tank so far, m^3/s (BALANCE; elsewhere 0);
-    width: the head below which roots are drawn smooth, m; height: of that tank's rim, m; gravity: m/s^2;
+    level: of the tank (pump: its target; pipe: its source); far_level: at the other end; head: driving head of the
+    flow; capacity: flow at 1 m of head through the place's orifice (tank: through its leak reference), m^2.5/s;
+    command: of the pump, or opening of the valve; net: net inflow of the tank so far, m^3/s (BALANCE; elsewhere 0);
+    width: head below which square roots are smoothed, m; height: of the tank, floor to rim, m; gravity: m/s^2;
     constants: the component's constants by field name.
     """
 
@@ -58,26 +58,25 @@ class Local:
     constants: Values
 
     def root(self, head: Tensor) -> Tensor:
-        """The signed square root of a head, regularised."""
+        """Regularised signed square root of a head, sgn(x) sqrt(|x|), m^0.5 (see `signed_root`)."""
         return signed_root(head, self.width)
 
     def magnitude(self, head: Tensor) -> Tensor:
-        """|head|, rounded off at zero so that it can be divided by: sqrt(x^2 + w^2)."""
+        """|head| smoothed at zero to sqrt(x^2 + w^2), so that it can be a divisor, m."""
         return torch.sqrt(head * head + self.width * self.width)
 
 
 class Effect:
-    """Base of all faults and unmodelled effects.
+    """Base class of all faults and unmodelled effects.
 
-    name: as in configs and answers. stage: which hook it overrides. places: the kinds of component it can sit at,
-    of 'pump', 'pipe', 'outlet', 'valve', 'tank', 'tank_pair', 'sensor'. memory: how many memory states it keeps.
-    smooth: whether the size's gradient at nominal is not zero. mistaken_for: effects that explain nearly the same data.
-    delays, rounds: whether it makes the signal late, or the reading coarse. at_first: whether it acts only until its
-    component has run for the first time. of_build: whether it comes with how a component is built, so that one of the
-    same make is expected to have it too. on_clock: parameters that tie it to the clock of one recording where they are
-    fitted (a moment, a phase, a pace since the start).
-    The first of its parameters is its size: where that is nominal, the effect is not there. The others are its
-    shape: nominal there is a typical value, or one (an onset of 0, a ramp of 0) that keeps the effect simple.
+    name: as in configurations and results. stage: the stage whose hook it overrides. places: the kinds of component at
+    which it can be placed, of 'pump', 'pipe', 'outlet', 'valve', 'tank', 'tank_pair', 'sensor'. memory: number of its
+    memory states. smooth: whether the gradient with respect to its size is non-zero at nominal. mistaken_for: effects
+    that explain nearly the same data. delays: whether it adds dead time to its signal. quantizes: whether it rounds
+    the reading. startup_only: whether it acts only until its component has run for the first time.
+
+    The first parameter is the effect's size: at its nominal value the effect is absent. The others are its shape; their
+    nominal values are typical ones, or those that keep the effect simple (onset 0, ramp 0).
     """
 
     name: ClassVar[str]
@@ -86,21 +85,19 @@ class Effect:
     memory: ClassVar[int] = 0
     smooth: ClassVar[bool] = True
     delays: ClassVar[bool] = False
-    rounds: ClassVar[bool] = False
-    at_first: ClassVar[bool] = False
-    of_build: ClassVar[bool] = False
-    on_clock: ClassVar[tuple[str, ...]] = ("onset",)
+    quantizes: ClassVar[bool] = False
+    startup_only: ClassVar[bool] = False
     mistaken_for: ClassVar[tuple[str, ...]] = ()
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        """Its parameters at that place, size first, under their own short names; ranges may follow the component."""
+        """Its parameters at that place, size first, under their short names; ranges may depend on the component."""
         raise NotImplementedError
 
-    def starts(self, place: str, plant: PlantDescription, reach: Reach) -> list[dict[str, float]]:
-        """Where a fit may begin (SI, short names). A start names what is to be fitted; the rest stays nominal.
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
+        """Starting points for a fit (SI, short names). Only the named parameters are fitted; the others stay nominal.
 
-        Here: a tenth of the size's range in each direction, the shape as it is. Effects with a threshold, which no
-        gradient finds, return a small grid over what the recording reaches.
+        Default: 10 % of the size's range in each direction with the nominal shape. Effects with a threshold, where the
+        gradient vanishes, return a coarse grid over the operating range.
         """
         size, *shape = self.parameters(place, plant)
         typical = {p.name: p.nominal for p in shape}
@@ -108,19 +105,19 @@ class Effect:
         return [{size.name: size.nominal + 0.1 * (bound - size.nominal)} | typical for bound in bounds]
 
     def delay(self, p: Values) -> Tensor:
-        """COMMAND, READING: by how many seconds the signal is late (only where `delays`)."""
+        """COMMAND, READING: dead time that the effect adds to its signal, s (only where `delays`)."""
         raise NotImplementedError
 
-    def remember(self, value: Tensor, p: Values) -> Memory:
-        """COMMAND, READING: the memory of a signal that has long been `value`."""
+    def steady_memory(self, value: Tensor, p: Values) -> Memory:
+        """COMMAND, READING: the memory in steady state, after the signal has been `value` for a long time."""
         return ()
 
     def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
-        """COMMAND: the mean command (or valve opening) over the step -> what the actuator does, and its memory."""
+        """COMMAND: mean command (or valve opening) over the step -> mean actuator output over the step, new memory."""
         return value, memory
 
     def head(self, head: Tensor, local: Local, p: Values) -> Tensor:
-        """FLOW: the head that drives a pipe, m."""
+        """FLOW: the driving head of a pipe, m."""
         return head
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
@@ -128,11 +125,11 @@ class Effect:
         return flow
 
     def inflow(self, local: Local, p: Values) -> Tensor:
-        """BALANCE: further net inflow of a tank, m^3/s; at a tank pair 'A-B' what flows from A to B."""
+        """BALANCE: additional net inflow of a tank, m^3/s; at a tank pair 'A-B', the flow from A to B."""
         raise NotImplementedError
 
-    def caught(self, p: Values) -> Mapping[str, Tensor]:
-        """BALANCE at a tank: which share of what it loses other tanks get; the rest leaves the plant."""
+    def recipients(self, p: Values) -> Mapping[str, Tensor]:
+        """BALANCE at a tank: share of the lost flow that each other tank receives; the rest leaves the plant."""
         return {}
 
     def area(self, area: Tensor, local: Local, p: Values) -> Tensor:
@@ -140,17 +137,17 @@ class Effect:
         return area
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
-        """READING: value at the end of the sampling interval -> the sensor's value, and its memory."""
+        """READING: sensor signal at the end of the sampling interval -> indicated value, new memory."""
         return value, memory
 
     def resolution(self, p: Values) -> Tensor:
-        """READING: the width of one step of a rounded reading (only where `rounds`), in the reading's unit."""
+        """READING: quantization step in the reading's unit (only where `quantizes`)."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Placement:
-    """An effect at a place. values: what its parameters are believed to be (SI); nominal where not named."""
+    """An effect at a place. values: its known parameters (SI); the others are nominal."""
 
     effect: Effect
     location: str
@@ -162,7 +159,7 @@ class Placement:
 
 
 def place_kind(plant: PlantDescription, location: str) -> str:
-    """'pump', 'pipe', 'outlet', 'tank', 'tank_pair' or 'sensor'. Raises ValueError for a place the plant lacks."""
+    """'pump', 'pipe', 'outlet', 'tank', 'tank_pair' or 'sensor'. Raises ValueError for an unknown place."""
     if location in {f"{a}-{b}" for a, b in plant.tank_pairs()}:
         return "tank_pair"
     component = plant.component(location)
@@ -172,7 +169,7 @@ def place_kind(plant: PlantDescription, location: str) -> str:
 
 
 def fits(effect: Effect, plant: PlantDescription, location: str) -> bool:
-    """Whether the effect can sit there."""
+    """Whether the effect can be placed at this location."""
     kind = place_kind(plant, location)
     component = None if kind == "tank_pair" else plant.component(location)
     with_valve = isinstance(component, Pipe) and component.valve is not None

@@ -1,4 +1,4 @@
-"""Torricelli's law through an orifice, regularised so that it has finite slope everywhere."""
+"""Outflow laws: Torricelli's law with finite slope at zero head, overflow over a rim, and a tank that runs empty."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import math
 import torch
 from torch import Tensor
 
-# RK4 is stable on the real axis down to -2.785. Errors over random faults were least with roots at this rate x step,
-# and rims at that one: enough below the limit for several orifices on one tank.
+# Stability of explicit RK4 on the real axis requires |rate x step| < 2.785. These values had the least error over
+# random faults; they leave a margin for several orifices on one tank.
 STABLE_RATE_TIMES_STEP = 2.2
 STABLE_SPILL_TIMES_STEP = 1.7
 EMPTYING_RATE_TIMES_STEP = 2.0
 WEIR_COEFFICIENT = 0.6
-_DRY = 1e-9  # m; keeps the weir's slope finite where nothing runs over it
+_DRY = 1e-9  # m; keeps the weir's slope finite at zero excess
 
 
 def signed_root(head: Tensor, width: Tensor) -> Tensor:
@@ -25,7 +25,7 @@ def signed_root(head: Tensor, width: Tensor) -> Tensor:
 
 
 def regular_width(rate: float, resolution: Tensor) -> Tensor:
-    """The width (m) at which the levels' fastest rate, `rate` / sqrt(w), suits a step of `resolution` (s).
+    """Smoothing width w (m) at which the levels' fastest rate, `rate` / sqrt(w), is stable at a step `resolution` (s).
 
     rate = C_d a sqrt(2 g) (1/A_1 + 1/A_2), in m^0.5/s.
     """
@@ -34,27 +34,26 @@ def regular_width(rate: float, resolution: Tensor) -> Tensor:
 
 
 def orifice_capacity(discharge_coefficient: Tensor, area: Tensor, gravity: Tensor) -> Tensor:
-    """C_d a sqrt(2 g): the flow at 1 m of head, m^2.5/s (Torricelli)."""
+    """C_d a sqrt(2 g): flow at 1 m of head, m^2.5/s (Torricelli)."""
     return discharge_coefficient * area * torch.sqrt(2.0 * gravity)
 
 
 def rim_strength(tank_area: Tensor, gravity: Tensor) -> Tensor:
-    """(2/3) C sqrt(2 g) 2 sqrt(pi A): the flow over the whole rim of a round tank at 1 m above it, m^1.5/s.
+    """Weir coefficient of a round tank's rim: (2/3) C sqrt(2 g) 2 sqrt(pi A), m^1.5/s.
 
-    A sharp-crested weir as long as the rim; x^(3/2) of it at x m.
+    The rim is a sharp-crested weir of length 2 sqrt(pi A); its overflow at x m above it is this times x^(3/2), m^3/s.
     """
     crest = 2.0 * torch.sqrt(math.pi * tank_area)
     return (2.0 / 3.0) * WEIR_COEFFICIENT * torch.sqrt(2.0 * gravity) * crest
 
 
-def held(rate: Tensor, level: Tensor, resolution: Tensor) -> Tensor:
-    """dh/dt (m/s) of a tank at `level` m that would change by `rate`: one that runs dry stays at its floor.
+def limit_emptying(rate: Tensor, level: Tensor, resolution: Tensor) -> Tensor:
+    """Limit dh/dt (m/s) from below so that a tank never falls below its floor: max(rate, -2 h / r).
 
-    What draws at an empty tank (a drain whose end lies lower, evaporation) would have the rate jump there, where no
-    step ends: so the last of the level goes no faster than 2 / r of it, r = `resolution` s. The implicit midpoint rule
-    then ends a step of r at the floor, and RK4 is stable.
+    A drain that ends below the floor, or evaporation, would make the rate jump at level 0 within a step. With
+    r = `resolution` (s), an implicit midpoint step of r ends at the floor, and RK4 is stable.
     """
-    # At the floor itself without a slope: a guess that it is dry gives way at once to water that comes after all.
+    # No slope at the floor itself: otherwise an iteration that starts from an empty tank could not leave it at once.
     slowest = torch.where(level > 0.0, -EMPTYING_RATE_TIMES_STEP * level / resolution, 0.0)
     return torch.maximum(rate, slowest)
 
@@ -62,11 +61,12 @@ def held(rate: Tensor, level: Tensor, resolution: Tensor) -> Tensor:
 def weir_flow(
     excess: Tensor, inflow: Tensor | float, tank_area: Tensor, strength: Tensor, resolution: Tensor
 ) -> Tensor:
-    """What runs over a rim (or a share of it) of that strength at `excess` m above it while `inflow` m^3/s comes in.
+    """Flow over a rim, or over a share of it, m^3/s.
 
-    w(x) = strength x^(3/2), m^3/s. It is far faster than the tank: where w'(x) r / A is too large for a step of
-    r = `resolution` s, it is taken linearly implicitly for the excess a of that number (Rosenbrock 1963),
-    (w + a q) / (1 + a). At rest this is w = q exactly, at any step.
+    w(x) = strength x^(3/2) at the excess x = `excess` (m) above the rim, while `inflow` (m^3/s) enters the tank. This
+    is much faster than the tank itself. Where the number w'(x) r / A exceeds its stable limit by a > 0, with r =
+    `resolution` (s), the flow is taken linearly implicitly (Rosenbrock, 1963): (w + a q) / (1 + a). The steady state is
+    w = q for every step.
     """
     above = torch.clamp(excess, min=0.0)
     root = torch.sqrt(above + _DRY)

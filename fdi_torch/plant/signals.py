@@ -1,4 +1,4 @@
-"""Time inside a simulation: the clock of one step, and held or linear signals averaged exactly over it."""
+"""Time inside a simulation: the clock of one step, and exact means of sampled signals over a step."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SAME_INSTANT = 1e-9  # s; closer than this, two instants differ by rounding only
 class Clock:
     """One integration step, or one sampling interval, [start, start + step] in s.
 
-    resolution: the shortest time the integrator resolves, in s; it sets how sharply roots and rims are drawn.
+    resolution: the shortest time that the integrator resolves, s; it sets the smoothing of square roots and rims.
     """
 
     start: Tensor
@@ -33,43 +33,43 @@ class Clock:
         return self.start + self.step
 
     def share_after(self, instant: Tensor) -> Tensor:
-        """The share of the step that lies after `instant`: a switch that no step needs to hit."""
+        """Share of the step after `instant`: the exact mean over the step of a switch at that instant."""
         return torch.clamp((self.end - instant) / self.step, 0.0, 1.0)
 
     def risen(self, onset: Tensor, ramp: Tensor) -> Tensor:
-        """The mean over the step of a rise from 0 to 1 that begins at `onset` and takes `ramp` seconds, exactly."""
+        """Exact mean over the step of a linear rise from 0 to 1 that begins at `onset` (s) and takes `ramp` (s)."""
         return (_rise_integral(self.end - onset, ramp) - _rise_integral(self.start - onset, ramp)) / self.step
 
     def risen_by_end(self, onset: Tensor, ramp: Tensor) -> Tensor:
-        """The same rise as a sample at the step's end sees it, drawn over one sampling interval where it is abrupt.
+        """The rise from 0 to 1 as a sample at the step's end shows it, smoothed over one sampling interval.
 
-        A sample at the onset or later sees an abrupt rise in full, so that an onset of 0 has always been there.
+        A sample at or after the onset of an abrupt rise shows it in full; an onset of 0 therefore acts from the start.
         """
         return torch.clamp((self.end - onset + self.step) / (torch.clamp(ramp, min=0.0) + self.step), 0.0, 1.0)
 
     def decay(self, time_constant: Tensor) -> Tensor:
-        """exp(-step / time constant); exactly 0, with slope 0, where the time constant vanishes beside the step."""
+        """exp(-step / time constant); exactly 0, with zero slope, for time constants far below the step."""
         ratio = torch.clamp(time_constant / self.step, min=1e-3)
         return torch.exp(-1.0 / ratio)
 
     def sine(self, period: Tensor, phase: Tensor) -> Tensor:
-        """The mean of sin(2 pi t / period + phase) over the step."""
+        """Mean of sin(2 pi t / period + phase) over the step."""
         half = math.pi * self.step / period
         return torch.sin(2.0 * math.pi * self.middle / period + phase) * torch.sin(half) / half
 
 
 def _rise_integral(since: Tensor, ramp: Tensor) -> Tensor:
-    """The integral of a rise from 0 to 1 within `ramp` (s), up to `since` seconds after it began."""
+    """Integral of a linear rise from 0 to 1 within `ramp` (s), from its onset to `since` seconds after it, s."""
     after = torch.clamp(since, min=0.0)
     rising = torch.minimum(after, ramp)
     return after - rising + 0.5 * rising * (rising / torch.clamp(ramp, min=1e-9))
 
 
 class CumulativeSignal:
-    """The integral of an input channel, so that its mean over any interval is exact, delayed or not.
+    """The integral of each input channel, which gives its exact mean over any interval, delayed or not.
 
-    time (T,) s, values (T, C). A held signal is integrated exactly between all instants; a linear one at its samples.
-    Before the first sample the signal is what it is there; after the last one likewise.
+    time (T,) s, values (T, C). A zero-order-hold signal is integrated exactly between any two instants; a linear one
+    between its samples. The signal is constant before the first and after the last sample.
     """
 
     def __init__(self, time: Tensor, values: Tensor, hold: Hold) -> None:
@@ -95,5 +95,5 @@ class CumulativeSignal:
         return (self.up_to(begin + step, channel) - self.up_to(begin, channel)) / step
 
     def _interval(self, instant: Tensor) -> Tensor:
-        """Which slope holds up to `instant`; at a switch the one before it: a delay reaches back, never ahead."""
+        """Index of the slope that holds up to `instant`; at a sample the one before it, because a delay looks back."""
         return torch.searchsorted(self.time, instant.detach() - SAME_INSTANT)

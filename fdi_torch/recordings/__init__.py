@@ -1,1 +1,3 @@
-"""Recordings out of files (CSV, MCAP logs, files that still grow), and what is odd about one before it is fitted."""
+"""Recordings from files (CSV and other tables, MCAP logs, files that still grow), and checks of a recording before a
+fit.
+"""

@@ -1,4 +1,6 @@
-"""Channels tied to the columns of a CSV file: by a header that tells its unit, or by what was said of them."""
+"""The binding of channels to the columns of a CSV file, by headers with units or by the mapping in the
+configuration.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from fdi_torch.parameters import header_unit, si_unit_of, unit_factor
 from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
 from fdi_torch.recordings.csv_text import Heading
 from fdi_torch.recordings.source import ChannelSource, ClockSource
-from fdi_torch.recordings.stamps import stamp_reader
+from fdi_torch.recordings.time_stamps import stamp_reader
 
 TIME_NAMES = (
     *("t", "time", "timestamp", "datetime", "date time", "date_time", "date/time", "time stamp", "utc"),
@@ -22,8 +24,9 @@ TIME_NAMES = (
 
 @dataclass(frozen=True)
 class Bound:
-    """A channel tied to the file: position of its column (or a constant), factor into SI, SI unit, and what its cells
-    mean. stamps: its cells are time stamps. plus: what is added to it.
+    """A channel bound to a column: position (None for a constant), factor into SI, SI unit, and the rule of its cells.
+
+    stamps: whether its cells are time stamps. plus: further columns that are added to it.
     """
 
     name: str
@@ -38,11 +41,11 @@ class Bound:
 
 
 def bind_clock(path: Path, header: Sequence[str], source: ChannelSource | None) -> Bound:
-    """The column of time: the one mapped, or one of `TIME_NAMES` with a unit, or one of them that holds time stamps."""
+    """The column of time: the mapped one, or one of `TIME_NAMES` with a unit, or one of them that holds time stamps."""
     source = source or ClockSource()
     if source.column is None:
-        split = {h: header_unit(h) for h in header}
-        timed = [h for h, found in split.items() if found and found[0].lower() in TIME_NAMES]
+        units = {h: header_unit(h) for h in header}
+        timed = [h for h, unit in units.items() if unit and unit[0].lower() in TIME_NAMES]
         stamped = sorted((h for h in header if h.lower() in TIME_NAMES), key=lambda h: TIME_NAMES.index(h.lower()))
         source = replace(source, column=(timed or stamped or ["t"])[0])
     column = _find_column(path, header, "t", source.column)
@@ -52,6 +55,9 @@ def bind_clock(path: Path, header: Sequence[str], source: ChannelSource | None) 
 
 
 def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | None, want: str | None = None) -> Bound:
+    """The binding of one channel; want: the SI unit that it must have. Raises ValueError for a missing column or a
+    wrong unit.
+    """
     source = source or ChannelSource()
     if source.constant is not None:
         unit = source.unit or "1"
@@ -69,11 +75,13 @@ def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | N
 
 
 def column_of(path: Path, header: Sequence[str], column: str) -> str:
-    """A header that was given for what is no channel. Raises ValueError where there is none."""
+    """The header `column` of a column that is no channel. Raises ValueError, with the nearest header, if there
+    is none.
+    """
     if column in header:
         return column
-    near = difflib.get_close_matches(column, header, n=1, cutoff=0.5)
-    hint = f"; the nearest is {near[0]}" if near else ""
+    nearest = difflib.get_close_matches(column, header, n=1, cutoff=0.5)
+    hint = f"; the nearest is {nearest[0]}" if nearest else ""
     raise ValueError(f"{path}: expected a column '{column}', got {', '.join(header)}{hint}")
 
 
@@ -85,26 +93,28 @@ def _rule(path: Path, header: Sequence[str], name: str, source: ChannelSource) -
 
 
 def rule_of(source: ChannelSource, quality: int | None) -> Rule:
-    """What was said of a channel's cells. Words that are numbers, such as -9999, are known by their value."""
+    """The rule of a channel's cells. Words that are numbers, such as -9999, are compared by value."""
     words = {text.strip().lower(): BAD if isnan(value) else value for text, value in source.words.items()}
     good = frozenset(word.strip().lower() for word in source.good) or GOOD_WORDS
     return Rule(words, quality, good)
 
 
 def _find_column(path: Path, header: Sequence[str], name: str, column: str | None) -> str:
-    """The column mapped to a channel: by its whole header, or by the name in a header of the form name_unit."""
+    """The column of a channel: with this whole header, or with this name in a header of the form name_unit."""
     wanted = column or name
     splits = [(h, header_unit(h)) for h in header]
-    meant = [h for h in header if h == wanted] or [h for h, split in splits if split and split[0] == wanted]
-    if len(meant) > 1:
-        fix = f"map one under columns: {{{name}: {{column: {meant[0]}}}}}" if meant[0] != meant[1] else "rename one"
-        raise ValueError(f"{path}: expected one column for {name}, got {' and '.join(meant)}; {fix}")
-    if meant:
-        return meant[0]
+    matches = [h for h in header if h == wanted] or [h for h, split in splits if split and split[0] == wanted]
+    if len(matches) > 1:
+        fix = (
+            f"map one under columns: {{{name}: {{column: {matches[0]}}}}}" if matches[0] != matches[1] else "rename one"
+        )
+        raise ValueError(f"{path}: expected one column for {name}, got {' and '.join(matches)}; {fix}")
+    if matches:
+        return matches[0]
     names = {split[0]: h for h, split in splits if split}
-    near = difflib.get_close_matches(wanted, [*header, *names], n=1, cutoff=0.5)
-    near = [h for h in header if h.lower().startswith(wanted.lower())] or near if len(wanted) > 1 else near
-    hint = f"; the nearest is {names.get(near[0], near[0])}" if near else ""
+    nearest = difflib.get_close_matches(wanted, [*header, *names], n=1, cutoff=0.5)
+    nearest = [h for h in header if h.lower().startswith(wanted.lower())] or nearest if len(wanted) > 1 else nearest
+    hint = f"; the nearest is {names.get(nearest[0], nearest[0])}" if nearest else ""
     raise ValueError(
         f"{path}: expected a column for {name} ('{wanted}' or '{wanted}_UNIT'), got {', '.join(header)}{hint}; "
         f"map it under columns: {{{name}: {{column: ..., unit: ...}}}}"
@@ -112,21 +122,21 @@ def _find_column(path: Path, header: Sequence[str], name: str, column: str | Non
 
 
 def _unit_in(path: Path, column: str, name: str) -> str:
-    split = header_unit(column)
-    if split is None:
+    name_and_unit = header_unit(column)
+    if name_and_unit is None:
         raise ValueError(
             f"{path}: column {column}: expected a header of the form name_unit such as h1_cm, got no unit in it; "
             f"give the unit under columns: {{{name}: {{column: {column}, unit: ...}}}}"
         )
-    return split[1]
+    return name_and_unit[1]
 
 
 def columns_of(
     path: Path, heading: Heading, bounds: Sequence[Bound], clock: ChannelSource | None = None, sparse: bool = False
 ) -> Columns:
-    """The columns of the file that are read, each once, in the order of their first use: time comes first.
+    """The columns of the file to read, each once, in the order of their first use: time comes first.
 
-    clock: how its time stamps are written. sparse: empty cells are other than those that say that nothing was read.
+    clock: the format of its time stamps. sparse: whether empty cells differ from cells that report a bad value.
     """
     bounds = [each for bound in bounds for each in (bound, *bound.plus)]
     positions = list(dict.fromkeys(b.position for b in bounds if b.position is not None))

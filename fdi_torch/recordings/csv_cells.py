@@ -1,4 +1,4 @@
-"""The cells of a CSV file: numbers with a point or a comma, cells that say that nothing was read, time stamps."""
+"""The cells of a CSV file: numbers with a decimal point or comma, words for bad values, and time stamps."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.recordings.csv_text import Heading, rows_of
-from fdi_torch.recordings.stamps import seconds_of
+from fdi_torch.recordings.time_stamps import seconds_of
 
 BAD = float("inf")
-"""A cell that says that nothing could be read, unlike an empty one (NaN), where nothing was logged."""
+"""The value of a cell that reports a bad reading; an empty cell, where nothing was logged, is NaN."""
 BAD_WORDS = frozenset(
     {"nan", "na", "n/a", "null", "none", "-", "--", "---", "bad", "bad input", "no data", "invalid", "error", "err"}
     | {"#n/a", "#div/0!", "#value!", "#ref!", "#num!", "#name?", "#null!"}
@@ -21,13 +21,15 @@ BAD_WORDS = frozenset(
     | {"calc failed", "configure", "over range", "under range", "out of serv", "offline", "disconnected"}
 )
 GOOD_WORDS = frozenset({"good", "ok", "valid", "g", "192", "0xc0", "0x00c0", "good, non-specific", "0x000000c0"})
-"""What servers write beside a value that counts; 192 is OPC's."""
+"""Quality words of valid values; 192 is OPC's."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What cells of a column mean beyond numbers. words: by lower case, in the column's unit; BAD where nothing was
-    read. quality: position of the column that tells whether a value counts, `good` the words by which it does.
+    """The meaning of a column's cells beyond numbers.
+
+    words: lower-case text -> value in the column's unit, BAD for a bad reading. quality: position of the column with
+    the quality of the value; good: its words for a valid value.
     """
 
     words: Mapping[str, float] = field(default_factory=dict)
@@ -37,8 +39,10 @@ class Rule:
 
 @dataclass(frozen=True)
 class Columns:
-    """Which columns (positions) are read, which of them holds time stamps instead of numbers and how these are read,
-    and by which rules. sparse: whether an empty cell is another thing than one that says that nothing was read.
+    """The columns to read, by position, with their rules.
+
+    stamps: the column with time stamps, read by `read_stamp`. sparse: whether empty cells differ from cells that report
+    a bad value.
     """
 
     path: Path
@@ -51,7 +55,7 @@ class Columns:
 
 
 def parse_fast(lines: list[str], columns: Columns) -> np.ndarray:
-    """Well-formed lines, in C, as (rows, columns) float64. Raises ValueError for anything else."""
+    """Parse well-formed lines in C into (rows, columns) float64. Raises ValueError for anything else."""
     delimiter, width = columns.heading.delimiter, len(columns.heading.names)
     if columns.rules or columns.sparse or any(line.count(delimiter) != width - 1 for line in lines):
         raise ValueError("uneven rows, or cells with more than numbers")
@@ -72,8 +76,8 @@ def parse_fast(lines: list[str], columns: Columns) -> np.ndarray:
 
 
 def parse_carefully(lines: list[str], columns: Columns, above: int) -> np.ndarray:
-    """Cell by cell: knows empty cells (NaN) and bad ones (BAD), and names the wrong one. above: lines of the file
-    before these.
+    """Parse lines cell by cell: empty cells are NaN, bad ones BAD; an error names row and column. above: lines before
+    these.
     """
     return np.array(list(_rows(lines, columns, above)), dtype=np.float64).reshape(-1, len(columns.positions))
 
@@ -101,11 +105,11 @@ def _value(cells: list[str], position: int, columns: Columns) -> float:
     rule, delimiter = columns.rules.get(position), columns.heading.delimiter
     if rule is None:
         return number_in(cells[position], delimiter)
-    return ruled(cells[position], None if rule.quality is None else cells[rule.quality], rule, delimiter)
+    return apply_rule(cells[position], None if rule.quality is None else cells[rule.quality], rule, delimiter)
 
 
-def ruled(cell: str, quality: str | None, rule: Rule, delimiter: str) -> float:
-    """The number in a cell, given what its column's words mean and how good it is said to be."""
+def apply_rule(cell: str, quality: str | None, rule: Rule, delimiter: str) -> float:
+    """The number in a cell, given the rule of its column and its quality."""
     text = cell.strip().lower()
     if text and quality is not None and quality.strip().lower() not in rule.good:
         return BAD
@@ -116,7 +120,7 @@ def ruled(cell: str, quality: str | None, rule: Rule, delimiter: str) -> float:
 
 
 def _is_number(word: str, number: float) -> bool:
-    """Whether a word is that number, as -9999 is -9999.0."""
+    """Whether a word has that value, as -9999 has that of -9999.0."""
     try:
         return float(word) == number
     except ValueError:
@@ -124,6 +128,7 @@ def _is_number(word: str, number: float) -> bool:
 
 
 def number_in(cell: str, delimiter: str) -> float:
+    """The number in a cell: NaN if empty, BAD for a word of `BAD_WORDS`. Raises ValueError for other text."""
     text = cell.strip()
     if not text:
         return float("nan")

@@ -1,9 +1,9 @@
-"""Recordings from CSV files (plain or .gz), and from other tables as if they were, read in blocks of lines: a long file
-costs its numbers and little more.
+"""Recordings from CSV files (plain or .gz), and from other tables in the same way, read in blocks of lines.
 
-A header of the form name_unit (`t_s`, `Q1_cm3_s`, `h1_cm`) or name [unit] tells all; other headers are mapped by
-`ChannelSource`. Empty and non-finite cells are allowed in channels (a missing reading, an unknown command), never in
-time. Where time has no unit it is time stamps; of these, and of seconds since 1970, the first is t = 0.
+A header of the form name_unit (`t_s`, `Q1_cm3_s`, `h1_cm`) or name [unit] is complete; other headers are mapped by
+`ChannelSource`. Empty and non-finite cells are allowed in channels (a missing reading, an unknown command) but not in
+time. A time without unit consists of time stamps; the first time stamp, or first number of seconds since 1970, is t =
+0.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
 from fdi_torch.recordings.csv_tags import read_tags
 from fdi_torch.recordings.csv_text import heading_of, open_csv
-from fdi_torch.recordings.sheets import Sheet, in_order, telling_rows, woven
+from fdi_torch.recordings.sheets import Sheet, in_order, informative_rows, merge_sheets
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, file_sha256
-from fdi_torch.recordings.stamps import from_zone
+from fdi_torch.recordings.time_stamps import from_zone
 
 LINES_PER_BLOCK = 1 << 16
-SINCE_1970 = 1e8  # s; later than that is no rig's own clock
+SINCE_1970 = 1e8  # s; larger times are taken to be seconds since 1970
 
 
 @dataclass(frozen=True)
 class Read:
-    """What one file has of the channels asked of it: sheets, SI units, constants, and sentences on what was done."""
+    """The requested channels of one file: sheets, SI units, constants, and notes on corrections."""
 
     sheets: Sequence[Sheet]
     units: Mapping[str, str]
@@ -52,10 +52,10 @@ def read_csv(
     mapping: Mapping[str, ChannelSource] | None = None,
     hold: Hold = "zero_order",
 ) -> Recording:
-    """The named channels of a CSV file as a recording in SI. In `mapping`, time goes by the name `t`.
+    """The named channels of a CSV file as a recording in SI. In `mapping`, time has the name `t`.
 
-    Raises ValueError, naming file, row and column, for a missing column (with the nearest one there is), a cell that
-    is no number, time that does not increase, and a file without rows.
+    Raises ValueError, naming file, row and column, for a missing column (with the nearest header), a cell that is not a
+    number, time that does not increase, and a file without rows.
     """
     return read_csv_files([FileSource(path, mapping or {})], inputs, outputs, hold)
 
@@ -63,20 +63,26 @@ def read_csv(
 def read_csv_files(
     files: Sequence[FileSource], inputs: Sequence[str], outputs: Sequence[str], hold: Hold = "zero_order"
 ) -> Recording:
-    """The same from several files, on the union of their times: a channel is taken from the first file whose `columns`
-    name it, or else that has it in its header.
+    """The named channels of several files on the union of their times.
+
+    A channel is taken from the first file whose `columns` name it, or else from the first with it in its header.
     """
-    shares = _shared_out(files, (*inputs, *outputs))
-    parts = [_read(file, names) for file, names in zip(files, shares, strict=True) if names]
-    sources = {n: f.columns[n] for f, names in zip(files, shares, strict=True) for n in names if n in f.columns}
-    stands = {name: sources[name].held if name in sources else 0.0 for name in inputs}
-    whole = woven([sheet for part in parts for sheet in part.sheets], stands, hold)
-    constants = {name: value for part in parts for name, value in part.constants.items()}
-    units = {name: unit for part in parts for name, unit in part.units.items()}
-    commands, readings = (_columns(whole, names, constants) for names in (inputs, outputs))
-    rows = telling_rows(commands, readings, hold) if sum(len(part.sheets) for part in parts) > 1 else slice(None)
-    seconds = whole.seconds[rows]
-    since_1970 = any(part.stamps for part in parts) or float(seconds[0]) > SINCE_1970
+    names_by_file = _assign_to_files(files, (*inputs, *outputs))
+    parts = [_read(file, names) for file, names in zip(files, names_by_file, strict=True) if names]
+    sources = {
+        name: f.columns[name]
+        for f, names in zip(files, names_by_file, strict=True)
+        for name in names
+        if name in f.columns
+    }
+    hold_times = {name: sources[name].held if name in sources else 0.0 for name in inputs}
+    merged = merge_sheets([sheet for p in parts for sheet in p.sheets], hold_times, hold)
+    constants = {name: value for p in parts for name, value in p.constants.items()}
+    units = {name: unit for p in parts for name, unit in p.units.items()}
+    commands, readings = (_columns(merged, names, constants) for names in (inputs, outputs))
+    rows = informative_rows(commands, readings, hold) if sum(len(p.sheets) for p in parts) > 1 else slice(None)
+    seconds = merged.seconds[rows]
+    since_1970 = any(p.stamps for p in parts) or float(seconds[0]) > SINCE_1970
     return Recording(
         time=torch.from_numpy(np.round(seconds - seconds[0], 6) if since_1970 else seconds),
         inputs=torch.from_numpy(commands[rows]),
@@ -89,21 +95,23 @@ def read_csv_files(
         source=str(files[0].path),
         sha256=_sha256([file.path for file in files]),
         began=float(seconds[0]) if since_1970 else None,
-        notes=tuple(note for part in parts for note in part.notes),
+        notes=tuple(note for p in parts for note in p.notes),
     )
 
 
-def _shared_out(files: Sequence[FileSource], names: Sequence[str]) -> list[list[str]]:
-    """Which channels are taken from which file; what none has, from the first, which says so."""
-    shares: list[list[str]] = [[] for _ in files]
+def _assign_to_files(files: Sequence[FileSource], names: Sequence[str]) -> list[list[str]]:
+    """The channels to take from each file; channels that no file has are assigned to the first, whose reader reports
+    them.
+    """
+    names_by_file: list[list[str]] = [[] for _ in files]
     headers = [
         _named_in(read_header(file.path, file.header, file.sheet)) if len(files) > 1 else set() for file in files
     ]
     for name in names:
-        said = [k for k, file in enumerate(files) if name in file.columns]
-        there = [k for k, header in enumerate(headers) if name in header]
-        shares[(said or there or [0])[0]].append(name)
-    return shares
+        mapped = [k for k, file in enumerate(files) if name in file.columns]
+        present = [k for k, header in enumerate(headers) if name in header]
+        names_by_file[(mapped or present or [0])[0]].append(name)
+    return names_by_file
 
 
 def _named_in(header: Sequence[str]) -> set[str]:
@@ -115,43 +123,45 @@ def _read(file: FileSource, names: Sequence[str]) -> Read:
 
 
 def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
-    """A file with a row an instant: one sheet."""
-    path, given = file.path, file.columns.get("t")
+    """A file with one row per instant: one sheet."""
+    path, clock_source = file.path, file.columns.get("t")
     with open_csv(path, file.sheet) as handle:
         heading, lines = heading_of(path, handle, file.header)
-        clock = bind_clock(path, heading.names, given)
+        clock = bind_clock(path, heading.names, clock_source)
         bounds = [bind(path, heading.names, name, file.columns.get(name)) for name in names]
         sparse = any(file.columns[name].held > 0.0 for name in names if name in file.columns)
-        columns = columns_of(path, heading, [clock, *bounds], given, sparse)
+        columns = columns_of(path, heading, [clock, *bounds], clock_source, sparse)
         table, notes = _read_table(lines, columns)
     place, first = f"{path}: row {{}}, column {clock.header}", heading.lines + 1
-    seconds = _clock(table[:, 0], clock, given, place, first)
-    there = [b for b in bounds if b.position is not None]
-    values = channels_in_si(table, columns, there)
-    order = in_order(seconds, values, _sorted(given), place, first, _summer(clock, given))
-    sheet = Sheet(str(path), order.seconds, tuple(b.name for b in there), order.values)
-    return Read([sheet], *_kinds(bounds), clock.stamps, [f"{path.name}: {n}" for n in (*notes, *order.told)])
+    seconds = _clock(table[:, 0], clock, clock_source, place, first)
+    in_file = [b for b in bounds if b.position is not None]
+    values = channels_in_si(table, columns, in_file)
+    order = in_order(seconds, values, _sorted(clock_source), place, first, _summer_time_hint(clock, clock_source))
+    sheet = Sheet(str(path), order.seconds, tuple(b.name for b in in_file), order.values)
+    return Read(
+        [sheet], *_units_and_constants(bounds), clock.stamps, [f"{path.name}: {n}" for n in (*notes, *order.notes)]
+    )
 
 
 def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
-    """A file with a row a value: a sheet a channel."""
-    path, given = file.path, file.columns.get("t")
+    """A file with one row per value: one sheet per channel."""
+    path, clock_source = file.path, file.columns.get("t")
     constant = [name for name in names if (source := file.columns.get(name)) and source.constant is not None]
-    clock, found = read_tags(file, [name for name in names if name not in constant])
+    clock, tagged = read_tags(file, [name for name in names if name not in constant])
     sheets, notes = [], []
-    for bound, rows, stamps, numbers in found:
+    for bound, rows, stamps, numbers in tagged:
         place = f"{path}: row {{}} ({bound.header}), column {clock.header}"
-        seconds = _clock(stamps, clock, given, place, 0, rows)
+        seconds = _clock(stamps, clock, clock_source, place, 0, rows)
         values = (numbers * np.float64(bound.factor))[:, None]
-        order = in_order(seconds, values, _sorted(given), place, 0, _summer(clock, given), rows)
+        order = in_order(seconds, values, _sorted(clock_source), place, 0, _summer_time_hint(clock, clock_source), rows)
         sheets.append(Sheet(f"{path} ({bound.header})", order.seconds, (bound.name,), order.values))
-        notes += [f"{path.name}: {bound.header}: {note}" for note in order.told]
-    bounds = [bound for bound, *_ in found] + [bind(path, (), name, file.columns[name]) for name in constant]
-    return Read(sheets, *_kinds(bounds), clock.stamps, notes)
+        notes += [f"{path.name}: {bound.header}: {note}" for note in order.notes]
+    bounds = [bound for bound, *_ in tagged] + [bind(path, (), name, file.columns[name]) for name in constant]
+    return Read(sheets, *_units_and_constants(bounds), clock.stamps, notes)
 
 
-def _kinds(bounds: Sequence[Bound]) -> tuple[dict[str, str], dict[str, float]]:
-    """SI units of the channels, and the values of those that are constant."""
+def _units_and_constants(bounds: Sequence[Bound]) -> tuple[dict[str, str], dict[str, float]]:
+    """SI units of the channels, and the values of constant ones."""
     return {b.name: b.si_unit for b in bounds}, {b.name: b.constant for b in bounds if b.position is None}
 
 
@@ -167,26 +177,29 @@ def _sorted(clock: ChannelSource | None) -> bool:
     return isinstance(clock, ClockSource) and clock.sort
 
 
-def _summer(clock: Bound, given: ChannelSource | None) -> str:
-    zoned = isinstance(given, ClockSource) and given.zone
-    told = "where summer time ends, say in which zone this is: columns: {t: {zone: Europe/Berlin}}"
-    return told if clock.stamps and not zoned else ""
+def _summer_time_hint(clock: Bound, clock_source: ChannelSource | None) -> str:
+    """Hint for a clock that is set back at the end of summer time; empty if a time zone is given."""
+    zoned = isinstance(clock_source, ClockSource) and clock_source.zone
+    hint = "where summer time ends, say in which zone this is: columns: {t: {zone: Europe/Berlin}}"
+    return hint if clock.stamps and not zoned else ""
 
 
 def _sha256(paths: Sequence[Path]) -> str:
-    """Of the file, or of several files' one after the other."""
+    """The file's hash, or the hash of several files' hashes."""
     each = [file_sha256(path) for path in paths]
     return each[0] if len(each) == 1 else hashlib.sha256("".join(each).encode()).hexdigest()
 
 
 def read_header(path: Path, header: bool = True, sheet: str | None = None) -> tuple[str, ...]:
-    """The column names of a table, as `FileSource` says how it is laid out."""
+    """The column names of a table, laid out as described in `FileSource`."""
     with open_csv(path, sheet) as handle:
         return heading_of(path, handle, header)[0].names
 
 
 def _read_table(lines: Iterator[str], columns: Columns) -> tuple[np.ndarray, list[str]]:
-    """The wanted columns as (rows, columns) float64, cells without a number not finite; and what was left out."""
+    """The columns as (rows, columns) float64, with non-finite cells where there is no number; and notes on omitted
+    lines.
+    """
     blocks, above, notes = [], columns.heading.lines, []
     for block in _blocks(columns.path, lines):
         if cut := cut_off(block[-1], columns):
@@ -204,7 +217,7 @@ def _read_table(lines: Iterator[str], columns: Columns) -> tuple[np.ndarray, lis
 
 
 def cut_off(line: str, columns: Columns) -> str:
-    """What there is of a last line that a program had not yet written to its end; nothing where it is whole."""
+    """The text of a last line that was not completely written; empty if it is complete."""
     whole = line.endswith(("\n", "\r")) or line.count(columns.heading.delimiter) >= len(columns.heading.names) - 1
     return "" if whole else line[:60]
 
@@ -218,25 +231,31 @@ def _blocks(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
 
 
 def _clock(
-    cells: np.ndarray, clock: Bound, given: ChannelSource | None, place: str, first: int, rows: np.ndarray | None = None
+    cells: np.ndarray,
+    clock: Bound,
+    source: ChannelSource | None,
+    place: str,
+    first: int,
+    rows: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Seconds (R,), since 1970 for time stamps. place: of a row, whose number is counted
-    from `first`, or stands in `rows`.
+    """Time of each row (R,), s, since 1970 for time stamps.
+
+    place: format of a row in messages; its number counts from `first`, or is listed in `rows`.
     """
     seconds = cells * clock.factor
     if not np.isfinite(seconds).all():
         row = int(np.flatnonzero(~np.isfinite(seconds))[0])
         number = first + row if rows is None else int(rows[row])
         raise ValueError(f"{place.format(number)}: expected a time in every row, got none")
-    if not isinstance(given, ClockSource):
-        given = ClockSource()
-    if given.zone:
-        seconds = from_zone(seconds, given.zone)
-    return seconds + given.shift if given.shift else seconds
+    if not isinstance(source, ClockSource):
+        source = ClockSource()
+    if source.zone:
+        seconds = from_zone(seconds, source.zone)
+    return seconds + source.shift if source.shift else seconds
 
 
 def from_first(seconds: np.ndarray, first: float, clock: Bound) -> np.ndarray:
-    """Time stamps, and numbers so large that they count from 1970, as seconds since the first; others as they are."""
+    """Time since the first sample, s, for time stamps and for seconds since 1970; other times unchanged."""
     return np.round(seconds - first, 6) if clock.stamps or first > SINCE_1970 else seconds
 
 
@@ -256,7 +275,9 @@ def _numbers(table: np.ndarray, columns: Columns, bound: Bound) -> np.ndarray:
 
 
 def write_csv(recording: Recording, path: Path) -> Path:
-    """The recording as CSV whose headers need no mapping: t_s, Q1_cm3_s, h1_cm ... Masked readings are left empty."""
+    """Write the recording as CSV whose headers need no mapping: t_s, Q1_cm3_s, h1_cm ... Masked readings become empty
+    cells.
+    """
     units = [_FILE_UNITS.get(unit, unit) for unit in (*recording.input_units, *recording.output_units)]
     si_units = (*recording.input_units, *recording.output_units)
     factors = [unit_factor(si, unit) for si, unit in zip(si_units, units, strict=True)]
@@ -272,7 +293,7 @@ def write_csv(recording: Recording, path: Path) -> Path:
 
 
 def header_of(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> str:
-    """A header that needs no mapping, from channels' names and SI units: t_s,Q1_cm3_s,h1_cm."""
+    """A header that needs no mapping, from names and SI units of channels: t_s,Q1_cm3_s,h1_cm."""
     named = (*inputs.items(), *outputs.items())
     return ",".join(["t_s", *(f"{name}_{_FILE_UNITS.get(unit, unit)}" for name, unit in named)])
 

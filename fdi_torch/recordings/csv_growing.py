@@ -1,4 +1,4 @@
-"""CSV files that another program is still writing: their rows, as they become whole."""
+"""CSV files that another program is still writing: their rows as they are completed."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from fdi_torch.recordings.csv_binding import bind, bind_clock, columns_of
 from fdi_torch.recordings.csv_cells import parse_carefully
 from fdi_torch.recordings.csv_files import channels_in_si, from_first
 from fdi_torch.recordings.csv_text import heading_of, open_csv
-from fdi_torch.recordings.sheets import held
+from fdi_torch.recordings.sheets import fill_held
 from fdi_torch.recordings.source import ChannelSource
-from fdi_torch.recordings.tables import TableText
+from fdi_torch.recordings.table_files import TableText
 
 
 class GrowingCsv:
-    """The rows of a CSV file that is still being written, as they become whole. Columns as for `read_csv`.
+    """Reader of the completed rows of a CSV file that is still being written. Columns as for `read_csv`.
 
-    input_units, output_units: SI. Raises ValueError where the file, its header or a column is missing.
+    input_units, output_units: SI. Raises ValueError if the file, its header or a column is missing.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class GrowingCsv:
         self._held = {k: source.held for k, source in enumerate(sources) if source.held > 0.0}
         bounds = [self._clock, *self._inputs, *self._outputs]
         self._columns = columns_of(path, heading, bounds, mapping.get("t"), bool(self._held))
-        self._logged = np.empty((0, 1 + len(inputs)))  # the last row in which each held input was logged
+        self._logged = np.empty((0, 1 + len(inputs)))  # the last rows with a logged value of a held input
         self._line = heading.lines
         self._first: float | None = None
         self.input_units = tuple(b.si_unit for b in self._inputs)
@@ -55,8 +55,9 @@ class GrowingCsv:
             self._place = sum(len(line) for line in islice(raw, self._line))
 
     def new(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-        """Times (R,) s, inputs (R, M) and outputs (R, N) in SI of the rows that have become whole since the last call,
-        and a sentence on each row that could not be read. Time may jump.
+        """The rows completed since the last call: times (R,) s, inputs (R, M), outputs (R, N), SI.
+
+        The fourth result has one sentence for each row that could not be read. Time may jump.
         """
         with self.path.open("rb") as raw:
             raw.seek(self._place)
@@ -75,17 +76,19 @@ class GrowingCsv:
         inputs, outputs = (channels_in_si(table, self._columns, bounds) for bounds in (self._inputs, self._outputs))
         seconds = self._seconds(table[:, 0])
         outputs[~np.isfinite(outputs)] = np.nan
-        return seconds, self._standing(seconds, inputs), outputs, troubles
+        return seconds, self._filled_inputs(seconds, inputs), outputs, troubles
 
-    def _standing(self, seconds: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """Inputs (R, M) with the last value that was logged, also before these rows, where it still stands."""
+    def _filled_inputs(self, seconds: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Inputs (R, M) with empty cells filled by the last logged value while it is held, also from before
+        these rows.
+        """
         rows = np.concatenate([self._logged, np.column_stack([seconds, inputs])])
         before = len(self._logged)
         if self._held and len(rows):
             last = {int(np.flatnonzero(~np.isnan(c))[-1]) for c in rows[:, 1:].T if not np.isnan(c).all()}
             self._logged = rows[sorted(last)]
-        stands = [held(rows[:, 0], c, self._held.get(k, 0.0), "zero_order") for k, c in enumerate(rows[:, 1:].T)]
-        return np.stack(stands, axis=1)[before:] if stands else inputs
+        filled = [fill_held(rows[:, 0], c, self._held.get(k, 0.0), "zero_order") for k, c in enumerate(rows[:, 1:].T)]
+        return np.stack(filled, axis=1)[before:] if filled else inputs
 
     def _seconds(self, clock: np.ndarray) -> np.ndarray:
         seconds = clock * self._clock.factor

@@ -1,4 +1,4 @@
-"""CSV files with a row for each value, as historians export them: tag, time, value and often a quality."""
+"""CSV files with one row per value, as process historians export them: tag, time, value and often a quality."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_binding import Bound, bind_clock, column_of, rule_of
-from fdi_torch.recordings.csv_cells import number_in, ruled
+from fdi_torch.recordings.csv_cells import apply_rule, number_in
 from fdi_torch.recordings.csv_text import heading_of, open_csv, rows_of
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource
-from fdi_torch.recordings.stamps import stamp_reader
+from fdi_torch.recordings.time_stamps import stamp_reader
 
 Tagged = tuple[Bound, np.ndarray, np.ndarray, np.ndarray]
-"""A channel, and of each of its rows the number in the file, the time in the clock's unit, and the value."""
+"""A channel, and for each of its rows the row number, the time in the clock's unit, and the value."""
 
 
 @dataclass
@@ -28,56 +28,60 @@ class _Rows:
 
 
 def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagged]]:
-    """The clock, and each channel's rows in the order of the file.
+    """The clock, and the rows of each channel in the order of the file.
 
-    Raises ValueError, naming file and row, for a tag that is not there, a channel without a unit, a wrong cell.
+    Raises ValueError, naming file and row, for a missing tag, a channel without unit, or a malformed cell.
     """
     path, tags = file.path, file.tags
     if tags is None:
         raise ValueError(f"{path}: expected a file with a row for each value, got none")
     sources = {name: file.columns.get(name, ChannelSource()) for name in names}
-    wanted = {source.column or name: name for name, source in sources.items()}
+    channel_by_tag = {source.column or name: name for name, source in sources.items()}
     rows = {name: _Rows() for name in names}
-    seen: set[str] = set()
+    other_tags: set[str] = set()
     for channel, source in sources.items():
         if source.plus:
             raise ValueError(f"{path}: columns.{channel}.plus: expected no such key where rows have tags; leave it out")
     with open_csv(path, file.sheet) as handle:
         heading, lines = heading_of(path, handle)
-        given = file.columns.get("t")
-        clock = bind_clock(path, heading.names, given)
-        when = heading.names.index(clock.header)
+        clock_source = file.columns.get("t")
+        clock = bind_clock(path, heading.names, clock_source)
+        time_column = heading.names.index(clock.header)
         tag, value = (heading.names.index(column_of(path, heading.names, c)) for c in (tags.tag, tags.value))
         quality = None if tags.quality is None else heading.names.index(column_of(path, heading.names, tags.quality))
         rules = {name: rule_of(source, quality) for name, source in sources.items()}
-        read = stamp_reader(given.stamps, given.zone) if isinstance(given, ClockSource) else stamp_reader(None, None)
+        read = (
+            stamp_reader(clock_source.stamps, clock_source.zone)
+            if isinstance(clock_source, ClockSource)
+            else stamp_reader(None, None)
+        )
         for number, cells in rows_of(path, lines, heading.delimiter, heading.lines):
             if len(cells) != len(heading.names):
                 if not any(cell.strip() for cell in cells):
                     continue
                 raise ValueError(f"{path}: row {number}: expected {len(heading.names)} cells, got {len(cells)}")
-            name = wanted.get(cells[tag].strip())
+            name = channel_by_tag.get(cells[tag].strip())
             if name is None:
-                seen.add(cells[tag].strip())
+                other_tags.add(cells[tag].strip())
                 continue
             try:
-                at = read(cells[when]) if clock.stamps else number_in(cells[when], heading.delimiter)
+                time = read(cells[time_column]) if clock.stamps else number_in(cells[time_column], heading.delimiter)
                 flag = None if quality is None else cells[quality]
-                found = ruled(cells[value], flag, rules[name], heading.delimiter)
+                reading = apply_rule(cells[value], flag, rules[name], heading.delimiter)
             except ValueError as error:
                 raise ValueError(f"{path}: row {number} ({cells[tag].strip()}): {error}") from None
             rows[name].number.append(number)
-            rows[name].time.append(at)
-            rows[name].value.append(found)
-    return clock, [_tagged(path, name, sources[name], rows[name], seen) for name in names]
+            rows[name].time.append(time)
+            rows[name].value.append(reading)
+    return clock, [_tagged(path, name, sources[name], rows[name], other_tags) for name in names]
 
 
-def _tagged(path: Path, name: str, source: ChannelSource, rows: _Rows, others: set[str]) -> Tagged:
+def _tagged(path: Path, name: str, source: ChannelSource, rows: _Rows, other_tags: set[str]) -> Tagged:
     tag = source.column or name
     if not rows.time:
-        near = difflib.get_close_matches(tag, sorted(others), n=1, cutoff=0.5)
-        known = ", ".join(sorted(others)[:12]) or "none"
-        hint = f"; the nearest is {near[0]}" if near else ""
+        nearest = difflib.get_close_matches(tag, sorted(other_tags), n=1, cutoff=0.5)
+        known = ", ".join(sorted(other_tags)[:12]) or "none"
+        hint = f"; the nearest is {nearest[0]}" if nearest else ""
         raise ValueError(
             f"{path}: expected rows of the tag {tag} for {name}, got {known}{hint}; "
             f"name it under columns: {{{name}: {{column: ..., unit: ...}}}}"

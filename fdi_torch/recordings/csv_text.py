@@ -1,4 +1,4 @@
-"""The text of a CSV file, as loggers, spreadsheets and historians write it: its encoding, delimiter and headers."""
+"""The text of a CSV file as loggers, spreadsheets and historians write it: encoding, delimiter and header."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any, TextIO
 
 from fdi_torch.outside import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, expect_unpacked
 from fdi_torch.parameters import header_unit, si_unit_of
-from fdi_torch.recordings.tables import TableText, format_of, table_text
+from fdi_torch.recordings.table_files import TableText, format_of, table_text
 
 _SNIFFED = 1 << 16
 _FOREIGN = {
@@ -26,7 +26,7 @@ _FOREIGN = {
 
 @dataclass(frozen=True)
 class Heading:
-    """Column names, the delimiter, and how many lines of the file they and what stands above them take."""
+    """Column names, the delimiter, and the number of lines up to and including the header."""
 
     names: tuple[str, ...]
     delimiter: str
@@ -34,9 +34,9 @@ class Heading:
 
 
 def open_csv(path: Path, sheet: str | None = None) -> TextIO | TableText:
-    """UTF-8 or UTF-16, or else what Western European Windows writes; or a table of another format as such text.
+    """The text of a CSV file in UTF-8, UTF-16 or Windows-1252; or a table of another format in the same form.
 
-    sheet: of an Excel workbook. Raises ValueError for what is neither.
+    sheet: of an Excel workbook. Raises ValueError for any other content.
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a CSV file, got none there; check the path")
@@ -52,7 +52,7 @@ def open_csv(path: Path, sheet: str | None = None) -> TextIO | TableText:
 
 
 class _Unpacked(io.RawIOBase):
-    """The bytes of a .gz file, as many as it may have."""
+    """The bytes of a .gz file, up to the allowed expansion."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._packed, self._count = path, path.stat().st_size, 0
@@ -62,11 +62,11 @@ class _Unpacked(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any) -> int:
-        found = self._file.read(len(buffer))
-        buffer[: len(found)] = found
-        self._count += len(found)
+        chunk = self._file.read(len(buffer))
+        buffer[: len(chunk)] = chunk
+        self._count += len(chunk)
         expect_unpacked(self._count, self._packed, str(self._path), MOST_UNPACKED, MOST_EXPANSION)
-        return len(found)
+        return len(chunk)
 
     def close(self) -> None:
         self._file.close()
@@ -74,7 +74,7 @@ class _Unpacked(io.RawIOBase):
 
 
 def rows_of(path: Path, lines: Iterable[str], delimiter: str, above: int = 0) -> Iterator[tuple[int, list[str]]]:
-    """The cells of each line, with the number of its row; `above`: rows of the file before these."""
+    """The cells of each line with the number of its row; above: rows of the file before these."""
     rows = csv.reader(lines, delimiter=delimiter)
     number = above
     try:
@@ -100,7 +100,7 @@ def _beginning(path: Path) -> bytes:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as raw:
             return raw.read(_SNIFFED)
     except EOFError:
-        return b""  # cut off; which the reader says
+        return b""  # cut off; the reader reports it
     except (gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{path}: expected a CSV file (plain or .gz), got something else: {error}") from error
 
@@ -121,11 +121,13 @@ def _encoding(path: Path, start: bytes) -> str:
 
 
 def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[Heading, Iterator[str]]:
-    """The heading, and the lines below it. Lines that start with # may stand above, and Excel's `sep=;`; a row of units
-    may stand below names without units. Without a header, columns are named by their numbers: 1, 2 ...
+    """The heading, and an iterator over the lines below it.
+
+    Lines that start with #, and Excel's `sep=;`, may precede the header; a row of units may follow names without units.
+    header: False if the file has none; columns are then named by their numbers 1, 2 ...
     """
-    rest, delimiter = _short_lines(path, lines), getattr(lines, "delimiter", "")
-    for number, line in enumerate(rest, start=1):
+    remaining, delimiter = _short_lines(path, lines), getattr(lines, "delimiter", "")
+    for number, line in enumerate(remaining, start=1):
         if line.lower().startswith("sep=") and len(line.strip()) == 5:
             delimiter = line[4]
         elif line.strip() and not line.startswith("#"):
@@ -133,37 +135,38 @@ def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[H
             names = _cells(path, line, delimiter, number - 1)
             if not header:
                 numbers = tuple(str(k + 1) for k in range(len(names)))
-                return Heading(numbers, delimiter, number - 1), chain([line], rest)
+                return Heading(numbers, delimiter, number - 1), chain([line], remaining)
             if len(names) < 2:
                 raise ValueError(
                     f"{path}: row {number}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got "
                     f"'{line.strip()[:60]}'; put # before what stands above the header, and part columns by commas"
                 )
-            return _with_units(path, names, delimiter, number, rest)
+            return _with_units(path, names, delimiter, number, remaining)
     raise ValueError(f"{path}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got an empty file")
 
 
 def _delimiter(line: str, header: bool) -> str:
-    """What parts the columns. In a row of numbers a comma beside tabs or semicolons is a decimal one."""
+    """The delimiter of the columns. In a row of numbers, a comma beside tabs or semicolons is a decimal comma."""
     if header:
         return max(",;\t", key=line.count)
     return next((each for each in "\t;" if each in line), ",")
 
 
 def _with_units(
-    path: Path, names: list[str], delimiter: str, number: int, rest: Iterator[str]
+    path: Path, names: list[str], delimiter: str, number: int, remaining: Iterator[str]
 ) -> tuple[Heading, Iterator[str]]:
-    below = next(rest, None)
-    if below is None:
-        return Heading(tuple(names), delimiter, number), rest
-    units = _cells(path, below, delimiter, number)
+    """The heading, with the units of a second row if it is one; and the remaining lines."""
+    next_line = next(remaining, None)
+    if next_line is None:
+        return Heading(tuple(names), delimiter, number), remaining
+    units = _cells(path, next_line, delimiter, number)
     bare = len(units) == len(names) and all(
         not unit or not header_unit(n) for n, unit in zip(names, units, strict=True)
     )
     if bare and any(units) and all(not unit or _is_unit(unit) for unit in units):
         named = tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True))
-        return Heading(named, delimiter, number + 1), rest
-    return Heading(tuple(names), delimiter, number), chain([below], rest)
+        return Heading(named, delimiter, number + 1), remaining
+    return Heading(tuple(names), delimiter, number), chain([next_line], remaining)
 
 
 def _cells(path: Path, line: str, delimiter: str, above: int) -> list[str]:

@@ -7,7 +7,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.recordings.tables import Row, expect_cells
+from fdi_torch.recordings.table_files import Row, expect_cells
 from fdi_torch.recordings.vectors import rows_of_arrays
 from fdi_torch.tables import needed
 
@@ -15,27 +15,27 @@ MOST_DATASETS = 10_000
 
 
 def rows(path: Path, sheet: str | None) -> Iterator[Row]:
-    """Datasets of numbers that are as long as the longest, a column each, by their path (`run/h1_cm`).
+    """Numeric datasets of the greatest length, one column each, named by their path (`run/h1_cm`).
 
-    Links into other files are not followed, and datasets that lie in other files are not read.
+    Links into other files are not followed, and datasets stored in other files are not read.
     """
     h5py = needed("h5py", "hdf5")
     with h5py.File(path, "r") as file:
-        there: dict[str, Any] = {}
+        datasets: dict[str, Any] = {}
         visited = 0
 
-        def look(name: str, item: Any) -> None:
+        def collect(name: str, item: Any) -> None:
             nonlocal visited
             visited += 1
             if visited > MOST_DATASETS:
                 raise ValueError(f"{path}: expected at most {MOST_DATASETS} groups and datasets, got more")
-            elsewhere = isinstance(item, h5py.Dataset) and (item.is_virtual or item.external is not None)
-            if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and not elsewhere and item.ndim in (1, 2):
-                there[name] = item
+            external = isinstance(item, h5py.Dataset) and (item.is_virtual or item.external is not None)
+            if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiub" and not external and item.ndim in (1, 2):
+                datasets[name] = item
 
-        file.visititems(look)
-        expect_cells(path, sum(max(int(item.size), prod(item.chunks or ())) for item in there.values()))
-        arrays = {name: item[()] for name, item in there.items()}
-        if "MATLAB_class" in {key for item in there.values() for key in item.attrs}:
-            arrays = {name: array.T for name, array in arrays.items()}  # it writes columns as rows
+        file.visititems(collect)
+        expect_cells(path, sum(max(int(item.size), prod(item.chunks or ())) for item in datasets.values()))
+        arrays = {name: item[()] for name, item in datasets.items()}
+        if "MATLAB_class" in {key for item in datasets.values() for key in item.attrs}:
+            arrays = {name: array.T for name, array in arrays.items()}  # MATLAB stores columns as rows
     return rows_of_arrays(path, arrays)

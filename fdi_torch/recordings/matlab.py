@@ -8,7 +8,7 @@ from pathlib import Path
 
 from scipy.io import loadmat, whosmat
 
-from fdi_torch.recordings.tables import Row, expect_cells
+from fdi_torch.recordings.table_files import Row, expect_cells
 from fdi_torch.recordings.vectors import rows_of_arrays
 
 _NUMBERS = frozenset(
@@ -17,8 +17,8 @@ _NUMBERS = frozenset(
 
 
 def rows(path: Path, sheet: str | None) -> Iterator[Row]:
-    """Variables of numbers that are as long as the longest, a column each; of a matrix M its columns are M:1 ..."""
-    there = [(name, shape) for name, shape, kind in whosmat(str(path), appendmat=False) if kind in _NUMBERS]
-    expect_cells(path, sum(prod(shape) for _, shape in there))
-    found = loadmat(str(path), appendmat=False, variable_names=[name for name, _ in there], squeeze_me=False)
-    return rows_of_arrays(path, {name: found[name] for name, _ in there})
+    """Numeric variables of the greatest length, one column each; the columns of a matrix M are M:1 ..."""
+    variables = [(name, shape) for name, shape, kind in whosmat(str(path), appendmat=False) if kind in _NUMBERS]
+    expect_cells(path, sum(prod(shape) for _, shape in variables))
+    arrays = loadmat(str(path), appendmat=False, variable_names=[name for name, _ in variables], squeeze_me=False)
+    return rows_of_arrays(path, {name: arrays[name] for name, _ in variables})

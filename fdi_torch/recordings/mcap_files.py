@@ -1,4 +1,4 @@
-"""Recordings from MCAP logs: our own by channel name, foreign ones by `TOPIC:FIELD` for each channel."""
+"""Recordings from MCAP logs: logs of this program by channel name, others by `TOPIC:FIELD` for each channel."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ def read_mcap(
     mapping: Mapping[str, ChannelSource] | None = None,
     hold: Hold = "zero_order",
 ) -> Recording:
-    """The named channels of a log as a recording in SI; as `read_csv`, with messages in the place of rows.
+    """The named channels of a log as a recording in SI; as `read_csv`, with messages in place of rows.
 
-    A log of ours needs no mapping. In a foreign one each channel has a column 'TOPIC:FIELD' and a unit; the column of
-    `t` is the field that holds the time (the log's own time where it is not given).
-    Raises ValueError, naming the file, for what is not in it, and LogError for a damaged one.
+    A log of this program needs no mapping. In any other log, each channel has a column 'TOPIC:FIELD' and a unit; the
+    column of `t` is the field with the time (default: the log time). Raises ValueError, naming the file, for missing
+    channels, and LogError for a damaged log.
     """
     mapping = mapping or {}
     run = read_run(path)
     channels = {name: mapping.get(name, ChannelSource()) for name in (*inputs, *outputs)}
-    wanted = {name: source for name, source in channels.items() if source.constant is None}
-    if any(":" in (source.column or "") for source in wanted.values()):
-        places = {name: _place(path, name, source) for name, source in wanted.items()}
+    sources = {name: source for name, source in channels.items() if source.constant is None}
+    if any(":" in (source.column or "") for source in sources.values()):
+        places = {name: _place(path, name, source) for name, source in sources.items()}
         time, scale = mapping.get("t", ChannelSource()), _seconds(path, mapping.get("t"))
         signals = mapped_signals(
             run,
@@ -45,13 +45,13 @@ def read_mcap(
     else:
         signals, scale = own_signals(run), 1.0
         logged = _by_name(signals)
-        table = {name: _find(path, name, source, logged) for name, source in wanted.items()}
+        table = {name: _find(path, name, source, logged) for name, source in sources.items()}
         hold = "linear" if signals.hold == "linear" else "zero_order"
     return _recording(path, signals, scale, table, channels, tuple(inputs), tuple(outputs), hold)
 
 
 def _seconds(path: Path, time: ChannelSource | None) -> float:
-    """How many seconds one of the time field's units is."""
+    """The unit of the time field, in s."""
     try:
         return unit_factor(time.unit, "s") if time and time.unit else 1.0
     except ValueError as error:
@@ -59,7 +59,7 @@ def _seconds(path: Path, time: ChannelSource | None) -> float:
 
 
 Column = tuple[np.ndarray, np.ndarray, str]
-"""Values (T,), whether each counts (T,), and their unit ('' where the log does not state it)."""
+"""Values (T,), whether each is valid (T,), and their unit ('' if the log does not state it)."""
 
 
 def _recording(

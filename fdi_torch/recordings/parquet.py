@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.recordings.tables import Row, expect_cells
+from fdi_torch.recordings.table_files import Row, expect_cells
 from fdi_torch.tables import needed
 
 ROWS_AT_ONCE = 1 << 14
@@ -17,7 +17,7 @@ def rows(path: Path, sheet: str | None) -> Iterator[Row]:
     needed("pyarrow", "parquet")
     parquet = needed("pyarrow.parquet", "parquet")
     schema = parquet.ParquetFile(path).schema_arrow
-    # Texts stay one entry of a dictionary each, however often they are repeated.
+    # Repeated texts are read as indices into a dictionary, which saves memory.
     texts = [field.name for field in schema if str(field.type) in ("string", "large_string")]
     file = parquet.ParquetFile(path, read_dictionary=texts)
     names = [str(name) for name in schema.names]
@@ -28,7 +28,7 @@ def rows(path: Path, sheet: str | None) -> Iterator[Row]:
 
 
 def _values(column: Any) -> list[Any]:
-    """A column as plain values; of lists and the like their kind, which is no number where one is asked for."""
+    """A column as plain values; for nested types the name of the type, which is then rejected as a number."""
     pyarrow = needed("pyarrow", "parquet")
     kind = column.type
     if pyarrow.types.is_dictionary(kind):

@@ -1,7 +1,7 @@
-"""Channels that were logged together, and how several such sheets, each with times of its own, become one recording.
+"""Sheets: channels that were logged together, and the merging of several sheets with different times.
 
-A plant's historian writes levels every second, flows every ten and a valve when it moves: in one file with empty cells,
-in a file each, or with a row for each value. What was not logged at an instant is NaN, what was logged as bad is BAD.
+A plant's historian may log levels every second, flows every ten seconds and a valve when it moves: in one file with
+empty cells, in one file each, or with one row per value. A missing value is NaN, a value that was logged as bad is BAD.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import numpy as np
 
 from fdi_torch.recording import Hold
 
-LONG_AGO = 1e8  # s; a clock that is beyond counts from 1970
+LONG_AGO = 1e8  # s; larger times are seconds since 1970
 HOUR, NEARLY = 3600.0, 120.0  # s
 HELD_MARGIN = 1e-3
-"""A sampling interval that wavers by so little is still the one for which a value stands."""
+"""Tolerance on the time for which a value is held, for sampling intervals that vary slightly."""
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """seconds (R,) increasing, on a clock that all sheets share; values (R, C) in SI of the named channels."""
+    """seconds (R,): increasing, on a clock common to all sheets; values (R, C): of the named channels, SI."""
 
     source: str
     seconds: np.ndarray
@@ -31,11 +31,11 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Ordered:
-    """Rows in the order of time, one an instant; told: what was done for it."""
+    """Rows in order of time, one per instant, and notes on what was changed."""
 
     seconds: np.ndarray
     values: np.ndarray
-    told: list[str]
+    notes: list[str]
 
 
 def in_order(
@@ -47,34 +47,34 @@ def in_order(
     summer: str = "",
     rows: np.ndarray | None = None,
 ) -> Ordered:
-    """Rows that repeat the one before are dropped; others are sorted where `sort` says so, the last value of each
-    channel counting where several have one time.
+    """Drop rows that repeat the one before; with `sort`, sort the others and merge rows with equal times.
 
-    place: of a row in error messages, whose number is counted from `first` or stands in `rows`. summer: what to do
-    where the clock is put back by an hour. Raises ValueError
-    where time does not increase.
+    Of several values of a channel at one time the last one counts. place: format of a row in messages; its number
+    counts from `first`, or is listed in `rows`. summer: advice for a clock that was set back by an hour. Raises
+    ValueError if time does not increase.
     """
-    told = []
-    same = (np.diff(seconds) == 0.0) & _equal(values[1:], values[:-1]).all(axis=1)
-    if same.any():
-        told.append(f"{_rows(same.sum())} repeating the one before left out")
-    numbers = (first + np.arange(len(seconds)) if rows is None else rows)[np.append(True, ~same)]
-    seconds, values = seconds[np.append(True, ~same)], values[np.append(True, ~same)]
-    back = np.flatnonzero(np.diff(seconds) <= 0)
-    if not len(back):
-        return Ordered(seconds, values, told)
+    notes = []
+    repeated = (np.diff(seconds) == 0.0) & _equal(values[1:], values[:-1]).all(axis=1)
+    if repeated.any():
+        notes.append(f"{_rows(repeated.sum())} repeating the one before left out")
+    numbers = (first + np.arange(len(seconds)) if rows is None else rows)[np.append(True, ~repeated)]
+    seconds, values = seconds[np.append(True, ~repeated)], values[np.append(True, ~repeated)]
+    decreasing = np.flatnonzero(np.diff(seconds) <= 0)
+    if not len(decreasing):
+        return Ordered(seconds, values, notes)
     if not sort:
-        before, after = seconds[back[0] : back[0] + 2] - (seconds[0] if seconds[0] > LONG_AGO else 0.0)
+        drop = int(decreasing[0])
+        before, after = seconds[drop : drop + 2] - (seconds[0] if seconds[0] > LONG_AGO else 0.0)
         fix = "correct the clock, or let rows be sorted: columns: {t: {sort: true}}"
         fix = summer if summer and abs(before - after - HOUR) < NEARLY else fix
         raise ValueError(
-            f"{place.format(numbers[back[0] + 1])}: expected time that increases, got {after:g} s after {before:g} s "
-            f"({_rows(len(back), 'such ')}); {fix}"
+            f"{place.format(numbers[drop + 1])}: expected time that increases, got {after:g} s after {before:g} s "
+            f"({_rows(len(decreasing), 'such ')}); {fix}"
         )
-    late = int((np.diff(seconds) < 0).sum())
+    out_of_order = int((np.diff(seconds) < 0).sum())
     times, merged = _merged(seconds, values)
-    told.append(f"rows sorted by time: {late} came late, {len(seconds) - len(times)} had the time of another")
-    return Ordered(times, merged, told)
+    notes.append(f"rows sorted by time: {out_of_order} came late, {len(seconds) - len(times)} had the time of another")
+    return Ordered(times, merged, notes)
 
 
 def _rows(count: int, such: str = "") -> str:
@@ -86,21 +86,22 @@ def _equal(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _merged(seconds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One row for each time, in order, with the last value of each channel that was logged for it."""
+    """One row per time, in order, with the last logged value of each channel."""
     order = np.argsort(seconds, kind="stable")
     times, place = np.unique(seconds, return_inverse=True)
     merged = np.full((len(times), values.shape[1]), np.nan)
     for k in range(values.shape[1]):
         logged = order[~np.isnan(values[order, k])]
-        merged[place[logged], k] = values[logged, k]  # of several at one place numpy keeps the last
+        merged[place[logged], k] = values[logged, k]  # numpy keeps the last of several values for one index
     return times, merged
 
 
-def woven(sheets: Sequence[Sheet], stands: Mapping[str, float], hold: Hold) -> Sheet:
-    """All sheets as one, on the union of their times. Inputs (`stands`: for how long a value stands where cells after
-    it are empty, s) run on between the rows of their own sheet; a reading is there only where it was logged.
+def merge_sheets(sheets: Sequence[Sheet], hold_times: Mapping[str, float], hold: Hold) -> Sheet:
+    """All sheets as one, on the union of their times.
 
-    Raises ValueError where a sheet has no time in common with the others, as where it counts from its own start.
+    hold_times: for each input, how long its last value is held after empty cells, s. Inputs continue between the rows
+    of their own sheet; a reading is present only where it was logged. Raises ValueError if a sheet's times do not
+    overlap with the others', for example because it counts from its own start.
     """
     if len(sheets) > 1:
         _expect_common_time(sheets)
@@ -111,8 +112,8 @@ def woven(sheets: Sequence[Sheet], stands: Mapping[str, float], hold: Hold) -> S
     for sheet, clock in zip(sheets, clocks, strict=True):
         rows = np.searchsorted(times, clock)
         for name, column in zip(sheet.names, sheet.values.T, strict=True):
-            if name in stands:
-                columns.append(_running(times, clock, column, stands[name], hold))
+            if name in hold_times:
+                columns.append(_resampled_input(times, clock, column, hold_times[name], hold))
                 continue
             placed = np.full(len(times), np.nan)
             placed[rows] = np.where(np.isfinite(column), column, np.nan)
@@ -125,9 +126,11 @@ def _names(sheets: Sequence[Sheet]) -> tuple[str, ...]:
     return tuple(name for sheet in sheets for name in sheet.names)
 
 
-def _running(times: np.ndarray, clock: np.ndarray, column: np.ndarray, most: float, hold: Hold) -> np.ndarray:
-    """An input at all times (T,) by its own rows (R,); unknown before the first, and once it stands no longer."""
-    filled = held(clock, column, most, hold)
+def _resampled_input(
+    times: np.ndarray, clock: np.ndarray, column: np.ndarray, hold_time: float, hold: Hold
+) -> np.ndarray:
+    """An input at all times (T,) from its own rows (R,); NaN before the first, and after it is no longer held."""
+    filled = fill_held(clock, column, hold_time, hold)
     if times is clock:
         return filled
     row = np.searchsorted(clock, times, side="right") - 1
@@ -139,12 +142,12 @@ def _running(times: np.ndarray, clock: np.ndarray, column: np.ndarray, most: flo
         )
         value = np.where(share > 0.0, value + share * (filled[after] - value), value)
     logged = np.flatnonzero(~np.isnan(column))
-    stale = times - (clock[logged[-1]] if len(logged) else np.inf) > most * (1.0 + HELD_MARGIN)
+    stale = times - (clock[logged[-1]] if len(logged) else np.inf) > hold_time * (1.0 + HELD_MARGIN)
     return np.where((row < 0) | ((times > clock[-1]) & stale), np.nan, value)
 
 
 def _expect_common_time(sheets: Sequence[Sheet]) -> None:
-    """What is logged on change may have ended long before the rest; nothing may begin after all else has ended."""
+    """Raises ValueError if a sheet begins after all others have ended. A channel logged on change may end early."""
     late = max(sheets, key=lambda s: float(s.seconds[0]))
     last = max((s for s in sheets if s is not late), key=lambda s: float(s.seconds[-1]))
     if late.seconds[0] > last.seconds[-1]:
@@ -154,25 +157,28 @@ def _expect_common_time(sheets: Sequence[Sheet]) -> None:
         )
 
 
-def telling_rows(inputs: np.ndarray, outputs: np.ndarray, hold: Hold) -> np.ndarray:
-    """Rows (R,), from the first reading to the last, that hold a reading or in which an input becomes another one;
-    under a linear hold each is a corner of an input.
+def informative_rows(inputs: np.ndarray, outputs: np.ndarray, hold: Hold) -> np.ndarray:
+    """The rows (R,) from the first to the last reading that have a reading or a new input value.
+
+    Under a linear hold, every row is a corner of an input and is kept.
     """
     read = ~np.isnan(outputs).all(axis=1)
-    tells = np.append(True, ~_equal(inputs[1:], inputs[:-1]).all(axis=1)) | read | (hold == "linear")
+    informative = np.append(True, ~_equal(inputs[1:], inputs[:-1]).all(axis=1)) | read | (hold == "linear")
     number = np.arange(len(read))
-    return tells & np.logical_or.accumulate(read) & (number <= (number[read][-1] if read.any() else -1))
+    return informative & np.logical_or.accumulate(read) & (number <= (number[read][-1] if read.any() else -1))
 
 
-def held(seconds: np.ndarray, column: np.ndarray, most: float, hold: Hold) -> np.ndarray:
-    """An input (R,) where nothing was logged: the last value for as long as it stands (`most`, s), or under a linear
-    hold the line to the next one, where that is no further off. A bad value ends what it follows, and is NaN.
+def fill_held(seconds: np.ndarray, column: np.ndarray, hold_time: float, hold: Hold) -> np.ndarray:
+    """An input (R,) with empty cells filled by the last value, for at most `most` s.
+
+    Under a linear hold they are interpolated, if the next value is no further away. A bad value is NaN and ends the
+    hold.
     """
-    filled = _filled(seconds, column, most * (1.0 + HELD_MARGIN), hold) if most > 0.0 else column
+    filled = _filled(seconds, column, hold_time * (1.0 + HELD_MARGIN), hold) if hold_time > 0.0 else column
     return np.where(np.isfinite(filled), filled, np.nan)
 
 
-def _filled(seconds: np.ndarray, column: np.ndarray, most: float, hold: Hold) -> np.ndarray:
+def _filled(seconds: np.ndarray, column: np.ndarray, hold_time: float, hold: Hold) -> np.ndarray:
     logged = ~np.isnan(column)
     if not logged.any():
         return column
@@ -184,7 +190,7 @@ def _filled(seconds: np.ndarray, column: np.ndarray, most: float, hold: Hold) ->
         known, after = known & (after < len(column)), np.minimum(after, len(column) - 1)
         span = seconds[after] - seconds[last]
         share = np.where(span > 0, (seconds - seconds[last]) / np.where(span > 0, span, 1.0), 0.0)
-        sound = np.isfinite(column[last]) & np.isfinite(column[after]) & (span <= most) & known
-        ends = [np.where(sound, column[place], 0.0) for place in (last, after)]
-        return np.where(logged, column, np.where(sound, ends[0] + share * (ends[1] - ends[0]), np.nan))
-    return np.where(known & (seconds - seconds[last] <= most), column[last], np.nan)
+        valid = np.isfinite(column[last]) & np.isfinite(column[after]) & (span <= hold_time) & known
+        ends = [np.where(valid, column[place], 0.0) for place in (last, after)]
+        return np.where(logged, column, np.where(valid, ends[0] + share * (ends[1] - ends[0]), np.nan))
+    return np.where(known & (seconds - seconds[last] <= hold_time), column[last], np.nan)

@@ -1,4 +1,4 @@
-"""What every reader of recordings is: a function from a file and the channels wanted of it to a Recording in SI."""
+"""Where a recording's channels come from, and the interface of all readers: file and channels -> Recording in SI."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from fdi_torch.recording import Hold, Recording
 
 @dataclass(frozen=True)
 class ChannelSource:
-    """Where a channel's numbers come from, and what its cells mean.
+    """The source of a channel's numbers, and the meaning of its cells.
 
-    column: its header (the channel's own name where None), or its tag. unit: of the numbers in it (from the header
-    where None). constant: the value (SI, in `unit`) of a channel that the file does not hold; NaN where it was never
-    recorded. held: how long an input's value stands where cells after it are empty, s. words: what a cell with that
-    text means, in `unit`; NaN: nothing was read. quality: header of the column that tells whether the value counts;
-    good: the words by which it does. plus: headers of further columns whose values are added to it.
+    column: its header or tag (default: the channel's name). unit: of its numbers (default: from the header). constant:
+    value (in `unit`, SI) of a channel that the file lacks; NaN for unknown. held: how long an input keeps its value
+    over empty cells, s. words: text of a cell -> value in `unit`, NaN for a bad reading. quality: header of the column
+    with the quality of the value; good: its words for a valid value. plus: headers of columns that are added.
     """
 
     column: str | None = None
@@ -34,8 +33,10 @@ class ChannelSource:
 
 @dataclass(frozen=True)
 class ClockSource(ChannelSource):
-    """Where time stands. stamps: how time stamps are written (as for strptime; ISO 8601 where None). zone: in which
-    their local time is, by its IANA name. shift: added to this clock, s. sort: rows may stand in any order.
+    """The source of time.
+
+    stamps: format of time stamps (as for strptime; default: ISO 8601). zone: IANA name of the zone of local time.
+    shift: added to this clock, s. sort: whether rows may be in any order.
     """
 
     stamps: str | None = None
@@ -46,7 +47,7 @@ class ClockSource(ChannelSource):
 
 @dataclass(frozen=True)
 class TagRows:
-    """Columns of a file with a row for each value: of the tag, of the value, and of its quality (or None)."""
+    """Column headers of a file with one row per value: tag, value, and quality (or None)."""
 
     tag: str
     value: str
@@ -55,9 +56,10 @@ class TagRows:
 
 @dataclass(frozen=True)
 class FileSource:
-    """A file, what its columns are to channels (time is `t`), and how its rows are laid out (None: one an instant).
+    """A file, its columns by channel (time is `t`), and its layout. tags: None for one row per instant.
 
-    header: whether its first row has the columns' names; else they are numbered from 1. sheet: of an Excel workbook.
+    header: whether its first row has the columns' names; otherwise columns are numbered from 1. sheet: of an Excel
+    workbook.
     """
 
     path: Path
@@ -68,9 +70,9 @@ class FileSource:
 
 
 class Reader(Protocol):
-    """The named channels of a file. In `mapping`, which says where those stand whose names do not tell, time is `t`.
+    """Reads the named channels of a file; `mapping` describes those whose names do not match, time is `t`.
 
-    Raises ValueError, naming the file, for what is not in it or cannot be understood.
+    Raises ValueError, naming the file, for missing or unreadable content.
     """
 
     def __call__(

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_torch.recordings.tables import Row
+from fdi_torch.recordings.table_files import Row
 
 
 def rows_of_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> Iterator[Row]:
-    """The arrays that are as long as the longest vector: of a vector NAME a column, of a matrix (rows, k) NAME:1 to
-    NAME:k. Names without their folders, where these are the same. Raises ValueError where there are none.
+    """A header and rows from the arrays of the greatest length.
+
+    A vector NAME is one column, a matrix (rows, k) the columns NAME:1 to NAME:k; folders are dropped from the names if
+    they stay unique. Raises ValueError if there are no such arrays.
     """
     tables = {
         name: array.reshape(-1, 1) if 1 in array.shape or array.ndim == 1 else array for name, array in arrays.items()
@@ -21,9 +23,9 @@ def rows_of_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> Iterator[Row
     columns: dict[str, np.ndarray] = {}
     for name, table in tables.items():
         if table.ndim == 2 and len(table) == length:
-            several = table.shape[1] > 1
+            is_matrix = table.shape[1] > 1
             columns |= {
-                f"{name}:{k + 1}" if several else name: table[:, k].astype(np.float64) for k in range(table.shape[1])
+                f"{name}:{k + 1}" if is_matrix else name: table[:, k].astype(np.float64) for k in range(table.shape[1])
             }
     if length < 2:
         raise ValueError(f"{path}: expected vectors of numbers of one length, got {', '.join(arrays) or 'none'}")

@@ -1,4 +1,4 @@
-"""What actuators make of their channels over a whole experiment, and how that moves with the parameters."""
+"""Actuator outputs over a whole experiment, and their slopes by the parameters."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.memory import Signals, chain, remembered
+from fdi_torch.simulate.linearised_stage import Signals, linearise_stage, solve_memory
 from fdi_torch.simulate.pointwise import Row, partials
 
 
 @dataclass(frozen=True)
 class Actuation:
-    """names: of the parameters that may move."""
+    """The actuators of a plant in one experiment. names: the parameters by which outputs are differentiated."""
 
     network: TankNetwork
     experiment: Experiment
@@ -26,71 +26,82 @@ class Actuation:
 
     @property
     def clock(self) -> Clock:
+        """The clock of all K steps at once."""
         e = self.experiment
         return Clock(e.nodes[:-1], e.steps, e.resolution)
 
     def commands(self, values: PlaceValues, lanes: int) -> list[Tensor]:
-        """Each actuator's command (L, K)."""
+        """Output of each actuator over the K steps, one tensor (L, K) each."""
         signals, count = self._channels(values, lanes), self.network.command_memory()
         stage = _Stage(self, values)
-        memory = remembered(stage.step, stage.first, signals, [], count, signals[0].shape) if signals else []
+        memory = solve_memory(stage.step, stage.first, signals, [], count, signals[0].shape) if signals else []
         return self.network.commands(signals, tuple(memory), self.clock, values)[0]
 
     def slopes(
         self, values: PlaceValues, theta: Signals, lanes: int
     ) -> tuple[list[Tensor], list[Tensor | None], list[int]]:
-        """theta: of each name (L, 1) -> commands (L, K), how each moves (L, M, K), and which M parameters move them."""
+        """Outputs (L, K) of the actuators and their slopes.
+
+        theta: each named parameter (L, 1). Returns the outputs, the slopes (L, M, K) of each output by the M parameters
+        that affect any of them (None for an output without slopes), and the indices of these M parameters.
+        """
         channels, stage = self._channels(values, lanes), _Stage(self, values)
         if not channels:
             return [], [], []
         shape = channels[0].shape
-        late: list[Row] = [[None] * len(theta)] * len(channels)
+        channel_slopes: list[Row] = [[None] * len(theta)] * len(channels)
         if self.network.command_delays(values):
-            late = partials(lambda x: self._channels(moved(values, self.names, x), lanes), theta, shape)[1]
-        found = chain(stage.step, stage.first, channels, theta, self.network.command_memory(), shape)
-        by_channel = {p for row in late for p, slope in enumerate(row) if slope is not None}
-        columns = sorted({*by_channel, *found.moved_by()})
-        signals = [_columns([row[p] for p in columns]) for row in late]
-        return found.outputs, found.along(signals, columns), columns
+            channel_slopes = partials(
+                lambda x: self._channels(with_parameters(values, self.names, x), lanes), theta, shape
+            )[1]
+        linearised = linearise_stage(stage.step, stage.first, channels, theta, self.network.command_memory(), shape)
+        by_channel = {p for row in channel_slopes for p, slope in enumerate(row) if slope is not None}
+        columns = sorted({*by_channel, *linearised.moved_by()})
+        signals = [_columns([row[p] for p in columns]) for row in channel_slopes]
+        return linearised.outputs, linearised.along(signals, columns), columns
 
     def _channels(self, values: PlaceValues, lanes: int) -> list[Tensor]:
-        """Each actuator's channel averaged over each step, late where it is late, (L, K)."""
+        """Mean of each actuator's channel over each step (L, K), with its dead time."""
         e = self.experiment
         delays = self.network.command_delays(values)
-        each = [
+        means = [
             e.signal.average(e.nodes[:-1], e.steps, channel, delays[i]) if i in delays else e.inputs[:, channel]
             for i, (_, channel) in enumerate(self.network.actuators())
         ]
-        return [c.expand(lanes, len(e.steps)) for c in each]
+        return [c.expand(lanes, len(e.steps)) for c in means]
 
 
 @dataclass(frozen=True)
 class _Stage:
-    of: Actuation
+    actuation: Actuation
     values: PlaceValues
 
     def step(self, signals: Signals, memory: Memory, theta: Signals) -> tuple[Signals, Memory]:
-        return self.of.network.commands(signals, memory, self.of.clock, moved(self.values, self.of.names, theta))
+        return self.actuation.network.commands(
+            signals, memory, self.actuation.clock, with_parameters(self.values, self.actuation.names, theta)
+        )
 
     def first(self, signals: Signals, theta: Signals) -> Memory:
-        clock = self.of.clock
-        at_first = Clock(clock.start[:1], clock.step[:1], clock.resolution)
-        return self.of.network.remember_commands(signals, at_first, moved(self.values, self.of.names, theta))
+        clock = self.actuation.clock
+        first_step = Clock(clock.start[:1], clock.step[:1], clock.resolution)
+        return self.actuation.network.steady_command_memory(
+            signals, first_step, with_parameters(self.values, self.actuation.names, theta)
+        )
 
 
-def moved(values: PlaceValues, names: Sequence[str], theta: Signals) -> PlaceValues:
-    """The values with those of the names replaced; as they are where theta is empty."""
+def with_parameters(values: PlaceValues, names: Sequence[str], theta: Signals) -> PlaceValues:
+    """The values with the named ones replaced by theta; unchanged if theta is empty."""
     if not theta:
         return values
-    own = {place: dict(fields) for place, fields in values.items()}
+    replaced = {place: dict(fields) for place, fields in values.items()}
     for name, value in zip(names, theta, strict=True):
         place, _, field = name.rpartition(".")
-        own[place][field] = value
-    return own
+        replaced[place][field] = value
+    return replaced
 
 
 def _columns(slopes: Row) -> Tensor | None:
-    known = next((s for s in slopes if s is not None), None)
-    if known is None:
+    like = next((s for s in slopes if s is not None), None)
+    if like is None:
         return None
-    return torch.stack([torch.zeros_like(known) if s is None else s for s in slopes], dim=1)
+    return torch.stack([torch.zeros_like(like) if s is None else s for s in slopes], dim=1)

@@ -1,7 +1,8 @@
-"""Compiles a source into a library once and keeps it in a cache that all processes of this user share.
+"""Compilation of C++ sources into shared libraries, with a cache that all processes of this user share.
 
-A cached library is code that will run. The folder therefore belongs to this user alone (mode 0700), a library's name
-holds the hash of its content, and owner, mode and hash are checked before it is loaded. One that fails is built anew.
+A cached library is code that will be executed. Its folder therefore belongs to this user alone (mode 0700), its name
+holds the hash of its content, and owner, mode and hash are checked before it is loaded. A library that fails the check
+is compiled again.
 """
 
 from __future__ import annotations
@@ -26,17 +27,19 @@ _FLAGS = (
 
 
 class BuildError(OSError):
-    """The machine has no C++ compiler, it did not take the source, or there is no folder to build in."""
+    """There is no C++ compiler, it rejected the source, or there is no writable folder for the result."""
 
 
 Command = tuple[str, ...]
 
 
 def find_compiler() -> Command | None:
-    """$CXX, or else the first of g++, c++ and clang++ on the PATH, or else the one in the package ziglang."""
+    """$CXX if set, else the first of g++, c++ and clang++ on the PATH, else the compiler of the package ziglang; or
+    None.
+    """
     names = [os.environ["CXX"]] if os.environ.get("CXX") else ["g++", "c++", "clang++"]
-    found = next((path for path in map(shutil.which, names) if path), None)
-    return (found,) if found else _packaged_compiler()
+    path = next((p for p in map(shutil.which, names) if p), None)
+    return (path,) if path else _packaged_compiler()
 
 
 def _packaged_compiler() -> Command | None:
@@ -48,12 +51,14 @@ def _packaged_compiler() -> Command | None:
 
 
 def warm_up() -> None:
-    """Lets a packaged compiler build its own library once, which takes it a minute. Raises BuildError."""
+    """Compile a small source, which makes a packaged compiler build its own library (a minute). Raises BuildError."""
     load_library("#include <thread>\n#include <vector>\nstd::vector<std::thread> threads;\n")
 
 
 def cache_folder() -> Path:
-    """$XDG_CACHE_HOME/fdi_torch or ~/.cache/fdi_torch; without a home, a folder of this user among temporary files."""
+    """$XDG_CACHE_HOME/fdi_torch or ~/.cache/fdi_torch; without a home folder, one of this user in the temporary
+    folder.
+    """
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"]) / "fdi_torch"
     try:
@@ -63,7 +68,7 @@ def cache_folder() -> Path:
 
 
 def is_cached(source: str) -> bool:
-    """Whether the source has been compiled on this machine before."""
+    """Whether the cache holds the compiled source."""
     compiler = find_compiler()
     try:
         return compiler is not None and _cached(_own_folder(), _key(compiler, source)) is not None
@@ -72,7 +77,7 @@ def is_cached(source: str) -> bool:
 
 
 def load_library(source: str, *functions: str) -> ctypes.CDLL:
-    """The compiled source, from the cache if it is there whole. functions: what it has to have. Raises BuildError."""
+    """The compiled source, from the cache if possible. functions: names that it must export. Raises BuildError."""
     compiler = find_compiler()
     if compiler is None:
         raise BuildError(
@@ -94,17 +99,17 @@ def _key(compiler: Command, source: str) -> str:
 
 
 def _own_folder() -> Path:
-    """The cache's folder, made where it is not there. Raises BuildError where others could write to it."""
+    """The cache folder, created if missing. Raises BuildError if another user owns it."""
     folder = cache_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.lstat()
-        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+        status = folder.lstat()
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
             raise BuildError(
                 f"{folder}: expected a folder of this user's own for compiled plants, got one of another user or a "
                 "link; remove it, or set XDG_CACHE_HOME"
             )
-        if stat.S_IMODE(found.st_mode) != 0o700:
+        if stat.S_IMODE(status.st_mode) != 0o700:
             folder.chmod(0o700)
     except BuildError:
         raise
@@ -114,7 +119,7 @@ def _own_folder() -> Path:
 
 
 def _cached(folder: Path, key: str) -> Path | None:
-    """A library of that key that is this user's and whole; those that are not are removed."""
+    """The cached library of that key if it passes the check; libraries that fail it are removed."""
     for library in sorted(folder.glob(f"{key}_*.so")):
         if _is_sound(library):
             return library
@@ -123,9 +128,9 @@ def _cached(folder: Path, key: str) -> Path | None:
 
 
 def _is_sound(library: Path) -> bool:
-    found = library.lstat()
-    own = stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o022
-    return own and library.stem.rpartition("_")[2] == _content_hash(library)
+    status = library.lstat()
+    is_ours = stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
+    return is_ours and library.stem.rpartition("_")[2] == _content_hash(library)
 
 
 def _content_hash(path: Path) -> str:
@@ -144,7 +149,7 @@ def _opened(library: Path, functions: Sequence[str]) -> ctypes.CDLL:
 
 
 def _compile(compiler: Command, source: str, folder: Path, key: str) -> Path:
-    """Builds the library, and returns where it lies."""
+    """Compile the source and return the path of the library."""
     try:
         with tempfile.TemporaryDirectory(dir=folder) as place:
             code, built = Path(place) / "kernel.cpp", Path(place) / "kernel.so"
@@ -164,13 +169,13 @@ def _compile(compiler: Command, source: str, folder: Path, key: str) -> Path:
 
 @lru_cache(maxsize=8)
 def _identity(compiler: Command) -> str:
-    found = os.stat(compiler[0])
-    return f"{os.path.realpath(compiler[0])} {found.st_size} {found.st_mtime_ns}"
+    status = os.stat(compiler[0])
+    return f"{os.path.realpath(compiler[0])} {status.st_size} {status.st_mtime_ns}"
 
 
 @lru_cache(maxsize=1)
 def _processor() -> str:
-    """What `-march=native` depends on."""
+    """The processor's description, on which `-march=native` depends."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

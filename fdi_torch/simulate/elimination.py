@@ -1,8 +1,8 @@
-"""Elimination in a sparse matrix whose pattern is known: the order of its pivots, and what each of them changes.
+"""Sparse Gaussian elimination with a fixed pattern: the order of the pivots and the operations of each.
 
-Pivots are taken from the diagonal, those with the fewest entries beside them first (Markowitz 1957), which leaves
-hardly any fill-in in a network of tanks that is nearly a tree. 1 - c df/dh needs no other pivots: water that leaves a
-tank arrives in another one, so that the diagonal outweighs its column.
+Pivots are on the diagonal, those with the fewest other entries first (Markowitz, 1957), which causes hardly any fill-in
+in a network of tanks that is nearly a tree. 1 - c df/dh needs no other pivots: the flow out of one tank enters another
+tank, so that the matrix is diagonally dominant by columns.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ X = TypeVar("X")
 
 @dataclass(frozen=True)
 class Elimination:
-    """entries: (row, column) of everything that is not zero once all is eliminated, the diagonal first.
+    """The operations of the elimination.
 
-    given: for each entry its place in the pattern, -1 for a diagonal or a fill-in that the pattern lacks.
-    order: the pivots. rows: (entry, pivot) of each multiplier in the order of the work, and after it `updates`:
-    (entry, entry of the pivot's row) from which the multiplier times the second is taken.
+    entries: (row, column) of every entry that becomes nonzero, the diagonal first. given: the index of each entry in
+    the pattern, -1 for a diagonal entry or fill-in that the pattern lacks. order: the pivots. rows: (entry, pivot) of
+    each multiplier in order of computation; updates: for each multiplier, the pairs (entry, entry of the pivot's row)
+    from which the multiplier times the second is subtracted. above: for each pivot in order, (entry, column) right of
+    the diagonal.
     """
 
     size: int
@@ -32,10 +34,10 @@ class Elimination:
     order: tuple[int, ...]
     rows: tuple[tuple[int, int], ...]
     updates: tuple[tuple[tuple[int, int], ...], ...]
-    above: tuple[tuple[tuple[int, int], ...], ...]  # of each pivot, in the order: (entry, column) beyond the diagonal
+    above: tuple[tuple[tuple[int, int], ...], ...]
 
     def factored(self, matrix: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """matrix: one tensor an entry -> multipliers and the upper factor in its place, and the pivots' inverses."""
+        """LU factors in place of the matrix (one tensor per entry), and the inverse pivots."""
         lu, inverse = list(matrix), [torch.empty(0)] * self.size
         work = list(zip(self.rows, self.updates, strict=True))
         for pivot in self.order:
@@ -47,7 +49,7 @@ class Elimination:
         return lu, inverse
 
     def solved(self, factors: tuple[list[Tensor], list[Tensor]], right: Sequence[Tensor]) -> list[Tensor]:
-        """The solution for a right-hand side, one tensor a row."""
+        """The solution for a right-hand side, one tensor per row."""
         (lu, inverse), x = factors, list(right)
         for entry, pivot in self.rows:
             row = self.entries[entry][0]
@@ -60,42 +62,42 @@ class Elimination:
 
 
 def eliminate(size: int, pattern: Sequence[tuple[int, int]]) -> Elimination:
-    """The work for a matrix of that size whose entries (row, column) besides the diagonal are those of the pattern."""
-    place = {at: e for e, at in enumerate(pattern)}
+    """The elimination of a matrix of that size with off-diagonal entries (row, column) at `pattern`."""
+    index = {at: e for e, at in enumerate(pattern)}
     entries = {(i, i): i for i in range(size)}
     for at in pattern:
         entries.setdefault(at, len(entries))
-    left, order = set(range(size)), []
+    remaining, order = set(range(size)), []
     rows: list[tuple[int, int]] = []
     updates, above = [], []
     columns = _neighbours(size, entries, lambda at: at)
-    lines = _neighbours(size, entries, lambda at: (at[1], at[0]))
-    while left:
-        pivot = min(left, key=lambda k: ((len(columns[k]) - 1) * (len(lines[k]) - 1), k))
-        left.remove(pivot)
+    rows_of_column = _neighbours(size, entries, lambda at: (at[1], at[0]))
+    while remaining:
+        pivot = min(remaining, key=lambda k: ((len(columns[k]) - 1) * (len(rows_of_column[k]) - 1), k))
+        remaining.remove(pivot)
         order.append(pivot)
-        beyond = sorted(columns[pivot] & left)
-        below = sorted(lines[pivot] & left)
+        beyond = sorted(columns[pivot] & remaining)
+        below = sorted(rows_of_column[pivot] & remaining)
         for row in below:
             rows.append((entries[row, pivot], pivot))
             for column in beyond:
                 entries.setdefault((row, column), len(entries))
                 columns[row].add(column)
-                lines[column].add(row)
+                rows_of_column[column].add(row)
             updates.append(tuple((entries[row, column], entries[pivot, column]) for column in beyond))
         above.append(tuple((entries[pivot, column], column) for column in beyond))
-        for k in left:
+        for k in remaining:
             columns[k].discard(pivot)
-            lines[k].discard(pivot)
-    given = tuple(place.get(at, -1) for at in entries)
+            rows_of_column[k].discard(pivot)
+    given = tuple(index.get(at, -1) for at in entries)
     return Elimination(size, tuple(entries), given, tuple(order), tuple(rows), tuple(updates), tuple(above))
 
 
 def _neighbours(
-    size: int, entries: dict[tuple[int, int], int], turned: Callable[[tuple[int, int]], tuple[int, int]]
+    size: int, entries: dict[tuple[int, int], int], orient: Callable[[tuple[int, int]], tuple[int, int]]
 ) -> list[set[int]]:
-    """For each row the columns of its entries; with rows and columns exchanged, for each column the rows."""
-    found: list[set[int]] = [set() for _ in range(size)]
-    for row, column in map(turned, entries):
-        found[row].add(column)
-    return found
+    """The columns of the entries in each row; with rows and columns exchanged by `turned`, the rows in each column."""
+    columns: list[set[int]] = [set() for _ in range(size)]
+    for row, column in map(orient, entries):
+        columns[row].add(column)
+    return columns

@@ -1,4 +1,4 @@
-"""What every engine answers: readings, their Jacobian, and sums over samples that need no trajectory to be kept."""
+"""The interface of all engines: readings, their Jacobian, and sums over samples that need no stored trajectory."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Readings:
-    """What was read, to be compared with what an engine predicts.
+    """Measured readings, to be compared with an engine's predictions.
 
-    values and weight: (S, C) for all lanes, or (problems, S, C), one set for each problem. weight 0 masks a reading.
-    ar: None, or the AR(1) coefficient of each channel's noise, (C,) or (problems, C): residuals and Jacobians are
-    whitened, x_k - ar x_(k-1); the first sample, and one after a masked one, is scaled by sqrt(1 - ar^2) instead.
+    values and weight: (S, C) for all lanes, or (problems, S, C), one set per problem; weight 0 masks a reading. ar:
+    None, or the AR(1) coefficient of each channel's noise, (C,) or (problems, C). With it, residuals and Jacobians are
+    whitened, x_k - ar x_(k-1); the first sample, and a sample after a masked one, is scaled by sqrt(1 - ar^2) instead.
     """
 
     values: Tensor
@@ -35,7 +35,7 @@ class Readings:
 
     @cached_property
     def count(self) -> Tensor:
-        """The number of readings that count, (C,) or (problems, C)."""
+        """The number of unmasked readings, (C,) or (problems, C)."""
         return self.weight.sum(dim=-2)
 
     @cached_property
@@ -50,24 +50,26 @@ class Readings:
 
     @cached_property
     def centre(self) -> Tensor:
-        """Weighted means, (C,) or (problems, C); 0 where nothing counts."""
+        """Weighted means, (C,) or (problems, C); 0 for a channel without readings."""
         return (self.known * self.weight).sum(dim=-2) / torch.where(self.count > 0, self.count, 1.0)
 
     def of(self, lanes: Tensor) -> Readings:
-        """The sets of some problems; readings shared by all are passed on as they are."""
+        """The readings of the selected problems; readings shared by all are returned unchanged."""
         if self.values.dim() == 2:
             return self
         return Readings(self.values[lanes], self.weight[lanes], self.ar[lanes] if self.ar is not None else None)
 
 
 class Engine(Protocol):
-    """A plant under one experiment, run for many parameter vectors at once."""
+    """A plant in one experiment, simulated for many parameter vectors (lanes) at once. C sensors, S samples, P
+    parameters.
+    """
 
     name: str
-    why: str  # a plain sentence on why this engine was chosen
+    why: str  # the reason for the choice of this engine, one sentence
 
     def readings(self, theta: Tensor) -> Tensor:
-        """theta (*batch, P) -> readings (*batch, S, C) in SI; with their gradient where theta requires it."""
+        """theta (*batch, P) -> readings (*batch, S, C) in SI; differentiable if theta requires a gradient."""
         ...
 
     def levels(self, theta: Tensor) -> Tensor:
@@ -86,15 +88,14 @@ class Engine(Protocol):
         ...
 
     def gram(self, theta: Tensor, data: Readings) -> Tensor:
-        """theta (problems, N, P) -> weighted sums of products of [d prediction/d theta, r, y', 1].
-
-        (problems, N, C, P+3, P+3).
+        """theta (problems, N, P) -> weighted sums of the products of [d prediction/d theta, r, y', 1], (problems, N, C,
+        P+3, P+3).
         """
         ...
 
 
 def expect_problems(theta: Tensor, data: Readings) -> None:
-    """Raises ValueError where theta (*problems, N, P) and the data speak of different problems."""
+    """Raises ValueError if theta (*problems, N, P) and the data have different problem dimensions."""
     problems = data.values.shape[:-2]
     if problems and theta.shape[:-2] != problems:
         raise ValueError(
@@ -125,7 +126,7 @@ def gram_of(readings: Tensor, jacobian: Tensor, data: Readings) -> Tensor:
 
 
 def whitened(columns: Tensor, weight: Tensor, ar: Tensor) -> Tensor:
-    """columns (..., S, sensors, M) -> x_k - ar x_(k-1); sqrt(1 - ar^2) x_k where no reading stands before it."""
+    """columns (..., S, sensors, M) -> x_k - ar x_(k-1), or sqrt(1 - ar^2) x_k where the preceding reading is masked."""
     ar = ar.expand(weight.shape).unsqueeze(-1)
     before = torch.cat([torch.zeros_like(columns[..., :1, :, :]), columns[..., :-1, :, :]], dim=-3)
     follows = torch.cat([torch.zeros_like(weight[..., :1, :]), weight[..., :-1, :]], dim=-2).unsqueeze(-1) > 0

@@ -1,4 +1,4 @@
-"""Experiment: what is imposed on a plant, laid out in integration steps, and when it is read."""
+"""Experiment: the inputs of a plant on a grid of integration steps, and its sample times."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 from fdi_torch.capacity import expect_room
 from fdi_torch.plant.signals import CumulativeSignal
 from fdi_torch.recording import Hold, Recording
-from fdi_torch.simulate.own_steps import OwnSteps
+from fdi_torch.simulate.step_control import StepControl
 
 BLOCK = 1 << 17
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Inputs and sample times on a grid of steps.
+    """Inputs and sample times on a grid of integration steps.
 
-    nodes (K+1,) s: the ends of the integration steps, which hit every switch of a held input they can.
-    inputs (K, channels): each channel's exact mean over each step. signal: the same for any delayed interval.
-    sample_times (S,) s; sample k lies at share `sample_share` (0..1] of step `sample_step` (the first at 0 of step 0).
-    resolution: the time below which roots and rims are drawn smooth, s; the longest step, or that of `own`.
-    own: None, or how each lane divides the steps by itself.
+    nodes (K+1,) s: the ends of the steps, which coincide with the switches of a held input where possible. inputs (K,
+    channels): exact mean of each channel over each step; signal: the same for any delayed interval. sample_times (S,)
+    s; sample k is at the fraction `sample_share` (0..1] of step `sample_step` (the first one at 0 of step 0).
+    resolution: time scale of the smoothing of square roots and rims, s; the longest step, or that of `step_control`.
+    step_control: None for fixed steps, or the control by which each lane divides the steps.
     """
 
     nodes: Tensor
@@ -34,14 +34,14 @@ class Experiment:
     sample_step: Tensor
     sample_share: Tensor
     resolution: Tensor
-    own: OwnSteps | None = None
+    step_control: StepControl | None = None
 
     @property
     def steps(self) -> Tensor:
         return torch.diff(self.nodes)
 
     def mapped(self, make: Callable[[Tensor], Tensor]) -> Experiment:
-        """The same experiment with another kind of tensor for all that a plant's equations see of it."""
+        """The same experiment with all tensors that enter a plant's equations mapped by `make`."""
         return replace(
             self,
             nodes=make(self.nodes),
@@ -53,8 +53,9 @@ class Experiment:
 
     @property
     def sample_intervals(self) -> Tensor:
-        """How long before each sample the one before it was, (S,) s. The first: since the start, or where it is the
-        start, as the second; a single one as the first step.
+        """Time since the preceding sample, (S,) s.
+
+        For the first sample, the time since the start; if it is at the start, the second interval, or the first step.
         """
         times = self.sample_times
         if float(self.sample_share[0]) > 0.0:
@@ -63,10 +64,13 @@ class Experiment:
         return torch.diff(times, prepend=times[:1] - first)
 
 
-def lay_out(recording: Recording, channels: tuple[str, ...], step: float, own: OwnSteps | None = None) -> Experiment:
-    """The experiment that a recording was, in steps no longer than `step` (s), which lanes divide into `own` ones.
+def lay_out(
+    recording: Recording, channels: tuple[str, ...], step: float, step_control: StepControl | None = None
+) -> Experiment:
+    """The experiment of a recording, in steps of at most `step` s, which each lane may divide by `step_control`.
 
-    channels: the plant's input channels, by name. Raises ValueError where the recording lacks one or does not know it.
+    channels: names of the plant's input channels. Raises ValueError if the recording lacks one or has unknown values in
+    it.
     """
     if not step > 0:
         raise ValueError(f"expected a positive integration step, got {step} s")
@@ -74,7 +78,7 @@ def lay_out(recording: Recording, channels: tuple[str, ...], step: float, own: O
         raise ValueError(f"{recording.source}: expected at least two samples, got {len(recording)}")
     inputs = _select(recording, channels)
     time = recording.time - recording.time[0]
-    nodes = grid_nodes(time, inputs, recording.hold, step, every=own is not None)
+    nodes = grid_nodes(time, inputs, recording.hold, step, every=step_control is not None)
     signal = CumulativeSignal(time, inputs, recording.hold)
     starts, steps = nodes[:-1], torch.diff(nodes)
     means = torch.empty(len(starts), len(channels), dtype=time.dtype, device=time.device)
@@ -90,25 +94,25 @@ def lay_out(recording: Recording, channels: tuple[str, ...], step: float, own: O
         sample_times=time,
         sample_step=index,
         sample_share=share,
-        resolution=steps.max() if own is None else steps.new_tensor(own.resolution),
-        own=own,
+        resolution=steps.max() if step_control is None else steps.new_tensor(step_control.resolution),
+        step_control=step_control,
     )
 
 
 def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float, every: bool = False) -> Tensor:
-    """Step ends (K+1,) s from the first to the last sample, time (S,) s: at switches of inputs (S, M), and at samples
-    where these are not denser than `step` s.
+    """Step ends (K+1,) s from the first to the last sample.
 
-    every: at every sample. Switches that come faster than half a step are averaged over instead.
+    A step ends at every switch of the inputs (S, M), and at every sample of time (S,) unless samples are denser than
+    `step` s; `every` forces the latter. If inputs switch faster than half a step on average, they are averaged instead.
     """
-    wanted, span = torch.ones_like(time, dtype=torch.bool), float(time[-1] - time[0])
+    is_anchor, span = torch.ones_like(time, dtype=torch.bool), float(time[-1] - time[0])
     if hold == "zero_order":
-        changed = torch.diff(inputs, dim=0).abs().sum(dim=1) > 0
-        wanted[1:] = changed
-        if int(changed.sum()) * step > 2.0 * span:
-            wanted[1:] = False
+        switched = torch.diff(inputs, dim=0).abs().sum(dim=1) > 0
+        is_anchor[1:] = switched
+        if int(switched.sum()) * step > 2.0 * span:
+            is_anchor[1:] = False
     dense = not every and span / (len(time) - 1) < 0.999 * step
-    anchors = time[wanted] if dense and hold == "zero_order" else time
+    anchors = time[is_anchor] if dense and hold == "zero_order" else time
     if dense and hold == "linear":
         anchors = time[:1]
     ends = torch.cat([time[:1], anchors, time[-1:]]).unique()
@@ -118,19 +122,19 @@ def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float, every: boo
     what = f"{total:.3g} integration steps of {step:g} s through {span:g} s"
     expect_room((2 + inputs.shape[1]) * total, what, "choose a longer step")
     counts = needed.to(torch.int64)
-    after = torch.cumsum(counts, 0)
-    nodes = torch.empty(int(after[-1]) + 1, dtype=time.dtype, device=time.device)
+    last_step = torch.cumsum(counts, 0)
+    nodes = torch.empty(int(last_step[-1]) + 1, dtype=time.dtype, device=time.device)
     nodes[-1] = ends[-1]
     for block in _blocks(len(nodes) - 1):
         number = torch.arange(block.start, block.stop, device=time.device)
-        gap = torch.searchsorted(after, number, right=True)
-        within = (number - (after[gap] - counts[gap])).to(time.dtype)
+        gap = torch.searchsorted(last_step, number, right=True)
+        within = (number - (last_step[gap] - counts[gap])).to(time.dtype)
         nodes[block] = ends[gap] + gaps[gap] * within / counts[gap]
     return nodes
 
 
 def _blocks(count: int) -> Iterator[slice]:
-    """0 .. count in pieces, so that what is worked out on the way to millions of steps takes little memory."""
+    """Slices of 0..count that bound the memory of intermediate results for millions of steps."""
     return (slice(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK))
 
 
@@ -147,7 +151,7 @@ def _select(recording: Recording, channels: tuple[str, ...]) -> Tensor:
     if not bool(torch.isfinite(inputs).all()):
         row = int((~torch.isfinite(inputs)).any(dim=1).nonzero()[0])
         raise ValueError(
-            f"{recording.source}: expected known inputs, got an unknown one at {float(recording.time[row]):g} s; "
-            "mask that stretch or cut the recording there"
+            f"{recording.source}: expected a value of every input, got a missing one at {float(recording.time[row]):g} "
+            "s; mask that segment or cut the recording there"
         )
     return inputs

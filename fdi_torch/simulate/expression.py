@@ -1,7 +1,7 @@
-"""Flat pointwise programs: a graph of operations in which equal subexpressions are one node.
+"""Expression graphs of pointwise programs, in which equal subexpressions share one node.
 
-Every node knows what it varies with: from lane to lane, from step to step, both, or neither. What does not vary in
-time is computed once, what does not vary between lanes once for all of them; nobody has to say so.
+Every node knows with what it varies: from lane to lane, from step to step, with both or neither. The generated program
+computes what does not vary in time once per trajectory, and what does not vary between lanes once for all lanes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from fdi_torch.simulate.operations import FOLDED, OPERATIONS
 
 
 class Varies(IntFlag):
-    """With what a value changes."""
+    """The indices on which a value depends."""
 
     NEVER = 0
     LANE = 1
@@ -24,7 +24,9 @@ class Varies(IntFlag):
 
 @dataclass(frozen=True)
 class Node:
-    """operation: a row of OPERATIONS, 'literal' or 'input'. arguments: node numbers; kind and index name an input."""
+    """operation: a row of OPERATIONS, 'literal' or 'input'. arguments: node numbers. kind and index: name of an
+    input.
+    """
 
     operation: str
     arguments: tuple[int, ...]
@@ -39,11 +41,11 @@ class Node:
 
 
 class Graph:
-    """Nodes in an order in which each follows its arguments.
+    """Nodes in topological order.
 
-    lifted: numbers from the equations that are handed to a program when it runs, so that plants that differ only
-    in such numbers share one program; simple ones (halves, small integers) stay in the program.
-    closed: products that are needed as they are anyway, and are not taken apart to be grouped with other factors.
+    lifted: numbers of the equations that are passed to a program at run time, so that plants that differ only in such
+    numbers share one program; simple numbers (halves, small integers) stay in the program. closed: products that are
+    needed unchanged elsewhere and are therefore not regrouped with other factors.
     """
 
     def __init__(self) -> None:
@@ -59,7 +61,7 @@ class Graph:
         return self._intern(Node("literal", (), Varies.NEVER, float(value)))
 
     def number(self, value: float) -> int:
-        """A number of the equations: kept if simple, else lifted."""
+        """The node of a number of the equations: a literal if it is simple, else a lifted number."""
         if value * 8 == int(value * 8) and abs(value) <= 64 if abs(value) < 1e18 else False:
             return self.literal(value)
         if value not in self.lifted:
@@ -70,7 +72,7 @@ class Graph:
         return self.nodes[node].value
 
     def apply(self, operation: str, *arguments: int) -> int:
-        """The node for an operation, simplified where the result is the same to rounding."""
+        """The node of an operation, simplified where the result is the same up to rounding."""
         values = [self.value(a) for a in arguments]
         if operation in FOLDED and all(v is not None for v in values):
             return self.literal(FOLDED[operation](*values))
@@ -83,24 +85,24 @@ class Graph:
         return self._intern(Node(operation, tuple(arguments), varies))
 
     def total(self, terms: Iterable[int]) -> int | None:
-        """The sum of some nodes, or None of none."""
+        """The sum of the nodes, or None for no nodes."""
         result = None
         for term in terms:
             result = term if result is None else self.apply("add", result, term)
         return result
 
     def reach(self, outputs: Iterable[int], stop: Iterable[int] = ()) -> list[int]:
-        """All nodes that the outputs need, in order; what stands behind a node of `stop` is not followed."""
+        """All nodes on which the outputs depend, in order; arguments of the nodes in `stop` are not followed."""
         ends = set(stop)
-        seen: set[int] = set()
+        visited: set[int] = set()
         queue = list(outputs)
         while queue:
             node = queue.pop()
-            if node not in seen:
-                seen.add(node)
+            if node not in visited:
+                visited.add(node)
                 if node not in ends:
                     queue.extend(self.nodes[node].arguments)
-        return sorted(seen)
+        return sorted(visited)
 
     def substitute(self, outputs: Sequence[int], replacements: Mapping[int, int]) -> list[int]:
         """The outputs with some nodes replaced by others."""
@@ -108,22 +110,23 @@ class Graph:
         for i in self.reach(outputs, stop=replacements):
             node = self.nodes[i]
             if i not in done:
-                moved = [done[a] for a in node.arguments]
-                done[i] = self.apply(node.operation, *moved) if moved else i
+                arguments = [done[a] for a in node.arguments]
+                done[i] = self.apply(node.operation, *arguments) if arguments else i
         return [done[o] for o in outputs]
 
     def partials(self, outputs: Sequence[int], inputs: Iterable[int]) -> list[dict[int, int]]:
-        """For each output, the nodes of its derivatives by the inputs, where these are not zero.
+        """For each output, the nodes of its non-zero derivatives by the inputs.
 
-        The inputs may be nodes within the graph: what stands behind them counts as constant.
+        The inputs may be nodes within the graph; what they depend on counts as constant.
         """
-        wanted = set(inputs)
+        variables = set(inputs)
         slopes: dict[int, dict[int, int]] = {}
-        for i in self.reach(outputs, stop=wanted):
-            slopes[i] = {i: self.literal(1.0)} if i in wanted else self._chain(i, slopes)
+        for i in self.reach(outputs, stop=variables):
+            slopes[i] = {i: self.literal(1.0)} if i in variables else self._chain(i, slopes)
         return [slopes[o] for o in outputs]
 
     def _chain(self, i: int, slopes: Mapping[int, Mapping[int, int]]) -> dict[int, int]:
+        """The chain rule at one node: its slopes by the inputs from those of its arguments."""
         node = self.nodes[i]
         if node.operation == "where":
             return self._chain_of_choice(node.arguments, slopes)
@@ -140,7 +143,7 @@ class Graph:
         return result
 
     def _chain_of_choice(self, arguments: tuple[int, ...], slopes: Mapping[int, Mapping[int, int]]) -> dict[int, int]:
-        """The slopes of the branch taken: what the other one's are does not matter."""
+        """The slopes of a `where`: those of the branch that is taken."""
         condition, yes, no = arguments
         zero = self.literal(0.0)
         sources = dict.fromkeys([*slopes[yes], *slopes[no]])
@@ -187,7 +190,7 @@ class Graph:
         return None
 
     def _divide(self, a: Sequence[int], value: Sequence[float | None]) -> int | None:
-        """By what varies less: a product with its inverse, which is computed less often."""
+        """A quotient as the product with an inverse that varies less and is therefore computed less often."""
         quartic = self._fourth_root(a[1])
         if quartic is not None and self.nodes[quartic].varies == Varies.BOTH:
             return self.apply("mul", a[0], self.apply("inverse_fourth_root", quartic))
@@ -196,7 +199,7 @@ class Graph:
         return self.apply("mul", a[0], self.apply("div", self.literal(1.0), a[1]))
 
     def _grouped(self, a: Sequence[int]) -> int | None:
-        """(x c) d = x (c d), where c and d vary less than x, so that c d is computed less often."""
+        """(x c) d = x (c d) if c and d vary less than x, so that c d is computed less often."""
         for product, d in ((a[0], a[1]), (a[1], a[0])):
             if self.nodes[product].operation != "mul" or product in self.closed:
                 continue
@@ -208,17 +211,17 @@ class Graph:
         return None
 
     def _below(self, i: int, often: Varies) -> bool:
-        """Whether a node varies less than that."""
+        """Whether the node varies with less than `often`."""
         return self.nodes[i].varies | often == often and self.nodes[i].varies != often
 
     def _fourth_root(self, i: int) -> int | None:
-        """What a node is the fourth root of."""
+        """The radicand of a node that is a fourth root, else None."""
         root = self.nodes[i]
         inner = self.nodes[root.arguments[0]] if root.operation == "sqrt" else root
         return inner.arguments[0] if root.operation == inner.operation == "sqrt" else None
 
     def _negated(self, operation: str, a: Sequence[int]) -> int | None:
-        """(-x) y = -(x y), so that x y is one node whatever its sign."""
+        """(-x) y = -(x y), so that x y is one node for both signs."""
         for i, x in enumerate(a):
             if self.nodes[x].operation == "neg":
                 bare = list(a)
@@ -230,7 +233,7 @@ class Graph:
         arguments = node.arguments
         if node.operation in ("add", "mul", "minimum", "maximum", "eq", "ne", "and", "or"):
             arguments = tuple(sorted(arguments))
-        # the sign of a zero is part of a literal
+        # str() distinguishes 0.0 from -0.0
         key = (node.operation, arguments, str(node.value), node.kind, node.index)
         if key not in self._known:
             self._known[key] = len(self.nodes)

@@ -1,7 +1,7 @@
-"""Forward mode by torch through any right-hand side, every number with a slope of its own.
+"""Forward-mode differentiation with torch, in which every number carries a slope.
 
-Where a slope meets a plain number or a tensor without one, torch (2.13) goes a way through Python that takes fifty
-times as long as the operation. So all that takes part is given a slope of zero beforehand.
+Where a slope meets a plain number or a tensor without one, torch (2.13) takes a path through Python that is fifty times
+slower than the operation itself. All operands are therefore given a slope of zero beforehand.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _FACTORIES = {"zeros_like", "ones_like", "full_like", "new_zeros", "new_ones", "
 
 
 def with_slope(value: Tensor, slope: Tensor | None = None) -> Tensor:
-    """A tensor of any shape with that slope, of the same shape; with one of zero where it has none."""
+    """The tensor with this slope (same shape); with a slope of zero if none is given and it has none."""
     if slope is None:
         if not value.is_floating_point() or forward_ad.unpack_dual(value).tangent is not None:
             return value
@@ -32,26 +32,26 @@ def with_slope(value: Tensor, slope: Tensor | None = None) -> Tensor:
 
 
 def value_and_slope(value: Tensor) -> tuple[Tensor, Tensor | None]:
-    """What `with_slope` put together; None where there is no slope, as outside forward mode."""
+    """The value and the slope of a tensor; None for the slope outside forward mode."""
     return forward_ad.unpack_dual(value)
 
 
-def beside(value: Tensor) -> Tensor:
-    """A tensor and its slope as plain numbers, (2, ...)."""
+def stack_with_slope(value: Tensor) -> Tensor:
+    """The value and the slope of a tensor as one plain tensor (2, ...)."""
     number, slope = value_and_slope(value)
     assert slope is not None
     return torch.stack([number, slope])
 
 
 def directions(lanes: Tensor) -> Tensor:
-    """lanes (L, P) -> (P L, P): the whole batch once for each parameter, moving along it."""
+    """lanes (L, P) -> (P L, P): one copy of the batch per parameter, with the unit slope by that parameter."""
     count, parameters = lanes.shape
     along = torch.eye(parameters, dtype=lanes.dtype, device=lanes.device).repeat_interleave(count, dim=0)
     return with_slope(lanes.repeat(parameters, 1), along)
 
 
-class Everywhere(TorchFunctionMode):
-    """Within it numbers in a tensor's arithmetic, and tensors made from nothing, have slopes of zero."""
+class ZeroSlopes(TorchFunctionMode):
+    """A mode in which numbers in a tensor's arithmetic and newly created tensors have slopes of zero."""
 
     def __init__(self) -> None:
         super().__init__()

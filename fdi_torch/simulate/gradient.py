@@ -1,4 +1,4 @@
-"""Gradients of readings on engines that torch cannot look into: forward-mode Jacobians in the backward pass."""
+"""Gradients of readings for engines outside autograd, from forward-mode Jacobians in the backward pass."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ class _Linearising(Protocol):
 
 
 def is_differentiated(theta: Tensor) -> bool:
-    """Whether torch records what is done with these parameters."""
+    """Whether autograd records operations on these parameters."""
     return theta.requires_grad and torch.is_grad_enabled()
 
 
 def readings_with_gradient(engine: _Linearising, theta: Tensor) -> Tensor:
     """theta (*batch, P) -> readings y (*batch, S, C), with dL/dtheta = sum over S and C of dL/dy dy/dtheta.
 
-    The Jacobian dy/dtheta (*batch, S, C, P) is computed with the readings and kept until then: 8 S C P bytes a member
-    in float64. Differentiating twice raises RuntimeError.
+    The Jacobian dy/dtheta (*batch, S, C, P) is computed together with the readings and stored for the backward pass, 8
+    S C P bytes per lane in float64. Differentiating twice raises RuntimeError.
     """
     return _Readings.apply(theta, engine)
 
 
 def expect_no_gradient(engine: _Linearising, theta: Tensor, what: str) -> None:
-    """Raises ValueError where a gradient is asked of what has none here, instead of losing it silently."""
+    """Raises ValueError if theta requires a gradient that this operation would silently lose."""
     if is_differentiated(theta):
         raise ValueError(
             f"{what}: expected theta without requires_grad on the {engine.name} engine, got one with it; differentiate "
@@ -53,7 +53,7 @@ class _Readings(torch.autograd.Function):
 
 
 class _Once(torch.autograd.Function):
-    """A gradient that cannot be differentiated again: the second derivative of the readings is not known."""
+    """A gradient that cannot be differentiated again, because the engine has no second derivatives."""
 
     @staticmethod
     def forward(ctx: Any, slope: Tensor, theta: Tensor, engine: str) -> Tensor:

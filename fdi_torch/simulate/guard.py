@@ -1,7 +1,7 @@
-"""What has to be computed only where a condition holds: the dear side of a `where` that most lanes never take.
+"""Nodes that are needed only where a condition holds: expensive branches of a `where` that most lanes never take.
 
-A level rarely stands above its rim; the weir's roots and quotients are skipped for a vector of lanes none of which
-does. Which lanes share a vector changes what is computed, never a result: each lane chooses by its own condition.
+A level rarely exceeds its rim, so the square roots and quotients of the weir are skipped for a vector of lanes in which
+none does. How lanes share vectors affects what is computed but no result: each lane selects by its own condition.
 """
 
 from __future__ import annotations
@@ -9,26 +9,26 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from fdi_torch.simulate.expression import Graph
-from fdi_torch.simulate.steady import DEAR
+from fdi_torch.simulate.step_invariants import EXPENSIVE
 
 
 def guarded(graph: Graph, order: Sequence[int], outputs: Collection[int]) -> dict[int, int]:
-    """Nodes of `order` that matter only where a condition holds, and the node of that condition.
+    """Nodes of `order` that matter only where a condition holds -> the node of that condition.
 
-    Such a node is used in the first branch of `where`s of that condition only, or by other such nodes; it is no output.
-    What would save no dear operation is left out.
+    Such a node is used only in the first branch of `where`s with that condition, or by other such nodes, and is no
+    output. Conditions that would save no expensive operation are left out.
     """
     conditions: dict[int, set[int | None]] = {i: {None} for i in outputs}
     owner: dict[int, int] = {}
     for i in reversed(order):
-        found = conditions.get(i, {None})
-        only = next(iter(found)) if len(found) == 1 else None
-        if only is not None:
-            owner[i] = only
+        uses = conditions.get(i, {None})
+        sole = next(iter(uses)) if len(uses) == 1 else None
+        if sole is not None:
+            owner[i] = sole
         node = graph.nodes[i]
-        first = node.arguments[1:2] if node.operation == "where" and only is None else ()
-        for place, argument in enumerate(node.arguments):
-            rare = argument in first and place == 1 and node.arguments.count(argument) == 1
-            conditions.setdefault(argument, set()).add(node.arguments[0] if rare else only)
-    worth = {owner[i] for i in owner if graph.nodes[i].operation in DEAR}
-    return {i: c for i, c in owner.items() if c in worth}
+        first = node.arguments[1:2] if node.operation == "where" and sole is None else ()
+        for position, argument in enumerate(node.arguments):
+            conditional = argument in first and position == 1 and node.arguments.count(argument) == 1
+            conditions.setdefault(argument, set()).add(node.arguments[0] if conditional else sole)
+    worthwhile = {owner[i] for i in owner if graph.nodes[i].operation in EXPENSIVE}
+    return {i: c for i, c in owner.items() if c in worthwhile}

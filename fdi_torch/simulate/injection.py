@@ -1,4 +1,4 @@
-"""Corrections fed into a simulation at its samples: what makes an observer of a plant."""
+"""Output injection: measurement feedback at the samples of a simulation, which makes it an observer of the plant."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from fdi_torch.simulate.experiment import Experiment
 
 @dataclass(frozen=True)
 class Injection:
-    """After each sample level += gain (reading - prediction), never below zero.
+    """After each sample: level <- max(level + gain (reading - prediction), 0).
 
-    gains (S, tanks, sensors) for all lanes, or (lanes, S, tanks, sensors). start (lanes, tanks): levels at the
-    beginning; memory (lanes, M): what actuators and then sensors remember there, settled where None.
+    gains (S, tanks, sensors) for all lanes, or (lanes, S, tanks, sensors), m per unit of the reading. start (lanes,
+    tanks): initial levels, m. memory (lanes, M): initial memory of the actuators and then of the sensors; steady state
+    if None.
     """
 
     gains: Tensor
@@ -29,7 +30,7 @@ class Injection:
         return 0 if self.gains.dim() == 3 else self.gains[0].numel()
 
     def tables(self, like: Tensor) -> dict[str, Tensor | None]:
-        """As the compiled engine takes them."""
+        """The arrays for the compiled engine."""
         memory = None if self.memory is None or not self.memory.shape[-1] else self.memory.to(like).contiguous()
         return {
             "gains": self.gains.to(like).contiguous(),
@@ -41,29 +42,32 @@ class Injection:
 def lay_out_samples(
     time: Tensor, inputs: Tensor, hold: Hold, step: float, from_first: bool = True, resolution: float | None = None
 ) -> Experiment:
-    """Every sample at the end of a step no longer than `step` (s), on the clock of `time` (S,); inputs (S, channels).
+    """An experiment with every sample at the end of a step of at most `step` s; time (S,) s, inputs (S, channels).
 
-    from_first: whether the first sample is one to be read, or only where the run begins. A single sample is read and
-    nothing else. resolution: how sharply roots and rims are drawn, s; by default by the longest of the steps.
+    from_first: whether the first sample is used, or only marks the start. A single sample is read without simulation.
+    resolution: time scale of the smoothing of square roots and rims, s; by default the longest step.
     """
     if len(time) == 1:
         time, inputs = torch.cat([time, time + step]), inputs.expand(2, -1)
-        beyond = lay_out_samples(time, inputs, "zero_order", step, resolution=resolution)
+        extended = lay_out_samples(time, inputs, "zero_order", step, resolution=resolution)
         return replace(
-            beyond, sample_times=time[:1], sample_step=beyond.sample_step[:1], sample_share=beyond.sample_share[:1]
+            extended,
+            sample_times=time[:1],
+            sample_step=extended.sample_step[:1],
+            sample_share=extended.sample_share[:1],
         )
     gaps = torch.diff(time)
     counts = torch.ceil(gaps / step - 1e-9).clamp(min=1).to(torch.int64)
-    which = torch.repeat_interleave(torch.arange(len(gaps)), counts)
+    interval = torch.repeat_interleave(torch.arange(len(gaps)), counts)
     ends = torch.cumsum(counts, 0)
-    within = torch.arange(len(which)) - (ends - counts)[which]
-    share = within.to(time.dtype) / counts[which]
-    nodes = torch.cat([time[which] + gaps[which] * share, time[-1:]])
+    within = torch.arange(len(interval)) - (ends - counts)[interval]
+    share = within.to(time.dtype) / counts[interval]
+    nodes = torch.cat([time[interval] + gaps[interval] * share, time[-1:]])
     if hold == "zero_order":
-        means = inputs[which]
+        means = inputs[interval]
     else:
-        middle = (share + 0.5 / counts[which]).unsqueeze(-1)
-        means = inputs[which] + middle * (inputs[which + 1] - inputs[which])
+        midpoint = (share + 0.5 / counts[interval]).unsqueeze(-1)
+        means = inputs[interval] + midpoint * (inputs[interval + 1] - inputs[interval])
     steps, shares = ends - 1, torch.ones_like(gaps)
     if from_first:
         steps = torch.cat([steps.new_zeros(1), steps])
@@ -80,11 +84,11 @@ def lay_out_samples(
 
 
 def expect_injectable(experiment: Experiment, injection: Injection, memory: int) -> None:
-    """Raises ValueError where a sample lies within a step, whose correction would come too late, or where what is
-    remembered is not of `memory` numbers.
+    """Raises ValueError if a sample lies within a step, or if the injected memory does not have `memory` numbers per
+    lane.
     """
     shares = experiment.sample_share
     if bool(((shares > 0.0) & (shares < 1.0)).any()):
         raise ValueError("expected every sample at the end of a step, got one within; use lay_out_samples")
     if injection.memory is not None and injection.memory.shape[-1] != memory:
-        raise ValueError(f"expected {memory} remembered numbers a lane, got {injection.memory.shape[-1]}")
+        raise ValueError(f"expected {memory} memory states per lane, got {injection.memory.shape[-1]}")

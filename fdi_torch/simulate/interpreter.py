@@ -1,4 +1,4 @@
-"""A traced program's sections, each of their operations run by torch on all lanes."""
+"""Execution of a traced program's sections with torch, operation by operation on all lanes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Change = Tensor | None
 
 @dataclass
 class State:
-    """Values (L,) and changes (P, L) by place; a change of None is zero."""
+    """Values (L,) and slopes by theta (P, L), by place; a slope of None is zero."""
 
     values: dict[Place, Tensor] = field(default_factory=dict)
     changes: dict[Place, Change] = field(default_factory=dict)
@@ -33,7 +33,7 @@ class State:
 class Interpreter:
     """Runs sections for lanes (L, P) on a state; what does not vary from step to step is computed once.
 
-    nominal (constants,): of the plant, in the order of its space. resolution: see `Experiment`, s.
+    nominal (constants,): of the plant, in the order of its parameter space. resolution: see `Experiment`, s.
     """
 
     def __init__(self, program: Program, lanes: Tensor, nominal: Tensor, resolution: Tensor) -> None:
@@ -48,54 +48,54 @@ class Interpreter:
         }
 
     def full(self, change: Change) -> Tensor:
-        """(P, L), zeros where nothing changes."""
+        """The change expanded to (P, L); zeros for None."""
         return self.lanes.new_zeros(self.lanes.shape[::-1]) if change is None else change.expand(self.lanes.shape[::-1])
 
     def run(self, section: Section) -> None:
-        """Computes the outputs and their changes and stores them, `next_` ones under the plain name."""
-        wanted = [o.node for o in section]
-        wanted += [n for o in section for n in [*(c for c, _ in o.row.terms), *o.row.theta.values()]]
-        known = self._evaluate(wanted, id(section))
+        """Compute the outputs of a section and their slopes, and store them; `next_` is dropped from their places."""
+        needed = [o.node for o in section]
+        needed += [n for o in section for n in [*(c for c, _ in o.row.terms), *o.row.theta.values()]]
+        computed = self._evaluate(needed, id(section))
         changes: dict[Place, Change] = {}
         for o in section:
-            changes[o.place] = self._change(o.row, known, changes)
+            changes[o.place] = self._change(o.row, computed, changes)
         for (kind, i), node in ((o.place, o.node) for o in section):
             place = (kind.removeprefix("next_"), i)
-            self.state.values[place] = known[node]
+            self.state.values[place] = computed[node]
             if self.program.tangent:
                 self.state.changes[place] = changes[kind, i]
 
-    def _change(self, row: Row, known: Mapping[int, Tensor], fresh: Mapping[Place, Change]) -> Change:
+    def _change(self, row: Row, computed: Mapping[int, Tensor], new_changes: Mapping[Place, Change]) -> Change:
         total: Change = None
         for factor, place in row.terms:
-            change = fresh[place] if place in fresh else self.state.changes.get(place)
+            change = new_changes[place] if place in new_changes else self.state.changes.get(place)
             if change is not None:
-                total = known[factor] * change if total is None else total + known[factor] * change
+                total = computed[factor] * change if total is None else total + computed[factor] * change
         if not row.theta:
             return total
-        own = self.lanes.new_zeros(self.lanes.shape[::-1])
+        direct = self.lanes.new_zeros(self.lanes.shape[::-1])
         for q, slope in row.theta.items():
-            own[q] = known[slope]
-        return own if total is None else total + own
+            direct[q] = computed[slope]
+        return direct if total is None else total + direct
 
-    def _evaluate(self, wanted: list[int], section: int) -> dict[int, Tensor]:
+    def _evaluate(self, needed: list[int], section: int) -> dict[int, Tensor]:
         nodes = self.program.graph.nodes
         if section not in self._orders:
-            self._orders[section] = self.program.graph.reach(wanted)
-        known: dict[int, Tensor] = {}
+            self._orders[section] = self.program.graph.reach(needed)
+        computed: dict[int, Tensor] = {}
         for i in self._orders[section]:
             if i not in self._constants:
-                value = self._compute(i, known)
-                (known if nodes[i].varies & Varies.STEP else self._constants)[i] = value
+                value = self._compute(i, computed)
+                (computed if nodes[i].varies & Varies.STEP else self._constants)[i] = value
             if i in self._constants:
-                known[i] = self._constants[i]
-        return known
+                computed[i] = self._constants[i]
+        return computed
 
-    def _compute(self, i: int, known: Mapping[int, Tensor]) -> Tensor:
+    def _compute(self, i: int, computed: Mapping[int, Tensor]) -> Tensor:
         node = self.program.graph.nodes[i]
         if node.operation == "literal":
             return self.lanes.new_tensor(node.value)
         if node.operation == "input":
             table = self._tables.get(node.kind)
             return self.state.values[node.kind, node.index] if table is None else table[node.index]
-        return OPERATIONS[node.operation].torch(*(known[a] for a in node.arguments))
+        return OPERATIONS[node.operation].torch(*(computed[a] for a in node.arguments))

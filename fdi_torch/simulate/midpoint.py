@@ -1,6 +1,6 @@
-"""Newton's correction of a whole trajectory under the implicit midpoint rule, and its slopes by parameters.
+"""Newton's correction of a whole trajectory under the implicit midpoint rule, and its sensitivities to the parameters.
 
-With M = 1 - dt/2 df/dh at each step, a correction x of the levels and the slopes s by theta both obey
+With M = 1 - dt/2 df/dh at each step, the correction x of the levels and the sensitivities s by theta both obey
 
     M x_{k+1} = (2 - M) x_k + forcing_k,   forcing: dt f - (h_{k+1} - h_k) for x, dt df/dtheta for s.
 """
@@ -17,11 +17,13 @@ from fdi_torch.simulate.scan import product, scan_in_time
 def newton_step(
     span: Tensor, path: Tensor, rates: Tensor, by_level: Tensor, by_theta: Tensor, start: Tensor, start_slopes: Tensor
 ) -> tuple[Tensor, ...]:
-    """span (K,) s; path (L, n, K+1); rates (L, n, K) at its mid-steps with their slopes (L, n, n, K) and (L, n, P, K);
-    start (L, n) and start_slopes (L, n, P): where the trajectory begins.
+    """One Newton step of all lanes and steps at once.
 
-    Returns the corrected levels (L, n, K+1), slopes (L, n, P, K+1), the transition and the gain (L, n, n, K) of a
-    disturbance, and the largest correction (L,).
+    span (K,): lengths of the steps, s. path (L, n, K+1): levels. rates (L, n, K): at mid-step, with their slopes
+    by_level (L, n, n, K) and by_theta (L, n, P, K). start (L, n) and start_slopes (L, n, P): initial levels.
+
+    Returns the corrected levels (L, n, K+1), their sensitivities (L, n, P, K+1), transition and gain of a disturbance
+    (L, n, n, K), and the largest correction (L,).
     """
     compiled = midpoint_step(span, path, rates, by_level, by_theta, start, start_slopes)
     if compiled is not None:
@@ -32,12 +34,14 @@ def newton_step(
     misfit = (span * rates - (path[..., 1:] - path[..., :-1])).unsqueeze(2)
     forcing = torch.cat([product(inverse, misfit), product(gain, by_theta)], dim=2)
     first = torch.cat([(start - path[..., 0]).unsqueeze(-1), start_slopes], dim=-1)
-    found = scan_in_time(transition, forcing, first)
-    return path + found[:, :, 0], found[:, :, 1:], transition, gain, found[:, :, 0].abs().amax(dim=(-1, -2))
+    solution = scan_in_time(transition, forcing, first)
+    return path + solution[:, :, 0], solution[:, :, 1:], transition, gain, solution[:, :, 0].abs().amax(dim=(-1, -2))
 
 
 def _inverse(a: Tensor) -> Tensor:
-    """Of (L, n, n, K) at every step, by elimination. No pivots: 1 - dt/2 df/dh has its weight on the diagonal."""
+    """Inverses of the matrices (L, n, n, K) of all steps, by elimination without pivoting (1 - dt/2 df/dh is diagonally
+    dominant).
+    """
     n = a.shape[1]
     one = torch.eye(n, dtype=a.dtype, device=a.device).unsqueeze(-1).expand(a.shape)
     rows = list(torch.cat([a, one], dim=2).unbind(1))

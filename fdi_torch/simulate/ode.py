@@ -1,4 +1,4 @@
-"""A plant as the right-hand side of an ordinary differential equation, as torchdiffeq and other solvers take it."""
+"""A plant as the right-hand side of an ordinary differential equation, for torchdiffeq and other solvers."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from torch import Tensor, nn
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Recording
 
-RESOLUTION = 0.01  # of roots and rims, in units of the plant's time scale
-INSTANT = 1e-3  # s; effects that act from an instant on are averaged over so long about the time asked for
+RESOLUTION = 0.01  # smoothing of square roots and rims, in units of the plant's time scale
+INSTANT = 1e-3  # s; time-dependent effects are averaged over this interval about t
 
 Inputs = Recording | Tensor | Callable[[Tensor], Tensor]
-"""A recording, whose inputs run as it holds them; constant inputs (channels,); or a function of time (s) to these."""
+"""A recording, whose inputs are used with its hold; constant inputs (channels,); or a function of time (s) to them."""
 
 
 class PlantOde(nn.Module):
     """dh/dt = f(t, h) in m/s: levels h (*batch, tanks) in m at the time t () in s, as `torchdiffeq.odeint` calls it.
 
     network: the plant. space, theta (*batch, P): constants and effects that differ from their nominal values. inputs:
-    in SI, one for each of the plant's channels in their order. resolution: s, how sharply roots and rims are drawn.
-    Gradients reach theta and h through every call. A new theta wants a new PlantOde.
+    SI, one per input channel of the plant, in its order. resolution: time scale of the smoothing of square roots and
+    rims, s. Gradients flow to theta and h through every call; a new theta needs a new PlantOde.
 
-    Raises ValueError for an actuator that remembers or acts late: its command is no function of t alone.
+    Raises ValueError for an actuator with memory or dead time, whose output is not a function of t alone.
     """
 
     def __init__(
@@ -48,8 +48,8 @@ class PlantOde(nn.Module):
         if network.command_memory() or delayed:
             names = sorted({p.prefix for p in network.placements if p.effect.stage.value == "command"})
             raise ValueError(
-                f"expected actuators whose command is a function of time alone, got {', '.join(names)}, which remember "
-                "or act late; leave them out, or use an engine of fdi_torch.set_up"
+                f"expected actuators without memory or dead time, got {', '.join(names)}; leave them out, or use an "
+                "engine of fdi_torch.set_up"
             )
         self._resolution = like.new_tensor(resolution or RESOLUTION * time_scale(network.description))
         self._inputs = _function_of_time(inputs, network, like)
@@ -63,11 +63,11 @@ class PlantOde(nn.Module):
         instant = torch.as_tensor(t).to(levels)
         clock = Clock(instant - 0.5 * INSTANT, torch.full_like(instant, INSTANT), self._resolution.to(levels))
         channels = self._inputs(instant).unbind(-1)
-        wanted = [channels[channel] for _, channel in self.network.actuators()]
-        commands, _ = self.network.commands(wanted, (), clock, self._values)
-        full = [c.expand(levels.shape[:-1]) if c.dim() <= levels.dim() - 1 else c for c in commands]
-        held = torch.stack(full, dim=-1) if full else levels.new_zeros(*levels.shape[:-1], 0)
-        rates: Tensor = self.network(levels, held, clock, self._values)
+        actuator_inputs = [channels[channel] for _, channel in self.network.actuators()]
+        commands, _ = self.network.commands(actuator_inputs, (), clock, self._values)
+        expanded = [c.expand(levels.shape[:-1]) if c.dim() <= levels.dim() - 1 else c for c in commands]
+        stacked = torch.stack(expanded, dim=-1) if expanded else levels.new_zeros(*levels.shape[:-1], 0)
+        rates: Tensor = self.network(levels, stacked, clock, self._values)
         return rates
 
 
@@ -84,7 +84,7 @@ def _function_of_time(inputs: Inputs, network: TankNetwork, like: Tensor) -> Cal
 
 
 def _played(recording: Recording) -> Callable[[Tensor], Tensor]:
-    """The inputs (channels,) of a recording at a time on its clock from 0 s on; the first and the last hold on."""
+    """The inputs (channels,) of a recording as a function of the time since its start, constant before and after it."""
     time, values = recording.time - recording.time[0], recording.inputs
 
     def at(t: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
-"""The pointwise operations a plant's equations may use: what torch, C and the differential calculus call each.
+"""The pointwise operations that a plant's equations may use: their form in torch and C, and their derivatives.
 
-An operation is one row of `OPERATIONS`; everything that traces, runs, differentiates or emits programs reads it here.
+Each operation is one row of `OPERATIONS`, which tracing, execution, differentiation and code generation all use.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 
 
 class Graph(Protocol):
-    """Where derivatives are written down: a node for a number, a node for an operation, the number of a node."""
+    """The operations of an expression graph in which derivatives are built."""
 
     def literal(self, value: float) -> int: ...
 
@@ -98,7 +98,7 @@ OPERATIONS: dict[str, Operation] = {
     "abs": Operation(torch.abs, "FABS({0})", lambda g, out, a: (g.apply("sign", a[0]),)),
     "sign": Operation(torch.sign, "SIGN({0})", _flat),
     "sqrt": Operation(torch.sqrt, "SQRT({0})", lambda g, out, a: (g.apply("div", g.literal(0.5), out),)),
-    # not among torch's own: the regularised square root's x / (x^2 + w^2)^(1/4) comes down to it
+    # not an operation of torch: occurs in the regularised square root x / (x^2 + w^2)^(1/4)
     "inverse_fourth_root": Operation(
         lambda s: 1.0 / torch.sqrt(torch.sqrt(s)), "INVERSE_FOURTH_ROOT({0})", _inverse_fourth_root
     ),
@@ -114,7 +114,7 @@ OPERATIONS: dict[str, Operation] = {
     "round": Operation(torch.round, "ROUND({0})", _flat),
     "minimum": Operation(torch.minimum, "MINIMUM({0}, {1})", _extreme("lt")),
     "maximum": Operation(torch.maximum, "MAXIMUM({0}, {1})", _extreme("gt")),
-    # clamp at one side: unlike minimum and maximum, torch gives the whole slope to a value on the bound
+    # one-sided clamp: unlike minimum and maximum, torch passes the full slope for a value on the bound
     "at_least": Operation(
         torch.clamp_min, "AT_LEAST({0}, {1})", lambda g, out, a: (_choose(g, g.apply("ge", *a), 1.0, 0.0), None)
     ),

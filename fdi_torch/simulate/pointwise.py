@@ -1,4 +1,4 @@
-"""Slopes of pointwise functions: many outputs of many inputs, each element on its own."""
+"""Derivatives of pointwise functions of many inputs."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ def partials(
 ) -> tuple[list[Tensor], list[Row]]:
     """y_i = function(x)_i and dy_i/dx_j, each of `shape`; None where y_i does not depend on x_j.
 
-    inputs broadcast to `shape`. One backward pass for each output: its price does not grow with the inputs, and what
-    an output does not depend on is never visited.
+    inputs broadcast to `shape`. One backward pass per output: the cost does not grow with the number of inputs.
     """
     leaves = [x.detach().expand(shape).requires_grad_() for x in inputs]
     with torch.enable_grad():
         outputs = [y.expand(shape) for y in function(leaves)]
-        # Summed, since no element depends on the inputs of another one.
+        # The sum's gradient holds all elementwise slopes, since no element depends on another element's inputs.
         totals = [y.sum() for y in outputs]
     rows: list[Row] = [
         torch.autograd.grad(total, leaves, retain_graph=True, allow_unused=True)

@@ -1,7 +1,8 @@
-"""A plant's simulation as sections of one graph: what to compute before, in and after each step, and at each sample.
+"""A plant's simulation as sections of one expression graph: what to compute before, in and after each step and at
+samples.
 
-With `columns` of theta to differentiate by, each section also has the rows of its Jacobian: what its outputs do when
-its inputs or a parameter change. Rates are differentiated stage by stage, so that a direction costs a few products.
+With `columns` of theta to differentiate by, each section also holds the rows of its Jacobian: the change of its outputs
+with its inputs and with theta. Rates are differentiated stage by stage, so that a direction costs a few products.
 """
 
 from __future__ import annotations
@@ -16,28 +17,28 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.elimination import Elimination, eliminate
 from fdi_torch.simulate.expression import Graph, Varies
-from fdi_torch.simulate.runge_kutta import Stages, moved
+from fdi_torch.simulate.runge_kutta import Stages, substituted
 from fdi_torch.simulate.section import Output, Place, Row, Section
-from fdi_torch.simulate.trace import Tracer
+from fdi_torch.simulate.tracer import Tracer
 
 
 @dataclass(frozen=True)
 class Program:
-    """The sections; each is a tuple of outputs.
+    """The sections of a simulation, each a tuple of outputs.
 
-    prepare: level (at t = 0), command_delay, reading_delay. settle_commands, settle_readings: the memories at first.
-    act: action, next_command_memory. stages: stage k's levels and then its rates ('slope'), four of each in turn.
-    advance: level. end: slope at the end of the step. read: reading, next_reading_memory.
-    within: each lane takes steps of its own within those of the grid, see `implicit.py`.
-    unrolled: whether there are stages, advance and end, in which what a step has in common is worked out once. If not,
-    there is the law, written once however many stages a step has: the rates ('slope') with what theta and the actions
-    alone do to them, and their slopes by the levels ('by_level'), an output for each (tank, tank) of `pattern`.
-    late_actuators, late_sensors: index of those that can be late, in the order of the delays.
+    prepare: level (at t = 0), command_delay, reading_delay. settle_commands, settle_readings: the initial memories in
+    steady state. act: action, next_command_memory. stages: stage k's levels and then its rates ('slope'), four of each
+    in turn. advance: level. end: slope at the end of the step. read: reading, next_reading_memory.
+
+    adaptive: each lane divides the steps of the grid, see `implicit.py`. unrolled: there are stages, advance and end,
+    which share common subexpressions. If not, there is `law`, evaluated at every stage: the rates ('slope') with their
+    direct changes by theta and the actions, and their slopes by the levels ('by_level'), one output per (tank, tank) of
+    `pattern`. late_actuators, late_sensors: indices of those with dead time, in the order of the delays.
     """
 
     graph: Graph
     tangent: bool
-    within: bool
+    adaptive: bool
     unrolled: bool
     columns: int
     tanks: int
@@ -62,31 +63,31 @@ class Program:
 
     @cached_property
     def step(self) -> Section:
-        """All that a step of the grid computes, in order, where all lanes take the same one."""
+        """The outputs of a whole step of the grid, in order, if all lanes take the same steps."""
         return self.act + tuple(o for stage in self.stages for o in stage) + self.advance
 
     @cached_property
     def elimination(self) -> Elimination:
-        """How to solve for the levels of an implicit step."""
+        """The elimination for the levels of an implicit step."""
         return eliminate(self.tanks, self.pattern)
 
 
 @lru_cache(maxsize=64)
 def build_program(
-    network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool = False, unrolled: bool = True
+    network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool = False, unrolled: bool = True
 ) -> Program:
-    """The program of a plant whose parameters `names` are columns of theta; `tangent`: with its Jacobian.
+    """The program of a plant whose parameters `names` are the columns of theta; tangent: with the Jacobian.
 
-    Steps of the lanes' own are never unrolled.
+    Adaptive steps are never unrolled.
     """
-    return _Builder(network, names, tangent, within, unrolled and not within).program()
+    return _Builder(network, names, tangent, adaptive, unrolled and not adaptive).program()
 
 
 class _Builder:
     def __init__(
-        self, network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool, unrolled: bool
+        self, network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool, unrolled: bool
     ) -> None:
-        self.network, self.tangent, self.within, self.unrolled = network, tangent, within, unrolled
+        self.network, self.tangent, self.adaptive, self.unrolled = network, tangent, adaptive, unrolled
         self.graph = Graph()
         self.tracer = Tracer(self.graph)
         self.theta = [self.graph.input("theta", i, Varies.LANE) for i in range(len(names))]
@@ -97,7 +98,7 @@ class _Builder:
         self.clock = Clock(tensor(self.span[0]), tensor(self.span[1]), tensor(resolution))
 
     def _values(self, names: tuple[str, ...]) -> dict[str, dict[str, Tensor]]:
-        """What TankNetwork.bind makes, with inputs of the program in place of numbers."""
+        """As `TankNetwork.bind`, with inputs of the program in place of numbers."""
         values: dict[str, dict[str, Tensor]] = {}
         for i, name in enumerate(self.network.constants.names):
             node = self.theta[names.index(name)] if name in names else self.graph.input("nominal", i, Varies.NEVER)
@@ -117,7 +118,7 @@ class _Builder:
         return Program(
             graph=self.graph,
             tangent=self.tangent,
-            within=self.within,
+            adaptive=self.adaptive,
             unrolled=self.unrolled,
             columns=len(self.theta),
             tanks=len(network.description.tanks),
@@ -155,7 +156,7 @@ class _Builder:
         return tuple(outputs), tuple(commands), tuple(readings)
 
     def _commands(self, late: Sequence[int]) -> tuple[Section, Section]:
-        """The memories at first, then what the actuators do and the memories after it."""
+        """Sections of the initial actuator memories, and of the actuators' outputs and new memories."""
         graph, network, tensor = self.graph, self.network, self.tracer.tensor
         late_inputs = self._inputs("late_channel", len(late))
         channels = [
@@ -164,17 +165,17 @@ class _Builder:
         ]
         memory = self._inputs("command_memory", network.command_memory())
         with self.tracer:
-            settled = network.remember_commands([tensor(c) for c in channels], self.clock, self.values)
-            actions, kept = network.commands(
+            steady = network.steady_command_memory([tensor(c) for c in channels], self.clock, self.values)
+            actions, new_memory = network.commands(
                 [tensor(c) for c in channels], tuple(tensor(m) for m in memory), self.clock, self.values
             )
         node = self.tracer.node
-        first, then = [node(s) for s in settled], [node(k) for k in kept]
+        first, following = [node(s) for s in steady], [node(k) for k in new_memory]
         moving = {n: ("late_channel", j) for j, n in enumerate(late_inputs)}
         settle = self._outputs("command_memory", first, moving)
-        lively = self._lively(memory, first, then, moving, "command_memory")
-        act = self._outputs("action", [node(a) for a in actions], lively)
-        return tuple(settle), (*act, *self._outputs("next_command_memory", then, lively))
+        changing = self._changing_inputs(memory, first, following, moving, "command_memory")
+        act = self._outputs("action", [node(a) for a in actions], changing)
+        return tuple(settle), (*act, *self._outputs("next_command_memory", following, changing))
 
     def _rates(self, act: Section) -> tuple[tuple[Section, ...], Section, Section]:
         """The stages of a step, the levels after it, and the slopes there."""
@@ -190,16 +191,16 @@ class _Builder:
         law = self._outputs("slope_right", self._network_rates(levels, held, self.clock), moving)
         stages, advance = Stages(graph, law, levels, self.span[1], dict(zip(held, actions, strict=True))).write()
         uniform = {h: a for h, a in zip(held, actions, strict=True) if not graph.nodes[a].varies & Varies.LANE}
-        return stages, advance, tuple(moved(graph, law, uniform, {}))
+        return stages, advance, tuple(substituted(graph, law, uniform, {}))
 
     def _law(self, act: Section) -> tuple[Section, tuple[tuple[int, int], ...]]:
-        """The rates, their slopes by the levels, and which tank's rate has one by which level."""
+        """The rates, their slopes by the levels, and the pattern of these slopes."""
         levels = self._inputs("level", len(self.network.description.tanks))
         held = self._inputs("action", len(self.network.actuators()))
-        rates = self._network_rates(levels, held, self._own_clock() if self.within else self.clock)
+        rates = self._network_rates(levels, held, self._step_clock() if self.adaptive else self.clock)
         moving = {held[o.place[1]]: o.place for o in act if o.place[0] == "action" and o.row}
         tank = {n: i for i, n in enumerate(levels)}
-        slopes = self.graph.partials(rates, levels) if self.within or self.tangent else []
+        slopes = self.graph.partials(rates, levels) if self.adaptive or self.tangent else []
         by_level = {(i, tank[n]): slope for i, row in enumerate(slopes) for n, slope in row.items()}
         jacobian = [Output(("by_level", e), slope) for e, slope in enumerate(by_level.values())]
         return (*self._outputs("slope", rates, moving), *jacobian), tuple(by_level)
@@ -210,41 +211,41 @@ class _Builder:
             rates = self.network.rates([tensor(h) for h in levels], [tensor(a) for a in held], clock, self.values)
         return [self.tracer.node(r) for r in rates]
 
-    def _own_clock(self) -> Clock:
-        """That of a lane's own step."""
+    def _step_clock(self) -> Clock:
+        """The clock of a lane's adaptive step."""
         start, step = (self.tracer.tensor(n) for n in self._inputs("part", 2))
         return Clock(start, step, self.clock.resolution)
 
     def _readings(self) -> tuple[Section, Section]:
         network, tensor, node = self.network, self.tracer.tensor, self.tracer.node
-        seen = self._inputs("seen", len(network.description.sensors))
+        measured = self._inputs("seen", len(network.description.sensors))
         memory = self._inputs("reading_memory", network.reading_memory())
         with self.tracer:
-            settled = network.remember_readings([tensor(s) for s in seen], self.clock, self.values)
-            readings, kept = network.read(
-                [tensor(s) for s in seen], tuple(tensor(m) for m in memory), self.clock, self.values
+            steady = network.steady_reading_memory([tensor(s) for s in measured], self.clock, self.values)
+            readings, new_memory = network.read(
+                [tensor(s) for s in measured], tuple(tensor(m) for m in memory), self.clock, self.values
             )
-        first, then = [node(s) for s in settled], [node(k) for k in kept]
-        moving = {n: ("seen", i) for i, n in enumerate(seen)}
-        lively = self._lively(memory, first, then, moving, "reading_memory")
+        first, following = [node(s) for s in steady], [node(k) for k in new_memory]
+        moving = {n: ("seen", i) for i, n in enumerate(measured)}
+        changing = self._changing_inputs(memory, first, following, moving, "reading_memory")
         settle = self._outputs("reading_memory", first, moving)
-        read = self._outputs("reading", [node(r) for r in readings], lively)
-        return tuple(settle), (*read, *self._outputs("next_reading_memory", then, lively))
+        read = self._outputs("reading", [node(r) for r in readings], changing)
+        return tuple(settle), (*read, *self._outputs("next_reading_memory", following, changing))
 
-    def _lively(
-        self, memory: list[int], first: list[int], then: list[int], moving: dict[int, Place], kind: str
+    def _changing_inputs(
+        self, memory: list[int], first: list[int], following: list[int], moving: dict[int, Place], kind: str
     ) -> dict[int, Place]:
-        """The inputs that can change with theta: those given, and the memories that they or theta reach."""
-        lively = dict(moving)
+        """The inputs that can change with theta: those given, and the memories that depend on them or on theta."""
+        changing = dict(moving)
         if not self.tangent:
-            return lively
-        settled = self._rows(first, moving)
+            return changing
+        initial = self._rows(first, moving)
         while True:
-            rows = self._rows(then, lively)
-            reached = {memory[i]: (kind, i) for i in range(len(memory)) if rows[i] or settled[i]}
-            if reached.keys() <= lively.keys():
-                return lively
-            lively |= reached
+            rows = self._rows(following, changing)
+            dependent = {memory[i]: (kind, i) for i in range(len(memory)) if rows[i] or initial[i]}
+            if dependent.keys() <= changing.keys():
+                return changing
+            changing |= dependent
 
     def _outputs(self, kind: str, nodes: list[int], moving: Mapping[int, Place]) -> list[Output]:
         rows = self._rows(nodes, moving)

@@ -1,8 +1,8 @@
-"""The recurrences of `scan.py` and `midpoint.py` as compiled loops: one walk through time instead of many operations.
+"""The recurrences of `scan.py` and `midpoint.py` as compiled loops over time.
 
-Compiled at the first use and once a machine for each number of tanks, up to MOST: the loops keep matrices of all steps
-of a block on the stack. None where there is no compiler, or for tensors that loops over numbers cannot take: torch does
-the same then, many times slower.
+Compiled at the first use for each number of tanks, up to MOST, because the loops keep matrices of a block of steps on
+the stack. The functions return None without a compiler or for tensors that loops cannot take (gradients, float32, GPU);
+the callers then do the same with torch, many times slower.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MOST = 32
 _SOURCE = Path(__file__).with_name("recurrence.hpp")
 
 
-def scanned(a: Tensor, b: Tensor, first: Tensor, gain: Tensor | None = None) -> Tensor | None:
+def compiled_scan(a: Tensor, b: Tensor, first: Tensor, gain: Tensor | None = None) -> Tensor | None:
     """x_{k+1} = A_k x_k + G_k b_k: a and gain (L, n, n, K), b (L, n, m, K), first (L, n, m) -> x (L, n, m, K+1)."""
     if not _plain(a, b, first, *(() if gain is None else (gain,))):
         return None
@@ -33,29 +33,31 @@ def scanned(a: Tensor, b: Tensor, first: Tensor, gain: Tensor | None = None) -> 
 def midpoint_step(
     span: Tensor, path: Tensor, rates: Tensor, by_level: Tensor, by_theta: Tensor, start: Tensor, start_slopes: Tensor
 ) -> tuple[Tensor, ...] | None:
-    """As `midpoint.newton_step`, which says what these are."""
-    given = [span, path, rates, by_level, by_theta, start, start_slopes]
-    if not _plain(*given):
+    """As `midpoint.newton_step`, or None."""
+    inputs = [span, path, rates, by_level, by_theta, start, start_slopes]
+    if not _plain(*inputs):
         return None
     lanes, n, columns, steps = by_theta.shape
     slopes, defect = path.new_empty(lanes, n, columns, steps + 1), path.new_empty(lanes)
-    made = [torch.empty_like(path), slopes, torch.empty_like(by_level), torch.empty_like(by_level), defect]
-    return tuple(made) if _run("midpoint_step", by_theta.shape, given, made) else None
+    outputs = [torch.empty_like(path), slopes, torch.empty_like(by_level), torch.empty_like(by_level), defect]
+    return tuple(outputs) if _run("midpoint_step", by_theta.shape, inputs, outputs) else None
 
 
-def _plain(*given: Tensor) -> bool:
-    """Whether all of these are nothing but numbers, of the kind that was compiled for."""
-    return not any(t.requires_grad or t.dtype is not torch.float64 or t.device.type != "cpu" for t in given)
+def _plain(*tensors: Tensor) -> bool:
+    """Whether all tensors are float64 numbers on the CPU without gradients."""
+    return not any(t.requires_grad or t.dtype is not torch.float64 or t.device.type != "cpu" for t in tensors)
 
 
-def _run(name: str, shape: torch.Size, given: Sequence[Tensor | None], made: Sequence[Tensor]) -> bool:
-    """Runs one of the loops. shape: (L, n, columns, K). given: is read as it lies there; made: is written."""
+def _run(name: str, shape: torch.Size, inputs: Sequence[Tensor | None], outputs: Sequence[Tensor]) -> bool:
+    """Run one of the loops; False without a compiled library. shape: (L, n, columns, K). given: inputs; made:
+    outputs.
+    """
     lanes, n, columns, steps = shape
     library = _library(n) if n <= MOST else None
     if library is None:
         return False
-    held = [None if t is None else t.contiguous() for t in given]
-    pointers = [ctypes.c_void_p(None if t is None else t.data_ptr()) for t in (*held, *made)]
+    contiguous = [None if t is None else t.contiguous() for t in inputs]
+    pointers = [ctypes.c_void_p(None if t is None else t.data_ptr()) for t in (*contiguous, *outputs)]
     getattr(library, name)(*(ctypes.c_int64(x) for x in (lanes, steps, columns)), *pointers)
     return True
 

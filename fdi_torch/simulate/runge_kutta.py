@@ -11,10 +11,10 @@ Slopes = tuple[tuple[int, int], ...]
 
 
 class Stages:
-    """Writes the stages one by one; each is the levels it looks at and the rates there.
+    """Writer of the stages; each stage holds its levels and the rates there.
 
-    law: the rates with their rows, as functions of the nodes `levels`. step: the node of the step's length.
-    replaced: further nodes of the law and what stands for them in a step.
+    law: the rates with their rows, as functions of the nodes `levels`. step: the node of the step's length. replaced:
+    further nodes of the law -> the nodes that replace them within a step.
     """
 
     def __init__(
@@ -42,22 +42,26 @@ class Stages:
         total = self._each("add", self._each("add", k1, middle), k4)
         after = self._each("add", h, self._each("mul", self._times_step(total), self.eighth))
         parts = ((eighth_step, 1), (thrice, 2), (thrice, 3), (eighth_step, 4))
-        advance = tuple(Output(("next_level", i), n, self._follows(i, parts)) for i, n in enumerate(after))
+        advance = tuple(Output(("next_level", i), n, self._level_change(i, parts)) for i, n in enumerate(after))
         return tuple(self.stages), advance
 
     def _slopes(self, at: list[int], slopes: Slopes) -> list[int]:
-        """The rates at some levels, which follow from earlier slopes."""
+        """Add a stage: the rates at the levels `at`, which depend on earlier slopes by the factors `slopes`."""
         stage = len(self.stages)
-        reached = [Output((f"stage{stage}", i), n, self._follows(i, slopes)) for i, n in enumerate(at)]
+        reached = [Output((f"stage{stage}", i), n, self._level_change(i, slopes)) for i, n in enumerate(at)]
         replaced = {**self.replaced, **dict(zip(self.levels, at, strict=True))}
-        found = moved(self.graph, self.law, replaced, {("level", i): (f"stage{stage}", i) for i in range(len(at))})
-        rates = [Output((f"slope{stage + 1}", o.place[1]), o.node, o.row) for o in found]
+        replaced_law = substituted(
+            self.graph, self.law, replaced, {("level", i): (f"stage{stage}", i) for i in range(len(at))}
+        )
+        rates = [Output((f"slope{stage + 1}", o.place[1]), o.node, o.row) for o in replaced_law]
         self.graph.closed |= {o.node for o in rates}
         self.stages.append((*reached, *rates))
         return [o.node for o in rates]
 
-    def _follows(self, i: int, slopes: Slopes) -> Row:
-        """How a level within the step changes: as the one at its start, and by factor x earlier slopes."""
+    def _level_change(self, i: int, slopes: Slopes) -> Row:
+        """Change of a level within the step: the change at the step's start plus factors times the changes of earlier
+        slopes.
+        """
         if not self.tangent:
             return Row()
         of_slopes = [(f, (f"slope{k}", i)) for f, k in slopes if self.stages[k - 1][len(self.law) + i].row]
@@ -71,13 +75,13 @@ class Stages:
         return self._each("mul", x, self.step)
 
 
-def moved(
+def substituted(
     graph: Graph,
     section: Sequence[Output],
     replaced: Mapping[int, int],
     renamed: Mapping[tuple[str, int], tuple[str, int]],
 ) -> list[Output]:
-    """The same outputs and rows with other nodes as inputs, and changes taken from other places."""
+    """The outputs and rows with nodes replaced, and with their changes taken from other places."""
     slopes = [n for o in section for n in (*(c for c, _ in o.row.terms), *o.row.theta.values())]
     new = dict(zip([*(o.node for o in section), *slopes], _substitute(graph, section, slopes, replaced), strict=True))
     return [

@@ -1,13 +1,15 @@
-"""A linear recurrence in time: a compiled loop, or else blocks of blocks, a few dozen vector operations for all K."""
+"""A linear recurrence in time: a compiled loop, or a few dozen vector operations on blocks of blocks for all K
+steps.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from fdi_torch.simulate.recurrence import scanned
+from fdi_torch.simulate.recurrence import compiled_scan
 
-LENGTH = 8  # steps taken one after the other in each block, and in blocks of blocks
+LENGTH = 8  # sequential steps in each block, and in blocks of blocks
 
 
 def linear_scan(transition: Tensor, forcing: Tensor, first: Tensor) -> Tensor:
@@ -20,16 +22,15 @@ def linear_scan(transition: Tensor, forcing: Tensor, first: Tensor) -> Tensor:
 
 
 def scan_in_time(a: Tensor, b: Tensor, first: Tensor, gain: Tensor | None = None) -> Tensor:
-    """The same with time last: a (L, n, n, K), b (L, n, m, K), first (L, n, m) -> (L, n, m, K+1).
+    """`linear_scan` with time last: a (L, n, n, K), b (L, n, m, K), first (L, n, m) -> (L, n, m, K+1).
 
-    gain: G (L, n, n, K), where it is G_k b_k that is added.
-
-    All blocks run side by side from zero, with the product of their A; the starts of the blocks are such a
-    recurrence again, and then every x follows.
+    gain: G (L, n, n, K), if the forcing is G_k b_k. Without a compiled loop, all blocks run in parallel from zero
+    together with the products of their A; the starts of the blocks obey such a recurrence again, and then every x
+    follows.
     """
     m, count = b.shape[2], b.shape[-1]
     a = a.expand(b.shape[0], *a.shape[1:])
-    if (compiled := scanned(a, b, first, gain)) is not None:
+    if (compiled := compiled_scan(a, b, first, gain)) is not None:
         return compiled
     if gain is not None:
         b = product(gain, b)
@@ -48,38 +49,38 @@ def scan_in_time(a: Tensor, b: Tensor, first: Tensor, gain: Tensor | None = None
 
 
 def _in_blocks(x: Tensor, blocks: int, one: bool) -> Tensor:
-    """(L, n, m, K) -> (LENGTH, L, n, m, blocks), the last block filled up with ones on the diagonal, or zeros."""
+    """(L, n, m, K) -> (LENGTH, L, n, m, blocks), the last block padded with identity matrices (`one`) or zeros."""
     lanes, n, m, count = x.shape
-    whole, rest = divmod(count, LENGTH)
-    found = x.new_empty(LENGTH, lanes, n, m, blocks)
-    found[..., :whole] = x[..., : whole * LENGTH].unflatten(-1, (whole, LENGTH)).permute(4, 0, 1, 2, 3)
-    if rest:
-        found[:rest, ..., whole] = x[..., whole * LENGTH :].permute(3, 0, 1, 2)
-        found[rest:, ..., whole] = torch.eye(n, m, dtype=x.dtype, device=x.device) if one else 0.0
-    return found
+    whole, remainder = divmod(count, LENGTH)
+    blocked = x.new_empty(LENGTH, lanes, n, m, blocks)
+    blocked[..., :whole] = x[..., : whole * LENGTH].unflatten(-1, (whole, LENGTH)).permute(4, 0, 1, 2, 3)
+    if remainder:
+        blocked[:remainder, ..., whole] = x[..., whole * LENGTH :].permute(3, 0, 1, 2)
+        blocked[remainder:, ..., whole] = torch.eye(n, m, dtype=x.dtype, device=x.device) if one else 0.0
+    return blocked
 
 
 def _side_by_side(a: Tensor, b: Tensor) -> list[Tensor]:
-    """Within each block: [x from zero | product of A] after each of its steps, (L, n, m + n, blocks)."""
+    """[x from zero | product of A] after each step within each block, (L, n, m + n, blocks)."""
     m = b.shape[3]
     state = torch.cat([b[0], a[0]], dim=2)
-    found = [state]
+    states = [state]
     for k in range(1, len(a)):
         state = product(a[k], state)
         state[:, :, :m] += b[k]
-        found.append(state)
-    return found
+        states.append(state)
+    return states
 
 
 def _one_by_one(a: Tensor, b: Tensor, first: Tensor) -> list[Tensor]:
-    found = [first]
+    states = [first]
     for k in range(b.shape[-1]):
-        found.append(product(a[..., k : k + 1], found[-1].unsqueeze(-1))[..., 0] + b[..., k])
-    return found
+        states.append(product(a[..., k : k + 1], states[-1].unsqueeze(-1))[..., 0] + b[..., k])
+    return states
 
 
 def product(a: Tensor, x: Tensor) -> Tensor:
-    """a (L, n, n, K) times x (L, n, m, K) at every step, as an explicit sum: the same bits alone and in a batch."""
+    """a (L, n, n, K) times x (L, n, m, K) at every step, as an explicit sum: bitwise equal alone and in a batch."""
     total = a[:, :, 0, None] * x[:, None, 0]
     for j in range(1, a.shape[2]):
         total.addcmul_(a[:, :, j, None], x[:, None, j])

@@ -1,4 +1,6 @@
-"""A section of a program: nodes to compute together, where their values go, and how these change with theta."""
+"""A section of a program: nodes that are computed together, the places of their values, and their changes with
+theta.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ Place = tuple[str, int]
 
 @dataclass(frozen=True)
 class Row:
-    """One output's change: sum of coefficient x change of an input, plus a coefficient for each column of theta."""
+    """One output's change: the sum of coefficient x change of an input, plus one coefficient for each column of
+    theta.
+    """
 
     terms: tuple[tuple[int, Place], ...] = ()
     theta: Mapping[int, int] = field(default_factory=dict)
@@ -21,7 +25,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Output:
-    """Where a result goes, the node that computes it, and how it changes."""
+    """The place of a result, the node that computes it, and its change with theta."""
 
     place: Place
     node: int

@@ -11,7 +11,7 @@ from fdi_torch.capacity import expect_room
 from fdi_torch.estimate.batch_algebra import apply
 from fdi_torch.estimate.information import Certainty, certainty
 from fdi_torch.simulate.engine import Engine, Readings
-from fdi_torch.simulate.record import noise_level
+from fdi_torch.simulate.simulated_recording import noise_level
 from fdi_torch.study.plan import Block, Plan
 
 # The noise (m) that bounds are stated for where the readings have none.

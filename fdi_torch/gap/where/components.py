@@ -28,7 +28,7 @@ from fdi_torch.gap.where.forms import (
 )
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump
 from fdi_torch.plant.effect import place_kind
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 
 Signals = dict[str, Tensor]
 RELAYS = 6  # values between which a place may switch

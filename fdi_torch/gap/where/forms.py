@@ -3,7 +3,7 @@
 What depends on a local variable bends or jumps at some of its values; what keeps a memory lags, sticks or dies away;
 what comes from elsewhere sets in, stops or creeps at some time, or comes and goes in a period.
 
-Times are those of tanks on a bench, and multiples of them by `pace` for others (`plant.pace.time_scale`).
+Times are those of tanks on a bench, and multiples of them by `pace` for others (`plant.scales.time_scale`).
 """
 
 from __future__ import annotations

@@ -19,9 +19,9 @@ from fdi_torch.gap.subject import between
 from fdi_torch.gap.where.components import Component, Ends, Signals, component_at, of_reading
 from fdi_torch.gap.where.forms import courses
 from fdi_torch.plant.description import OUTSIDE, Sensor
-from fdi_torch.plant.pace import time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
-from fdi_torch.simulate.joint import Joint, with_blanks
+from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
 from fdi_torch.simulate.scan import product, scan_in_time
 
 MOST_ROWS = 1000  # of a channel; more samples are taken together, for no form is as fast
@@ -112,7 +112,7 @@ class Survey:
 
     def _pieces(self, near: Linearised) -> list[Piece]:
         whole = self.engine
-        parts = whole.apart(self.theta, near) if isinstance(whole, Joint) else [(whole, self.theta, near)]
+        parts = whole.apart(self.theta, near) if isinstance(whole, JointCollocation) else [(whole, self.theta, near)]
         found = []
         for rows, (engine, theta, own) in zip(self.fitter.subject.rows, parts, strict=True):
             values = engine.network.bind(engine.space, theta.unsqueeze(-2))
@@ -166,7 +166,7 @@ class Survey:
 
     def _of_sensor(self, channel: int, sensor: Sensor) -> Discrepancy:
         """About what the model makes of the sensor's tank while the others are as they were read."""
-        levels = self.engine.driven(self.theta, self.levels, self.tank(sensor.tank))
+        levels = self.engine.simulate_tank(self.theta, self.levels, self.tank(sensor.tank))
         seen: list[Signals] = []
         first = 0
         for piece in self.pieces:

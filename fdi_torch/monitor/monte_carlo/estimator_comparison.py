@@ -15,8 +15,8 @@ from fdi_torch.monitor.adaptive_observer import LEVEL_NOISE, JointModel, adaptiv
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.window_estimators import ESTIMATORS, WindowData, cut
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.pace import length_scale
-from fdi_torch.simulate.record import noise_level
+from fdi_torch.plant.scales import length_scale
+from fdi_torch.simulate.simulated_recording import noise_level
 
 # Integration step (s) of the data and of the bounds: fine, so that no estimator has the same discretization error.
 DATA_STEP = 0.05

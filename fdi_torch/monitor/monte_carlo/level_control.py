@@ -9,7 +9,7 @@ from torch import Tensor
 
 from fdi_torch.monitor.monte_carlo.simulated_runs import Controller
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import area_scale, time_scale
+from fdi_torch.plant.scales import area_scale, time_scale
 
 GAIN, RESET = 1.5e-3, 0.01  # m^2/s and 1/s, of a level control on a bench-scale plant
 

@@ -1,4 +1,4 @@
-"""Which engine to use for the work ahead, and why, in a sentence that can be shown."""
+"""Choice of the simulation engine for a given amount of work, with the reason as a sentence."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import torch
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.pace import length_scale, time_scale
+from fdi_torch.plant.scales import length_scale, time_scale
 from fdi_torch.simulate.build import BuildError
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Engine
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.integrate import ReferenceEngine
-from fdi_torch.simulate.traced import TracedEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.traced_engine import TracedEngine
 
 Kind = Literal["auto", "compiled", "traced", "reference"]
 KINDS = ("auto", "compiled", "traced", "reference")
 
-# Time steps (as many as the experiment has, a simulation each) that torch alone runs in about the time that a
-# compiler takes: it runs some 2000 a second, however many lanes each has.
+# Below this product of simulations and time steps, the traced engine (about 2000 steps per second, for any number of
+# lanes) is finished before a compiler would be.
 _WORTH_COMPILING = 2000
 
 
@@ -33,9 +33,10 @@ def make_engine(
     simulations: float = float("inf"),
     device: str = "cpu",
 ) -> Engine:
-    """The engine asked for, or under 'auto' the fastest for about `simulations` calls; `engine.why` says why.
+    """The requested engine, or under 'auto' the fastest one for about `simulations` calls; `engine.why` states the
+    reason.
 
-    Raises ValueError for an unknown kind, BuildError where 'compiled' is asked for and there is no compiler.
+    Raises ValueError for an unknown kind, and BuildError if 'compiled' is requested without a compiler.
     """
     if kind not in KINDS:
         raise ValueError(f"expected an engine of {', '.join(KINDS)}, got '{kind}'")
@@ -51,16 +52,17 @@ def make_engine(
 
 
 def adaptive_engine(network: TankNetwork, space: ParameterSpace, experiment: Experiment, step: float) -> Engine:
-    """The reference engine by an adaptive solver, about as exact as RK4 in steps of `step` s, roots drawn as sharply.
+    """The reference engine with an adaptive solver about as accurate as RK4 with steps of `step` s.
 
-    For a few lanes it is far cheaper than so many steps in Python would be.
+    Square roots and rims have the same smoothing as with those steps. For a few lanes this is much cheaper than so many
+    fixed steps in Python.
     """
-    drawn = replace(experiment, resolution=torch.full_like(experiment.resolution, step))
+    smoothed = replace(experiment, resolution=torch.full_like(experiment.resolution, step))
     plant = network.description
     rtol = 2.5e-6 * (step / time_scale(plant)) ** 2
     atol = 0.01 * rtol * length_scale(plant)
     why = f"reference engine (torchdiffeq, dopri5 at {rtol:.0e}): asked for"
-    return ReferenceEngine(network, space, drawn, "dopri5", rtol, atol, why, every_node=False)
+    return ReferenceEngine(network, space, smoothed, "dopri5", rtol, atol, why, every_node=False)
 
 
 def _fastest(compiled: CompiledEngine, simulations: float, device: str) -> Engine:

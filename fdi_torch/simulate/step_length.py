@@ -1,4 +1,4 @@
-"""How long a step may be: chosen by measured error, not by the sampling time."""
+"""Choice of the integration step by measured error, independent of the sampling time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PROBES = 64
 
 
 def probe_points(low: Tensor, high: Tensor, count: int = PROBES) -> Tensor:
-    """Points (count, P) spread evenly over a box (P,) by a scrambled Sobol sequence of fixed seed."""
+    """Points (count, P) spread evenly over a box (P,) by a scrambled Sobol sequence with a fixed seed."""
     if low.numel() == 0:
         return low.new_zeros(1, 0)
     unit = torch.quasirandom.SobolEngine(low.numel(), scramble=True, seed=0).draw(count, dtype=torch.float64)
@@ -30,11 +30,11 @@ def choose_step(
     scale: float,
     quantile: float = 1.0,
 ) -> float:
-    """The longest step (s) of the ladder at which readings of `points` (N, P) are right to `tolerance` (C,).
+    """The longest step (s) of the ladder at which readings of `points` (N, P) are accurate to `tolerance` (C,).
 
-    Right: they differ from those at a quarter of the step by no more, at that quantile of the points. The step is
-    never longer than `longest`; the shortest of the ladder is returned where none suffices. scale: the plant's time
-    scale, s.
+    The error is the difference from readings with a quarter of the step; the given quantile over the points must not
+    exceed the tolerance. The step is at most `longest` (s); the shortest of the ladder is returned if none suffices.
+    scale: the plant's time scale, s.
     """
     ladder = [scale * rung for rung in LADDER if scale * rung <= longest] or [longest]
     for step in ladder[:-1]:

@@ -1,6 +1,6 @@
-"""The engine without a compiler: the same traced program, each of its operations run by torch on all lanes.
+"""The traced engine: the traced program executed by torch, operation by operation on all lanes; needs no compiler.
 
-Slower than the compiled engine and faster than differentiating through torchdiffeq; runs on any of torch's devices.
+Slower than the compiled engine, faster than differentiation through torchdiffeq; runs on any device of torch.
 """
 
 from __future__ import annotations
@@ -17,14 +17,16 @@ from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
 from fdi_torch.simulate.implicit import ImplicitStep
 from fdi_torch.simulate.injection import Injection, expect_injectable
-from fdi_torch.simulate.integrate import hermite
 from fdi_torch.simulate.interpreter import Change, Interpreter
-from fdi_torch.simulate.own_steps import judged, own_step
 from fdi_torch.simulate.program import Program, build_program
+from fdi_torch.simulate.reference_engine import hermite
+from fdi_torch.simulate.step_control import accept_steps, next_step
 
 
 class TracedEngine:
-    """Readings and their Jacobians (forward mode) of many parameter vectors at once, by fixed-step RK4."""
+    """Readings and their Jacobians (forward mode) of many parameter vectors at once, by fixed-step RK4 or adaptive
+    steps.
+    """
 
     name = "traced"
 
@@ -58,7 +60,7 @@ class TracedEngine:
 
     def observe(self, theta: Tensor, data: Readings, injection: Injection) -> Tensor:
         expect_no_gradient(self, theta, "observe")
-        program = build_program(self.network, self.space.names, False, self.experiment.own is not None)
+        program = build_program(self.network, self.space.names, False, self.experiment.step_control is not None)
         expect_injectable(self.experiment, injection, program.command_memory + program.reading_memory)
         lanes = theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
         run = _Run(program, self.network, self.experiment, lanes, injection)
@@ -67,13 +69,13 @@ class TracedEngine:
         return torch.stack(rows, dim=1).reshape(*theta.shape[:-1], len(rows), -1)
 
     def _simulate(self, theta: Tensor, tangent: bool, levels: bool = False) -> tuple[Tensor, Tensor | None]:
-        program = build_program(self.network, self.space.names, tangent, self.experiment.own is not None)
+        program = build_program(self.network, self.space.names, tangent, self.experiment.step_control is not None)
         run = _Run(
             program, self.network, self.experiment, theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
         )
         rows = [run.levels() if levels else run.read(s) for s in run.samples()]
-        full = len(run.lanes)
-        values = torch.stack([torch.stack([v.expand(full) for v, _ in row], dim=-1) for row in rows], dim=1)
+        lanes = len(run.lanes)
+        values = torch.stack([torch.stack([v.expand(lanes) for v, _ in row], dim=-1) for row in rows], dim=1)
         values = values.reshape(*theta.shape[:-1], *values.shape[1:])
         if not tangent:
             return values, None
@@ -102,28 +104,28 @@ class _Run:
         self.size = lanes.new_zeros(lanes.shape[::-1])
 
     def samples(self) -> Iterator[int]:
-        """Runs; at each sample's turn the state holds 'sample' levels and the sample's number is handed out."""
+        """Run the simulation; yields the index of each sample while the state holds its levels as 'sample'."""
         e, p, state = self.experiment, self.program, self.state
         firsts = torch.searchsorted(e.sample_step, torch.arange(len(e.nodes))).tolist()
         shares = e.sample_share.tolist()
         self.compute(p.prepare)
         if self.injection is not None:
-            self._begin_with("level", self.injection.start)
+            self._set_state("level", self.injection.start)
         for k in range(len(e.nodes) - 1):
-            self._enter(k)
+            self._begin_step(k)
             if k == 0:
                 self.compute(p.settle_commands)
-                self._remember("command_memory", 0, p.command_memory)
-            mine = list(range(firsts[k], firsts[k + 1]))
-            for s in [s for s in mine if shares[s] <= 0.0]:
+                self._restore_memory("command_memory", 0, p.command_memory)
+            due = list(range(firsts[k], firsts[k + 1]))
+            for s in [s for s in due if shares[s] <= 0.0]:
                 state.put("sample", self._levels())
                 yield s
-            self._set_clock(e.nodes[k], e.steps[k])  # reading a sample has set another
+            self._set_clock(e.nodes[k], e.steps[k])  # reading a sample has changed the clock
             before = self._levels()
             self._step(k)
-            if any(0.0 < shares[s] < 1.0 for s in mine):
+            if any(0.0 < shares[s] < 1.0 for s in due):
                 self.compute(p.end)
-            for s in [s for s in mine if shares[s] > 0.0]:
+            for s in [s for s in due if shares[s] > 0.0]:
                 state.put("sample", self._between(before, k, e.sample_share[s]))
                 yield s
 
@@ -134,72 +136,74 @@ class _Run:
         p, times = self.program, self.experiment.sample_times
         interval = self.experiment.sample_intervals[s]
         self._set_clock(times[s] - interval, interval)
-        seen = self.levels()
-        self.state.put("seen", [seen[tank] for tank in p.sensor_tanks])
-        self._see_late(s)
+        levels = self.levels()
+        self.state.put("seen", [levels[tank] for tank in p.sensor_tanks])
+        self._delay_levels(s)
         if s == 0:
             self.compute(p.settle_readings)
-            self._remember("reading_memory", p.command_memory, p.reading_memory)
+            self._restore_memory("reading_memory", p.command_memory, p.reading_memory)
         self.compute(p.read)
         return self.state.group("reading", p.sensors)
 
     def correct(self, s: int, values: Tensor, weight: Tensor) -> Tensor:
-        """The observer's correction at sample s: levels, memories and the reading expected, (L, n + M + C)."""
+        """The observer's correction at sample s: levels, memories and the predicted reading, (L, n + M + C)."""
         assert self.injection is not None
-        full = len(self.lanes)
-        expected = torch.stack([value.expand(full) for value, _ in self.read(s)], dim=-1)
+        lanes = len(self.lanes)
+        expected = torch.stack([value.expand(lanes) for value, _ in self.read(s)], dim=-1)
         error = torch.where(weight != 0, values - expected, 0.0)
         gain = self.injection.gains[..., s, :, :]
-        move = sum(gain[..., c] * error[..., c : c + 1] for c in range(error.shape[-1]))
-        levels = torch.stack([level.expand(full) for level, _ in self._levels()], dim=-1) + move
-        self._begin_with("level", torch.clamp(levels, min=0.0))
+        correction = sum(gain[..., c] * error[..., c : c + 1] for c in range(error.shape[-1]))
+        levels = torch.stack([level.expand(lanes) for level, _ in self._levels()], dim=-1) + correction
+        self._set_state("level", torch.clamp(levels, min=0.0))
         p, state = self.program, self.state
         kinds = (("level", p.tanks), ("command_memory", p.command_memory), ("reading_memory", p.reading_memory))
-        kept = [value.expand(full) for kind, count in kinds for value, _ in state.group(kind, count)]
-        return torch.cat([torch.stack(kept, dim=-1), expected], dim=-1)
+        state_values = [value.expand(lanes) for kind, count in kinds for value, _ in state.group(kind, count)]
+        return torch.cat([torch.stack(state_values, dim=-1), expected], dim=-1)
 
-    def _begin_with(self, kind: str, values: Tensor) -> None:
+    def _set_state(self, kind: str, values: Tensor) -> None:
         self.state.put(kind, [(value, None) for value in values.unbind(-1)])
 
-    def _remember(self, kind: str, first: int, count: int) -> None:
+    def _restore_memory(self, kind: str, first: int, count: int) -> None:
         if self.injection is not None and self.injection.memory is not None:
-            self._begin_with(kind, self.injection.memory[..., first : first + count])
+            self._set_state(kind, self.injection.memory[..., first : first + count])
 
     def _step(self, k: int) -> None:
-        """A step of the grid: at once, or each lane in as many of its own as it needs."""
+        """One step of the grid: at once, or for each lane in as many adaptive steps as it needs."""
         e, p, values = self.experiment, self.program, self.state.values
-        if e.own is None:
+        if e.step_control is None:
             return self.compute(p.step)
         self.compute(p.act)
         start, span = values["clock", 0], values["clock", 1]
-        gone = torch.zeros_like(self.pace)
-        while bool((gone < span).any()):
-            own = own_step(gone, self.pace, span)
-            values["part", 0], values["part", 1] = start + gone, own
+        elapsed = torch.zeros_like(self.pace)
+        while bool((elapsed < span).any()):
+            step = next_step(elapsed, self.pace, span)
+            values["part", 0], values["part", 1] = start + elapsed, step
             before = self._levels()
-            error, wrong = self.implicit.take(own, e.own.tolerance)
-            size = self._largest_slopes(wrong)
-            kept, gone, self.pace = judged(own, self._worst(error, wrong, size), gone, self.pace, span, e.own.shortest)
-            self.size = torch.where(kept, size, self.size)
+            error, slope_errors = self.implicit.take(step, e.step_control.tolerance)
+            size = self._largest_slopes(slope_errors)
+            accepted, elapsed, self.pace = accept_steps(
+                step, self._worst(error, slope_errors, size), elapsed, self.pace, span, e.step_control.shortest
+            )
+            self.size = torch.where(accepted, size, self.size)
             rows = zip(self._levels(), before, strict=True)
-            self.state.put("level", [self._either(kept, now, then) for now, then in rows])
+            self.state.put("level", [self._select(accepted, now, then) for now, then in rows])
 
-    def _largest_slopes(self, wrong: Sequence[Tensor]) -> Tensor:
-        """Of the levels by each parameter so far, (P, L)."""
-        if not wrong:
+    def _largest_slopes(self, slope_errors: Sequence[Tensor]) -> Tensor:
+        """Largest slope of any level by each parameter so far, (P, L)."""
+        if not slope_errors:
             return self.size
         return torch.maximum(self.size, torch.stack([self.full(d).abs() for _, d in self._levels()]).amax(dim=0))
 
-    def _worst(self, error: Tensor, wrong: Sequence[Tensor], size: Tensor) -> Tensor:
-        """The larger of a step's two errors, each as a share of what is tolerated, (L,)."""
-        if not wrong or not len(size):
+    def _worst(self, error: Tensor, slope_errors: Sequence[Tensor], size: Tensor) -> Tensor:
+        """The larger of a step's relative errors of levels and slopes, (L,)."""
+        if not slope_errors or not len(size):
             return error
-        assert self.experiment.own is not None
-        largest = torch.stack(list(wrong)).amax(dim=0)
-        share = torch.where(largest > 0.0, largest / (self.experiment.own.slope_tolerance * size), 0.0)
+        assert self.experiment.step_control is not None
+        largest = torch.stack(list(slope_errors)).amax(dim=0)
+        share = torch.where(largest > 0.0, largest / (self.experiment.step_control.slope_tolerance * size), 0.0)
         return torch.fmax(error, torch.nan_to_num(share, nan=0.0).amax(dim=0))
 
-    def _either(self, yes: Tensor, x: tuple[Tensor, Change], y: tuple[Tensor, Change]) -> tuple[Tensor, Change]:
+    def _select(self, yes: Tensor, x: tuple[Tensor, Change], y: tuple[Tensor, Change]) -> tuple[Tensor, Change]:
         level = torch.where(yes, x[0], y[0])
         both = x[1] is None and y[1] is None
         return level, None if both else torch.where(yes, self.full(x[1]), self.full(y[1]))
@@ -210,17 +214,18 @@ class _Run:
     def _set_clock(self, start: Tensor, step: Tensor) -> None:
         self.state.values["clock", 0], self.state.values["clock", 1] = start.to(self.lanes), step.to(self.lanes)
 
-    def _enter(self, k: int) -> None:
-        """The clock and the channels of step k, late ones looked up."""
+    def _begin_step(self, k: int) -> None:
+        """Set the clock and the channels of step k, including delayed ones."""
         e = self.experiment
         start, step = e.nodes[k], e.steps[k]
         self._set_clock(start, step)
         for c in range(e.inputs.shape[1]):
             self.state.values["channel", c] = e.inputs[k, c].to(self.lanes)
         for j, actuator in enumerate(self.program.late_actuators):
-            self._look_up(j, self.program.channels[actuator], start, step)
+            self._delay_channel(j, self.program.channels[actuator], start, step)
 
-    def _look_up(self, j: int, channel: int, start: Tensor, step: Tensor) -> None:
+    def _delay_channel(self, j: int, channel: int, start: Tensor, step: Tensor) -> None:
+        """The mean of a delayed channel over a step, and its slopes."""
         signal, delay = self.experiment.signal, self.state.values["command_delay", j]
         begin = start - delay
         self.state.values["late_channel", j] = signal.average(start, step, channel, delay)
@@ -230,7 +235,7 @@ class _Run:
             self.state.changes["late_channel", j] = -rise / step * d_delay
 
     def _between(self, before: list[tuple[Tensor, Change]], k: int, share: Tensor) -> list[tuple[Tensor, Change]]:
-        """The levels at a share of step k."""
+        """The levels at a fraction of step k."""
         after = self._levels()
         if share >= 1.0:
             return after
@@ -240,29 +245,30 @@ class _Run:
         levels = [hermite(h0[0], h1[0], k0[0], k1[0], step, share) for h0, h1, k0, k1 in rows]
         if not self.program.tangent:
             return [(level, None) for level in levels]
-        moved = [[self.full(change) for _, change in row] for row in rows]
-        return [(h, hermite(d[0], d[1], d[2], d[3], step, share)) for h, d in zip(levels, moved, strict=True)]
+        changes = [[self.full(change) for _, change in row] for row in rows]
+        return [(h, hermite(d[0], d[1], d[2], d[3], step, share)) for h, d in zip(levels, changes, strict=True)]
 
-    def _see_late(self, s: int) -> None:
-        """Late sensors see what was, between the samples on a straight line."""
-        late, times, state = self.program.late_sensors, self.experiment.sample_times, self.state
-        self.history.append([(state.values["seen", i], state.changes.get(("seen", i))) for i in late])
-        for j, i in enumerate(late) if s else ():
+    def _delay_levels(self, s: int) -> None:
+        """Replace the levels at delayed sensors by earlier ones, with linear interpolation between samples."""
+        delayed, times, state = self.program.late_sensors, self.experiment.sample_times, self.state
+        self.history.append([(state.values["seen", i], state.changes.get(("seen", i))) for i in delayed])
+        for j, i in enumerate(delayed) if s else ():
             delay = state.values["reading_delay", j].expand(len(self.lanes))
-            wanted = times[s] - torch.clamp(delay, min=0.0)
-            right = torch.searchsorted(times, wanted.contiguous()).clamp(1, s)
+            instant = times[s] - torch.clamp(delay, min=0.0)
+            right = torch.searchsorted(times, instant.contiguous()).clamp(1, s)
             gap = times[right] - times[right - 1]
-            linear = (wanted - times[right - 1]) / gap
+            linear = (instant - times[right - 1]) / gap
             share = torch.clamp(linear, min=0.0)
             past = torch.stack([row[j][0].expand(len(self.lanes)) for row in self.history])
             first, last = past.gather(0, right[None] - 1)[0], past.gather(0, right[None])[0]
             state.values["seen", i] = first + share * (last - first)
             if state.changes:
-                moved = torch.where((linear >= 0) & (delay >= 0), -(last - first) / gap, 0.0)
-                state.changes["seen", i] = self._late_change(j, right, share, moved)
+                by_delay = torch.where((linear >= 0) & (delay >= 0), -(last - first) / gap, 0.0)
+                state.changes["seen", i] = self._late_change(j, right, share, by_delay)
 
-    def _late_change(self, j: int, right: Tensor, share: Tensor, moved: Tensor) -> Tensor:
+    def _late_change(self, j: int, right: Tensor, share: Tensor, by_delay: Tensor) -> Tensor:
+        """Slopes of a delayed level; moved: its slope by the delay."""
         past = torch.stack([self.full(row[j][1]) for row in self.history])
         index = right.expand(1, *past.shape[1:])
         first, last = past.gather(0, index - 1)[0], past.gather(0, index)[0]
-        return first + share * (last - first) + moved * self.full(self.state.changes.get(("reading_delay", j)))
+        return first + share * (last - first) + by_delay * self.full(self.state.changes.get(("reading_delay", j)))

@@ -1,4 +1,4 @@
-"""What a signal goes through at each of some places: the effects put there, one after the other."""
+"""The series connection of all effects that act on one signal: a command on its way to the actuator, or a reading."""
 
 from __future__ import annotations
 
@@ -7,45 +7,48 @@ from collections.abc import Iterable, Iterator, Sequence
 from torch import Tensor
 
 from fdi_torch.plant.effect import Effect, Memory, Placement, Stage, Values
-from fdi_torch.plant.moment import PlaceValues
+from fdi_torch.plant.operating_point import PlaceValues
 from fdi_torch.plant.signals import Clock
 
 
 class SignalChain:
-    """The effects of a stage (COMMAND or READING) at `places`, one signal each. memory: how many they keep in all."""
+    """The effects of one stage (COMMAND or READING) at each of `places`, in series; one signal per place.
+
+    memory: total number of memory states of these effects.
+    """
 
     def __init__(self, stage: Stage, places: Iterable[str], placements: Sequence[Placement]) -> None:
         self._is_command = stage is Stage.COMMAND
         self._placed = [[p for p in placements if p.location == at and p.effect.stage is stage] for at in places]
         self.memory = sum(placement.effect.memory for placed in self._placed for placement in placed)
 
-    def through(
+    def propagate(
         self, signals: Sequence[Tensor], memory: Memory, clock: Clock, values: PlaceValues
     ) -> tuple[list[Tensor], Memory]:
-        """What comes out of each place over a step, and the memories after it."""
-        outcomes: list[Tensor] = []
-        remembered: list[Tensor] = []
-        rest = list(memory)
+        """Pass each place's signal (*batch) through its effects over one step; return the outputs and new memories."""
+        outputs: list[Tensor] = []
+        new_memory: list[Tensor] = []
+        old_memory = list(memory)
         for place, value in enumerate(signals):
             for effect, p in self._effects(place, values):
-                value, kept = self._apply(effect, value, tuple(rest[: effect.memory]), clock, p)
-                del rest[: effect.memory]
-                remembered.extend(kept)
-            outcomes.append(value)
-        return outcomes, tuple(remembered)
+                value, states = self._apply(effect, value, tuple(old_memory[: effect.memory]), clock, p)
+                del old_memory[: effect.memory]
+                new_memory.extend(states)
+            outputs.append(value)
+        return outputs, tuple(new_memory)
 
-    def settled(self, signals: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Memory:
-        """The memories after the signals have long been what they are."""
-        remembered: list[Tensor] = []
+    def steady_memory(self, signals: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Memory:
+        """The memories in steady state, after the signals have been constant for a long time."""
+        states: list[Tensor] = []
         for place, value in enumerate(signals):
             for effect, p in self._effects(place, values):
-                memory = effect.remember(value, p)
+                memory = effect.steady_memory(value, p)
                 value, _ = self._apply(effect, value, memory, clock, p)
-                remembered.extend(memory)
-        return tuple(remembered)
+                states.extend(memory)
+        return tuple(states)
 
     def delays(self, values: PlaceValues) -> dict[int, Tensor]:
-        """By how many seconds a place (index) is late; only those that can be."""
+        """Total dead time of each place's signal, s, by index of the place; only places with a delay effect."""
         delays: dict[int, Tensor] = {}
         for place in range(len(self._placed)):
             for effect, p in self._effects(place, values):

@@ -1,6 +1,6 @@
-"""Recordings in other formats than CSV, as the text that a CSV file of the same table would be.
+"""Tables in formats other than CSV, converted to the text of an equivalent CSV file.
 
-So every rule for headers, units, time stamps and cells, and every error, is that of CSV. A format is one line of
+All rules and error messages for headers, units, time stamps and cells are thus those of CSV. A format is one entry of
 `FORMATS` and a module with `rows(path, sheet)`, which yields a header and then rows of plain values.
 """
 
@@ -22,12 +22,12 @@ from fdi_torch.outside import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, expect_u
 Row = Sequence[object]
 DELIMITER = "\t"
 BYTES_A_CELL = 8
-_AT_ONCE = 256  # rows between two looks at how much there is
+_AT_ONCE = 256  # rows between two checks of the size
 
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of file by its first bytes. module: the one below this package that reads it."""
+    """A file format, recognised by its first bytes. module: its reader in this package."""
 
     magic: bytes
     name: str
@@ -49,17 +49,17 @@ def format_of(beginning: bytes) -> Format | None:
 
 
 def table_text(path: Path, known: Format, sheet: str | None) -> TableText:
-    """The table in a file of that format. sheet: of a workbook with several; None for the first."""
+    """The table in a file of that format. sheet: of a workbook; None for the first."""
     if sheet is not None and known.module != "excel":
         raise ValueError(f"{path}: sheet: expected this key of an Excel workbook only, got {known.name}; leave it out")
     reader = import_module(f"fdi_torch.recordings.{known.module}")
-    return TableText(path, known, _begun(lambda: reader.rows(path, sheet)))
+    return TableText(path, known, _opened_lazily(lambda: reader.rows(path, sheet)))
 
 
 class TableText(io.TextIOBase):
-    """The lines of a table as a CSV file with tabs has them, a few rows ahead of what is read.
+    """The lines of a table as tab-separated text, produced a few rows ahead of the reader.
 
-    Raises ValueError, naming the file, where its content is damaged or larger than a file of its size may be.
+    Raises ValueError, naming the file, if the content is damaged or exceeds the allowed expansion.
     """
 
     delimiter = DELIMITER
@@ -68,7 +68,7 @@ class TableText(io.TextIOBase):
     def __init__(self, path: Path, known: Format, rows: Iterator[Row]) -> None:
         self._path, self._known = path, known
         self._rows = rows
-        self._lines = self._written()
+        self._lines = self._text_lines()
 
     def readable(self) -> bool:
         return True
@@ -80,7 +80,7 @@ class TableText(io.TextIOBase):
         with closing(self._lines):
             super().close()
 
-    def _written(self) -> Generator[str, None, None]:
+    def _text_lines(self) -> Generator[str, None, None]:
         packed, cells, width = self._path.stat().st_size, 0, 0
         while block := self._next_rows():
             cells += sum(map(len, block))
@@ -95,21 +95,21 @@ class TableText(io.TextIOBase):
             raise
         except ImportError as error:
             raise ValueError(f"{self._path}: {error}") from error
-        except Exception as error:  # what a library says of a file that is none, or damaged
+        except Exception as error:  # libraries raise many types for a damaged file
             if isinstance(error, ValueError) and str(error).startswith(str(self._path)):
                 raise
-            told = str(error).partition("\n")[0] or type(error).__name__
+            reason = str(error).partition("\n")[0] or type(error).__name__
             what = f"{self._path}: expected {self._known.name} that is whole, got one that cannot be read"
-            raise ValueError(f"{what}: {told}") from error
+            raise ValueError(f"{what}: {reason}") from error
 
 
-def _begun(rows: Callable[[], Iterator[Row]]) -> Iterator[Row]:
-    """The rows of a file that is not opened before the first is asked for."""
+def _opened_lazily(rows: Callable[[], Iterator[Row]]) -> Iterator[Row]:
+    """The rows of a file, opened only when the first one is requested."""
     yield from rows()
 
 
 def expect_cells(path: Path, cells: int) -> None:
-    """Raises ValueError where a file claims more cells than one of its size may have, before they are read."""
+    """Raises ValueError, before reading, if a file claims more cells than its size allows."""
     expect_unpacked(BYTES_A_CELL * cells, path.stat().st_size, str(path), MOST_UNPACKED, MOST_EXPANSION)
 
 
@@ -122,13 +122,13 @@ def _lines(rows: Iterable[Row]) -> list[str]:
 
 
 def _trimmed(row: Row) -> Row:
-    """Without the empty cells at its end."""
+    """The row without trailing empty cells."""
     last = next((k for k in range(len(row), 0, -1) if row[k - 1] not in (None, "")), 0)
     return row[:last]
 
 
 def _of_width(row: Row, width: int) -> Row:
-    """As wide as the header, as far as what it has allows: empty cells at the end are added or left out."""
+    """The row extended or cut to the header's width by empty cells; unchanged if non-empty cells exceed it."""
     if len(row) < width:
         return [*row, *[None] * (width - len(row))]
     return row if any(value not in (None, "") for value in row[width:]) else row[:width]

@@ -1,4 +1,4 @@
-"""Channels of a recording held against what its plant can read, deliver and open: units, rims, limits."""
+"""Checks of a recording's channels against the plant: units, rims, and limits of pumps and valves."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from torch import Tensor
 
 from fdi_torch.plant.description import PlantDescription, Pump, Sensor
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.finding import Finding
+from fdi_torch.recordings.channel_finding import ChannelFinding
 
 RIM_MARGIN = 0.02
 SMALL_SHARE = 0.01
-"""Wrong unit: all values below this share of the limit, or above ten times the limit."""
+"""The unit is suspect if all values are below this share of the limit, or any is above ten times the limit."""
 
 
-def against_plant(recording: Recording, plant: PlantDescription) -> Iterator[Finding]:
+def plant_limit_findings(recording: Recording, plant: PlantDescription) -> Iterator[ChannelFinding]:
+    """Findings of all sensors, pumps and valves that the recording has."""
     for sensor in plant.sensors:
         if sensor.column in recording.output_names:
             column = recording.output_names.index(sensor.column)
@@ -29,7 +30,7 @@ def against_plant(recording: Recording, plant: PlantDescription) -> Iterator[Fin
             yield from _valve_findings(valve, recording.inputs[:, recording.input_names.index(valve)])
 
 
-def _level_findings(sensor: Sensor, plant: PlantDescription, readings: Tensor) -> Iterator[Finding]:
+def _level_findings(sensor: Sensor, plant: PlantDescription, readings: Tensor) -> Iterator[ChannelFinding]:
     rim = next(tank.height for tank in plant.tanks if tank.name == sensor.tank)
     levels = (readings - sensor.offset) / sensor.gain
     if not len(levels):
@@ -37,38 +38,38 @@ def _level_findings(sensor: Sensor, plant: PlantDescription, readings: Tensor) -
     low, high = float(levels.min()), float(levels.max())
     if high > 10 * rim or high < SMALL_SHARE * rim:
         text = f"highest level {100 * high:.3g} cm, rim {100 * rim:.3g} cm: a wrong unit, or empty throughout?"
-        yield Finding("unit", sensor.column, text, {"high": high, "rim": rim})
+        yield ChannelFinding("unit", sensor.column, text, {"high": high, "rim": rim})
     elif high > (1 + RIM_MARGIN) * rim:
         above = int((levels > (1 + RIM_MARGIN) * rim).sum())
         text = f"{above} readings lie above the rim of {sensor.tank} ({100 * high:.4g} cm of {100 * rim:.4g} cm)"
-        yield Finding("range", sensor.column, text, {"high": high, "rim": rim, "count": above})
+        yield ChannelFinding("range", sensor.column, text, {"high": high, "rim": rim, "count": above})
     if low < -RIM_MARGIN * rim:
         below = int((levels < -RIM_MARGIN * rim).sum())
         text = f"{below} readings lie below the floor of {sensor.tank}, down to {100 * low:.4g} cm: an offset?"
-        yield Finding("range", sensor.column, text, {"low": low, "count": below})
+        yield ChannelFinding("range", sensor.column, text, {"low": low, "count": below})
 
 
-def _pump_findings(pump: Pump, command: Tensor) -> Iterator[Finding]:
+def _pump_findings(pump: Pump, command: Tensor) -> Iterator[ChannelFinding]:
     flow = pump.gain * command[torch.isfinite(command)]
     if not len(flow):
         return
     low, high = float(flow.min()), float(flow.max())
     if high > 10 * pump.max_flow or 0 < high < SMALL_SHARE * pump.max_flow:
         text = f"its highest flow is {1e6 * high:.3g} cm^3/s of {1e6 * pump.max_flow:.3g} cm^3/s: is its unit right?"
-        yield Finding("unit", pump.channel, text, {"high": high, "limit": pump.max_flow})
+        yield ChannelFinding("unit", pump.channel, text, {"high": high, "limit": pump.max_flow})
     elif high > (1 + 1e-6) * pump.max_flow:
         text = (
             f"asks for up to {1e6 * high:.4g} cm^3/s of {pump.name}, which delivers {1e6 * pump.max_flow:.4g} at most"
         )
-        yield Finding("range", pump.channel, text, {"high": high, "limit": pump.max_flow})
+        yield ChannelFinding("range", pump.channel, text, {"high": high, "limit": pump.max_flow})
     if low < 0:
         text = f"asks for a negative flow of {pump.name}, down to {1e6 * low:.4g} cm^3/s: it delivers none"
-        yield Finding("range", pump.channel, text, {"low": low})
+        yield ChannelFinding("range", pump.channel, text, {"low": low})
 
 
-def _valve_findings(valve: str, opening: Tensor) -> Iterator[Finding]:
-    known = opening[torch.isfinite(opening)]
-    if len(known) and (float(known.max()) > 1 + RIM_MARGIN or float(known.min()) < -RIM_MARGIN):
-        low, high = float(known.min()), float(known.max())
+def _valve_findings(valve: str, opening: Tensor) -> Iterator[ChannelFinding]:
+    finite = opening[torch.isfinite(opening)]
+    if len(finite) and (float(finite.max()) > 1 + RIM_MARGIN or float(finite.min()) < -RIM_MARGIN):
+        low, high = float(finite.min()), float(finite.max())
         text = f"opens from {low:.3g} to {high:.3g} where 0 is closed and 1 is open: is its unit right (pct)?"
-        yield Finding("unit", valve, text, {"low": low, "high": high})
+        yield ChannelFinding("unit", valve, text, {"low": low, "high": high})

@@ -1,4 +1,4 @@
-"""Time stamps as loggers write them, as seconds since 1970: ISO 8601, day.month.year, or a format that is given."""
+"""Time stamps of loggers, converted to seconds since 1970: ISO 8601, day.month.year, or a given format."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 
 QUARTER = 900.0
-"""Local time changes by whole quarters of an hour, s."""
+"""Offsets of time zones are multiples of a quarter of an hour, s."""
 BACK = 1000.0
-"""A clock that goes back by more than this was put back, s."""
+"""A clock that goes back by more than this was set back, s."""
 _DOTTED = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})[ T](\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,6}))?)?$")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def stamp_reader(form: str | None, zone: str | None) -> Callable[[str], float]:
-    """From a stamp's text to seconds since 1970; NaN for an empty cell. A stamp without an offset is taken for UTC.
+    """A function from a stamp's text to seconds since 1970, NaN for an empty cell. A stamp without offset is UTC.
 
-    Raises ValueError for a stamp that is written otherwise, and for one with an offset where a zone is given.
+    The function raises ValueError for a stamp in another format, and for one with an offset if a zone is given.
     """
 
     def seconds(text: str) -> float:
@@ -38,7 +38,7 @@ def stamp_reader(form: str | None, zone: str | None) -> Callable[[str], float]:
 
 
 seconds_of = stamp_reader(None, None)
-"""An ISO 8601 time stamp, or one such as 29.3.2026 08:30:00, in seconds since 1970."""
+"""Seconds since 1970 of an ISO 8601 time stamp, or of one such as 29.3.2026 08:30:00."""
 
 
 def _plain(stamp: str) -> datetime:
@@ -66,7 +66,7 @@ def _with_format(stamp: str, form: str) -> datetime:
 
 
 def expect_zone(zone: str) -> None:
-    """Raises ValueError for a zone that is none."""
+    """Raises ValueError for an unknown time zone."""
     try:
         ZoneInfo(zone)
     except (ZoneInfoNotFoundError, ValueError) as error:
@@ -74,9 +74,9 @@ def expect_zone(zone: str) -> None:
 
 
 def from_zone(local: np.ndarray, zone: str) -> np.ndarray:
-    """Local time of a zone, as seconds since 1970 if it were UTC (R,), as seconds since 1970.
+    """Seconds since 1970 of local times (R,), which are given as seconds since 1970 as if they were UTC.
 
-    An hour that comes twice is the first until the clock goes back within it, and the second from there on.
+    In the hour that occurs twice, times count as the first occurrence until the clock goes back, then as the second.
     """
     quarters, place = np.unique(np.floor(local / QUARTER), return_inverse=True)
     naive = [_EPOCH.replace(tzinfo=None) + timedelta(seconds=float(q) * QUARTER) for q in quarters]

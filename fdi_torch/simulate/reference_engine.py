@@ -1,4 +1,4 @@
-"""The reference engine: the plant integrated with torchdiffeq. This file is the only importer of torchdiffeq."""
+"""The reference engine: the plant integrated with torchdiffeq. This is the only file that imports torchdiffeq."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from torch.autograd import forward_ad
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Memory
-from fdi_torch.plant.moment import Constants
 from fdi_torch.plant.network import PlaceValues, TankNetwork
+from fdi_torch.plant.operating_point import Constants
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.forward_mode import Everywhere, beside, directions, value_and_slope, with_slope
+from fdi_torch.simulate.forward_mode import ZeroSlopes, directions, stack_with_slope, value_and_slope, with_slope
 from fdi_torch.simulate.gradient import expect_no_gradient
 
 
 class ReferenceEngine:
     """Readings of many parameter vectors at once, by torchdiffeq's fixed-step RK4 (3/8 rule) or an adaptive solver.
 
-    method: 'rk4' for populations, or any adaptive method of torchdiffeq for one run (rtol, atol in m).
-    Adaptive solvers share one step over the batch, so a member would depend on its neighbours: lanes run one by one.
-    every_node: an adaptive solver begins anew at each node, not only where an actuator switches; its levels there are
-    then steps' ends rather than interpolated within long steps.
+    method: 'rk4' for populations, or any adaptive method of torchdiffeq for single runs (rtol; atol in m). Adaptive
+    solvers share one step over the batch, which would make a lane depend on its neighbours; lanes therefore run one by
+    one. every_node: an adaptive solver restarts at each node and not only where an actuator switches; levels at the
+    nodes are then ends of steps rather than interpolated.
     """
 
     name = "reference"
@@ -44,8 +44,8 @@ class ReferenceEngine:
         why: str = "",
         every_node: bool = True,
     ) -> None:
-        if experiment.own is not None:
-            raise ValueError("expected the same steps for all lanes in the reference engine, got steps of their own")
+        if experiment.step_control is not None:
+            raise ValueError("expected the same steps for all lanes in the reference engine, got adaptive steps")
         self.network, self.space, self.experiment, self.why = network, space, experiment, why
         self.method, self.rtol, self.atol, self.every_node = method, rtol, atol, every_node
 
@@ -68,7 +68,7 @@ class ReferenceEngine:
     def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """theta (*batch, P) -> readings (*batch, S, sensors), their Jacobian (*batch, S, sensors, P), forward mode.
 
-        Levels and their slopes are integrated side by side; torch differentiates each operation of the right-hand side.
+        Levels and their slopes are integrated together; torch differentiates each operation of the right-hand side.
         """
         expect_no_gradient(self, theta, "linearise")
         lanes = theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
@@ -79,11 +79,13 @@ class ReferenceEngine:
         return readings.reshape(shape), slopes.movedim(1, 0).reshape(*shape, theta.shape[-1])
 
     def _run_with_slopes(self, lanes: Tensor) -> tuple[Tensor, Tensor]:
-        """lanes (L, P) -> readings (S, L, sensors) and slopes (S, L, sensors, P): each lane once for each slope."""
+        """lanes (L, P) -> readings (S, L, sensors) and slopes (S, L, sensors, P), from one copy of the lanes per
+        parameter.
+        """
         with forward_ad.dual_level():
-            moving = copy(self)
-            moving.experiment, moving.arithmetic = self.experiment.mapped(with_slope), Everywhere()
-            readings, slopes = value_and_slope(moving._run(directions(lanes)))
+            engine = copy(self)
+            engine.experiment, engine.arithmetic = self.experiment.mapped(with_slope), ZeroSlopes()
+            readings, slopes = value_and_slope(engine._run(directions(lanes)))
         assert slopes is not None
         return readings[:, : len(lanes)], slopes.unflatten(1, (lanes.shape[-1], len(lanes))).movedim(1, -1)
 
@@ -98,10 +100,12 @@ class ReferenceEngine:
         return gram_of(*self.linearise(theta), data)
 
     def _run(self, lanes: Tensor) -> Tensor:
-        """lanes (L, P) -> readings (S, L, sensors); with slopes where the lanes have them."""
+        """lanes (L, P) -> readings (S, L, sensors), with slopes if the lanes have them."""
         values = self.network.bind(self.space, lanes)
         if value_and_slope(lanes)[1] is not None:
-            values = Constants({place: {f: with_slope(v) for f, v in own.items()} for place, own in values.items()})
+            values = Constants(
+                {place: {f: with_slope(v) for f, v in constants.items()} for place, constants in values.items()}
+            )
         levels, commands, values = self._integrate(values, len(lanes))
         with self.arithmetic:
             return self._read(self._sample(levels, commands, values), values)
@@ -110,7 +114,9 @@ class ReferenceEngine:
         return Clock(start, step, self.experiment.resolution)
 
     def _integrate(self, values: PlaceValues, lanes: int) -> tuple[Tensor, Tensor, PlaceValues]:
-        """Levels at the nodes (K+1, L, tanks), what the actuators do over the steps (K, L, actuators)."""
+        """Levels at the nodes (K+1, L, tanks), actuator outputs over the steps (K, L, actuators), and the bound
+        values.
+        """
         e = self.experiment
         with self.arithmetic:
             commands = self._commands(values, lanes)
@@ -126,24 +132,24 @@ class ReferenceEngine:
             if slopes is None:
                 return self.network(state, held[k], clocks[k], values)
             with self.arithmetic:
-                return beside(self.network(with_slope(*state.unbind()), held[k], clocks[k], values))
+                return stack_with_slope(self.network(with_slope(*state.unbind()), held[k], clocks[k], values))
 
-        # `perturb` asks for the slopes just inside each step, so that a switch at its end is not seen early.
-        begins_anew = instants[1:-1]
+        # `perturb` evaluates slopes just inside each step, so that a switch at its end does not act early.
+        restarts = instants[1:-1]
         if not self.every_node:
-            begins_anew = begins_anew[(torch.diff(commands.detach(), dim=0) != 0).flatten(1).any(dim=1)]
-        options = {"perturb": True} if self.method == "rk4" else {"jump_t": begins_anew}
-        import torchdiffeq  # half a second, which no command has to wait for that does not ask for this engine
+            restarts = restarts[(torch.diff(commands.detach(), dim=0) != 0).flatten(1).any(dim=1)]
+        options = {"perturb": True} if self.method == "rk4" else {"jump_t": restarts}
+        import torchdiffeq  # takes half a second, which commands without this engine avoid
 
-        first = start if slopes is None else torch.stack([start, slopes])
+        initial = start if slopes is None else torch.stack([start, slopes])
         states = torchdiffeq.odeint(
-            rates, first, instants, method=self.method, rtol=self.rtol, atol=self.atol, options=options
+            rates, initial, instants, method=self.method, rtol=self.rtol, atol=self.atol, options=options
         )
         levels = states if slopes is None else with_slope(*states.unbind(1))
         return levels, commands, values
 
     def _commands(self, values: PlaceValues, lanes: int) -> Tensor:
-        """What each pump and valve makes of its channel over each step, (K, L, actuators)."""
+        """Output of each pump and valve over each step, (K, L, actuators)."""
         starts, steps = self.experiment.nodes[:-1], self.experiment.steps
         delays = self.network.command_delays(values)
         channels = {}
@@ -156,25 +162,25 @@ class ReferenceEngine:
         if not channels:
             return starts.new_zeros(len(starts), lanes, 0)
         stacked = torch.stack([channels[i] for i in range(len(channels))], dim=-1)
-        return self._through_actuators(stacked, values)
+        return self._actuator_outputs(stacked, values)
 
-    def _through_actuators(self, channels: Tensor, values: PlaceValues) -> Tensor:
+    def _actuator_outputs(self, channels: Tensor, values: PlaceValues) -> Tensor:
         starts, steps = self.experiment.nodes[:-1], self.experiment.steps
         if self.network.command_memory() == 0:
             clock = self._clock(starts.unsqueeze(1), steps.unsqueeze(1))
-            actual, _ = self.network.commands(channels.unbind(-1), (), clock, values)
-            return torch.stack([a.expand(channels.shape[:-1]) for a in actual], dim=-1)
-        memory = self.network.remember_commands(channels[0].unbind(-1), self._clock(starts[0], steps[0]), values)
+            outputs, _ = self.network.commands(channels.unbind(-1), (), clock, values)
+            return torch.stack([a.expand(channels.shape[:-1]) for a in outputs], dim=-1)
+        memory = self.network.steady_command_memory(channels[0].unbind(-1), self._clock(starts[0], steps[0]), values)
         rows = []
         for k in range(len(steps)):
-            actual, memory = self.network.commands(
+            outputs, memory = self.network.commands(
                 channels[k].unbind(-1), memory, self._clock(starts[k], steps[k]), values
             )
-            rows.append(torch.stack([a.expand(channels.shape[1]) for a in actual], dim=-1))
+            rows.append(torch.stack([a.expand(channels.shape[1]) for a in outputs], dim=-1))
         return torch.stack(rows)
 
     def _sample(self, levels: Tensor, commands: Tensor, values: PlaceValues) -> Tensor:
-        """Levels at the samples (S, L, tanks): the nodes themselves, or the cubic through both ends' levels, slopes."""
+        """Levels at the samples (S, L, tanks): those at the nodes, or a cubic Hermite interpolation within a step."""
         e = self.experiment
         left, right = levels[e.sample_step], levels[e.sample_step + 1]
         inside = (e.sample_share > 0.0) & (e.sample_share < 1.0)
@@ -191,21 +197,21 @@ class ReferenceEngine:
 
     def _read(self, levels: Tensor, values: PlaceValues) -> Tensor:
         """Tank levels at the samples (S, L, tanks) -> readings (S, L, sensors)."""
-        seen = [levels[..., tank] for tank in self.network.sensor_tanks()]
+        measured = [levels[..., tank] for tank in self.network.sensor_tanks()]
         for i, delay in self.network.reading_delays(values).items():
-            seen[i] = late(seen[i], self.experiment.sample_times, delay)
+            measured[i] = late(measured[i], self.experiment.sample_times, delay)
         times = self.experiment.sample_times
         intervals = self.experiment.sample_intervals
         if self.network.reading_memory() == 0:
             clock = self._clock((times - intervals).unsqueeze(1), intervals.unsqueeze(1))
-            readings, _ = self.network.read(seen, (), clock, values)
+            readings, _ = self.network.read(measured, (), clock, values)
             return torch.stack([r.expand(levels.shape[:2]) for r in readings], dim=-1)
         clock = self._clock(times[0] - intervals[0], intervals[0])
-        memory: Memory = self.network.remember_readings([s[0] for s in seen], clock, values)
+        memory: Memory = self.network.steady_reading_memory([s[0] for s in measured], clock, values)
         rows = []
         for k in range(len(times)):
             clock = self._clock(times[k] - intervals[k], intervals[k])
-            readings, memory = self.network.read([s[k] for s in seen], memory, clock, values)
+            readings, memory = self.network.read([s[k] for s in measured], memory, clock, values)
             rows.append(torch.stack([r.expand(levels.shape[1]) for r in readings], dim=-1))
         return torch.stack(rows)
 
@@ -213,19 +219,23 @@ class ReferenceEngine:
 def hermite(
     left: Tensor, right: Tensor, slope_left: Tensor, slope_right: Tensor, step: Tensor, share: Tensor
 ) -> Tensor:
-    """The cubic through both ends' values and slopes, at `share` (0..1) of the step."""
-    rest = 1.0 - share
-    bend_left = share * rest * rest
-    bend_right = share * share * rest
+    """Cubic Hermite interpolation between values and slopes at both ends, at the fraction `share` (0..1) of the
+    step.
+    """
+    remaining = 1.0 - share
+    bend_left = share * remaining * remaining
+    bend_right = share * share * remaining
     blend = share * share * (3.0 - 2.0 * share)
     return left + blend * (right - left) + step * (bend_left * slope_left - bend_right * slope_right)
 
 
 def late(series: Tensor, times: Tensor, delay: Tensor) -> Tensor:
-    """series (S, L) at `times` (S,), each lane seen `delay` (L,) s later; before the first sample it is that sample."""
-    wanted = times.unsqueeze(1) - torch.clamp(delay, min=0.0).expand(series.shape[1])
-    right = torch.searchsorted(times, wanted.detach().contiguous()).clamp(1, len(times) - 1)
+    """series (S, L) at times (S,), delayed by `delay` (L,) s with linear interpolation; constant before the first
+    sample.
+    """
+    delayed_times = times.unsqueeze(1) - torch.clamp(delay, min=0.0).expand(series.shape[1])
+    right = torch.searchsorted(times, delayed_times.detach().contiguous()).clamp(1, len(times) - 1)
     left = right - 1
     before, after = series.gather(0, left), series.gather(0, right)
-    share = (wanted - times[left]) / (times[right] - times[left])
-    return before + torch.where(wanted > times[0], share, 0.0) * (after - before)
+    share = (delayed_times - times[left]) / (times[right] - times[left])
+    return before + torch.where(delayed_times > times[0], share, 0.0) * (after - before)

@@ -1,4 +1,4 @@
-"""The statements of a section in C++: `common` to all lanes, and those of each loop over the vectors of a block."""
+"""The C++ statements of a section: those common to all lanes, and those of each loop over the vectors of a block."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from fdi_torch.simulate.operations import OPERATIONS
 
 
 class Statements:
-    """Writes what computes the nodes of one section, loop after loop.
+    """Writes the statements that compute the nodes of one section, loop by loop.
 
-    constant: where a node that does not vary in time stands, or None before time, when it has to be computed.
-    steady: further nodes that stand where `constant` says.
-    kept: where a node stands that is needed after its own loop, by node.
+    constant: expression for a node that does not vary in time, or None while such nodes are themselves computed.
+    steady: further nodes for which `constant` is used. kept: index in the storage of nodes that are needed after their
+    loop.
     """
 
     def __init__(
@@ -29,17 +29,17 @@ class Statements:
         self._inside = False
 
     def keep(self, loops: Sequence[list[int]], slopes: Iterable[int]) -> None:
-        """Finds what to keep: the slopes, for the loop over directions, and what a loop needs of an earlier one."""
-        wanted = [i for i in slopes if self.graph.nodes[i].varies == Varies.BOTH and i not in self.steady]
-        known: set[int] = set()
+        """Select the nodes to store: slopes for the loop over directions, and nodes that later loops need."""
+        needed = [i for i in slopes if self.graph.nodes[i].varies == Varies.BOTH and i not in self.steady]
+        computed: set[int] = set()
         for loop in loops:
-            order = self._order(loop, known)
-            wanted += [i for i in order if i in known]
-            known |= {i for i in order if self._is_computed(i)}
-        self.kept = {i: k for k, i in enumerate(dict.fromkeys(wanted))}
+            order = self._order(loop, computed)
+            needed += [i for i in order if i in computed]
+            computed |= {i for i in order if self._is_computed(i)}
+        self.kept = {i: k for k, i in enumerate(dict.fromkeys(needed))}
 
     def compute(self, wanted: Sequence[int]) -> list[str]:
-        """The statements of a loop: one for each node that the wanted ones need."""
+        """The statements of a loop: one for each node on which the wanted ones depend."""
         self._inside = True
         order = self._order(wanted, self._known)
         for i in order:
@@ -61,14 +61,14 @@ class Statements:
             node = self.graph.nodes[i]
             inner = []
             if node.operation == "where" and i not in self._known:
-                behind = set(self.graph.reach(node.arguments[1:2], stop=[j for j in order if j not in owner]))
-                inner = [j for j in order if j in behind - done and owner.get(j) == node.arguments[0]]
+                needed = set(self.graph.reach(node.arguments[1:2], stop=[j for j in order if j not in owner]))
+                inner = [j for j in order if j in needed - done and owner.get(j) == node.arguments[0]]
             lines += self._guarded(i, inner, order) if inner else [f"        {self._statement(i)}"]
             done |= {*inner}
         return lines
 
     def _guarded(self, i: int, inner: Sequence[int], order: Sequence[int]) -> list[str]:
-        """A `where` whose first branch is computed for vectors in which it is taken."""
+        """A `where` whose first branch is computed only for vectors in which some lane takes it."""
         condition, yes, no = self.graph.nodes[i].arguments
         others = {a for j in order if j != i and j not in inner for a in self.graph.nodes[j].arguments}
         lines = [f"        {self._type(j)} v{j};" for j in inner if j in others]
@@ -77,11 +77,11 @@ class Statements:
         return [*lines, f"            v{i} = WHERE({self.text(condition)}, {self.text(yes)}, v{i});", "        }"]
 
     def leave(self) -> None:
-        """From here on, nodes are read where they are stored: a loop has ended."""
+        """End a loop: from here on, nodes are read from storage."""
         self._inside = False
 
     def text(self, i: int) -> str:
-        """The expression of a node that has been computed; in the loop over directions, of one that was kept."""
+        """The expression of a computed node; in the loop over directions, of a stored one."""
         node = self.graph.nodes[i]
         if node.operation == "literal":
             return _literal(node.value)
@@ -90,11 +90,11 @@ class Statements:
         return self._stored(i)
 
     def number(self, i: int) -> str:
-        """The same as a number."""
+        """The expression of a node as a number, also for truth values."""
         return f"WHERE({self.text(i)}, real(1), real(0))" if self.graph.nodes[i].boolean else self.text(i)
 
     def _order(self, wanted: Iterable[int], known: set[int]) -> list[int]:
-        """What has to be there for the wanted nodes; what is known, or constant, is not followed."""
+        """The nodes that the wanted nodes need, in order; known and constant nodes are not followed."""
         if self.constant is None:
             return self.graph.reach(wanted)
         wanted = list(wanted)
@@ -102,7 +102,7 @@ class Statements:
         return self.graph.reach(wanted, stop=[*known, *constant])
 
     def _is_computed(self, i: int) -> bool:
-        """Whether a node of a loop is the result of an operation, and not read from where it stands anyway."""
+        """Whether the node is the result of an operation in a loop."""
         node = self.graph.nodes[i]
         return node.varies == Varies.BOTH and node.operation != "input" and i not in self.steady
 
@@ -120,7 +120,7 @@ class Statements:
         return OPERATIONS[node.operation].c.format(*(self.text(a) for a in node.arguments))
 
     def _stored(self, i: int) -> str:
-        """Where a node's value stands in memory."""
+        """The storage location of a node's value."""
         node = self.graph.nodes[i]
         if i in self.kept and (i in self._known or not self._inside):
             text = f"AT(kept[{self.kept[i]}])"

@@ -1,6 +1,8 @@
-"""From the plant's own Python code to flat pointwise programs: runs it once on tiny tensors and writes down each step.
+"""Tracing of the plant's Python code into an expression graph: the code runs once on small tensors, and each operation
+is recorded.
 
-The physics stays written once, in TankNetwork and the effects; whatever they do must be pointwise over lanes.
+The physics is written once, in TankNetwork and the effects; it may contain only operations that are pointwise over
+lanes.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from fdi_torch.simulate.expression import Graph, Varies
 
-_LANES = 2  # any number: two tells lanes from the dimensions of single numbers
+_LANES = 2  # any number above 1, which distinguishes lanes from single numbers
 
 _SAME = {"expand", "view", "detach", "clone", "alias", "lift_fresh", "contiguous", "unsqueeze", "squeeze", "reshape"}
 _DIRECT = {
@@ -37,26 +39,28 @@ _RENAMED = {
 
 
 class Tracer(TorchDispatchMode):
-    """While it is active, operations on tensors made by `tensor` are written into the graph."""
+    """While active, records operations on tensors made by `tensor` in the graph."""
 
     def __init__(self, graph: Graph) -> None:
         super().__init__()
         self.graph = graph
         self._node: dict[int, int] = {}
-        self._alive: list[Tensor] = []  # an id is a name only while its tensor lives
+        self._alive: list[Tensor] = []  # keeps tensors alive, so that ids remain unique
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        """Nothing here is ever compiled by torch: without this, it imports its compiler at the first call (1.5 s)."""
+        """False, because torch would otherwise import its compiler at the first call (1.5 s), which is not used
+        here.
+        """
         return False
 
     def tensor(self, node: int) -> Tensor:
-        """A tensor that stands for a node: (2,) where it varies between lanes, else without dimensions."""
+        """A tensor that represents a node: (2,) if it varies between lanes, else without dimensions."""
         shape = (_LANES,) if self.graph.nodes[node].varies & Varies.LANE else ()
         return self._track(torch.full(shape, 0.5, dtype=torch.float64), node)
 
     def node(self, value: Any) -> int:
-        """The node that a tensor or number stands for."""
+        """The node that a tensor or number represents."""
         if not isinstance(value, Tensor):
             return self.graph.number(float(value))
         if id(value) not in self._node:
@@ -132,7 +136,7 @@ def _cast(t: Tracer, args: Sequence[Any], kwargs: dict[str, Any]) -> int:
 
 
 def _truth(t: Tracer, operation: str, args: Sequence[Any]) -> int:
-    """A product with a truth value: 1 where it holds."""
+    """A product in which truth values count as 1 and 0."""
     parts = [_cast(t, (a,), {}) for a in args]
     return t.graph.apply(operation, *parts)
 

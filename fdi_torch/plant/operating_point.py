@@ -1,4 +1,4 @@
-"""A plant at one moment: what holds at each of its places, for the laws that are written over single components."""
+"""The operating point of a plant: levels, commands and constants at one instant, and the conditions at each place."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ PlaceValues = Mapping[str, Values]
 
 
 class Constants(dict[str, Values]):
-    """The constants of a plant by place and field, and what follows from them alone, worked out once."""
+    """The constants of a plant by place and field, with a cache for quantities that depend on them alone."""
 
     def __init__(self, values: PlaceValues) -> None:
         super().__init__(values)
-        self._known: dict[str, tuple[object, Tensor]] = {}
+        self._cache: dict[str, tuple[object, Tensor]] = {}
 
-    def once(self, name: str, work: Callable[[], Tensor], given: object = None) -> Tensor:
-        """What `work` gives, kept as long as `given` is the same thing.
+    def cached(self, name: str, compute: Callable[[], Tensor], key: object = None) -> Tensor:
+        """Return `compute()`, reusing the last result under `name` while `key` is the same object.
 
-        Not kept where gradients are to flow back through it, which they can do once only.
+        Results that require gradients are not cached, because autograd can go back through their graph only once.
         """
-        before, known = self._known.get(name, (self, None))
-        if known is not None and before is given:
-            return known
-        value = work()
+        last_key, value = self._cache.get(name, (self, None))
+        if value is not None and last_key is key:
+            return value
+        value = compute()
         if not value.requires_grad:
-            self._known[name] = given, value
+            self._cache[name] = key, value
         return value
 
 
 @dataclass(frozen=True)
-class Moment:
-    """levels (m) of the tanks and commands of the actuators as they act, in the clock's step; all (*batch), SI."""
+class OperatingPoint:
+    """Levels (m) of the tanks and commands after the actuators' effects, in one step of the clock; all (*batch), SI."""
 
     plant: PlantDescription
     levels: Mapping[str, Tensor]
@@ -58,29 +58,29 @@ class Moment:
         commands: Sequence[Tensor],
         clock: Clock,
         values: PlaceValues,
-    ) -> Moment:
+    ) -> OperatingPoint:
         by_tank = dict(zip((tank.name for tank in plant.tanks), levels, strict=True))
-        known = values if isinstance(values, Constants) else Constants(values)
-        return cls(plant, by_tank, dict(zip(actuators, commands, strict=True)), clock, known)
+        constants = values if isinstance(values, Constants) else Constants(values)
+        return cls(plant, by_tank, dict(zip(actuators, commands, strict=True)), clock, constants)
 
     @property
     def gravity(self) -> Tensor:
         return self.values[""]["gravity"]
 
     def at_pump(self, pump: Pump) -> Local:
-        """At a pump: the level of its target, its own gain and command."""
-        own = self.values[pump.name]
+        """Conditions at a pump: the level of its target tank, the pump's gain and command."""
+        constants = self.values[pump.name]
         at_target = self.at_tank(pump.target)
-        return replace(at_target, capacity=own["gain"], command=self.commands[pump.name], constants=own)
+        return replace(at_target, capacity=constants["gain"], command=self.commands[pump.name], constants=constants)
 
     def at_pipe(self, pipe: Pipe) -> Local:
-        """At a pipe or outlet: both levels, the head between them, its opening."""
-        own = self.values[pipe.name]
+        """Conditions at a pipe or outlet: both levels, the head between them, the valve's opening."""
+        constants = self.values[pipe.name]
         level = self.levels[pipe.source]
-        head, far = level - own["elevation"], level
+        head, far = level - constants["elevation"], level
         if not pipe.is_outlet:
             far = self.levels[pipe.target]
-            wet_far = torch.clamp(far - own["elevation"], min=0.0)
+            wet_far = torch.clamp(far - constants["elevation"], min=0.0)
             head = torch.clamp(head, min=0.0) - wet_far if pipe.elevation else level - far
         elif pipe.target == OUTSIDE:
             far = torch.zeros_like(level)
@@ -98,47 +98,47 @@ class Moment:
             width=self.width(pipe),
             height=self.values[pipe.source]["height"],
             gravity=self.gravity,
-            constants=own,
+            constants=constants,
         )
 
     def at_tank(self, name: str, far: str | None = None, net: Tensor | None = None) -> Local:
-        """At a tank, or between two: the levels, the capacity of its leak reference, what flows in so far (m^3/s)."""
-        own, level = self.values[name], self.levels[name]
+        """Conditions at a tank, or between a tank and `far`; net: inflow of the tank so far, m^3/s."""
+        constants, level = self.values[name], self.levels[name]
         return Local(
             self.clock,
             level,
             self.levels[far or name],
             head=level,
-            capacity=own["leak_capacity"],
+            capacity=constants["leak_capacity"],
             command=level,
             net=self._number(0.0) if net is None else net,
             width=self.width(leak_pipe(self.plant, name)),
-            height=own["height"],
+            height=constants["height"],
             gravity=self.gravity,
-            constants=own,
+            constants=constants,
         )
 
     def capacity(self, pipe: Pipe) -> Tensor:
-        """Flow at 1 m of head, m^2.5/s."""
-        own = self.values[pipe.name]
-        return self.values.once(
+        """C_d a sqrt(2 g) of a pipe: its flow at 1 m of head, m^2.5/s."""
+        constants = self.values[pipe.name]
+        return self.values.cached(
             f"capacity of {pipe.name}",
-            lambda: orifice_capacity(own["discharge_coefficient"], own["area"], self.gravity),
+            lambda: orifice_capacity(constants["discharge_coefficient"], constants["area"], self.gravity),
         )
 
     def width(self, pipe: Pipe) -> Tensor:
-        """The head below which the roots of a pipe are drawn smooth, m."""
+        """Head below which the square root of a pipe's law is smoothed, m."""
 
-        def work() -> Tensor:
+        def compute() -> Tensor:
             rate = nominal_capacity(self.plant, pipe) * inverse_areas(self.plant, pipe)
             return regular_width(rate, self.clock.resolution)
 
-        return self.values.once(f"width of {pipe.name}", work, self.clock.resolution)
+        return self.values.cached(f"width of {pipe.name}", compute, self.clock.resolution)
 
     def rim(self, tank: Tank) -> Tensor:
-        """What runs over a tank's rim at 1 m above it, as a strength: m^1.5/s."""
-        own = self.values[tank.name]
-        return self.values.once(f"rim of {tank.name}", lambda: rim_strength(own["area"], self.gravity))
+        """Weir coefficient of a tank's whole rim: its overflow at 1 m above the rim, m^1.5/s."""
+        constants = self.values[tank.name]
+        return self.values.cached(f"rim of {tank.name}", lambda: rim_strength(constants["area"], self.gravity))
 
     def _number(self, value: float) -> Tensor:
-        return self.values.once(f"the number {value}", lambda: torch.full_like(self.gravity, value))
+        return self.values.cached(f"the number {value}", lambda: torch.full_like(self.gravity, value))

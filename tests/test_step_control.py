@@ -17,12 +17,12 @@ from fdi_torch.estimate.hybrid import HybridSettings, information_std, refine_to
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.compiled import CompiledEngine
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings, gram_of
 from fdi_torch.simulate.experiment import Experiment, lay_out
-from fdi_torch.simulate.integrate import ReferenceEngine
-from fdi_torch.simulate.own_steps import OwnSteps, judged, own_step
-from fdi_torch.simulate.traced import TracedEngine
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.step_control import StepControl, accept_steps, next_step
+from fdi_torch.simulate.traced_engine import TracedEngine
 
 
 def experiment(tolerance: float | None, step: float = 20.0, samples: int = 41) -> Experiment:
@@ -36,8 +36,8 @@ def experiment(tolerance: float | None, step: float = 20.0, samples: int = 41) -
     return lay_out(recording, ("Q1", "Q2"), step, None if tolerance is None else own_steps(tolerance))
 
 
-def own_steps(tolerance: float) -> OwnSteps:
-    return OwnSteps.within(tolerance, three_tank())
+def own_steps(tolerance: float) -> StepControl:
+    return StepControl.for_tolerance(tolerance, three_tank())
 
 
 @pytest.fixture(scope="module")
@@ -127,8 +127,8 @@ def test_every_effect_keeps_its_meaning() -> None:
 
 def test_the_control_by_hand() -> None:
     n = torch.tensor
-    assert own_step(n([0.0, 6.0, 7.5, 10.0]), n([4.0, 4.0, 4.0, 4.0]), n(10.0)).tolist() == [4.0, 4.0, 2.5, 10.0]
-    assert own_step(n([4.0]), n([4.0]), n(10.0)).tolist() == [3.0], "two of 3 s, rather than 4 s and 2 s"
+    assert next_step(n([0.0, 6.0, 7.5, 10.0]), n([4.0, 4.0, 4.0, 4.0]), n(10.0)).tolist() == [4.0, 4.0, 2.5, 10.0]
+    assert next_step(n([4.0]), n([4.0]), n(10.0)).tolist() == [3.0], "two of 3 s, rather than 4 s and 2 s"
     cases = {  # own step, error, gone, pace -> kept, how far, pace
         "small error": (1.0, 0.01, 0.0, 1.0, True, 1.0, 0.9 * 100**0.25),
         "none": (1.0, 0.0, 0.0, 1.0, True, 1.0, 3.0),
@@ -141,7 +141,7 @@ def test_the_control_by_hand() -> None:
     }
     columns = [torch.tensor(c, dtype=torch.float64) for c in zip(*(case[:4] for case in cases.values()), strict=True)]
     own, error, gone, pace = columns
-    kept, after, paces = judged(own, error, gone, pace, n(10.0), 0.1)
+    kept, after, paces = accept_steps(own, error, gone, pace, n(10.0), 0.1)
     for i, (name, case) in enumerate(cases.items()):
         assert (bool(kept[i]), float(after[i])) == case[4:6], name
         assert float(paces[i]) == pytest.approx(case[6]), name
@@ -151,7 +151,8 @@ def test_misuse_is_named() -> None:
     network, space = rig()
     with pytest.raises(ValueError, match=r"expected a tolerance above the rounding of levels .*, got 0 m"):
         experiment(0.0)
-    with pytest.raises(ValueError, match="expected the same steps for all lanes in the reference engine, got steps of"):
+    message = "expected the same steps for all lanes in the reference engine, got adaptive steps"
+    with pytest.raises(ValueError, match=message):
         ReferenceEngine(network, space, experiment(1e-6))
 
 

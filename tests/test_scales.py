@@ -24,13 +24,13 @@ from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.pace import length_scale, time_scale
+from fdi_torch.plant.scales import length_scale, time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.own_steps import OwnSteps
-from fdi_torch.simulate.record import clean_readings, with_noise
-from fdi_torch.simulate.traced import TracedEngine
+from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
+from fdi_torch.simulate.step_control import StepControl
+from fdi_torch.simulate.traced_engine import TracedEngine
 from tests.test_monitor import NAMES, SPACE, followed, recorded, step_to
 
 SCALES = [(0.01, 1.0), (100.0, 1.0), (1.0, 0.05), (1.0, 60.0), (0.1, 0.05), (20.0, 60.0)]
@@ -101,7 +101,7 @@ def test_steps_of_a_lane_s_own_scale_with_the_rig(metres: float, seconds: float)
     found = []
     for m, s in ((1.0, 1.0), (metres, seconds)):
         plant, blank = experiment(m, s)
-        own = OwnSteps.like(0.5 * s, plant)
+        own = StepControl.for_fixed_step(0.5 * s, plant)
         assert own.resolution == pytest.approx(0.5 * s)
         network = build_network(plant, placements_for(FAULTS))
         space = ParameterSpace(network.constants[name] for name in FAULTS)

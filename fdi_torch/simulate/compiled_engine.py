@@ -1,4 +1,4 @@
-"""The fast engine: the plant's own equations, traced and compiled into one loop over blocks of lanes."""
+"""The compiled engine: the plant's equations, traced and compiled into one C++ loop over blocks of lanes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fdi_torch.capacity import expect_room
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.build import is_cached, load_library
-from fdi_torch.simulate.emit import emit
+from fdi_torch.simulate.cpp_source import emit
 from fdi_torch.simulate.engine import Readings, expect_problems
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
@@ -29,11 +29,11 @@ _ARRAYS = (
     "sample_intervals", "sample_shares", "signal_times", "signal_integral", "signal_slopes", "values", "weights",
     "centres", "memory", "gains", "start", "start_memory", "out", "jacobian",
 )  # fmt: skip
-_OWN_STEPS = ("tolerance", "slope_tolerance", "shortest")
+_STEP_CONTROL = ("tolerance", "slope_tolerance", "shortest")
 _MODES = {"levels": 0, "readings": 1, "moments": 2, "linearise": 3, "gram": 4, "observe": 5}
 _REALS = {torch.float64: "double", torch.float32: "float"}
 VALUE_LANES, TANGENT_LANES = 32, 16
-# Up to so many tanks a step is unrolled, which makes it faster and takes a compiler longer.
+# Steps of plants with up to this many tanks are unrolled, which is faster but takes longer to compile.
 MOST_UNROLLED = 6
 
 
@@ -47,21 +47,21 @@ class _Job(ctypes.Structure):
     """`struct Job` of kernel.hpp."""
 
     _fields_ = [(n, ctypes.c_int64) for n in _INTEGERS]
-    _fields_ += [(n, ctypes.c_double) for n in _OWN_STEPS] + [(n, ctypes.c_void_p) for n in _ARRAYS]
+    _fields_ += [(n, ctypes.c_double) for n in _STEP_CONTROL] + [(n, ctypes.c_void_p) for n in _ARRAYS]
     _fields_ += [("python", ctypes.POINTER(_Python))]
 
 
 _API = ("PyEval_SaveThread", "PyEval_RestoreThread", "PyErr_CheckSignals")
 _PYTHON = _Python(*(ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p) for name in _API))
-_RUN = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)  # called with Python's lock, which the loop lets go of while it runs
+_RUN = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)  # called with Python's global lock, which the loop releases
 
 
 class CompiledEngine:
     """Readings of many parameter vectors at once, by the same fixed-step RK4 as the reference engine.
 
-    Compiles at the first use of each kind (values, sensitivities; float64, float32 as theta is) and at most once a
-    machine. Raises BuildError where there is no compiler, and what a signal's handler raises while a loop runs.
-    Threads: as many as torch is set to.
+    Each variant (values or sensitivities; float64 or float32, as theta) is compiled at its first use and cached on the
+    machine. Runs on as many threads as torch is set to. Raises BuildError without a compiler, and passes on an
+    exception that a signal handler raises while a loop runs.
     """
 
     name = "compiled"
@@ -70,7 +70,7 @@ class CompiledEngine:
         self.network, self.space, self.experiment, self.why = network, space, experiment, why
         shares = experiment.sample_share
         inner = bool(((shares > 0) & (shares < 1)).any())
-        self._form = experiment.own is not None, inner
+        self._form = experiment.step_control is not None, inner
         self._tables: dict[torch.dtype, dict[str, Tensor]] = {}
 
     def levels(self, theta: Tensor) -> Tensor:
@@ -115,11 +115,11 @@ class CompiledEngine:
         return out
 
     def prepare(self, tangent: bool = False, dtype: torch.dtype = torch.float64) -> None:
-        """Compiles ahead of the first use."""
+        """Compile before the first use."""
         _kernel(self.network, self.space.names, tangent, *self._form, _REALS[dtype])
 
     def is_built(self, tangent: bool = False, dtype: torch.dtype = torch.float64) -> bool:
-        """Whether the kernel lies in the cache already."""
+        """Whether the cache holds the compiled kernel."""
         return is_cached(_source(self.network, self.space.names, tangent, *self._form, _REALS[dtype]))
 
     @property
@@ -170,8 +170,8 @@ class CompiledEngine:
             "jacobian_bytes": 0 if jacobian is None else jacobian.nbytes,
         }
         pointers = {name: None if a is None else a.data_ptr() for name, a in arrays.items()}
-        own = self.experiment.own
-        control = {} if own is None else {name: getattr(own, name) for name in _OWN_STEPS}
+        step_control = self.experiment.step_control
+        control = {} if step_control is None else {name: getattr(step_control, name) for name in _STEP_CONTROL}
         run(ctypes.byref(_Job(**sizes, **control, **pointers, python=ctypes.pointer(_PYTHON))))
 
     def _lanes(self, theta: Tensor) -> Tensor:
@@ -201,9 +201,9 @@ class CompiledEngine:
                 "signal_integral": e.signal.integral,
                 "signal_slopes": e.signal.slopes,
             }
-            kept = {name: t.detach().to(like.dtype).contiguous() for name, t in tables.items()}
-            kept["first_sample"] = torch.searchsorted(e.sample_step.contiguous(), steps).contiguous()
-            self._tables[like.dtype] = kept
+            converted = {name: t.detach().to(like.dtype).contiguous() for name, t in tables.items()}
+            converted["first_sample"] = torch.searchsorted(e.sample_step.contiguous(), steps).contiguous()
+            self._tables[like.dtype] = converted
         return dict(self._tables[like.dtype])
 
     def _data(self, like: Tensor, data: Readings) -> dict[str, Tensor | None]:
@@ -224,21 +224,21 @@ class CompiledEngine:
 
 
 @lru_cache(maxsize=128)
-def _source(network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool, inner: bool, real: str) -> str:
-    # Lanes with steps of their own wait for each other, so that no more of them go together than a register holds.
-    lanes = "VECTOR" if within else TANGENT_LANES if tangent else VALUE_LANES
-    return emit(_program(network, names, tangent, within), inner, real, lanes)
+def _source(network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool, inner: bool, real: str) -> str:
+    # With adaptive steps the lanes of a block wait for the slowest one; one register's width keeps that short.
+    lanes = "VECTOR" if adaptive else TANGENT_LANES if tangent else VALUE_LANES
+    return emit(_program(network, names, tangent, adaptive), inner, real, lanes)
 
 
-def _program(network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool) -> Program:
-    return build_program(network, names, tangent, within, len(network.description.tanks) <= MOST_UNROLLED)
+def _program(network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool) -> Program:
+    return build_program(network, names, tangent, adaptive, len(network.description.tanks) <= MOST_UNROLLED)
 
 
 @lru_cache(maxsize=128)
 def _kernel(
-    network: TankNetwork, names: tuple[str, ...], tangent: bool, within: bool, inner: bool, real: str
+    network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool, inner: bool, real: str
 ) -> tuple[Any, Tensor]:
-    """The compiled function, and the numbers of the equations that it is handed."""
-    run = _RUN(("run", load_library(_source(network, names, tangent, within, inner, real), "run")))
-    lifted = _program(network, names, tangent, within).graph.lifted
+    """The compiled function, and the numbers of the equations that are its arguments."""
+    run = _RUN(("run", load_library(_source(network, names, tangent, adaptive, inner, real), "run")))
+    lifted = _program(network, names, tangent, adaptive).graph.lifted
     return run, torch.tensor(lifted or [0.0], dtype=torch.float64)

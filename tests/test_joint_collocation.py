@@ -22,7 +22,7 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.joint import Joint
+from fdi_torch.simulate.joint_collocation import JointCollocation
 
 CM = 1e-2
 
@@ -45,7 +45,7 @@ def run(seed: int, samples: int, effects: dict[str, float], offset: float = 0.0)
     engine = Fitter(subject, Noise(torch.ones(3), torch.zeros(3))).engine(Candidate(tuple(placements)), list(effects))
     start = {"T1.start_level": 10 * CM, "T2.start_level": 20 * CM, "T3.start_level": 30 * CM}
     theta = engine.space.vector(start | effects).unsqueeze(0)
-    clean = engine.settle(theta, engine.constant_guess(theta), rounds=30).readings[0]
+    clean = engine.converge(theta, engine.constant_guess(theta), rounds=30).readings[0]
     noise = 5e-4 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
     outputs = clean + noise + torch.tensor([offset, 0.0, 0.0], dtype=torch.float64)
     return replace(recording, outputs=outputs, mask=torch.ones_like(outputs, dtype=torch.bool))
@@ -56,17 +56,17 @@ def test_each_recording_is_simulated_as_if_it_were_alone() -> None:
     believed = plant()
     subject = subject_of(believed, (), recordings, 2.0)
     engine = Fitter(subject, Noise(torch.ones(3), torch.zeros(3))).engine(Candidate(), ())
-    assert isinstance(engine, Joint)
+    assert isinstance(engine, JointCollocation)
     starts = {
         f"{t}.start_level@{k}" if k else f"{t}.start_level": 0.1 + 0.05 * k
         for t in ("T1", "T2", "T3")
         for k in range(3)
     }
     theta = engine.space.vector(starts | {"P13.discharge_coefficient": 0.55}).unsqueeze(0)
-    joint = engine.settle(theta, engine.constant_guess(theta), rounds=30)
+    joint = engine.converge(theta, engine.constant_guess(theta), rounds=30)
     for k, (recording, rows) in enumerate(zip(recordings, subject.rows, strict=True)):
         alone = _alone(believed, recording)
-        near = alone.settle(t := _own_theta(alone, k), alone.constant_guess(t), rounds=30)
+        near = alone.converge(t := _own_theta(alone, k), alone.constant_guess(t), rounds=30)
         torch.testing.assert_close(joint.readings[:, rows], near.readings, rtol=0.0, atol=1e-9)
         columns = [engine.space.index(n if not k or "start" not in n else f"{n}@{k}") for n in alone.space.names]
         torch.testing.assert_close(joint.jacobian[:, rows][..., columns], near.jacobian, rtol=1e-6, atol=1e-9)

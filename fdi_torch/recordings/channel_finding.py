@@ -1,0 +1,18 @@
+"""A finding of a check of a recording: a sentence, and the numbers behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class ChannelFinding:
+    """kind: read, clock, gap, constant, clipped, frozen, quantised, range, unit, missing, on change, undersampled,
+    unknown, stuck or slip. values: the numbers of the text by name, SI.
+    """
+
+    kind: str
+    channel: str
+    text: str
+    values: Mapping[str, float] = field(default_factory=dict)

@@ -1,0 +1,130 @@
+"""Collocation over several recordings, each with its own initial state and clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.simulate.collocation import Collocation, Linearised
+
+
+def name_in_recording(name: str, recording: int) -> str:
+    """Name of a constant that differs between recordings: 'L.start_level', 'L.start_level@1' ..."""
+    return name if recording == 0 else f"{name}@{recording}"
+
+
+class JointCollocation:
+    """The interface of `Collocation` for several recordings.
+
+    space: all parameters; a name with '@k' belongs to recording k alone, the same name without '@' then to recording 0.
+    Levels (L, N, tanks) of the recordings are concatenated; so are readings, with a blank sample (0) between
+    recordings, which a mask must exclude.
+    """
+
+    def __init__(self, parts: Sequence[Collocation], space: ParameterSpace) -> None:
+        """parts: one collocation per recording, with names without '@' in its space."""
+        self.parts, self.space = tuple(parts), space
+        self._columns = [
+            torch.tensor(
+                [space.index(n if (m := name_in_recording(n, k)) not in space else m) for n in part.space.names]
+            )
+            for k, part in enumerate(parts)
+        ]
+        self._nodes = [len(part.experiment.nodes) for part in parts]
+
+    @property
+    def network(self) -> TankNetwork:
+        """The plant of the first recording; the others differ only in the constants of each recording."""
+        return self.parts[0].network
+
+    def linearise(self, theta: Tensor, levels: Tensor) -> Linearised:
+        """theta (L, P) and an approximate trajectory levels (L, N, tanks) -> one Newton step, with derivatives."""
+        pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
+        return self._joined([part.linearise(columns, piece) for part, columns, piece in pieces])
+
+    def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
+        """The levels and the defect of `linearise`, without derivatives."""
+        pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
+        corrected = [part.corrected(columns, piece) for part, columns, piece in pieces]
+        return torch.cat([c[0] for c in corrected], dim=1), torch.stack([c[1] for c in corrected]).amax(dim=0)
+
+    def converge(self, theta: Tensor, levels: Tensor, rounds: int = 12) -> Linearised:
+        """Newton steps at fixed theta from levels (L, N, tanks), m, until every recording has converged."""
+        pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
+        return self._joined([part.converge(columns, piece, rounds) for part, columns, piece in pieces])
+
+    def simulate_tank(self, theta: Tensor, levels: Tensor, tank: int) -> Tensor:
+        """Simulate one tank with the levels of all others given: levels (L, N, tanks) m, with that tank's replaced."""
+        pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
+        return torch.cat([part.simulate_tank(columns, piece, tank) for part, columns, piece in pieces], dim=1)
+
+    def rates(self, middle: Tensor, theta: Tensor) -> Tensor:
+        """dh/dt (L, N-1, tanks), m/s, at given mid-step levels; 0 between recordings."""
+        pieces = torch.split(_with_last(middle), self._nodes, dim=1)
+        rates = [
+            p.rates(m[:, :-1], columns) for p, m, columns in zip(self.parts, pieces, self._own(theta), strict=True)
+        ]
+        return with_blanks(rates)
+
+    def read(self, levels: Tensor, theta: Tensor) -> Tensor:
+        """Readings (L, S, C) of given levels (L or 1, N, tanks)."""
+        pieces = zip(self.parts, self._split(levels), self._own(theta), strict=True)
+        return with_blanks([part.read(piece, columns) for part, piece, columns in pieces])
+
+    def apart(self, theta: Tensor, near: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
+        """For each recording, its collocation, its parameters and its part of a joint trajectory, without slopes."""
+        steps = (torch.split(_with_last(x), self._nodes, dim=1) for x in (near.transition, near.gain))
+        transition, gain = ([piece[:, :-1] for piece in pieces] for pieces in steps)
+        pieces = zip(self.parts, self._own(theta), self._split(near.levels), transition, gain, strict=True)
+        nothing = near.defect.new_zeros(0)
+        return [
+            (part, columns, Linearised(levels, nothing, nothing, nothing, t, g, near.defect))
+            for part, columns, levels, t, g in pieces
+        ]
+
+    def constant_guess(self, theta: Tensor) -> Tensor:
+        """Trajectories that stay at their start levels, (L, N, tanks)."""
+        pairs = zip(self.parts, self._own(theta), strict=True)
+        return torch.cat([part.constant_guess(columns) for part, columns in pairs], dim=1)
+
+    def _own(self, theta: Tensor) -> list[Tensor]:
+        return [theta[..., columns] for columns in self._columns]
+
+    def _split(self, levels: Tensor) -> tuple[Tensor, ...]:
+        return torch.split(levels, self._nodes, dim=1)
+
+    def _joined(self, parts: Sequence[Linearised]) -> Linearised:
+        slopes = [self._spread(f.slopes, k) for k, f in enumerate(parts)]
+        return Linearised(
+            levels=torch.cat([f.levels for f in parts], dim=1),
+            slopes=torch.cat(slopes, dim=1),
+            readings=with_blanks([f.readings for f in parts]),
+            jacobian=with_blanks([self._spread(f.jacobian, k) for k, f in enumerate(parts)]),
+            transition=with_blanks([f.transition for f in parts]),
+            gain=with_blanks([f.gain for f in parts]),
+            defect=torch.stack([f.defect for f in parts]).amax(dim=0),
+        )
+
+    def _spread(self, slopes: Tensor, recording: int) -> Tensor:
+        """Slopes by one recording's parameters (..., p) -> by all parameters (..., P)."""
+        full = slopes.new_zeros(*slopes.shape[:-1], len(self.space))
+        return full.index_copy_(-1, self._columns[recording], slopes)
+
+
+def with_blanks(pieces: Sequence[Tensor], dim: int = 1) -> Tensor:
+    """Concatenate (..., n_k, ...) along a dimension, with one row of zeros between pieces."""
+    if len(pieces) == 1:
+        return pieces[0]
+    rows = [pieces[0]]
+    for piece in pieces[1:]:
+        rows += [torch.zeros_like(piece.narrow(dim, 0, 1)), piece]
+    return torch.cat(rows, dim=dim)
+
+
+def _with_last(x: Tensor) -> Tensor:
+    """x with its last row repeated, so that each recording has as many rows as nodes."""
+    return torch.cat([x, x[:, -1:]], dim=1)

@@ -1,0 +1,79 @@
+"""Simulated recordings: an accurate simulation under planned inputs, and measurement noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.effect import Stage
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.scales import length_scale, time_scale
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.build import BuildError
+from fdi_torch.simulate.compiled_engine import CompiledEngine
+from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.step_control import StepControl
+
+# In units of the plant's time scale. The smoothing suits steps far shorter than those of any estimator.
+RESOLUTION = 0.01
+LONGEST_STEP = 1.0
+TOLERANCE = 1e-10  # of levels, in units of the plant's length scale
+
+
+def clean_readings(network: TankNetwork, planned: Recording, values: Mapping[str, float]) -> Tensor:
+    """Noise-free readings (T, N) with some constants changed by name, by L-stable steps with a tolerance of 1e-10.
+
+    Without a compiler, an adaptive solver does the same a thousand times slower.
+    """
+    space = ParameterSpace(network.constants[name] for name in values)
+    theta = torch.tensor([[float(value) for value in values.values()]], dtype=planned.time.dtype)
+    plant = network.description
+    scale, tolerance = time_scale(plant), TOLERANCE * length_scale(plant)
+    step_control = StepControl.for_tolerance(tolerance, plant, RESOLUTION * scale)
+    engine = CompiledEngine(network, space, lay_out(planned, plant.channels(), LONGEST_STEP * scale, step_control))
+    try:
+        return engine.readings(theta)[0]
+    except BuildError:
+        experiment = lay_out(planned, plant.channels(), LONGEST_STEP * scale)
+        sharp = replace(experiment, resolution=theta.new_tensor(RESOLUTION * scale))
+        reference = ReferenceEngine(network, space, sharp, method="dopri5", rtol=TOLERANCE, atol=0.01 * tolerance)
+        return reference.readings(theta)[0]
+
+
+def noise_level(clean: Tensor, snr_db: float, definition: str = "variance") -> Tensor:
+    """Standard deviation (*batch, N) of the noise that gives clean readings (*batch, T, N) this signal-to-noise ratio
+    in dB.
+
+    sqrt(P 10^(-SNR/10)), with P each output's variance, or its mean square under the definition 'power'.
+    """
+    power = clean.var(dim=-2, correction=0) if definition == "variance" else clean.square().mean(dim=-2)
+    return (power * 10.0 ** (-snr_db / 10.0)).sqrt()
+
+
+def with_noise(
+    planned: Recording, clean: Tensor, std: Tensor, generator: torch.Generator, network: TankNetwork
+) -> Recording:
+    """The recording of clean readings (T, N) by sensors with white noise of standard deviation std (N,).
+
+    A quantizing sensor rounds after the noise, with its nominal step.
+    """
+    noise = torch.randn(clean.shape, generator=generator, dtype=clean.dtype) * std
+    return replace(planned, outputs=quantized(clean + noise, network), mask=torch.isfinite(clean), source="simulated")
+
+
+def quantized(readings: Tensor, network: TankNetwork) -> Tensor:
+    """Readings (T, N) rounded by the plant's quantizing sensors."""
+    values = network.bind(ParameterSpace(), readings.new_zeros(0))
+    columns = list(readings.unbind(-1))
+    for placement in network.placements:
+        if placement.effect.stage is Stage.READING and placement.effect.quantizes:
+            i = [sensor.name for sensor in network.description.sensors].index(placement.location)
+            width = placement.effect.resolution(values[placement.prefix])
+            if float(width) > 0.0:
+                columns[i] = torch.round(columns[i] / width) * width
+    return torch.stack(columns, dim=-1)
