@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
+import inspect
 import re
 import shlex
 import unicodedata
@@ -105,21 +106,27 @@ def test_every_command_has_a_path_of_functions_that_exist() -> None:
     for command, path in rows:
         functions = re.findall(r"`([\w.]+)`", path)
         assert functions[0] == f"cli.{command}.run"
+        earlier = ""
         for function in functions:
-            assert exists(function), f"{command}: no function fdi_torch.{function}"
+            module, name = home(function)
+            assert name, f"{command}: no function fdi_torch.{function}"
+            assert not earlier or name.rpartition(".")[2] in earlier, f"{command}: nothing before it calls {function}"
+            earlier += inspect.getsource(module)
 
 
-def exists(name: str) -> bool:
-    parts = name.split(".")
+def home(function: str) -> tuple[ModuleType, str]:
+    """The module of a function below fdi_torch and its name there; the name is empty if it does not exist."""
+    parts = function.split(".")
     for k in range(len(parts) - 1, 0, -1):
         try:
-            found: object = importlib.import_module(".".join(["fdi_torch", *parts[:k]]))
+            module = importlib.import_module(".".join(["fdi_torch", *parts[:k]]))
         except ImportError:
             continue
+        found: object = module
         for part in parts[k:]:
             found = getattr(found, part, None)
-        return callable(found)
-    return False
+        return module, ".".join(parts[k:]) if callable(found) else ""
+    return fdi_torch, ""
 
 
 def test_every_page_is_in_the_navigation() -> None:
