@@ -103,7 +103,13 @@ class Judged:
         self._failed: set[Key] = set()
 
     def judge(self, fit: Fit, start: StateNoise | None = None) -> Explanation:
-        """Works out the noise and the evidence of a fit, which goes on under that noise."""
+        """Works out the noise and the evidence of a fit, which goes on under that noise.
+
+        The same effects are judged again only where they fit better under the noise that was worked out before.
+        """
+        before = self.each.get(fit.key)
+        if before and before.fitter.cost(fit) > before.fit.cost - SETTLED:
+            return before
         judged: Explanation | None = None
         while True:
             own, likely = with_own_noise(self.fitter, fit, start, climb=judged is None)
