@@ -24,7 +24,7 @@ class Recording(Shown):
 
     time (T,) in s, strictly increasing. inputs (T, M) and outputs (T, N) in the SI units named beside them.
     mask (T, N): True where a reading counts; a missing reading is NaN in outputs and False here.
-    An unknown input is NaN; `known_stretches` cuts the recording there. hold: how inputs run between samples.
+    An unknown input is NaN; `known_segments` cuts the recording there. hold: how inputs run between samples.
     began: its time 0 in seconds since 1970, where its clock tells.
     notes: what the reader did to the file's rows, in sentences.
     ran: inputs that were on, or may have been, before the first sample, as far as what it was cut from tells.
@@ -233,7 +233,7 @@ class Recording(Shown):
         volume = torch.zeros_like(first).index_add_(0, block, (self.inputs - first[block]) * held)
         return first + volume / torch.zeros_like(first[:, :1]).index_add_(0, block, held)
 
-    def known_stretches(self) -> list[Recording]:
+    def known_segments(self) -> list[Recording]:
         """The longest stretches whose inputs are all known."""
         known = torch.isfinite(self.inputs).all(dim=1).to(torch.int8)
         edges = torch.diff(known, prepend=known.new_zeros(1), append=known.new_zeros(1)).nonzero().flatten().tolist()

@@ -8,7 +8,7 @@ import pytest
 import torch
 from rigs import constant_inputs, paper_network, three_tank
 
-from fdi_torch.config.run import load_run
+from fdi_torch.config.run_file import load_run
 from fdi_torch.jobs.train import train
 from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out

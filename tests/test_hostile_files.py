@@ -25,15 +25,15 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
-from fdi_torch.config.files import parse_yaml
-from fdi_torch.config.loaded_recordings import known_parts, read_recording
-from fdi_torch.config.logged import logged_plant
-from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
+from fdi_torch.config.logged_config import logged_plant
+from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import dump_plant
-from fdi_torch.config.recordings import RecordingConfig
-from fdi_torch.config.run import build_run
+from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.config.run_file import build_run
 from fdi_torch.config.simulation import planned_recording
-from fdi_torch.config.study import build_study
+from fdi_torch.config.study_file import build_study
+from fdi_torch.config.yaml_files import parse_yaml
 from fdi_torch.effects import build_network
 from fdi_torch.jobs.logged_recordings import recording_in
 from fdi_torch.jobs.replay import asked_again
@@ -67,7 +67,7 @@ def read_run_file(data: bytes, folder: Path) -> None:
     if run.config.simulate is not None:
         planned_recording(run.config.simulate, run.plant)
     for config in run.config.recordings:
-        known_parts(read_recording(config, run.plant, folder), config, run.plant)
+        known_segments_of(read_recording(config, run.plant, folder), config, run.plant)
 
 
 def read_study(data: bytes, folder: Path) -> None:
@@ -79,7 +79,7 @@ def read_csv(data: bytes, folder: Path) -> None:
     config = RecordingConfig(file="recording.csv")
     recording = read_recording(config, PLANT, folder)
     check_recording(recording, PLANT)
-    known_parts(recording, config, PLANT)
+    known_segments_of(recording, config, PLANT)
 
 
 def read_log(data: bytes, folder: Path) -> None:

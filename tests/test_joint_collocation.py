@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.effects import place

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.linalg import solve_discrete_are
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
 from fdi_torch.monitor.gain import hand_gain, kalman_gain, linearised, riccati, spectral_radius, timed_gain
 from fdi_torch.monitor.noise import learn_noise, operating_point

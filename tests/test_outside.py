@@ -17,9 +17,9 @@ import pytest
 
 from fdi_torch import cli
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.files import SHIPPED
-from fdi_torch.config.logged import logged_mapping, logged_plant
+from fdi_torch.config.logged_config import logged_mapping, logged_plant
 from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.yaml_files import SHIPPED
 from fdi_torch.disk import replacing
 from fdi_torch.logbook import LogError, arrays, read_run
 from fdi_torch.logbook.channel import Channel

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from fdi_torch.cli import COMMANDS, DONE, main
-from fdi_torch.config.run import load_run
+from fdi_torch.config.run_file import load_run
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
 

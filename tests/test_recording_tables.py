@@ -17,9 +17,9 @@ import torch
 
 from fdi_torch import cli
 from fdi_torch.config.loaded_recordings import read_recording
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.recordings.source import ChannelSource
 

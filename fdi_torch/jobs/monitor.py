@@ -18,9 +18,9 @@ import orjson
 import torch
 from torch import Tensor
 
-from fdi_torch.config.growing import Row, growing_rows
+from fdi_torch.config.growing_recordings import Row, growing_rows
 from fdi_torch.config.loaded_recordings import read_recording
-from fdi_torch.config.monitor import MonitorRun
+from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.gap.acquisition import usable
 from fdi_torch.jobs.arrived import followed_on, logged_rows, reaching, recording_of, samples_of
 from fdi_torch.jobs.log_paths import RESUMES, free_path, go_on_from

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.rehearsal import Rehearsal
+from fdi_torch.config.rehearsal_file import Rehearsal
 from fdi_torch.jobs.log_paths import RESUMES
 from fdi_torch.jobs.study import carried_over, log_and_earlier
 from fdi_torch.logbook import Listener, RunLog

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.config.loaded_recordings import LoadedRecording
-from fdi_torch.config.run import Run
+from fdi_torch.config.run_file import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters

@@ -17,7 +17,7 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.rehearsal:RehearsalConfig", required=True)
+    add_config(parser, "fdi_torch.config.rehearsal_file:RehearsalConfig", required=True)
     parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
     parser.add_argument("--resume", action="store_true", help="go on from what a stopped run left in its log")
     add_live(parser)
