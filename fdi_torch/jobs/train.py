@@ -27,7 +27,7 @@ from fdi_torch.jobs.run_setup import (
     usable_device,
     wanted_space,
 )
-from fdi_torch.logbook import Listener, RunLog, Trickle, as_array
+from fdi_torch.logbook import DeferredTopic, Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.report.fit_figure import fit_figure, save
 from fdi_torch.report.style import inline_svg
@@ -135,8 +135,8 @@ class Watch:
         self._fields = ("problem", "generation", "best_cost", "mean_cost", "evaluations", *space.names)
         self.iterations = 0
         units = {p.name: p.unit for p in space}
-        self._generation = Trickle(GENERATION, self._generations, units)
-        self._iteration = Trickle(ITERATION, self._iterations, units)
+        self._generation = DeferredTopic(GENERATION, self._generations, units)
+        self._iteration = DeferredTopic(ITERATION, self._iterations, units)
         self._keep, self._next_state = log.keep, 0
 
     def generation(self, search: Search) -> None:

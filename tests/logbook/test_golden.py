@@ -14,7 +14,7 @@ import pytest
 
 from fdi_torch.cli import DONE, main
 from fdi_torch.logbook import arrays, content_hash, inspect_log, last_state, own_signals, read_run, series, unpack
-from fdi_torch.logbook.schemas import TOPICS
+from fdi_torch.logbook.topic_definitions import TOPICS
 
 TESTS = Path(__file__).parents[1]
 FORMAT_1 = TESTS / "data/log_format_1.mcap"
