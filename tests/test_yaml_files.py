@@ -11,7 +11,7 @@ import pytest
 
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.yaml_files import parse_yaml, with_overrides, write_yaml
-from fdi_torch.outside import MOST_YAML_BYTES
+from fdi_torch.untrusted_input import MOST_YAML_BYTES
 
 LEVELS = range(1, 10)
 MERGES = "a0: &a0 {x: 1}\n" + "".join(f"a{i}: &a{i}\n  <<: [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in LEVELS)

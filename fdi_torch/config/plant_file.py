@@ -14,7 +14,6 @@ from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Share, Strict, quantity
 from fdi_torch.config.yaml_files import find_plant, read_yaml
 from fdi_torch.names import unknown
-from fdi_torch.outside import MOST_COMPONENTS
 from fdi_torch.plant.description import (
     LARGEST_DISCHARGE_COEFFICIENT,
     OUTSIDE,
@@ -25,6 +24,7 @@ from fdi_torch.plant.description import (
     Sensor,
     Tank,
 )
+from fdi_torch.untrusted_input import MOST_COMPONENTS
 
 
 def _start_level(value: Any) -> float | None:

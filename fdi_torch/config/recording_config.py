@@ -11,9 +11,9 @@ from zoneinfo import ZoneInfo
 from pydantic import AllowInfNan, BeforeValidator, Field, model_validator
 
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
-from fdi_torch.outside import MOST_SAMPLES
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.time_stamps import expect_zone
+from fdi_torch.untrusted_input import MOST_SAMPLES
 
 StartLevel = Literal["free", "equilibrium"] | float
 """A tank's initial level: to be estimated, the equilibrium of the first inputs, or a value in m."""

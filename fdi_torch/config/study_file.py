@@ -24,7 +24,6 @@ from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.names import unknown
-from fdi_torch.outside import MOST_SETTINGS, MOST_TRIALS
 from fdi_torch.plant.operating_range import bounded_by_recording
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.study.plan import (
@@ -38,6 +37,7 @@ from fdi_torch.study.plan import (
     mode_faults,
     uniform_faults,
 )
+from fdi_torch.untrusted_input import MOST_SETTINGS, MOST_TRIALS
 
 
 class StudyConfig(Strict):

@@ -12,7 +12,7 @@ import yaml
 
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.names import nearest, shortened, unknown
-from fdi_torch.outside import MOST_DIGITS, MOST_YAML_BYTES, MOST_YAML_VALUES
+from fdi_torch.untrusted_input import MOST_DIGITS, MOST_YAML_BYTES, MOST_YAML_VALUES
 
 MOST_EXTENSIONS = 8
 SHIPPED = Path(__file__).resolve().parents[1] / "configs"

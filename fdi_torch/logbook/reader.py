@@ -25,7 +25,7 @@ from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.payload import decode
 from fdi_torch.logbook.schemas import conforming
 from fdi_torch.logbook.sink import EPOCH_NS
-from fdi_torch.outside import MOST_EXPANSION, MOST_UNPACKED
+from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_UNPACKED
 
 # Outside chunks these records have no CRC. Logs of this program have none there; one found there is a damaged record.
 _LOOSE = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)

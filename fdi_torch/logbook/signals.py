@@ -19,7 +19,7 @@ from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.reader import Message, Run
 from fdi_torch.logbook.sink import EPOCH_NS
 from fdi_torch.logbook.topic_definitions import topic_definition
-from fdi_torch.outside import MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION, expect_unpacked
+from fdi_torch.untrusted_input import MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION, expect_unpacked
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 _BLOCK = 65536

@@ -24,7 +24,7 @@ from fdi_torch.disk import replacing
 from fdi_torch.logbook import LogError, arrays, read_run
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.sink import Sink
-from fdi_torch.outside import MOST_LINE, MOST_UNPACKED, printable, printable_json
+from fdi_torch.untrusted_input import MOST_LINE, MOST_UNPACKED, printable, printable_json
 
 HEADER = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n"
 ROWS = "".join(f"{t},{50 + t % 7},50,{40 + t % 11},{30 + t % 5},{35 + t % 3}\n" for t in range(60))

@@ -1,7 +1,7 @@
-"""What comes from outside (recordings, plants, run files, logs): how much of it is taken, and how its text is shown.
+"""Limits on untrusted input (recordings, plants, run files, logs), and safe display of its text.
 
-A file may ask for more than a machine has: by aliases, by compression, by a number that is a size. Every reader asks
-here how much that may be, and refuses the file before it takes the memory.
+A small file can demand more memory than a machine has: by aliases, by compression, or by a number that is a size. Every
+reader checks these limits before it allocates.
 """
 
 from __future__ import annotations
@@ -10,23 +10,23 @@ import re
 
 MOST_YAML_BYTES = 2**20
 MOST_YAML_VALUES = 100_000
-"""Values of a YAML document with its aliases and merge keys spelled out."""
+"""Values of a YAML document with its aliases and merge keys expanded."""
 MOST_DIGITS = 400
 """Digits of one number in a YAML document."""
 MOST_COMPONENTS = 500
-"""Tanks, pipes, pumps, sensors and effects of a plant, together."""
+"""Total number of tanks, pipes, pumps, sensors and effects of a plant."""
 MOST_SAMPLES = 10**8
 """Samples of one recording."""
 MOST_SETTINGS, MOST_TRIALS = 4096, 10**6
-"""Settings of a study, and trials of all of them together."""
+"""Settings of a study, and the total number of trials."""
 MOST_LINE = 2**20
 """Characters in a line of a CSV file."""
 MOST_UNPACKED, MOST_EXPANSION = 3 * 2**23, 50
-"""A compressed recording becomes at most so many bytes, or so many times as long as it is, whichever is more."""
+"""Greatest size of an unpacked recording, bytes, and greatest expansion factor; the larger limit applies."""
 MOST_SHEET, MOST_SHEET_EXPANSION = 3 * 2**22, 15
-"""The same of an Excel workbook, where a logger's columns come to 8 times, and reading takes longest."""
+"""The same for an Excel workbook; a logger's columns expand 8 times, and reading them is slow."""
 MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION = 2**26, 50
-"""The same of the arrays in a log."""
+"""The same for the arrays in a log."""
 
 _UNSHOWN = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
@@ -34,17 +34,17 @@ _UNSHOWN = re.compile(
 
 
 def printable(text: str) -> str:
-    """Text as it may go to a terminal: what would move the cursor, colour, hide or turn words is spelled out."""
+    """Text that is safe for a terminal: control, colour, invisible and direction characters are escaped."""
     return _UNSHOWN.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
 
 
 def printable_json(text: str) -> str:
-    """JSON text as it may go to a terminal; it says the same."""
+    """JSON text that is safe for a terminal and has the same meaning."""
     return _UNSHOWN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def expect_unpacked(unpacked: int, packed: int, source: str, most: int, expansion: int) -> None:
-    """Raises ValueError where something compressed becomes larger than it may."""
+    """Raises ValueError if the unpacked size exceeds both limits."""
     allowed = max(most, expansion * packed)
     if unpacked > allowed:
         raise ValueError(
