@@ -92,11 +92,11 @@ class _Parser:
         self._tokens: list[tuple[str, str]] = []
         place = 0
         while place < len(text):
-            found = _TOKEN.match(text, place)
-            if found is None or found.end() == place:
+            token = _TOKEN.match(text, place)
+            if token is None or token.end() == place:
                 raise self._wrong()
-            self._tokens.append((str(found.lastgroup), found[str(found.lastgroup)]))
-            place = found.end()
+            self._tokens.append((str(token.lastgroup), token[str(token.lastgroup)]))
+            place = token.end()
 
     def whole(self) -> Any:
         unit = self._product()

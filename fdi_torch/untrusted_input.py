@@ -35,12 +35,12 @@ _UNSHOWN = re.compile(
 
 def printable(text: str) -> str:
     """Text that is safe for a terminal: control, colour, invisible and direction characters are escaped."""
-    return _UNSHOWN.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+    return _UNSHOWN.sub(lambda match: match[0].encode("unicode_escape").decode("ascii"), text)
 
 
 def printable_json(text: str) -> str:
     """JSON text that is safe for a terminal and has the same meaning."""
-    return _UNSHOWN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return _UNSHOWN.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def expect_unpacked(unpacked: int, packed: int, source: str, most: int, expansion: int) -> None:

@@ -1,4 +1,6 @@
-"""How accurate what is reported is: levels over the whole fault box, and the paper's noise-free faults."""
+"""Accuracy of the results: simulated levels over the whole range of faults, and noise-free estimates of the paper's
+faults.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The layout of the package: imports point one way, one door per outside library, printing only in cli."""
+"""Architecture of the package: import directions, one file per outside library, and printing in cli only."""
 
 from __future__ import annotations
 

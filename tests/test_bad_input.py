@@ -1,4 +1,4 @@
-"""What a user may do wrong with the main job: one clear sentence that names file and field, and exit code 2."""
+"""User errors in the main command: exit code 2 and one sentence that names file and field."""
 
 from __future__ import annotations
 

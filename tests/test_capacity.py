@@ -1,4 +1,4 @@
-"""Work that no machine can do is refused before anything is allocated, and says what it would take."""
+"""Work beyond the machine's memory is refused before anything is allocated, with the amount that it would need."""
 
 from __future__ import annotations
 

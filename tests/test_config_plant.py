@@ -1,4 +1,4 @@
-"""Plant files: the shipped ones say what they should, and each impossible one is refused in one sentence."""
+"""Plant files: the shipped plants have the documented values, and every invalid file is refused in one sentence."""
 
 from __future__ import annotations
 

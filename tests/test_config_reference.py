@@ -1,4 +1,4 @@
-"""The reference of keys: complete, and every key in it is one that a file may have."""
+"""The key reference is complete, and each of its keys is accepted in a file."""
 
 from __future__ import annotations
 

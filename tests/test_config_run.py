@@ -1,4 +1,4 @@
-"""Run files: what is shipped is understood, defaults are the ones stated, and what is wrong is said in sentences."""
+"""Run files: shipped files are valid, defaults are as documented, and errors are sentences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Single effects against closed forms: what each equation says, in numbers worked out by other means."""
+"""Single effects against closed forms and independent calculations."""
 
 from __future__ import annotations
 

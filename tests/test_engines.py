@@ -1,4 +1,4 @@
-"""The engines agree: compiled and traced with torchdiffeq, Jacobians with differences, sums with what they sum."""
+"""Agreement of the engines with torchdiffeq, of Jacobians with differences, and of sums with their terms."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Files from outside, drawn by grammars: each is read, or refused in sentences; none ends in a traceback or hangs.
+"""Fuzzing of file readers: each generated file is read, or refused in sentences, without a traceback or a hang.
 
-The quick profile draws a few hundred files. The long one runs for two minutes, or as long as `--fuzz-minutes` says:
+The quick profile draws a few hundred files. The long one runs for two minutes, or as long as `--fuzz-minutes` states:
 
     python -m pytest tests/test_hostile_files.py -m slow -s --fuzz-minutes 60
 
-What it finds goes, made small, into tests/corpus.
+Reduced counterexamples are kept in tests/corpus.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A rig in code equals its file, and the commands as functions give results that show themselves."""
+"""The Python interface: a rig in code equals its file, and the functions return results with a display."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: work ends soon, no write is cut in two, and what is printed of the log is true."""
+"""Ctrl-C and SIGTERM: work ends soon, writes are not interrupted, and the printed state of the log is correct."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several recordings as one: each part is what it is alone, and what they have in common is fitted to all of them."""
+"""Joint collocation: each recording's part equals its separate simulation, and common parameters are fitted to all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files to begin with, and the catalogue of effects."""
+"""File templates, and the catalogue of effects."""
 
 from __future__ import annotations
 

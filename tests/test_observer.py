@@ -1,4 +1,4 @@
-"""The observer against linear theory, SciPy's Riccati solution and a plant whose middle level nobody measures."""
+"""The observer against linear theory, SciPy's Riccati solution, and a plant with an unmeasured level."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is adopted changes the lines of the plant file that it has to, and nothing else."""
+"""Adoption of an estimate changes only the necessary lines of a plant file."""
 
 from __future__ import annotations
 

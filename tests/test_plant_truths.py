@@ -1,4 +1,4 @@
-"""The plant against closed forms, SciPy, conservation and the paper's own form."""
+"""The plant against closed forms, SciPy, conservation of volume and the paper's equations."""
 
 from __future__ import annotations
 

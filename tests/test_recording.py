@@ -1,4 +1,4 @@
-"""Recording: selection of stretches on one clock, and what it refuses."""
+"""Recording: selection of segments on one clock, and rejected arguments."""
 
 from __future__ import annotations
 

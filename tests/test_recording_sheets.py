@@ -1,4 +1,4 @@
-"""Recordings as plants keep them: channels at rates of their own, in one file or several, with odd clocks."""
+"""Plant recordings: channels with different sampling, in one or several files, with clock errors."""
 
 from __future__ import annotations
 

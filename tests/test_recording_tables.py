@@ -1,4 +1,4 @@
-"""Recordings in Parquet, Excel, MATLAB and HDF5 files read as the CSV file of the same table does, and so do errors."""
+"""Recordings in Parquet, Excel, MATLAB and HDF5 files give the same result, or error, as the equivalent CSV file."""
 
 from __future__ import annotations
 

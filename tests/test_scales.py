@@ -1,4 +1,4 @@
-"""A rig scaled in metres and seconds gives the scaled answers: nothing assumes the size of a laboratory bench."""
+"""Invariance to scales: a rig scaled in length and time gives scaled results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps of each lane's own: as exact as asked for, the same in both engines, and nobody's neighbour's business."""
+"""Adaptive steps of each lane: accuracy, agreement of both engines, and independence of other lanes."""
 
 from __future__ import annotations
 

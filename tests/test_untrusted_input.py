@@ -1,4 +1,4 @@
-"""Text and sizes from outside: what reaches the terminal, what a file may ask for, which files a log may open."""
+"""Untrusted input: safe display of text, limits on sizes, and files that a log may not open."""
 
 from __future__ import annotations
 

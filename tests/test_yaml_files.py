@@ -1,4 +1,4 @@
-"""YAML from outside: plain values, as many as a file may have with its aliases spelled out, in bounded time."""
+"""Untrusted YAML: plain values only, a limited number with aliases expanded, in bounded time."""
 
 from __future__ import annotations
 

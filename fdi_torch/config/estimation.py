@@ -104,9 +104,9 @@ class EstimationConfig(Strict):
 
 def full_name(name: str, plant: PlantDescription) -> str:
     """'T1.leak' -> 'T1.leak.size': an effect's name means its size. Raises ValueError for an impossible place."""
-    location, _, rest = name.partition(".")
-    if rest in {e.name for e in EFFECTS}:
-        return f"{name}.{effect_at(rest, location, plant).parameters(location, plant)[0].name}"
+    location, _, effect_name = name.partition(".")
+    if effect_name in {e.name for e in EFFECTS}:
+        return f"{name}.{effect_at(effect_name, location, plant).parameters(location, plant)[0].name}"
     return name
 
 

@@ -194,11 +194,12 @@ def _source(config: FileConfig, path: Path, mapping: Mapping[str, ChannelSource]
     return FileSource(path, mapping, rows, config.header, config.sheet)
 
 
-def _levels(wanted: Any, plant: PlantDescription, config: RecordingConfig) -> dict[str, StartLevel]:
+def _levels(start_levels: Any, plant: PlantDescription, config: RecordingConfig) -> dict[str, StartLevel]:
+    """The start level of each tank; tanks that are not mentioned are free."""
     tanks = [tank.name for tank in plant.tanks]
-    if not isinstance(wanted, dict):
-        return dict.fromkeys(tanks, wanted)
-    for name in wanted:
+    if not isinstance(start_levels, dict):
+        return dict.fromkeys(tanks, start_levels)
+    for name in start_levels:
         if name not in tanks:
             raise ConfigError([f"{config.file}: start_levels.{name}: {unknown('a tank', name, tanks)}"])
-    return {tank: wanted.get(tank, "free") for tank in tanks}
+    return {tank: start_levels.get(tank, "free") for tank in tanks}

@@ -153,8 +153,8 @@ def _in_unit_of(value: str | float, written: str | None) -> Any:
     number, unit = number_and_unit(str(value))
     if written is not None:
         try:
-            _, wanted = number_and_unit(written)
-            number, unit = in_unit(number, unit, wanted), wanted
+            _, written_unit = number_and_unit(written)
+            number, unit = in_unit(number, unit, written_unit), written_unit
         except UnitError:
             pass  # `written` is a word such as equilibrium
     short = f"{number:.{DIGITS}g}"

@@ -129,8 +129,8 @@ def _clock(config: SimulationConfig, plant: PlantDescription) -> Tensor:
     _expect_room_for_samples(config, plant)
     intervals = round(config.duration / config.sample_time)
     if intervals < 1 or abs(intervals * config.sample_time - config.duration) > 1e-9 * config.duration:
-        wanted = f"a multiple of sample_time ({config.sample_time:g} s)"
-        raise ConfigError([f"simulate.duration: expected {wanted}, got {config.duration:g} s"])
+        expected = f"a multiple of sample_time ({config.sample_time:g} s)"
+        raise ConfigError([f"simulate.duration: expected {expected}, got {config.duration:g} s"])
     return torch.arange(intervals + 1, dtype=torch.float64) * config.sample_time
 
 

@@ -76,7 +76,7 @@ def compare(paths: Sequence[str | Path]) -> Comparison:
     runs = [read_run(path) for path in paths]
     return Comparison(
         labels_of([run.path for run in runs]),
-        {section: found for section in SECTIONS if (found := _differing(runs, section))},
+        {section: entries for section in SECTIONS if (entries := _differing(runs, section))},
         _results(runs),
         len({content_hash(run.messages()) for run in runs}) == 1,
         len({tuple(sorted(_hashes(run).items())) for run in runs}) == 1 and bool(_hashes(runs[0])),

@@ -103,7 +103,7 @@ class Messages:
         The first message of a topic is written at once, so that errors surface.
         """
         if deferred.topic not in self.register:
-            ((t, fields),) = deferred.told((item,))
+            ((t, fields),) = deferred.encode((item,))
             self.write(deferred.topic, fields, t, units=deferred.units)
             return
         self._buffer.add(deferred, item, size)

@@ -17,12 +17,12 @@ _TOGETHER, _TOGETHER_BYTES = 512, 1 << 22
 class DeferredTopic:
     """Messages of one topic that may be deferred.
 
-    told: time (s) and fields of each buffered item, computed when they are written; the items must not change
+    encode: time (s) and fields of each buffered item, computed when they are written; the items must not change
     meanwhile.
     """
 
     topic: str
-    told: Callable[[Sequence[Any]], Iterable[tuple[float, Mapping[str, Any]]]]
+    encode: Callable[[Sequence[Any]], Iterable[tuple[float, Mapping[str, Any]]]]
     units: Mapping[str, str] | None = None
 
 
@@ -55,6 +55,6 @@ class WriteBuffer:
             items: dict[DeferredTopic, list[Any]] = {}
             for topic, item in batch:
                 items.setdefault(topic, []).append(item)
-            messages = {topic: iter(topic.told(of_topic)) for topic, of_topic in items.items()}
+            messages = {topic: iter(topic.encode(of_topic)) for topic, of_topic in items.items()}
             for topic, _ in batch:
                 yield topic, *next(messages[topic])

@@ -1,4 +1,4 @@
-"""Logs to test with: a run with every topic in it, written with a frozen clock; a log of several chunks."""
+"""Example logs: a run with every topic, written with a fixed clock, and a log of several chunks."""
 
 from __future__ import annotations
 

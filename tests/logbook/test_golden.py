@@ -1,4 +1,4 @@
-"""Logs of every format version stay readable, and the layout for viewers names what the logs hold."""
+"""Logs of every format version remain readable, and the viewers' layout names existing topics and fields."""
 
 from __future__ import annotations
 

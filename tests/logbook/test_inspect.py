@@ -1,4 +1,4 @@
-"""What `inspect` tells about a log, and what comes out by export."""
+"""Inspection of logs, and export from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading logs: arrays out of messages, foreign files, files that grow, files that lie."""
+"""Reading of logs: arrays from messages, logs of other programs, growing files and inconsistent files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every schema is one that viewers read."""
+"""Viewers can read every schema."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writing a log: what is in it, byte for byte the same however it came there."""
+"""Writing of logs: the contents, and identical bytes for every order of writing."""
 
 from __future__ import annotations
 
