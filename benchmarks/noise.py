@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks import simulators
 from benchmarks.physics import START, make_rates, make_step, widths
-from fdi_torch.config.study import load_study
+from fdi_torch.config.study_file import load_study
 from fdi_torch.study.monte_carlo import run_block
 from fdi_torch.study.plan import Block, Plan
 from fdi_torch.study.trials import make_trials

@@ -16,7 +16,7 @@ from typing import Any
 
 import fdi_torch
 from fdi_torch.cli import COMMANDS
-from fdi_torch.config.reference import keys
+from fdi_torch.config.key_reference import keys
 from fdi_torch.logbook.schemas import TOPICS
 
 DOCS = Path(__file__).resolve().parent

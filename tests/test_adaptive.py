@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
 from fdi_torch.monitor.adaptive_observer import JointModel, adaptive_observer, joint_filter
 from fdi_torch.monitor.observer import bind_parameters

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.floor import estimate_noise
 from fdi_torch.plant.operating_range import operating_range_of, with_simulated_levels

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from fdi_torch import cli
-from fdi_torch.config.run import load_run
-from fdi_torch.config.study import load_study
+from fdi_torch.config.run_file import load_run
+from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.jobs.study import run_study
 from fdi_torch.jobs.train import train

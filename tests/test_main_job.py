@@ -13,7 +13,7 @@ import torch
 
 from fdi_torch.cli import DONE, MISUSE, main
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.run import Run, load_run
+from fdi_torch.config.run_file import Run, load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.logbook import content_hash, read_run
 
@@ -215,7 +215,7 @@ KILLED = """
 import os, signal, sys, time
 import yaml
 from pathlib import Path
-from fdi_torch.config.run import build_run
+from fdi_torch.config.run_file import build_run
 from fdi_torch.jobs.train import TrainResult, train
 def tell(share, text):
     if f"generation {sys.argv[2]}," in text:

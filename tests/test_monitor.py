@@ -14,8 +14,8 @@ from torch import Tensor
 
 from fdi_torch.cli import main
 from fdi_torch.config.loaded_recordings import read_recording
-from fdi_torch.config.monitor import load_monitor
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.monitor_file import load_monitor
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor

@@ -9,8 +9,8 @@ from operator import attrgetter
 import pytest
 import torch
 
-from fdi_torch.config.files import SHIPPED
-from fdi_torch.config.run import load_run
+from fdi_torch.config.run_file import load_run
+from fdi_torch.config.yaml_files import SHIPPED
 from fdi_torch.paper import tables
 from fdi_torch.paper.cases import Case, shipped_run, solve
 from fdi_torch.paper.equations import EQUATIONS, ERRATA, STATEMENTS

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.gap.fitting import Fit, Fitter
 from fdi_torch.gap.in_turn import in_turn
 from fdi_torch.gap.prediction import predict

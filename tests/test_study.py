@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.study import Study, load_study
+from fdi_torch.config.study_file import Study, load_study
 from fdi_torch.jobs.study import TRIAL, progress, run_study
 from fdi_torch.logbook import read_run
 from fdi_torch.study.isolation import isolate

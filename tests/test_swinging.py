@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.monitor import Monitor

@@ -21,7 +21,7 @@ from fdi_torch.blind.scaling import Scales
 from fdi_torch.blind.table import misses, sheets
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.library import STANDARD as LIBRARY
 from fdi_torch.gap.one_at_a_time import one_at_a_time

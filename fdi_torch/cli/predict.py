@@ -12,10 +12,10 @@ import torch
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.channels import missing_inputs
-from fdi_torch.config.files import find_data
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
-from fdi_torch.config.plant import load_plant
-from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.config.yaml_files import find_data
 from fdi_torch.gap.prediction import Prediction, predict
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription

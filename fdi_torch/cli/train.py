@@ -10,7 +10,7 @@ from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.windows import show_windows
-from fdi_torch.config.run import load_run
+from fdi_torch.config.run_file import load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.parameters import display_unit

@@ -1,8 +1,9 @@
 """A recording as a diagnosis may use it: sensors that are stuck are masked and told; a recording whose units, channels
 or clocks have slipped is refused. `fdi check`, `gap`, `train` and `monitor` all ask here, before they fit anything.
 
-A run of equal readings that noise and rounding do not make (`recordings/held.py`) is a sensor that is stuck, unless its
-value ends the range of what it reads: there it may be clipped, as far as the plant's level lies beyond.
+A run of equal readings that noise and rounding do not make (`recordings/repeated_readings.py`) is a sensor that is
+stuck, unless its value ends the range of what it reads: there it may be clipped, as far as the plant's level lies
+beyond.
 """
 
 from __future__ import annotations

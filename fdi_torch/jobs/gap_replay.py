@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.logged import logged_plant
+from fdi_torch.config.logged_config import logged_plant
 from fdi_torch.gap.diagnose import Settings, Tell
 from fdi_torch.gap.search import DEEPEST
 from fdi_torch.jobs.gap import groups, run_gap

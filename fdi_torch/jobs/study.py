@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.study import Study
+from fdi_torch.config.study_file import Study
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.logbook.reader import Run as LoggedRun

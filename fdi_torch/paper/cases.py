@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.config.files import SHIPPED
-from fdi_torch.config.run import Run, load_run
+from fdi_torch.config.run_file import Run, load_run
 from fdi_torch.config.simulation import NoiseConfig, noise_std
+from fdi_torch.config.yaml_files import SHIPPED
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import estimate_parameters, information_std

@@ -9,7 +9,7 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
-from fdi_torch.config.run import Run
+from fdi_torch.config.run_file import Run
 from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.estimate.evolution import evolve
 from fdi_torch.estimate.fitting import Fitting, set_up

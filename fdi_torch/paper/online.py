@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.config.estimation import parameter_values, placements_of
-from fdi_torch.config.run import Run
+from fdi_torch.config.run_file import Run
 from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.diagnosis import sample_noise

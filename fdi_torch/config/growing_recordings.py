@@ -1,4 +1,4 @@
-"""Recordings that another program is still writing, as CSV or MCAP: their samples as they come."""
+"""Recordings that another program is still writing, as CSV or MCAP: their samples as they arrive."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from fdi_torch.config.channels import channel_mapping, expect_units
-from fdi_torch.config.files import find_data
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import ColumnConfig, RecordingConfig
+from fdi_torch.config.recording_config import ColumnConfig, RecordingConfig
+from fdi_torch.config.yaml_files import find_data
 from fdi_torch.logbook import LogError, Message, follow, number_at
 from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.plant.description import PlantDescription
@@ -22,14 +22,13 @@ from fdi_torch.recordings.source import ChannelSource
 POLL = 0.1  # s
 
 Row = tuple[float, list[float], list[float]]
-"""Time in s, the plant's inputs and its readings in SI; NaN where unknown."""
+"""Time, s, the plant's inputs and its readings, SI; NaN for missing values."""
 
 
 def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, idle: float) -> Iterator[Row | str]:
-    """Samples in the order in which they are written, and a sentence on what could not be read.
+    """Samples in the order of writing, and a sentence for each row that cannot be read.
 
-    Ends when the file is finished, or when nothing came for `idle` s. Raises ConfigError for a file that cannot be
-    understood.
+    Ends when the file is finished, or when nothing has arrived for `idle` s. Raises ConfigError for an unusable file.
     """
     if config.mask or config.every != 1:
         raise ConfigError([f"{config.file}: expected neither mask nor every for a file that is followed; leave them"])
@@ -55,7 +54,7 @@ def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, i
 
 
 def _find(name: str, base: Path) -> Path:
-    """The file, or the one that it is while it is being written."""
+    """The file, or its name with .partial, which it has while it is written."""
     try:
         return find_data(name, base)
     except ConfigError:
@@ -84,16 +83,16 @@ def _csv_rows(
 def _mcap_rows(
     path: Path, plant: PlantDescription, mapping: Mapping[str, ChannelSource], idle: float
 ) -> Iterator[Row | str]:
-    """Messages put together by their time: inputs are held, a reading that does not come is missing."""
+    """Messages grouped by time: inputs are held, a missing reading is NaN."""
     inputs, outputs = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
     sources = {name: mapping.get(name, ChannelSource()) for name in (*inputs, *outputs)}
     places = {n: _place(n, source, n in inputs) for n, source in sources.items() if source.constant is None}
     factors: dict[str, float] = {}
     constants = {name: sources[name].constant for name in inputs}
-    known = {name: np.nan if value is None else value for name, value in constants.items()}
+    inputs_now = {name: np.nan if value is None else value for name, value in constants.items()}
     clock = mapping.get("t", ChannelSource())
     scale = unit_factor(clock.unit, "s") if clock.unit else 1.0
-    now, read = None, dict.fromkeys(outputs, np.nan)
+    time_now, readings_now = None, dict.fromkeys(outputs, np.nan)
     troubles: list[str] = []
     topics = {topic for topic, _ in places.values()}
     for message in follow(path, topics, idle, POLL, lambda damage: troubles.append(str(damage))):
@@ -102,23 +101,23 @@ def _mcap_rows(
         payload = message.payload
         t = number_at(payload, clock.column or "t") * scale
         t = message.t if np.isnan(t) else t
-        if now is not None and t != now:
-            if any(np.isfinite(list(read.values()))):
-                yield now, list(known.values()), list(read.values())
-            read = dict.fromkeys(outputs, np.nan)
-        now = t
+        if time_now is not None and t != time_now:
+            if any(np.isfinite(list(readings_now.values()))):
+                yield time_now, list(inputs_now.values()), list(readings_now.values())
+            readings_now = dict.fromkeys(outputs, np.nan)
+        time_now = t
         for name, (topic, field) in places.items():
             if topic == message.topic:
                 value = number_at(payload, field)
                 factor = factors.setdefault(name, _factor(message, name, field, mapping, plant))
-                counts = field not in payload.get("masked", ())
-                (known if name in known else read)[name] = value * factor if counts else np.nan
-    if now is not None and any(np.isfinite(list(read.values()))):
-        yield now, list(known.values()), list(read.values())
+                is_valid = field not in payload.get("masked", ())
+                (inputs_now if name in inputs_now else readings_now)[name] = value * factor if is_valid else np.nan
+    if time_now is not None and any(np.isfinite(list(readings_now.values()))):
+        yield time_now, list(inputs_now.values()), list(readings_now.values())
 
 
 def _place(name: str, source: ChannelSource, is_input: bool) -> tuple[str, str]:
-    """Topic and field of a channel: as mapped, or where our own logs have it."""
+    """Topic and field of a channel: as mapped, or as in logs of this program."""
     topic, _, field = (source.column or "").rpartition(":")
     return (topic, field) if topic else ("/plant/input" if is_input else "/plant/output", source.column or name)
 
@@ -126,7 +125,7 @@ def _place(name: str, source: ChannelSource, is_input: bool) -> tuple[str, str]:
 def _factor(
     message: Message, name: str, field: str, mapping: Mapping[str, ChannelSource], plant: PlantDescription
 ) -> float:
-    """From the numbers of a message into SI. Raises ValueError where no unit is told, or one of another kind."""
+    """Factor from the numbers of a message to SI. Raises ValueError for a missing unit or one of another dimension."""
     source = mapping.get(name, ChannelSource())
     unit = source.unit or dict(message.channel.metadata).get(f"unit.{field}", "")
     if not unit:

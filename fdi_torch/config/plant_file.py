@@ -9,12 +9,11 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, ValidationError
 
-from fdi_torch.config.files import find_plant, read_yaml
-from fdi_torch.config.plant_in_code import Plant, effect_parameters, settled, settled_effect, settled_tolerances
+from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Share, Strict, quantity
+from fdi_torch.config.yaml_files import find_plant, read_yaml
 from fdi_torch.names import unknown
-from fdi_torch.outside import MOST_COMPONENTS
 from fdi_torch.plant.description import (
     LARGEST_DISCHARGE_COEFFICIENT,
     OUTSIDE,
@@ -25,6 +24,7 @@ from fdi_torch.plant.description import (
     Sensor,
     Tank,
 )
+from fdi_torch.untrusted_input import MOST_COMPONENTS
 
 
 def _start_level(value: Any) -> float | None:
@@ -37,8 +37,8 @@ class TankConfig(Strict):
     start_level: Annotated[float | None, BeforeValidator(_start_level)] = Field(
         None, description="level at t = 0, m, or equilibrium (of the first inputs)"
     )
-    overflow_to: str = Field(OUTSIDE, description="the tank that catches what runs over the rim")
-    leak_reference: str | None = Field(None, description="the pipe whose capacity a leak's size is a share of")
+    overflow_to: str = Field(OUTSIDE, description="the tank that receives the overflow")
+    leak_reference: str | None = Field(None, description="the pipe whose capacity is a leak of size 1")
 
 
 class PipeConfig(Strict):
@@ -54,29 +54,29 @@ class PipeConfig(Strict):
 
 class PumpConfig(Strict):
     target: str = Field(description="the tank it fills")
-    max_flow: Flow = Field(description="what it can deliver at most, m^3/s")
+    max_flow: Flow = Field(description="greatest flow, m^3/s")
     gain: Amount = Field(1.0, description="flow for a command of 1: none, l/min/V, l/min/mA, l/min/Hz; l/min of a duty")
-    command: str | None = Field(None, description="its input channel, where that is not its name")
+    command: str | None = Field(None, description="its input channel, if it differs from its name")
 
 
 class SensorConfig(Strict):
     tank: str = Field(description="the tank whose level it reads")
     gain: Amount = Field(1.0, description="reading for a level of 1: no unit, or in mbar/cm, V/cm, mA/cm, %/cm")
     offset: Amount | None = Field(None, description="reading at level 0, in the reading's unit")
-    channel: str | None = Field(None, description="its output channel, where that is not its name")
-    low: Amount | None = Field(None, description="it never reads less, in the reading's unit")
-    high: Amount | None = Field(None, description="it never reads more, in the reading's unit")
+    channel: str | None = Field(None, description="its output channel, if it differs from its name")
+    low: Amount | None = Field(None, description="least reading, in its unit")
+    high: Amount | None = Field(None, description="greatest reading, in its unit")
 
 
 class EffectConfig(Strict):
-    effect: str = Field(description="which effect, such as pump_lag")
+    effect: str = Field(description="name of the effect, such as pump_lag")
     location: str = Field(description="the component that has it")
     parameters: dict[str, Amount] = Field(default_factory=dict, description="with units, such as time_constant: 8 s")
 
 
 class MatterConfig(Strict):
-    smallest: Amount = Field(0.0, description="deviation from nominal from which on it is said aloud, with its unit")
-    urgency: str = Field("", description="a word that the events carry, such as high")
+    smallest: Amount = Field(0.0, description="least deviation from nominal that is reported, with its unit")
+    urgency: str = Field("", description="a word that is added to its events, such as high")
 
 
 class PlantConfig(Strict):
@@ -88,20 +88,20 @@ class PlantConfig(Strict):
     sensors: dict[str, SensorConfig] = Field(default_factory=dict)
     tolerances: dict[str, Amount] = Field(
         default_factory=dict,
-        description="one standard deviation of a constant as a share of it (of an offset, or a parameter of an effect: "
+        description="relative standard deviation of a constant (of an offset, a start level or an effect's parameter: "
         "in its unit); * is any name",
     )
     varying: list[str] = Field(
-        default_factory=list, description="constants with a tolerance that are others in each recording; * is any name"
+        default_factory=list, description="constants with a tolerance that differ between recordings; * is any name"
     )
-    effects: list[EffectConfig] = Field(default_factory=list, description="what the plant is known to have")
+    effects: list[EffectConfig] = Field(default_factory=list, description="known effects of the plant")
     matters: dict[str, MatterConfig] = Field(
-        default_factory=dict, description="faults by name, such as T1.leak, and how much they matter to a monitor"
+        default_factory=dict, description="least reported size and urgency of faults by name, such as T1.leak"
     )
 
 
 def load_plant(name: str | Path, base: Path | None = None) -> Plant:
-    """The plant in a file, or one that is shipped, by its name ('three_tank'). Raises ConfigError."""
+    """The plant in a file, or a shipped one by its name ('three_tank'). Raises ConfigError."""
     path = find_plant(str(name), base or Path.cwd())
     data = read_yaml(path)
     return build_plant({"name": path.stem, **data}, str(path))
@@ -133,14 +133,14 @@ def _plant(config: PlantConfig) -> Plant:
         name=config.name,
     )
     placed = [PlacedEffect(e.effect, e.location, e.parameters) for e in config.effects]  # type: ignore[arg-type]
-    plant = replace(plant, effects=tuple(settled_effect(i, e, plant, quantity) for i, e in enumerate(placed)))
-    tolerances = settled_tolerances(config.tolerances, plant, quantity)
+    plant = replace(plant, effects=tuple(effect_in_si(i, e, plant, quantity) for i, e in enumerate(placed)))
+    tolerances = tolerances_in_si(config.tolerances, plant, quantity)
     matters = tuple(_matter(name, matter, plant) for name, matter in config.matters.items())
     return replace(plant, tolerances=tolerances, varying=tuple(config.varying), matters=matters)
 
 
 def _matter(name: str, matter: MatterConfig, plant: Plant) -> FaultPriority:
-    """'T1.leak' stands for the leak's size."""
+    """The priority of a fault; 'T1.leak' means the leak's size."""
     location, _, rest = name.partition(".")
     effect, _, field = rest.partition(".")
     try:
@@ -150,7 +150,7 @@ def _matter(name: str, matter: MatterConfig, plant: Plant) -> FaultPriority:
     size = parameters.get(field or next(iter(parameters)))
     if size is None:
         raise ValueError(f"matters.{name}: {unknown('a parameter', field, parameters)}")
-    smallest = settled(f"matters.{name}.smallest", matter.smallest, size.unit, quantity)
+    smallest = si_value(f"matters.{name}.smallest", matter.smallest, size.unit, quantity)
     if smallest < 0.0:
         raise ValueError(f"matters.{name}.smallest: expected no negative size, got {matter.smallest}")
     return FaultPriority(f"{location}.{effect}.{size.name}", smallest, matter.urgency)
@@ -161,5 +161,5 @@ def _sensor(name: str, config: SensorConfig) -> Sensor:
     given: dict[str, Any] = {}
     for field in ("offset", "low", "high"):
         if (value := getattr(config, field)) is not None:
-            given[field] = settled(f"sensors.{name}.{field}", value, sensor.unit, quantity)
+            given[field] = si_value(f"sensors.{name}.{field}", value, sensor.unit, quantity)
     return replace(sensor, **given)

@@ -1,4 +1,4 @@
-"""Run files: which plant, which recordings (or a simulation), what to estimate and how, and where the results go."""
+"""Run files: the plant, recordings or a simulation, what to estimate, and the place of the results."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from fdi_torch.config.estimation import EstimationConfig
-from fdi_torch.config.files import DEFAULT_RUN
-from fdi_torch.config.loaded_recordings import named_apart
+from fdi_torch.config.loaded_recordings import separate_recordings
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.config.resolved_config import resolve, values_in
 from fdi_torch.config.simulation import SimulationConfig
 from fdi_torch.config.strict import Strict
-from fdi_torch.config.understood import understood, values_in
+from fdi_torch.config.yaml_files import DEFAULT_RUN
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
@@ -25,7 +25,7 @@ LONGEST_NAME = 200
 
 class OutputConfig(Strict):
     folder: str = Field("logs", description="for the log and the pictures")
-    name: str = Field("", description="of the run, a file's name without ending; by default that of its file")
+    name: str = Field("", description="name of the run and its log, without ending; by default the run file's name")
 
     @field_validator("name")
     @classmethod
@@ -41,9 +41,9 @@ class RunConfig(Strict):
     simulate: SimulationConfig | None = Field(None, description="or a run to be simulated")
     estimate: EstimationConfig = Field(default_factory=EstimationConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
-    seed: int = Field(0, ge=0, description="of everything drawn at random")
+    seed: int = Field(0, ge=0, description="seed of all random numbers")
     device: str = Field("cpu", pattern=r"^(cpu|cuda(:\d{1,2})?)$", description="cpu or cuda")
-    engine: Literal["auto", "reference", "compiled"] = Field("auto", description="what integrates")
+    engine: Literal["auto", "reference", "compiled"] = Field("auto", description="simulation engine")
 
     @model_validator(mode="after")
     def _one_source(self) -> RunConfig:
@@ -55,8 +55,10 @@ class RunConfig(Strict):
 
 @dataclass(frozen=True)
 class Run:
-    """A run file understood. base: where its paths start. text: YAML that gives the same run, plant included.
-    given: recordings that are at hand, by what `file` calls them.
+    """A resolved run file.
+
+    base: folder of relative paths. text: YAML of the same run, including the plant. given: recordings in memory, by the
+    name that `file` gives them.
     """
 
     config: RunConfig
@@ -68,7 +70,7 @@ class Run:
 
     @property
     def resolved(self) -> dict[str, Any]:
-        """Every value, defaults included, as plain nested values."""
+        """All values, including defaults, as plain nested values."""
         return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
 
     @property
@@ -77,20 +79,20 @@ class Run:
 
 
 def load_run(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Run:
-    """A run file, or the built-in default, with some values changed ('estimate.search.population=40').
+    """A run file, or the built-in default, with overrides ('estimate.search.population=40').
 
-    Raises ConfigError with one sentence for each thing that is wrong.
+    Raises ConfigError with one sentence per problem.
     """
     data, file = values_in(DEFAULT_RUN if path is None else path, overrides)
     return build_run(data, file.parent, str(file))
 
 
 def build_run(data: Mapping[str, Any], base: Path, source: str) -> Run:
-    """A run from a mapping as in a run file. `base` is where its paths start.
+    """A run from the mapping of a run file; base: folder of relative paths.
 
-    In place of the name of a plant or of a recording's file may stand the `Plant` or the `Recording` itself.
+    A `Plant` or a `Recording` object may replace the name of a plant or of a recording's file.
     """
     recordings = data.get("recordings")
-    listed, given = named_apart(recordings) if isinstance(recordings, list | tuple) else (recordings, {})
-    config, plant, text = understood(RunConfig, {**data, "recordings": listed} if given else data, base, source)
+    listed, given = separate_recordings(recordings) if isinstance(recordings, list | tuple) else (recordings, {})
+    config, plant, text = resolve(RunConfig, {**data, "recordings": listed} if given else data, base, source)
     return Run(config, plant, base, source, text, given)

@@ -1,4 +1,4 @@
-"""Text and sizes from outside: what reaches the terminal, what a file may ask for, which files a log may open."""
+"""Untrusted input: safe display of text, limits on sizes, and files that a log may not open."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ import pytest
 
 from fdi_torch import cli
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.files import SHIPPED
-from fdi_torch.config.logged import logged_mapping, logged_plant
+from fdi_torch.config.logged_config import logged_mapping, logged_plant
 from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.yaml_files import SHIPPED
 from fdi_torch.disk import replacing
 from fdi_torch.logbook import LogError, arrays, read_run
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.sink import Sink
-from fdi_torch.outside import MOST_LINE, MOST_UNPACKED, printable, printable_json
+from fdi_torch.untrusted_input import MOST_LINE, MOST_UNPACKED, printable, printable_json
 
 HEADER = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n"
 ROWS = "".join(f"{t},{50 + t % 7},50,{40 + t % 11},{30 + t % 5},{35 + t % 3}\n" for t in range(60))

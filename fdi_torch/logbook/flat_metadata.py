@@ -1,4 +1,4 @@
-"""Nested values as the flat texts that a metadata record holds."""
+"""Nested values as the flat texts of a metadata record."""
 
 from __future__ import annotations
 

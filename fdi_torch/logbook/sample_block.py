@@ -1,7 +1,7 @@
-"""Many samples at once as message records: the bytes that one after the other gives, in a tenth of the time.
+"""Blocks of samples as message records: the same bytes as one message after the other, ten times faster.
 
-A recording is most of what a run writes, and its messages differ in their numbers only. So the numbers are written as
-text all together, and what stands between them is put in between afterwards, column by column.
+Most of a log is recordings, whose messages differ in their numbers only. All numbers of a block are therefore converted
+to text together, and the constant parts of the records are inserted afterwards, column by column.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ _HEAD = np.dtype(
 )
 _COMMA, _CLOSING = b",}"
 _WIDEST = 32
-"""Bytes that are moved for a number: no less than its text, and no more than reach from it into the next sample's."""
+"""Bytes copied for a number: at least its text, and not beyond the same number of the next sample."""
 _UNCOUNTED = 9
-"""Bytes of a record that its length does not count: opcode and length."""
+"""Bytes of a record that its length field does not count: opcode and length."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """B samples of S channels in turn, each a record of the format; an iteration gives them as messages.
+    """B samples of S channels in turn, each a message record; iteration yields them as messages.
 
-    sequences: of the first sample, one a channel. log_times (B,) in ns. data: the records, without the channels'
-    numbers. ends (B, S): where each record ends in data.
+    sequences: sequence number of the first sample of each channel. log_times (B,): ns. data: the records, without
+    channel numbers. ends (B, S): end of each record in data.
     """
 
     channels: Sequence[Channel]
@@ -50,7 +50,7 @@ class Block:
         return self.messages(0, len(self.ends))
 
     def messages(self, first: int, last: int) -> Iterator[Timed]:
-        """The samples first..last."""
+        """The messages of samples first..last."""
         start = int(self.ends[first - 1, -1]) if first else 0
         times = self.log_times[first:last].tolist()
         for i, time, ends in zip(count(first), times, self.ends[first:last].tolist(), strict=False):
@@ -59,7 +59,7 @@ class Block:
                 start = end
 
     def number(self, numbers: Sequence[int]) -> None:
-        """Writes the heads of the records; numbers: of the channels in this file."""
+        """Write the heads of the records; numbers: of the channels in this file."""
         heads = np.empty(len(self.ends), _HEAD)
         heads["opcode"] = Opcode.MESSAGE
         heads["log"] = heads["published"] = self.log_times
@@ -79,7 +79,7 @@ def block_of(
     time: np.ndarray,
     log_times: np.ndarray,
 ) -> Block:
-    """Samples values[k] (B, N_k), finite float64, of channel k over time (B,) in s."""
+    """The block of samples values[k] (B, N_k), finite float64, of each channel k over time (B,), s."""
     columns = np.column_stack([time, *values])
     bare = orjson.dumps(columns.ravel(), option=orjson.OPT_SERIALIZE_NUMPY)
     text = np.frombuffer(bare + bytes(_WIDEST), np.uint8)
@@ -88,25 +88,27 @@ def block_of(
     lengths = np.ascontiguousarray(stops.reshape(columns.shape).T - begins)
     pieces = _pieces(names)
     sizes = sum(lengths[column] for _, column, _ in pieces) + sum(len(piece) + last for piece, _, last in pieces)
-    stop = np.cumsum(sizes) - sizes  # of what has its place already, in each sample
+    stop = np.cumsum(sizes) - sizes  # end of the parts of each sample that have been placed
     data = np.empty(int(sizes.sum()) + _WIDEST, np.uint8)
     numbers, target = _windows(text, _WIDEST), _windows(data, _WIDEST)
     places, ends = [], []
     for piece, column, last in pieces:
         places.append(stop)
         begin = stop + len(piece)
-        target[begin] = numbers[begins[column]]  # with what follows it there, which what is written next covers
+        target[begin] = numbers[begins[column]]  # copies some bytes too many, which the next write covers
         stop = begin + lengths[column] + last
         ends += [stop] if last else []
     for (piece, *_), place in zip(pieces, places, strict=True):
         _windows(data, len(piece))[place] = np.frombuffer(piece, f"V{len(piece)}")
-    found = np.column_stack(ends)
-    data[found - 1] = _CLOSING
-    return Block(channels, sequences, log_times, data, found)
+    record_ends = np.column_stack(ends)
+    data[record_ends - 1] = _CLOSING
+    return Block(channels, sequences, log_times, data, record_ends)
 
 
 def _pieces(names: Sequence[Sequence[str]]) -> list[tuple[bytes, int, bool]]:
-    """Of each number of a sample: what stands before it, its column (time is the first), is it its record's last?"""
+    """For each number of a sample: the text before it, its column (time is the first), and whether it ends its
+    record.
+    """
     pieces, column = [], 0
     for named in names:
         pieces.append((bytes(_HEAD.itemsize) + b'{"t":', 0, not named))
@@ -121,5 +123,5 @@ def _key(name: str) -> bytes:
 
 
 def _windows(array: np.ndarray, width: int) -> np.ndarray:
-    """Every stretch of so many bytes of an array of bytes, at each place one, as items to be written."""
+    """All windows of `width` bytes of an array of bytes, one per position, as writable items."""
     return np.ndarray((len(array) - width + 1,), f"V{width}", buffer=array, strides=(1,))

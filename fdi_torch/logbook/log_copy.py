@@ -1,4 +1,4 @@
-"""A log written again: same records, same order, full chunks."""
+"""Rewriting of a log: same records in the same order, in full chunks."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Extra = Callable[[Run, int], Mapping[str, Mapping[str, str]]]
 
 
 def copy_log(source: Path, target: Path, salvage: bool = False, extra: Extra | None = None) -> Run:
-    """Write every record of `source` that can be read to the new file `target`, then the metadata of `extra`.
+    """Write every readable record of `source` to the new file `target`, then the metadata of `extra`.
 
-    extra: called with the run and the number of its messages when all are copied.
+    extra: called with the run and the number of copied messages.
     """
     run = read_run(source, salvage=salvage)
     sink = Sink(target, run.library, run.profile)
@@ -33,7 +33,7 @@ def copy_log(source: Path, target: Path, salvage: bool = False, extra: Extra | N
 
 
 def _copy_records(run: Run, sink: Sink) -> int:
-    """Metadata, attachments and messages in the order of the file. Returns how many messages."""
+    """Copy metadata, attachments and messages in order of the file; returns the number of messages."""
     count = 0
     for part in run.walk():
         if not isinstance(part, Frame):

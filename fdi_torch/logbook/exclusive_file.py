@@ -1,4 +1,4 @@
-"""The file under a log: nobody else writes it, and every error of the disk is one sentence."""
+"""The file of a log: written by one process only, with disk errors as sentences."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from fdi_torch.logbook.errors import LogError, log_error
 _PIECE = 1 << 20
 
 
-class Stream:
-    """An unbuffered file. Raises LogError where the path is taken or not writable; after an error it is dead.
+class ExclusiveFile:
+    """An unbuffered file. Raises LogError if the path exists or is not writable; after a disk error it refuses writes.
 
-    size: bytes written. dead: what ended it.
+    size: bytes written. dead: the error that ended it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,17 +32,17 @@ class Stream:
 
     def write(self, data: bytes) -> None:
         self.expect_alive()
-        rest = memoryview(data)
+        remaining = memoryview(data)
         try:
-            while rest:
-                done = os.write(self._file, rest)
-                rest, self.size = rest[done:], self.size + done
+            while remaining:
+                count = os.write(self._file, remaining)
+                remaining, self.size = remaining[count:], self.size + count
         except OSError as error:
             self.dead = log_error(self.path, error)
             raise self.dead from error
 
     def copy(self, source: BinaryIO, start: int, end: int) -> None:
-        """The bytes `start` to `end` of another file."""
+        """Copy the bytes `start` to `end` of another file."""
         source.seek(start)
         while start < end:
             data = source.read(min(_PIECE, end - start))
@@ -54,7 +54,7 @@ class Stream:
             raise LogError(f"{self.dead}; nothing more is logged")
 
     def go_back(self, place: int) -> None:
-        """What is written next stands at that place; all from there on is given up."""
+        """Discard everything from `place` on, and continue writing there."""
         try:
             os.lseek(self._file, place, os.SEEK_SET)
         except OSError as error:
@@ -62,7 +62,7 @@ class Stream:
         self.size = place
 
     def sync(self) -> None:
-        """All of it on disk, and nothing behind it."""
+        """Truncate the file to its size and flush it to disk."""
         try:
             os.ftruncate(self._file, self.size)
             os.fsync(self._file)
@@ -74,7 +74,7 @@ class Stream:
 
 
 def _taken(path: Path) -> str:
-    """Why an existing file keeps us out: somebody writes it, or somebody was killed while writing it."""
+    """The reason why an existing file cannot be used: it is being written, or its writer was killed."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError as error:

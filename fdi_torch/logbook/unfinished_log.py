@@ -1,4 +1,4 @@
-"""A run that was killed goes on from what its log holds."""
+"""Continuation of an interrupted run from its unfinished log."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from fdi_torch.logbook.reader import Run, read_run
 
 
 def set_aside(path: str | Path) -> Path | None:
-    """Give the unfinished log of `NAME.mcap` another name, so that the run can be written again; None if there is none.
+    """Rename the unfinished log of `NAME.mcap`, so that the run can be written again; None if there is none.
 
-    It becomes NAME.mcap.partial.1, or the next number that is free. Raises LogError where its writer is still alive.
+    The new name is NAME.mcap.partial.1, or the next free number. Raises LogError if its writer is still running.
     """
     partial = Path(f"{path}.partial")
     if not partial.exists():
@@ -34,16 +34,16 @@ def set_aside(path: str | Path) -> Path | None:
 
 
 def unfinished(path: str | Path) -> Run | None:
-    """What a killed run left of `NAME.mcap`, set aside and opened; None if there is nothing."""
+    """The unfinished log of `NAME.mcap`, renamed and opened; None if there is none."""
     aside = set_aside(path)
     return read_run(aside, salvage=True) if aside else None
 
 
 def last_state(run: Run, problem: int = 0) -> tuple[int, dict[str, np.ndarray]] | None:
-    """The last logged state of the search of one problem: generation and arrays; None where none was logged."""
-    found = None
+    """The last logged state of one problem's search: generation and arrays; None if none was logged."""
+    latest = None
     for message in run.messages(["/estimator/de/population"]):
         payload = message.payload
         if payload.get("problem", 0) == problem:
-            found = payload
-    return (int(found["generation"]), unpack(found)) if found else None
+            latest = payload
+    return (int(latest["generation"]), unpack(latest)) if latest else None

@@ -1,4 +1,4 @@
-"""YAML files: read, changed by --set, written, and found. The only importer of yaml."""
+"""YAML files: reading, overriding by --set, writing and finding. This is the only file that imports yaml."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import yaml
 
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.names import nearest, shortened, unknown
-from fdi_torch.outside import MOST_DIGITS, MOST_YAML_BYTES, MOST_YAML_VALUES
+from fdi_torch.untrusted_input import MOST_DIGITS, MOST_YAML_BYTES, MOST_YAML_VALUES
 
 MOST_EXTENSIONS = 8
 SHIPPED = Path(__file__).resolve().parents[1] / "configs"
@@ -20,7 +20,7 @@ DEFAULT_RUN = SHIPPED / "default.yaml"
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file. Raises ConfigError where there is no file, no YAML or no mapping."""
+    """The mapping in a YAML file. Raises ConfigError if there is no such file, no YAML or no mapping."""
     if not path.is_file():
         raise ConfigError([f"{path}: expected a YAML file, got none there; check the path"])
     with path.open("rb") as file:
@@ -28,7 +28,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(text: bytes, source: str) -> dict[str, Any]:
-    """The mapping in YAML text of plain values. Raises ConfigError, naming `source`, where it is none or too large."""
+    """The mapping in YAML text with plain values. Raises ConfigError, naming `source`, if it is none or too large."""
     if len(text) > MOST_YAML_BYTES:
         raise ConfigError([f"{source}: expected at most {MOST_YAML_BYTES} bytes of YAML, got more; split the file"])
     data = _values(text, source)
@@ -43,16 +43,16 @@ def _values(text: bytes, source: str) -> Any:
         return yaml.load(text.decode("utf-8"), _Loader)
     except RecursionError:
         raise ConfigError([f"{source}: expected YAML of a few levels, got hundreds within each other"]) from None
-    except (yaml.YAMLError, ValueError, OverflowError) as error:  # numbers, dates and text that there cannot be
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two for impossible numbers and dates
         where = getattr(error, "problem_mark", None)
         line = f"line {where.line + 1}: " if where else ""
         problem = getattr(error, "problem", None) or str(error).partition("\n")[0]
-        told = problem if isinstance(error, _NotTakenError) else f"expected YAML, got something else: {problem}"
-        raise ConfigError([f"{source}: {line}{told}"]) from error
+        sentence = problem if isinstance(error, _RejectedError) else f"not valid YAML: {problem}"
+        raise ConfigError([f"{source}: {line}{sentence}"]) from error
 
 
 def compose_yaml(text: str) -> yaml.Node:
-    """The nodes of a YAML text that was read before, with the places where they stand."""
+    """The nodes of a YAML text that has been read before, with their positions."""
     loader = _Loader(text)
     try:
         return loader.get_single_node()
@@ -61,26 +61,27 @@ def compose_yaml(text: str) -> yaml.Node:
 
 
 def read_extended(path: Path, depth: int = 0) -> dict[str, Any]:
-    """A YAML file laid over the one that its key `extends` names (a path beside it), mappings merged key by key."""
+    """A YAML file merged key by key over the file that its key `extends` names (a path relative to it)."""
     data = read_yaml(path)
     if "extends" not in data:
         return data
     if depth >= MOST_EXTENSIONS:
         raise ConfigError([f"{path}: extends: expected at most {MOST_EXTENSIONS} files in a row, got more; a circle?"])
-    below = path.parent / str(data.pop("extends"))
-    return _merged(read_extended(below, depth + 1), data)
+    base_file = path.parent / str(data.pop("extends"))
+    return _merged(read_extended(base_file, depth + 1), data)
 
 
-def _merged(below: Any, above: Any) -> Any:
-    if not (isinstance(below, dict) and isinstance(above, dict)):
-        return above
-    return below | {key: _merged(below.get(key), value) for key, value in above.items()}
+def _merged(base: Any, override: Any) -> Any:
+    if not (isinstance(base, dict) and isinstance(override, dict)):
+        return override
+    return base | {key: _merged(base.get(key), value) for key, value in override.items()}
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain values only, as many as `MOST_YAML_VALUES` with every alias spelled out: counted while the text is read,
-    since nine aliases of nine aliases make few bytes huge. A key that stands twice is refused: the first would be
-    lost without a word.
+    """Loads plain values only, at most `MOST_YAML_VALUES` with all aliases expanded, and refuses repeated keys.
+
+    Values are counted during reading, because nested aliases make a few bytes huge. Of a repeated key, YAML would
+    silently drop the first.
     """
 
     def __init__(self, text: str) -> None:
@@ -91,39 +92,39 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         event = self.peek_event()
         if getattr(event, "tag", None) is not None:
-            raise _trouble(f"expected plain values, got the tag {shortened(event.tag)}; remove it", event)
-        before = self._spelled_out
+            raise _rejected(f"expected plain values, got the tag {shortened(event.tag)}; remove it", event)
+        count_before = self._spelled_out
         node = super().compose_node(parent, index)
         if isinstance(event, yaml.AliasEvent):
             if id(node) not in self._sizes:
-                raise _trouble(f"expected plain values, got *{event.anchor} within itself; remove it", event)
+                raise _rejected(f"expected plain values, got *{event.anchor} within itself; remove it", event)
             self._spelled_out += self._sizes[id(node)]
         else:
             self._spelled_out += 1
-            self._sizes[id(node)] = self._spelled_out - before
+            self._sizes[id(node)] = self._spelled_out - count_before
         if self._spelled_out > MOST_YAML_VALUES:
-            raise _trouble(f"expected at most {MOST_YAML_VALUES} values, aliases spelled out, got more", event)
+            raise _rejected(f"expected at most {MOST_YAML_VALUES} values, aliases spelled out, got more", event)
         return node
 
     def construct_scalar(self, node: Any) -> Any:
         if node.tag in _NUMBERS and len(node.value) > MOST_DIGITS:
-            raise _trouble(f"expected a number of at most {MOST_DIGITS} digits, got {len(node.value)}", node)
+            raise _rejected(f"expected a number of at most {MOST_DIGITS} digits, got {len(node.value)}", node)
         return super().construct_scalar(node)
 
     def construct_yaml_int(self, node: Any) -> int:
         value: int = super().construct_yaml_int(node)
         if not abs(value) < 2**63:
-            raise _trouble(f"expected a whole number below 2^63, got {shortened(node.value)}", node)
+            raise _rejected(f"expected a whole number below 2^63, got {shortened(node.value)}", node)
         return value
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        seen = set()
+        keys = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
-                if key.value in seen:
-                    told = f"expected each key once, got {shortened(key.value)} twice; rename or remove one"
-                    raise _trouble(told, key)
-                seen.add(key.value)
+                if key.value in keys:
+                    sentence = f"expected each key once, got {shortened(key.value)} twice; rename or remove one"
+                    raise _rejected(sentence, key)
+                keys.add(key.value)
         return super().construct_mapping(node, deep)
 
 
@@ -131,12 +132,12 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 _NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 
 
-class _NotTakenError(yaml.constructor.ConstructorError):
-    """YAML as it may be, but not here."""
+class _RejectedError(yaml.constructor.ConstructorError):
+    """Valid YAML that a configuration may not contain."""
 
 
-def _trouble(sentence: str, where: Any) -> _NotTakenError:
-    return _NotTakenError(None, None, sentence, where.start_mark)
+def _rejected(sentence: str, where: Any) -> _RejectedError:
+    return _RejectedError(None, None, sentence, where.start_mark)
 
 
 def write_yaml(data: dict[str, Any]) -> str:
@@ -144,7 +145,7 @@ def write_yaml(data: dict[str, Any]) -> str:
 
 
 def with_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
-    """A copy of the mapping in which each 'a.b.0.c=value' (YAML) is set. Keys are checked with the whole, later."""
+    """A copy of the mapping with each 'a.b.0.c=value' (YAML) set. Keys are checked later with the whole mapping."""
     changed = deepcopy(data)
     for override in overrides:
         path, equals, text = override.partition("=")
@@ -156,7 +157,7 @@ def with_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, 
 
 
 def _set(node: Any, keys: Sequence[str], value: Any, override: str) -> None:
-    """Sets the value at the end of a path of keys and indices, making mappings where there are none yet."""
+    """Set the value at the end of a path of keys and indices; missing mappings are created."""
     for i, key in enumerate(keys):
         index: Any = key
         place = ".".join(keys[:i])
@@ -175,7 +176,9 @@ def _set(node: Any, keys: Sequence[str], value: Any, override: str) -> None:
 
 
 def find_file(name: str, base: Path, also: Sequence[Path] = ()) -> Path:
-    """A file named in a configuration: as given, or below the configuration's folder, here, or one of `also`."""
+    """A file named in a configuration: as given, relative to the configuration's folder, the current folder, or
+    `also`.
+    """
     folders = [base, Path.cwd(), *also]
     for folder in folders:
         if (folder / name).is_file():
@@ -188,7 +191,7 @@ def find_file(name: str, base: Path, also: Sequence[Path] = ()) -> Path:
 
 
 def find_data(name: str, base: Path) -> Path:
-    """A recording: also below the folder that the environment variable FDI_TORCH_DATA names."""
+    """A recording: as `find_file`, and in the folder of the environment variable FDI_TORCH_DATA."""
     data = os.environ.get("FDI_TORCH_DATA")
     try:
         return find_file(name, base, [Path(data)] if data else [])
@@ -198,12 +201,12 @@ def find_data(name: str, base: Path) -> Path:
 
 
 def shipped_plants() -> dict[str, Path]:
-    """The plants that come with the package, by name."""
+    """The plant files in the package, by name."""
     return {path.stem: path for path in sorted((SHIPPED / "plants").glob("*.yaml"))}
 
 
 def find_plant(name: str, base: Path) -> Path:
-    """A plant file, or a plant that is shipped, by its name ('three_tank')."""
+    """A plant file, or a shipped plant by its name ('three_tank')."""
     plants = shipped_plants()
     if name in plants:
         return plants[name]

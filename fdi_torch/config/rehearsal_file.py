@@ -1,4 +1,4 @@
-"""Rehearsal files: a simulated plant, its noise, and what a monitor is tried out on."""
+"""Rehearsal files: a simulated plant with noise, and the Monte Carlo validations of the monitor to run on it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pydantic import BeforeValidator, Field
 
 from fdi_torch.capacity import expect_room
 from fdi_torch.config.estimation import full_name
-from fdi_torch.config.monitor import WindowConfig
+from fdi_torch.config.monitor_file import WindowConfig
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.reading_noise import reading_noise
-from fdi_torch.config.run import OutputConfig
+from fdi_torch.config.resolved_config import resolve, values_in
+from fdi_torch.config.run_file import OutputConfig
 from fdi_torch.config.strict import BenchSeconds, Decibel, Share, Strict, quantity
-from fdi_torch.config.understood import understood, values_in
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.monitor.monitor_setup import with_shapes
@@ -37,43 +37,43 @@ Metres = Annotated[float, BeforeValidator(lambda value: quantity(value, "m"))]
 
 
 class NoiseConfig(Strict):
-    colour: float = Field(0.0, ge=0, lt=1, description="coefficient of the first-order filter that colours it")
-    wander: Metres = Field(0.0, ge=0, description="by which levels wander in a sample")
+    colour: float = Field(0.0, ge=0, lt=1, description="AR(1) coefficient of the measurement noise")
+    wander: Metres = Field(0.0, ge=0, description="standard deviation of the levels' random walk per sample")
 
 
 class FalseAlarmConfig(Strict):
     noises: dict[str, NoiseConfig] = Field(min_length=1, description="each by a name")
-    runs: int = Field(500, ge=1, description="free of faults")
-    lasts: BenchSeconds = Field(3600.0, gt=0, description="each of them, and the one that noise is learnt from, s")
-    calibrations: int = Field(8, ge=1, description="other runs that noise is learnt from, one after the other")
+    runs: int = Field(500, ge=1, description="number of fault-free runs")
+    lasts: BenchSeconds = Field(3600.0, gt=0, description="duration of each run, and of runs for noise estimation, s")
+    calibrations: int = Field(8, ge=1, description="number of runs from which the noise is estimated")
 
 
 class FaultsFoundConfig(Strict):
-    faults: list[str] = Field(min_length=1, description="one of them opens in each run")
+    faults: list[str] = Field(min_length=1, description="faults, one per run")
     sizes: list[Share] = Field([0.02, 0.05, 0.1, 0.2], min_length=1, description="shares of the fault's range")
-    runs: int = Field(500, ge=1, description="of each size")
-    named: int = Field(100, ge=0, description="how many of them the monitor follows to name the fault")
-    onset: BenchSeconds = Field(300.0, description="when the fault opens, s")
-    lasts: BenchSeconds = Field(900.0, description="each run, s")
+    runs: int = Field(500, ge=1, description="number of runs of each size")
+    named: int = Field(100, ge=0, description="number of these runs in which the monitor also isolates the fault")
+    onset: BenchSeconds = Field(300.0, description="onset of the fault, s")
+    lasts: BenchSeconds = Field(900.0, description="duration of each run, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
 
 
 class NamingConfig(Strict):
-    faults: list[str] = Field(min_length=1, description="sudden, and slowly growing where they can")
+    faults: list[str] = Field(min_length=1, description="faults, abrupt and (if possible) incipient")
     loops: list[Literal["closed", "open"]] = Field(["closed", "open"], description="level control, or commands alone")
-    swing: Metres = Field(0.03, description="of the set points each minute")
-    share: Share = Field(0.5, description="by which commands change each minute, of themselves")
-    runs: int = Field(200, ge=1, description="of each loop")
-    times: float = Field(3.0, gt=0, description="the smallest size that can be isolated")
-    onset: BenchSeconds = Field(300.0, description="when the fault opens, s")
-    lasts: BenchSeconds = Field(900.0, description="each run, s")
+    swing: Metres = Field(0.03, description="change of the set points each minute")
+    share: Share = Field(0.5, description="relative change of the commands each minute")
+    runs: int = Field(200, ge=1, description="number of runs of each loop")
+    times: float = Field(3.0, gt=0, description="size of the faults as a multiple of the smallest isolable size")
+    onset: BenchSeconds = Field(300.0, description="onset of the fault, s")
+    lasts: BenchSeconds = Field(900.0, description="duration of each run, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
 
 
 class RivalConfig(Strict):
-    faults: list[str] = Field(min_length=1, description="random sets of them")
-    sets: int = Field(200, ge=1, description="of faults")
-    part: int = Field(50, ge=1, description="sets computed at once")
+    faults: list[str] = Field(min_length=1, description="faults from which random sets are drawn")
+    sets: int = Field(200, ge=1, description="number of sets of faults")
+    part: int = Field(50, ge=1, description="number of sets computed at once")
     snr_db: list[Decibel] = Field([30.0, 10.0], min_length=1, description="signal-to-noise ratios, dB")
     rivals: list[Literal[ESTIMATOR_NAMES]] = Field(list(ESTIMATOR_NAMES), min_length=1, description="who is compared")  # type: ignore[valid-type]
     looks: list[int] = Field([30, 60, 100, 150, 200, 300, 400, 600, 800, 1000], description="in samples")
@@ -81,17 +81,17 @@ class RivalConfig(Strict):
 
 class RehearsalConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
-    inputs: list[str] = Field(description="constant commands, one for each channel")
+    inputs: list[str] = Field(description="constant commands, one per channel")
     reading_noise: str = Field("1 mm", description="standard deviation: 1 mm (of the level), or h1 = 1 mm, p2 = 2 mV")
-    sampling: BenchSeconds = Field(1.0, gt=0, description="between readings, s")
-    false_alarms_every: BenchSeconds = Field(20000.0, description="mean time between false alarms asked for, s")
-    detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="what raises alarms under naming")
-    false_alarms: FalseAlarmConfig | None = Field(None, description="how often without a fault")
-    faults_found: FaultsFoundConfig | None = Field(None, description="how soon, how surely and under which name")
-    naming: NamingConfig | None = Field(None, description="faults of components, sensors and actuators told apart")
-    rivals: RivalConfig | None = Field(None, description="estimators side by side")
+    sampling: BenchSeconds = Field(1.0, gt=0, description="sampling interval, s")
+    false_alarms_every: BenchSeconds = Field(20000.0, description="design mean time between false alarms, s")
+    detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="detector that raises alarms under naming")
+    false_alarms: FalseAlarmConfig | None = Field(None, description="measure the false alarm rate")
+    faults_found: FaultsFoundConfig | None = Field(None, description="measure detection delay, power and isolation")
+    naming: NamingConfig | None = Field(None, description="measure isolation of component, sensor and actuator faults")
+    rivals: RivalConfig | None = Field(None, description="compare estimators")
     output: OutputConfig = Field(default_factory=OutputConfig)
-    seed: int = Field(0, ge=0, description="of everything drawn at random")
+    seed: int = Field(0, ge=0, description="seed of all random numbers")
 
 
 Plan = FalseAlarmPlan | DetectionPlan | IsolationPlan | EstimatorComparisonPlan
@@ -99,7 +99,7 @@ Plan = FalseAlarmPlan | DetectionPlan | IsolationPlan | EstimatorComparisonPlan
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """A rehearsal file understood. plans: what is tried out. text: YAML that gives the same."""
+    """A resolved rehearsal file. plans: the validations to run. text: YAML of the same rehearsal."""
 
     config: RehearsalConfig
     plant: PlantDescription
@@ -117,9 +117,9 @@ class Rehearsal:
 
 
 def load_rehearsal(path: str | Path, overrides: Iterable[str] = ()) -> Rehearsal:
-    """A rehearsal file with some values changed. Raises ConfigError with one sentence for each thing that is wrong."""
+    """A rehearsal file with overrides. Raises ConfigError with one sentence per problem."""
     data, file = values_in(path, overrides)
-    config, plant, text = understood(RehearsalConfig, data, file.parent, str(file))
+    config, plant, text = resolve(RehearsalConfig, data, file.parent, str(file))
     plans = tuple(_plans(config, plant))
     if not plans:
         raise ValueError(f"{file}: expected false_alarms, faults_found, naming or rivals, got none of them; add one")

@@ -1,7 +1,7 @@
-"""The channel of each topic, which describes its messages, and how many of them there were.
+"""The channels of all topics, which describe their messages, and the number of messages of each.
 
 A topic's channel is registered with its first message. A later message with further fields gets a further channel of
-the same topic, so that every message is described by a schema.
+the same topic, so that a schema describes every message.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import orjson
 
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.payload import NON_FINITE, WALL
-from fdi_torch.logbook.schemas import FORMAT_VERSION, Kind, Topic, json_schema, named_kinds, topic_definition
+from fdi_torch.logbook.schemas import json_schema, named_kinds
+from fdi_torch.logbook.topic_definitions import FORMAT_VERSION, Kind, Topic, topic_definition
 
 
 class Register:
-    """One channel a topic at a time; sequence numbers count on over all of its channels."""
+    """The current channel of each topic; sequence numbers continue over all channels of a topic."""
 
     def __init__(self) -> None:
         self._described: dict[str, tuple[frozenset[str], Channel]] = {}
@@ -34,16 +35,16 @@ class Register:
         told_units: Mapping[str, str] | None = None,
         about: Mapping[str, str] | None = None,
     ) -> Channel:
-        """The topic's channel; a new one where the message has fields that it does not describe.
+        """The topic's channel; a new one if the message has fields that the current one does not describe.
 
-        fields: as given. message: the same as plain values. about: further metadata, heard at the first message.
-        Raises ValueError for names that the topic does not take.
+        fields: as given. message: the same as plain values. about: further metadata, used with the first message.
+        Raises ValueError for field names that the topic does not allow.
         """
-        known, channel = self._described.get(topic, (frozenset(), None))
-        if channel is not None and known.issuperset(fields):
+        described, channel = self._described.get(topic, (frozenset(), None))
+        if channel is not None and described.issuperset(fields):
             return channel
         present = [name for name, value in fields.items() if value is not None]
-        if channel is not None and known.issuperset(present):
+        if channel is not None and described.issuperset(present):
             return channel
         definition = topic_definition(topic)
         named = named_kinds(definition, channel.schema_data) if channel else {}
@@ -65,23 +66,23 @@ class Register:
         return channel
 
     def count(self, topic: str) -> int:
-        """Messages so far: the sequence number of the next one."""
+        """The number of messages so far, which is the next sequence number."""
         return self._count.get(topic, 0)
 
     def next_number(self, topic: str) -> int:
-        """The sequence number of a further message."""
+        """Take the next sequence number of the topic."""
         number = self._count.get(topic, 0)
         self._count[topic] = number + 1
         return number
 
     def next_numbers(self, topics: Sequence[str], count: int) -> tuple[list[Channel], list[int]]:
-        """The channels of so many further messages of each topic, and the sequence numbers of the first ones."""
+        """The channels of `count` further messages of each topic, and their first sequence numbers."""
         first = [self.count(topic) for topic in topics]
         self._count.update({topic: number + count for topic, number in zip(topics, first, strict=True)})
         return [self._described[topic][1] for topic in topics], first
 
     def follow_on(self, channel: Channel, sequence: int) -> None:
-        """Describe and number what comes as if the message (channel, sequence) had just been written."""
+        """Continue description and numbering as if the message (channel, sequence) had just been written."""
         if self._described.get(channel.topic, (None, None))[1] != channel:
             properties = orjson.loads(channel.schema_data)["properties"]
             self._described[channel.topic] = (frozenset(properties), channel)
@@ -102,7 +103,7 @@ def _check_names(topic: str, definition: Topic, named: Mapping[str, Kind]) -> No
 
 
 def _kind(value: Any) -> Kind:
-    """JSON kind of a plain value; None stands for a number that was left out as non-finite."""
+    """JSON kind of a plain value; None is a number that was omitted as non-finite."""
     if isinstance(value, list):
         first = value[0] if value else 0.0
         return "texts" if isinstance(first, str) else "integers" if type(first) is int else "numbers"

@@ -1,4 +1,4 @@
-"""The end of a file as it shall be, kept until it may replace what stands on disk meanwhile."""
+"""Buffer for a file's tail, written once the file is closed."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 from fdi_torch.logbook.errors import log_error
 
 IN_MEMORY = 4 << 20
-"""Bytes beyond which they wait in a nameless file, that vanishes with its process."""
+"""Size beyond which the buffer is an unnamed file, which disappears with its process."""
 _PIECE = 1 << 20
 
 
-class Rest:
-    """Bytes that belong behind the first `start` of a file at `path`. Raises LogError where the disk has no room."""
+class TailBuffer:
+    """The bytes after the first `start` of the final file at `path`. Raises LogError if the disk is full."""
 
     def __init__(self, path: Path, start: int) -> None:
         self.path, self.start = path, start
@@ -27,7 +27,7 @@ class Rest:
             raise log_error(self.path, error) from error
 
     def pieces(self) -> Iterator[bytes]:
-        """All of them, from the first."""
+        """All bytes, in pieces."""
         self._bytes.seek(0)
         while data := self._bytes.read(_PIECE):
             yield data

@@ -1,4 +1,4 @@
-"""Every key of a configuration with its default and meaning, for help texts and documentation."""
+"""The reference of a configuration's keys with defaults and meanings, for help texts and documentation."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 
-from fdi_torch.config.strict import Strict, is_for_a_bench
+from fdi_torch.config.strict import Strict, has_bench_default
 
 Key = tuple[str, str, str]
-"""Path of the key, its default as YAML would show it ('required' where there is none), its meaning."""
+"""Path of the key, its default in YAML notation ('required' if it has none), its meaning."""
 
 
 def keys(model: type[BaseModel], prefix: str = "") -> Iterator[Key]:
-    """The keys of a model and of the models in it. `N` stands for the index of a list, `NAME` for any name."""
+    """The keys of a model and of its nested models. In a path, `N` is the index of a list and `NAME` any name."""
     for name, field in model.model_fields.items():
         path = f"{prefix}{name}"
         inner, step = _inner(field.annotation)
         if inner is None:
             default = "required" if field.is_required() else _shown(field.get_default(call_default_factory=True))
-            default += " on a bench" if is_for_a_bench(field) else ""
+            default += " on a bench" if has_bench_default(field) else ""
             yield path, default, field.description or ""
         elif field.description:
             yield path, "", field.description
@@ -39,7 +39,7 @@ def config_reference(model: type[BaseModel]) -> str:
 
 
 def _inner(annotation: Any) -> tuple[Any, str]:
-    """The model or settings inside an annotation, and the step of the path that leads into it."""
+    """The model or settings class inside an annotation, and the step of the path that leads to it."""
     if isinstance(annotation, type) and (issubclass(annotation, Strict) or dataclasses.is_dataclass(annotation)):
         return annotation, ""
     origin: Any = get_origin(annotation)
