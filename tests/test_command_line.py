@@ -16,7 +16,7 @@ import pytest
 
 import fdi_torch
 from fdi_torch import cli
-from fdi_torch.cli.options import LIVE, overrides, access_text
+from fdi_torch.cli.options import LIVE, access_text, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import DiskError, write_text
 
