@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from fdi_torch.blind import cases
+from fdi_torch.blind.case_kinds import ON_NETWORKS
 from fdi_torch.blind.cases import make, plans
 from fdi_torch.blind.conditions import commands_of_pumps
 from fdi_torch.blind.control import BAND, LevelControl, draw_control
-from fdi_torch.blind.disturbances import HOLDS, KINDS, Disturbance, draw_disturbance
-from fdi_torch.blind.kinds import ON_NETWORKS
 from fdi_torch.blind.networks import HIGHEST, LOWEST, Networks, equilibrium, with_unmeasured
 from fdi_torch.blind.plants import three_tank
+from fdi_torch.blind.random_flows import HOLDS, KINDS, Disturbance, draw_disturbance
 from fdi_torch.blind.simulator import Drive, HiddenRigs, conductance, simulate
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 

@@ -12,12 +12,11 @@ import pytest
 import torch
 
 from fdi_torch.blind import cases
+from fdi_torch.blind.case_kinds import KINDS, STANDARD, choose
 from fdi_torch.blind.cases import make, plans
 from fdi_torch.blind.conditions import WIDEST, as_built, asked_of_pumps, exercised
 from fdi_torch.blind.deviation import Array, Deviation
-from fdi_torch.blind.files import as_csv
 from fdi_torch.blind.inputs import SIGNALS, commanded, with_standstills
-from fdi_torch.blind.kinds import KINDS, STANDARD, choose
 from fdi_torch.blind.laws_pipe import HEAD_LAWS, PIPE_LAWS
 from fdi_torch.blind.laws_pump import PUMP_LAWS
 from fdi_torch.blind.laws_sensor import READOUT_LAWS, SENSOR_LAWS
@@ -27,6 +26,7 @@ from fdi_torch.blind.nominal_run import NominalRun
 from fdi_torch.blind.places import EFFECTS, canonical, effect_places
 from fdi_torch.blind.plants import Rig, cascaded_tanks, quadruple_tank, three_tank
 from fdi_torch.blind.scaling import Scales, on_bench
+from fdi_torch.blind.sealed_files import as_csv
 from fdi_torch.blind.sensor_noise import NoiseCorrelation, autoregressive, rippling, smoothed
 from fdi_torch.blind.simulator import Drive, HiddenRigs, simulate
 from fdi_torch.blind.unseen_laws import UNKNOWN, unknown_to

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.blind.case_kinds import FAINT, KINDS, Chosen, Kind, case_generator, choose
 from fdi_torch.blind.conditions import (
     COARSE,
     HELD_OUT,
@@ -23,15 +24,14 @@ from fdi_torch.blind.conditions import (
     nominal_runs,
 )
 from fdi_torch.blind.deviation import Array, Deviation
-from fdi_torch.blind.disturbances import draw_disturbance
 from fdi_torch.blind.inputs import channel_to_rest
-from fdi_torch.blind.kinds import FAINT, KINDS, Chosen, Kind, case_generator, choose
 from fdi_torch.blind.laws_sensor import READOUT_LAWS, SENSOR_LAWS
 from fdi_torch.blind.named_effects import NAMED
 from fdi_torch.blind.networks import Networks, with_unmeasured
 from fdi_torch.blind.nominal_run import NominalRun
 from fdi_torch.blind.plants import Rig
-from fdi_torch.blind.simulator import STEP, HiddenRigs, Ran, grouped, simulate
+from fdi_torch.blind.random_flows import draw_disturbance
+from fdi_torch.blind.simulator import STEP, HiddenRigs, SimulatedRun, grouped, simulate
 from fdi_torch.plant.description import PlantDescription
 
 Off = tuple[Deviation, ...]
@@ -45,7 +45,7 @@ PARTS = (("recording", RECORDED), ("holdout", HELD_OUT))
 
 
 @dataclass(frozen=True)
-class Plan:
+class CasePlan:
     """Which case: `index` counts within its kind, `number` within the benchmark."""
 
     number: int
@@ -64,7 +64,7 @@ class Case:
     commands, readings: of recording and hold-out, (T, C) in the header's unit and (T, S) m.
     """
 
-    plan: Plan
+    plan: CasePlan
     rig: Rig
     commands: tuple[Array, Array]
     readings: tuple[Array, Array]
@@ -72,12 +72,12 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Draft:
+class CaseDraft:
     """A case whose rig has not run yet. nominal: the recording without any effect and disturbance."""
 
-    plan: Plan
+    plan: CasePlan
     conditions: Conditions
-    nominal: Ran
+    nominal: SimulatedRun
     chosen: Chosen
     deviations: Off = ()
     shows: bool = True
@@ -96,7 +96,7 @@ class Draft:
         return (*self.deviations[:k], *self.deviations[k + 1 :])
 
 
-def plans(cases: int, seed: int, kinds: Sequence[str]) -> list[Plan]:
+def plans(cases: int, seed: int, kinds: Sequence[str]) -> list[CasePlan]:
     """Kinds in turn, in an order shuffled anew each round, so that a case's number does not give its kind away."""
     strange = [k for k in kinds if k not in KINDS]
     if strange or not kinds:
@@ -107,12 +107,16 @@ def plans(cases: int, seed: int, kinds: Sequence[str]) -> list[Plan]:
     for number in range(cases):
         turn, at = divmod(number, len(kinds))
         order = case_generator(seed, "order", turn).permutation(len(kinds))
-        out.append(Plan(number, kinds[int(order[at])], turn))
+        out.append(CasePlan(number, kinds[int(order[at])], turn))
     return out
 
 
 def make(
-    todo: Sequence[Plan], rigs: Rig | Networks, seed: int, library: Collection[str] = (), leave_out: Sequence[str] = ()
+    todo: Sequence[CasePlan],
+    rigs: Rig | Networks,
+    seed: int,
+    library: Collection[str] = (),
+    leave_out: Sequence[str] = (),
 ) -> list[Case]:
     """The cases of these plans, all rigs in one batch. A case is the same in whatever company it is made."""
     own = [_rig(plan, rigs, seed) for plan in todo]
@@ -121,12 +125,12 @@ def make(
     conditions = kept_within([_conditions(*each, seed) for each in zip(todo, own, chosen, rest, strict=True)])
     conditions, nominal = _looped(todo, conditions, seed)
     conditions = _disturbed(todo, conditions, seed)
-    drafts = [Draft(*each) for each in zip(todo, conditions, nominal, chosen, strict=True)]
+    drafts = [CaseDraft(*each) for each in zip(todo, conditions, nominal, chosen, strict=True)]
     drafts = _shown([_drawn(d, d.chosen, seed) for d in drafts], seed, library, leave_out)
     return [_read(draft, runs) for draft, runs in zip(drafts, _run(drafts), strict=True)]
 
 
-def _rig(plan: Plan, rigs: Rig | Networks, seed: int) -> Rig:
+def _rig(plan: CasePlan, rigs: Rig | Networks, seed: int) -> Rig:
     rig = rigs.rig(case_generator(seed, plan.kind, plan.index, 6)) if isinstance(rigs, Networks) else rigs
     share = KINDS[plan.kind].unmeasured
     return with_unmeasured(rig, share, case_generator(seed, plan.kind, plan.index, 7)) if share else rig
@@ -140,7 +144,7 @@ def _rests(rigs: Sequence[Rig]) -> list[Array]:
     return [known[id(rig.plant.tanks)] for rig in rigs]
 
 
-def _conditions(plan: Plan, rig: Rig, chosen: Chosen, rest: Array, seed: int) -> Conditions:
+def _conditions(plan: CasePlan, rig: Rig, chosen: Chosen, rest: Array, seed: int) -> Conditions:
     kind = KINDS[plan.kind]
     rng = case_generator(seed, plan.kind, plan.index, 3)
     resting = channel_to_rest(rig.plant, chosen.place) if chosen.unknown and chosen.unknown.reversing else None
@@ -149,7 +153,9 @@ def _conditions(plan: Plan, rig: Rig, chosen: Chosen, rest: Array, seed: int) ->
     return replace(drawn, errors=tuple(drawn.correlation.noise(rng, samples, drawn.noise) for _, samples in PARTS))
 
 
-def _looped(todo: Sequence[Plan], conditions: Sequence[Conditions], seed: int) -> tuple[list[Conditions], list[Ran]]:
+def _looped(
+    todo: Sequence[CasePlan], conditions: Sequence[Conditions], seed: int
+) -> tuple[list[Conditions], list[SimulatedRun]]:
     """Closes the loop of those that have one; with each recording without any effect."""
     out, nominal = list(conditions), nominal_runs(conditions, 0)
     looped = [i for i, plan in enumerate(todo) if KINDS[plan.kind].looped]
@@ -161,7 +167,7 @@ def _looped(todo: Sequence[Plan], conditions: Sequence[Conditions], seed: int) -
     return out, nominal
 
 
-def _disturbed(todo: Sequence[Plan], conditions: Sequence[Conditions], seed: int) -> list[Conditions]:
+def _disturbed(todo: Sequence[CasePlan], conditions: Sequence[Conditions], seed: int) -> list[Conditions]:
     out = list(conditions)
     some = [i for i, plan in enumerate(todo) if KINDS[plan.kind].disturbed]
     generators = [case_generator(seed, todo[i].kind, todo[i].index, 9) for i in some]
@@ -171,7 +177,7 @@ def _disturbed(todo: Sequence[Plan], conditions: Sequence[Conditions], seed: int
     return out
 
 
-def _drawn(draft: Draft, chosen: Chosen, seed: int, trial: int = 0) -> Draft:
+def _drawn(draft: CaseDraft, chosen: Chosen, seed: int, trial: int = 0) -> CaseDraft:
     """With the numbers of its causes."""
     rng = case_generator(seed, draft.plan.kind, draft.plan.index, 4, *([trial] if trial else []))
     built, nominal = draft.conditions.built, draft.nominal
@@ -187,7 +193,9 @@ def _drawn(draft: Draft, chosen: Chosen, seed: int, trial: int = 0) -> Draft:
     return replace(draft, chosen=chosen, deviations=deviations)
 
 
-def _shown(drafts: Sequence[Draft], seed: int, library: Collection[str], leave_out: Sequence[str]) -> list[Draft]:
+def _shown(
+    drafts: Sequence[CaseDraft], seed: int, library: Collection[str], leave_out: Sequence[str]
+) -> list[CaseDraft]:
     """Draws the causes anew of those that have to show and do not."""
     out = list(drafts)
     todo = [i for i, draft in enumerate(out) if draft.kind.shows]
@@ -203,7 +211,7 @@ def _shown(drafts: Sequence[Draft], seed: int, library: Collection[str], leave_o
     return out
 
 
-def _all_show(drafts: Sequence[Draft]) -> list[bool]:
+def _all_show(drafts: Sequence[CaseDraft]) -> list[bool]:
     """Whether the lack of any full cause moves some reading by `SHOWS`, in coarse runs."""
     if not drafts:
         return []
@@ -222,7 +230,7 @@ def _all_show(drafts: Sequence[Draft]) -> list[bool]:
     return found
 
 
-def _lanes(draft: Draft) -> list[tuple[Conditions, int, Off, bool]]:
+def _lanes(draft: CaseDraft) -> list[tuple[Conditions, int, Off, bool]]:
     """Which part is run with what: both as the rig is, both without any effect; the recording without each of several
     full causes; the recording without any effect and undisturbed, where flows are disturbed.
     """
@@ -232,26 +240,26 @@ def _lanes(draft: Draft) -> list[tuple[Conditions, int, Off, bool]]:
     return [(c, 0, off, True), (c, 1, off, True), (c, 0, (), True), (c, 1, (), True), *without, *undisturbed]
 
 
-def _run(drafts: Sequence[Draft]) -> list[list[Ran]]:
+def _run(drafts: Sequence[CaseDraft]) -> list[list[SimulatedRun]]:
     """The runs of each case, a lane each."""
     lanes = [_lanes(draft) for draft in drafts]
     runs = iter(_simulated([lane for own in lanes for lane in own], STEP))
     return [[next(runs) for _ in own] for own in lanes]
 
 
-def _simulated(lanes: Sequence[tuple[Conditions, int, Off, bool]], step: float) -> list[Ran]:
+def _simulated(lanes: Sequence[tuple[Conditions, int, Off, bool]], step: float) -> list[SimulatedRun]:
     rigs = HiddenRigs([c.built for c, *_ in lanes], [off for _, _, off, _ in lanes])
     return simulate(rigs, [c.drive(part, disturbed) for c, part, _, disturbed in lanes], step)
 
 
-def _readings(draft: Draft, ran: Ran, part: int, off: Off) -> tuple[Array, Array]:
+def _readings(draft: CaseDraft, ran: SimulatedRun, part: int, off: Off) -> tuple[Array, Array]:
     """Readings with noise, and without noise and readout, (T, S) m each."""
     c = draft.conditions
     clean = _sensed(c.rig, c.built, ran.levels, off)
     return _applied(READOUT_LAWS, c.rig, clean + c.errors[part], off), clean
 
 
-def _read(draft: Draft, runs: Sequence[Ran]) -> Case:
+def _read(draft: CaseDraft, runs: Sequence[SimulatedRun]) -> Case:
     c, rig, readings, noise_rms, gap_rms = draft.conditions, draft.conditions.rig, [], {}, {}
     for part, (name, _) in enumerate(PARTS):
         shown, clean = _readings(draft, runs[part], part, draft.deviations)
@@ -288,7 +296,7 @@ def _read(draft: Draft, runs: Sequence[Ran]) -> Case:
     return Case(draft.plan, rig, commands, (readings[0], readings[1]), truth)
 
 
-def _truth(draft: Draft, hidden: Collection[int]) -> dict[str, Any]:
+def _truth(draft: CaseDraft, hidden: Collection[int]) -> dict[str, Any]:
     """hidden: full causes that the others keep from showing, such as a weir above a level that a leak lowers."""
     full = [draft.deviations[k] for k in draft.full if k not in hidden]
     return {

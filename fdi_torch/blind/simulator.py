@@ -1,11 +1,11 @@
-"""The hidden rigs, many at once: a second, independent simulation in plain NumPy at a step of 0.02 s.
+"""Simulator of the hidden rigs, independent of the library: plain NumPy with a step of 0.02 s, many rigs at once.
 
 It integrates volumes, not levels: V' = inflow - outflow, with h = h(V) by inverting V(h) = integral of A(h).
-Inflow is a mean over the step; the flows that depend on levels are extrapolated by Adams-Bashforth 2:
+Inflow is averaged over the step; level-dependent flows are extrapolated by Adams-Bashforth 2:
     V_{n+1} = V_n + dt (pumped_n + disturbance_n + 3/2 f_n - 1/2 f_{n-1}).
-What stands above a rim at the end of a step runs over it at once, into the tank that catches it or outside.
-All tanks of all rigs stand in one vector, and so do pipes and pumps, so that rigs of any layouts run together.
-Each tank's flows are summed in the order of its rig's pipes, so a rig does not depend on its company.
+Water above a rim at the end of a step overflows at once, into the receiving tank or outside. All tanks of all rigs are
+in one vector, and so are pipes and pumps, so that rigs of different layouts run together. Each tank's flows are summed
+in the order of its rig's pipes, so that a rig's result does not depend on the others.
 """
 
 from __future__ import annotations
@@ -218,14 +218,14 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class Ran:
+class SimulatedRun:
     """levels (T, N) m at 0, 1, 2, ... s, and asked (T, M) m^3/s: as driven, with what a level control asked for."""
 
     levels: Array
     asked: Array
 
 
-def simulate(rigs: HiddenRigs, drives: Sequence[Drive], step: float = STEP) -> list[Ran]:
+def simulate(rigs: HiddenRigs, drives: Sequence[Drive], step: float = STEP) -> list[SimulatedRun]:
     """Runs all rigs together, a drive each.
 
     Raises ValueError where a second is not a whole number of steps.
@@ -264,7 +264,7 @@ def simulate(rigs: HiddenRigs, drives: Sequence[Drive], step: float = STEP) -> l
         volume = rigs.spilled(volume)
         before = drained
     return [
-        Ran(levels[:own, t : rigs.first_tank[i + 1]], asked[:own, p : rigs.first_pump[i + 1]])
+        SimulatedRun(levels[:own, t : rigs.first_tank[i + 1]], asked[:own, p : rigs.first_pump[i + 1]])
         for i, (own, t, p) in enumerate(zip(lengths, rigs.first_tank, rigs.first_pump, strict=False))
     ]
 

@@ -27,7 +27,7 @@ from fdi_torch.names import unknown
 from fdi_torch.outside import MOST_SETTINGS, MOST_TRIALS
 from fdi_torch.plant.pace import time_scale
 from fdi_torch.plant.reach import bounded
-from fdi_torch.study.plan import (
+from fdi_torch.study.study_plan import (
     ESTIMATORS,
     Estimator,
     Method,

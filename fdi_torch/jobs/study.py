@@ -15,9 +15,9 @@ from fdi_torch.logbook.reader import Run as LoggedRun
 from fdi_torch.report.fit_figure import save
 from fdi_torch.report.study_figures import correlation_figure, error_figure
 from fdi_torch.study.cluster import run_on_cluster
-from fdi_torch.study.isolation import Isolation, isolate
+from fdi_torch.study.mode_isolation import Isolation, count_modes
 from fdi_torch.study.monte_carlo import Trial, run_blocks
-from fdi_torch.study.plan import Plan
+from fdi_torch.study.study_plan import Plan
 from fdi_torch.study.summary import Ratio, Summary, summarise
 from fdi_torch.tables import Shown, Table
 
@@ -155,7 +155,7 @@ def isolation_of(study: Study, trials: Mapping[int, Trial]) -> Isolation | None:
     if study.config.faults != "modes" or "free" not in study.config.estimators:
         return None
     ordered = [trials[number] for number in sorted(trials)]
-    return isolate(study.plan.fitting.space, ordered, study.run.config.estimate.confidence)
+    return count_modes(study.plan.fitting.space, ordered, study.run.config.estimate.confidence)
 
 
 def log_summary(study: Study, trials: Mapping[int, Trial], log: RunLog) -> tuple[tuple[Summary, ...], Isolation | None]:

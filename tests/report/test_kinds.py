@@ -103,7 +103,7 @@ def test_every_verdict_has_its_words(changes: dict[str, Any], words: str, tmp_pa
         log.gap_verdict({**GAP_ANSWER, **changes, "closure": {**GAP_ANSWER["closure"], "closed": None}})
     made = report_of(material_of(tmp_path / "run.mcap"))
     assert headline(made.material) == words
-    assert "is undefined: it is too small against its own standard error" in page([made])
+    assert "is undefined: the gap is too small compared with its standard error" in page([made])
 
 
 def test_a_page_of_the_second_format_shows_what_the_first_could_not_say(tmp_path: Path) -> None:

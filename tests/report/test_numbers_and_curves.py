@@ -48,5 +48,5 @@ def test_held_signals_keep_their_corners() -> None:
 
 def test_text_is_escaped_once_and_tables_say_what_they_leave_out() -> None:
     assert tag("p", "<b>", tag("i", "&"), title='"') == '<p title="&quot;">&lt;b&gt;<i>&amp;</i></p>'
-    assert "and 5 rows more" in table(["a"], [["x"]] * (MOST_ROWS + 5))
+    assert "and 5 more rows" in table(["a"], [["x"]] * (MOST_ROWS + 5))
     assert short("a" * 50, 10) == "a" * 9 + "…"

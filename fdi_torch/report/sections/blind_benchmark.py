@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from fdi_torch.blind.rows import Scores, group_of, tables
 from fdi_torch.blind.score import Row
-from fdi_torch.blind.table import OWN, Sheet, misses, sheets
+from fdi_torch.blind.score_tables import OWN, Sheet, misses, sheets
+from fdi_torch.blind.scored_rows import Scores, group_of, tables
 from fdi_torch.report.blind_benchmark_figures import calibration_panel, confusion_panel, shares_panel
 from fdi_torch.report.html import Markup, folded, join, table, tag
 from fdi_torch.report.material import Material, Payload

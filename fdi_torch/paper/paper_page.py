@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from fdi_torch.disk import write_text
-from fdi_torch.paper import tables
-from fdi_torch.paper.cases import Case, shipped_run, solve
 from fdi_torch.paper.modes import Modes, confusion, diagnose_modes, mode_name
 from fdi_torch.paper.online import TIME_BETWEEN_FALSE_ALARMS, OnLine, follow
 from fdi_torch.paper.published import SYMBOLS, TABLE_2, TABLE_3
+from fdi_torch.paper.table_cases import Case, shipped_run, solve
 from fdi_torch.report.paper_figures import (
     confusion_figure,
     convergence_figure,
@@ -101,21 +100,21 @@ def text_of(results: Results) -> str:
     searched = max(float((c.searched - c.truth).abs().max()) for c in results.table_2)
     right = float(results.modes.right.double().mean())
     return PAGE.format(
-        worst=tables.error(worst),
-        searched=tables.error(searched),
-        table_2=tables.table_2(results.table_2, TABLE_2),
-        correlations_2=tables.correlations(results.table_2),
-        table_3=tables.table_3(results.table_3, TABLE_3),
-        correlations_3=tables.correlations(results.table_3),
-        windows=tables.windows(results.online),
+        worst=paper_tables.error(worst),
+        searched=paper_tables.error(searched),
+        table_2=paper_tables.table_2(results.table_2, TABLE_2),
+        correlations_2=paper_tables.correlations(results.table_2),
+        table_3=paper_tables.table_3(results.table_3, TABLE_3),
+        correlations_3=paper_tables.correlations(results.table_3),
+        windows=paper_tables.windows(results.online),
         run_length=f"{TIME_BETWEEN_FALSE_ALARMS:g}",
         alarms=_alarms(results.online),
         draws=DRAWS,
         right=f"{100 * right:.1f} %",
-        wrong=tables.wrongly_named(results.modes),
-        dimensions=tables.by_dimension(results.modes),
-        equations=tables.equations(),
-        errata=tables.errata(),
+        wrong=paper_tables.wrongly_named(results.modes),
+        dimensions=paper_tables.by_dimension(results.modes),
+        equations=paper_tables.equations(),
+        errata=paper_tables.errata(),
     )
 
 
