@@ -11,6 +11,7 @@ import torch
 
 from fdi_torch.config.files import SHIPPED
 from fdi_torch.config.run import load_run
+from fdi_torch.paper import paper_tables
 from fdi_torch.paper.equations import EQUATIONS, ERRATA, STATEMENTS
 from fdi_torch.paper.modes import Modes, all_modes, called_present, confusion, diagnose_modes, mode_name
 from fdi_torch.paper.online import follow, varies

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fdi_torch.disk import write_text
+from fdi_torch.paper import paper_tables
 from fdi_torch.paper.modes import Modes, confusion, diagnose_modes, mode_name
 from fdi_torch.paper.online import TIME_BETWEEN_FALSE_ALARMS, OnLine, follow
 from fdi_torch.paper.published import SYMBOLS, TABLE_2, TABLE_3
