@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from fdi_torch.blind import cases
+from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.case_kinds import ON_NETWORKS
-from fdi_torch.blind.cases import make, plans
+from fdi_torch.blind.cases import make
 from fdi_torch.blind.conditions import commands_of_pumps
 from fdi_torch.blind.control import BAND, LevelControl, draw_control
 from fdi_torch.blind.networks import HIGHEST, LOWEST, Networks, equilibrium, with_unmeasured

@@ -12,8 +12,9 @@ import pytest
 import torch
 
 from fdi_torch.blind import cases
+from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.case_kinds import KINDS, STANDARD, choose
-from fdi_torch.blind.cases import make, plans
+from fdi_torch.blind.cases import make
 from fdi_torch.blind.conditions import WIDEST, as_built, asked_of_pumps, exercised
 from fdi_torch.blind.deviation import Array, Deviation
 from fdi_torch.blind.inputs import SIGNALS, commanded, with_standstills

@@ -16,7 +16,8 @@ import pytest
 
 from fdi_torch.blind import blind_benchmark, joined, tables
 from fdi_torch.blind.baselines import always_null
-from fdi_torch.blind.cases import Case, plans
+from fdi_torch.blind.case_drafts import plans
+from fdi_torch.blind.cases import Case
 from fdi_torch.blind.plants import three_tank
 from fdi_torch.blind.score import by_effect, judge, summary, utility
 from fdi_torch.blind.scored_rows import reliability, write_rows

@@ -12,8 +12,9 @@ from secrets import token_hex
 from typing import Any
 
 from fdi_torch.blind.baselines import Diagnosis, always_null, random_pair
+from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.case_kinds import ON_NETWORKS, STANDARD
-from fdi_torch.blind.cases import make, plans
+from fdi_torch.blind.cases import make
 from fdi_torch.blind.networks import Networks
 from fdi_torch.blind.plants import Rig, three_tank
 from fdi_torch.blind.scored_rows import Row, judged

@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.blind.cases import PARTS, Case
+from fdi_torch.blind.case_readings import PARTS
+from fdi_torch.blind.cases import Case
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import DECIMALS, command_unit
 from fdi_torch.blind.plants import Rig
