@@ -1,4 +1,4 @@
-"""Level control of a hidden rig: one pump keeps one level near a set point that steps at random."""
+"""Level control of a hidden rig: one pump keeps one level near a set point that changes in random steps."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class LevelControl:
 
 
 class Controller:
-    """A level control at work: what it asks for depends on what it asked for before."""
+    """State of a level control: its output depends on its previous output."""
 
     def __init__(self, control: LevelControl) -> None:
         self.control, self.pump, self.tank = control, control.pump, control.tank
         self.asked, self.integral = 0.5 * (control.low + control.high), 0.0
 
     def flow(self, second: int, reading: float) -> float:
-        """The flow asked for in the second that follows, m^3/s. reading: m."""
+        """Requested flow in the next second, m^3/s. reading: m."""
         c = self.control
         error = float(c.set_points[min(second, len(c.set_points) - 1)]) - reading
         if c.law == "two_point":
@@ -64,7 +64,7 @@ class Controller:
 def draw_control(
     rng: np.random.Generator, plant: PlantDescription, levels: Sequence[Array], limits: Array, quantum: Array
 ) -> tuple[LevelControl, ...]:
-    """The control of one level, for recordings of the lengths of each of `levels` ((T, N) m, undisturbed open loop).
+    """The control of one level, for recordings with the lengths of `levels` ((T, N) m, undisturbed, open loop).
 
     limits (M, 2): lowest and highest flow of each pump, quantum (M,): its least change, m^3/s. Set points lie between
     the fifth and the four fifths of the levels that the open loop reaches, so that the pump can hold them.

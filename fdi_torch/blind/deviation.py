@@ -1,4 +1,4 @@
-"""What a law of the hidden rigs sees of the instant it acts in."""
+"""Input of a law of the hidden rigs at one instant, and a rig's deviation from its plant file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class Deviation:
-    """One thing that is off at a hidden rig.
+    """One deviation of a hidden rig from its plant file.
 
     effect: its name in the diagnosis' vocabulary ('unknown' where it has none). location: the component.
     law: the equation, by name. numbers: SI. other: the second tank, where water goes from one into another.

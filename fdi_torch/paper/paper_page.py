@@ -1,4 +1,4 @@
-"""The page: everything solved from the run files, then written as Markdown with its pictures."""
+"""The page about the paper: all run files are computed, then written as Markdown with pictures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fdi_torch.report.paper_figures import (
 from fdi_torch.report.style import save
 
 WINDOWS = ("nominal", "table2_2d", "table3_snr50")
-"""Run files of Figures 6 and 7, one a window."""
+"""Run files of Figures 6 and 7, one per window."""
 MODES, DRAWS = "modes", 4
 TO_CM = 100.0
 
@@ -33,7 +33,7 @@ Tell = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class Results:
-    """Everything that the page shows."""
+    """All results that the page shows."""
 
     table_2: tuple[Case, ...]
     table_3: tuple[Case, ...]
@@ -42,7 +42,7 @@ class Results:
 
 
 def make_page(folder: Path, tell: Tell) -> list[Path]:
-    """Solves and writes; tell(share, text) is called as work goes on. Returns the files, the page first."""
+    """Compute and write the page. tell(share, text): progress. Returns the files, the page first."""
     results = solve_all(tell)
     tell(0.97, "drawing")
     pictures = draw(results, folder)
@@ -64,7 +64,7 @@ def solve_all(tell: Tell) -> Results:
 
 
 def draw(results: Results, folder: Path) -> list[Path]:
-    """Every figure as PNG."""
+    """Write every figure as PNG."""
     low, high = results.table_3[-1], results.table_3[0]
     online = results.online
     time, read = online.recording.time.numpy(), TO_CM * online.recording.outputs.numpy()
