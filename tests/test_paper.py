@@ -178,7 +178,7 @@ def test_row_1_of_table_2_is_found_to_five_digits() -> None:
 def test_modes_are_named_in_one_batch() -> None:
     run = shipped_run("modes")
     found = diagnose_modes(run, 1)
-    assert found.said.shape == (31, 1, 5)
+    assert found.stated.shape == (31, 1, 5)
     assert float((found.refined - found.truth.unsqueeze(1)).abs().max()) < 0.2
 
 

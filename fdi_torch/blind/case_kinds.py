@@ -137,10 +137,10 @@ def _unseen(
     rng: np.random.Generator,
 ) -> Unknown:
     """A law outside the library. Laws that need reversing flow require inputs that are at rest for a while."""
-    found = {u.law: u for u in unknown_to(library) if places(plant, u.at)}
+    laws = {u.law: u for u in unknown_to(library) if places(plant, u.at)}
     if kind.inputs != "rich" or not any(not p.is_outlet for p in plant.pipes):
-        found = {name: u for name, u in found.items() if not u.reversing}
-    return found[in_turn(sorted(found), seed, kind.name, index) if trial < 2 else str(rng.choice(sorted(found)))]
+        laws = {name: u for name, u in laws.items() if not u.reversing}
+    return laws[in_turn(sorted(laws), seed, kind.name, index) if trial < 2 else str(rng.choice(sorted(laws)))]
 
 
 def _twin(plant: PlantDescription, index: int, rng: np.random.Generator) -> Cause:
@@ -154,8 +154,8 @@ def _left_out(
 ) -> Chosen:
     """An effect to leave out of the library, for which no equivalent effect remains in it."""
     alike = {canonical(c, plant) for c in effect_places(plant) if canonical(c, plant) != c}
-    found = {e: places(plant, EFFECTS.get(e, ())) for e in leave_out}
-    free = {e: [p for p in at if canonical((e, p), plant) not in alike] for e, at in found.items()}
+    candidates = {e: places(plant, EFFECTS.get(e, ())) for e in leave_out}
+    free = {e: [p for p in at if canonical((e, p), plant) not in alike] for e, at in candidates.items()}
     possible = [e for e in leave_out if free[e]]
     if not possible:
         raise ValueError("expected an effect to leave out that has a place in this plant, got none; name one")

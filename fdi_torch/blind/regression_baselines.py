@@ -65,18 +65,18 @@ def split_f_test(
     """Chooses effects one by one on one half of the data, and keeps them as long as the F test on the other half says
     that they are needed ("Where is my physics wrong?", arXiv 2606.23215, in its simplest form).
     """
-    found = Regression(equation_errors(plant, recording), leave_out)
+    regression = Regression(equation_errors(plant, recording), leave_out)
     chosen: list[int] = []
-    left, samples = found.residual(chosen, ~found.half)[0], int((~found.half).sum())
+    left, samples = regression.residual(chosen, ~regression.half)[0], int((~regression.half).sum())
     while len(chosen) < MOST_CAUSES:
-        free = [k for k in range(len(found.causes)) if k not in chosen]
-        best = min(free, key=lambda k: found.residual([*chosen, k], found.half)[0])
-        after = found.residual([*chosen, best], ~found.half)[0]
-        p = f_test(left - after, after, 1, samples - len(chosen) - found.nuisance.shape[1])
-        if p > LEVEL / len(found.causes):
+        free = [k for k in range(len(regression.causes)) if k not in chosen]
+        best = min(free, key=lambda k: regression.residual([*chosen, k], regression.half)[0])
+        after = regression.residual([*chosen, best], ~regression.half)[0]
+        p = f_test(left - after, after, 1, samples - len(chosen) - regression.nuisance.shape[1])
+        if p > LEVEL / len(regression.causes):
             break
         chosen, left = [*chosen, best], after
-    return _answer([found.causes[k] for k in chosen])
+    return _answer([regression.causes[k] for k in chosen])
 
 
 def sparse_regression(
@@ -85,22 +85,24 @@ def sparse_regression(
     """Sequentially thresholded least squares over all columns (Brunton, Proctor and Kutz, 2016, SINDy); the threshold
     comes from the Bayesian information criterion.
     """
-    found = Regression(equation_errors(plant, recording), leave_out)
-    rows, n = np.ones(len(found.y), dtype=bool), len(found.y)
+    regression = Regression(equation_errors(plant, recording), leave_out)
+    rows, n = np.ones(len(regression.y), dtype=bool), len(regression.y)
     candidates: list[list[int]] = [[]]
     for threshold in THRESHOLDS:
-        kept = list(range(len(found.causes)))
+        kept = list(range(len(regression.causes)))
         for _ in range(TRIALS):
-            x = np.concatenate([found.columns[:, kept], found.nuisance], axis=1)
-            ridge = np.concatenate([np.full(len(kept), n * RIDGE), np.full(found.nuisance.shape[1], _TOLERANCE**-2)])
-            size = np.abs(np.linalg.solve(x.T @ x + np.diag(ridge), x.T @ found.y))[: len(kept)]
+            x = np.concatenate([regression.columns[:, kept], regression.nuisance], axis=1)
+            ridge = np.concatenate(
+                [np.full(len(kept), n * RIDGE), np.full(regression.nuisance.shape[1], _TOLERANCE**-2)]
+            )
+            size = np.abs(np.linalg.solve(x.T @ x + np.diag(ridge), x.T @ regression.y))[: len(kept)]
             large = [k for k, s in zip(kept, size, strict=True) if s > threshold]
             if large == kept:
                 break
             kept = large
         candidates.append(kept)
-    best = min(candidates, key=lambda own: n * np.log(found.residual(own, rows)[0] / n) + len(own) * np.log(n))
-    return _answer([found.causes[k] for k in best])
+    best = min(candidates, key=lambda own: n * np.log(regression.residual(own, rows)[0] / n) + len(own) * np.log(n))
+    return _answer([regression.causes[k] for k in best])
 
 
 def gaussian_process(
@@ -110,10 +112,10 @@ def gaussian_process(
     the highest marginal likelihood, and never a cause.
     """
     errors = equation_errors(plant, recording)
-    found = Regression(errors, leave_out)
-    rows = np.ones(len(found.y), dtype=bool)
+    regression = Regression(errors, leave_out)
+    rows = np.ones(len(regression.y), dtype=bool)
     y, noise = np.full_like(errors.y, np.nan), noise_of(errors.y)
-    calibrated = found.y - found.nuisance @ found.residual([], rows)[1]
+    calibrated = regression.y - regression.nuisance @ regression.residual([], rows)[1]
     y[:, np.isfinite(errors.y).all(axis=0)] = calibrated.reshape(len(y), -1)
     gains = {place: _gain(y, seen, balance / noise) for place, (seen, balance) in errors.local.items()}
     ranked = sorted(gains, key=lambda place: gains[place], reverse=True)

@@ -108,10 +108,10 @@ def _truth(row: Row) -> str:
     return listed((row["effect"] if e == "unknown" else e, p) for e, p in row["truth"]) or "nothing"
 
 
-def markdown(found: Tables, rows: Sequence[Row]) -> str:
+def markdown(scores: Tables, rows: Sequence[Row]) -> str:
     """All tables of all rigs, then the wrong answers, as Markdown."""
     parts = []
-    for group, by in found.items():
+    for group, by in scores.items():
         parts += [f"## {group}", origin(row for row in rows if row["by"] == OWN and group_of(row) == group)]
         for sheet in sheets(by):
             parts += [f"{sheet.title}:", _table(sheet)]

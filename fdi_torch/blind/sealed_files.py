@@ -124,15 +124,15 @@ def read_plant(out: Path, line: Mapping[str, Any]) -> PlantDescription:
 def read_recording(out: Path, line: Mapping[str, Any], part: str, plant: PlantDescription) -> Recording:
     """One recording of a case, checked against its line of the manifest. Its source names the case and nothing else."""
     path = out / "cases" / f"{line['case']}_{part}.csv.gz"
-    found = read_csv(path, plant.channels(), [s.column for s in plant.sensors])
-    _expect_unchanged(line, part, found.sha256)
-    return replace(found, source=f"{line['case']}/{part}")
+    recording = read_csv(path, plant.channels(), [s.column for s in plant.sensors])
+    _expect_unchanged(line, part, recording.sha256)
+    return replace(recording, source=f"{line['case']}/{part}")
 
 
-def _expect_unchanged(line: Mapping[str, Any], part: str, found: str) -> None:
-    if found != line[part]:
+def _expect_unchanged(line: Mapping[str, Any], part: str, actual: str) -> None:
+    if actual != line[part]:
         raise ValueError(
-            f"{line['case']}: expected a {part} of SHA-256 {line[part][:12]}..., got {found[:12]}...; "
+            f"{line['case']}: expected a {part} of SHA-256 {line[part][:12]}..., got {actual[:12]}...; "
             "it was changed after it was sealed: make the benchmark anew"
         )
 
@@ -154,10 +154,10 @@ def open_key(out: Path) -> dict[str, dict[str, Any]]:
     for case, line in manifest(out).items():
         if case not in keys:
             raise ValueError(f"{case}: expected a sealed key, got none; make the benchmark anew")
-        found = digest(sealed_line(keys[case]))
-        if found != line["key"]:
+        actual = digest(sealed_line(keys[case]))
+        if actual != line["key"]:
             raise ValueError(
-                f"{case}: expected a key of SHA-256 {line['key'][:12]}..., got {found[:12]}...; "
+                f"{case}: expected a key of SHA-256 {line['key'][:12]}..., got {actual[:12]}...; "
                 "it was changed after it was sealed: make the benchmark anew"
             )
     return keys

@@ -60,14 +60,16 @@ def grouped(
     first_tank = np.cumsum([0, *(len(own) for own in tanks)])
     groups = []
     for name, law in laws.items():
-        found = [(rig, d) for rig, ds in enumerate(deviations) for d in ds if d.law == name]
-        if not found:
+        matching = [(rig, d) for rig, ds in enumerate(deviations) for d in ds if d.law == name]
+        if not matching:
             continue
-        if len({rig for rig, _ in found}) < len(found):
+        if len({rig for rig, _ in matching}) < len(matching):
             raise ValueError(f"expected each law once in a rig, got {name} twice; draw another place")
-        spot = [first[rig] + list(names[rig]).index(d.location.split("-")[0]) for rig, d in found]
-        other = [first_tank[rig] + list(tanks[rig]).index(d.other) if d.other else first_tank[-1] for rig, d in found]
-        numbers = {key: np.array([d.numbers[key] for _, d in found]) for key in found[0][1].numbers}
+        spot = [first[rig] + list(names[rig]).index(d.location.split("-")[0]) for rig, d in matching]
+        other = [
+            first_tank[rig] + list(tanks[rig]).index(d.other) if d.other else first_tank[-1] for rig, d in matching
+        ]
+        numbers = {key: np.array([d.numbers[key] for _, d in matching]) for key in matching[0][1].numbers}
         groups.append(Group(law, np.array(spot, dtype=np.intp), np.array(other, dtype=np.intp), numbers))
     return groups
 

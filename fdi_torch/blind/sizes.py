@@ -85,7 +85,7 @@ def size_errors(truth: Mapping[str, Any], causes: Iterable[Mapping[str, Any]], p
     units = truth.get("scales") or {}
     scales = Scales(units.get("time_s", 1.0), units.get("length_m", 1.0), units.get("area_m2", 1.0))
     true = {(c["effect"], c["location"]) for c in truth["causes"]}
-    found = []
+    scores = []
     for cause in causes:
         for d in truth.get("deviations", ()):
             here = (d["effect"], d["location"])
@@ -96,8 +96,8 @@ def size_errors(truth: Mapping[str, Any], causes: Iterable[Mapping[str, Any]], p
             expected = value(d["numbers"], plant, d["location"], scales)
             if amount.get("std") and math.isfinite(expected):
                 factor = unit_factor(amount.get("unit") or "1", unit)
-                found.append(f"{d['effect']} {(factor * amount['value'] - expected) / (factor * amount['std']):.4g}")
-    return found
+                scores.append(f"{d['effect']} {(factor * amount['value'] - expected) / (factor * amount['std']):.4g}")
+    return scores
 
 
 def sizes(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -27,8 +27,10 @@ discretization errors.
 
 @dataclass(frozen=True)
 class Modes:
-    """modes (M, P) bool, which faults each has; the rest has leading dimensions (M, draws): searched, refined, std
-    (..., P); said (..., P) bool, the faults called present. truth (M, P).
+    """Estimates of all fault modes.
+
+    modes (M, P) bool: faults of each mode; truth (M, P). With leading dimensions (M, draws): searched, refined, std
+    (..., P), and stated (..., P) bool, the faults stated as present.
     """
 
     modes: Tensor
@@ -36,12 +38,12 @@ class Modes:
     searched: Tensor
     refined: Tensor
     std: Tensor
-    said: Tensor
+    stated: Tensor
 
     @property
     def right(self) -> Tensor:
         """(M, draws) bool: whether exactly the true faults were named."""
-        return (self.said == self.modes.unsqueeze(1)).all(-1)
+        return (self.stated == self.modes.unsqueeze(1)).all(-1)
 
 
 def all_modes(faults: int) -> Tensor:
@@ -69,13 +71,13 @@ def diagnose_modes(run: Run, draws: int) -> Modes:
     shape = (len(modes) * draws, len(space))
     low, high = space.low(), space.high()
     coarse = shared_problem(fitting, data, SEARCH_STEP, "correlation")
-    found = evolve(coarse.cost, low.expand(shape), high.expand(shape), settings.search, seeds=run.config.seed)
+    search = evolve(coarse.cost, low.expand(shape), high.expand(shape), settings.search, seeds=run.config.seed)
     fine = shared_problem(fitting, data, FINE_STEP, "likelihood")
-    refined = levenberg_marquardt(fine.linearise, found.best, low, high, settings.refine)
+    refined = levenberg_marquardt(fine.linearise, search.best, low, high, settings.refine)
     assert refined.curvature is not None
     std = certainty(refined.curvature).std
-    said = called_present(refined.theta, std, space.nominal(), settings.confidence)
-    parts = (found.best, refined.theta, std, said)
+    stated = called_present(refined.theta, std, space.nominal(), settings.confidence)
+    parts = (search.best, refined.theta, std, stated)
     return Modes(modes, truth, *(part.reshape(len(modes), draws, len(space)) for part in parts))
 
 
@@ -115,5 +117,5 @@ def confusion(result: Modes) -> Tensor:
     """(M, M + 1) counts of simulated modes (rows) and stated modes (columns, 'no fault' first)."""
     faults = result.modes.shape[-1]
     known = torch.cat([torch.zeros(1, faults, dtype=torch.bool), result.modes])
-    same = (result.said.unsqueeze(2) == known).all(-1)
+    same = (result.stated.unsqueeze(2) == known).all(-1)
     return same.sum(1)

@@ -85,9 +85,9 @@ def draw(results: Results, folder: Path) -> list[Path]:
 
 
 def _correlation(cases: tuple[Case, ...]):  # type: ignore[no-untyped-def]
-    snr, found = np.array([c.snr_db for c in cases]), np.array([c.correlation for c in cases])
+    snr, correlations = np.array([c.snr_db for c in cases]), np.array([c.correlation for c in cases])
     axis = np.linspace(0.0, 60.0, 200)
-    return correlation_figure(snr, found, axis, 3.0 / np.sqrt(1.0 + 10.0 ** (-axis / 10.0)))
+    return correlation_figure(snr, correlations, axis, 3.0 / np.sqrt(1.0 + 10.0 ** (-axis / 10.0)))
 
 
 def _convergence(case: Case):  # type: ignore[no-untyped-def]
@@ -119,12 +119,12 @@ def text_of(results: Results) -> str:
     )
 
 
-def _alarms(found: OnLine) -> str:
-    early = [w for w in found.windows[:1] if w.alarm is not None]
+def _alarms(online: OnLine) -> str:
+    early = [w for w in online.windows[:1] if w.alarm is not None]
     first = "One false alarm was raised in it." if early else "No alarm was raised in it."
     scores = [
         float(((w.result.estimate.value[:5] - w.truth) / w.result.estimate.std[:5]).abs().max())
-        for w in found.windows
+        for w in online.windows
         if w.result is not None
     ]
     return f"{first} Every parameter lies within {max(scores):.1f} standard errors of the truth."

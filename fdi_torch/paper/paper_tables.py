@@ -70,7 +70,7 @@ def by_dimension(result: Modes) -> str:
 
 
 def _group(result: Modes, chosen: Tensor, name: str) -> list[str]:
-    there, said = result.modes[chosen].unsqueeze(1), result.said[chosen]
+    there, said = result.modes[chosen].unsqueeze(1), result.stated[chosen]
     searched, refined = (part[chosen] - result.truth[chosen].unsqueeze(1) for part in (result.searched, result.refined))
     # At an end of the box an estimate is held, and its error is not that of a free one.
     inside = there.expand_as(refined) & (result.refined[chosen] < 1.0) & (result.refined[chosen] > 0.0)
@@ -91,15 +91,15 @@ def _group(result: Modes, chosen: Tensor, name: str) -> list[str]:
 def wrongly_named(result: Modes) -> str:
     """Every draw whose faults were not named correctly."""
     wrong = (~result.right).nonzero().tolist()
-    said = [f"{mode_name(result.modes[m])} as {mode_name(result.said[m, d])}" for m, d in wrong]
+    said = [f"{mode_name(result.modes[m])} as {mode_name(result.stated[m, d])}" for m, d in wrong]
     return f"Named otherwise: {'; '.join(said)}." if said else "None was named otherwise."
 
 
-def windows(found: OnLine) -> str:
+def windows(online: OnLine) -> str:
     """Alarms, delays and estimates of each window."""
     header = ("window, s", "alarm", "", "true", "estimate", "standard error", "error / standard error", "correlation")
     rows = []
-    for window in found.windows:
+    for window in online.windows:
         span = f"{window.begin:g} to {window.end:g}"
         alarm = "none" if window.alarm is None else f"{window.alarm:g} s (delay {window.delay:g} s)"
         if window.result is None:

@@ -42,10 +42,10 @@ def headline(material: Material) -> str:
     return material.about("status").get("status", "did not end").replace("_", " ").capitalize()
 
 
-def fault_words(found: list[DiagnosedEffect]) -> str:
-    if not found:
+def fault_words(effects: list[DiagnosedEffect]) -> str:
+    if not effects:
         return ""
-    present = [f.sized for f in found if f.present]
+    present = [f.sized for f in effects if f.present]
     if not present:
         return "No fault found"
     return f"{'Fault' if len(present) == 1 else f'{len(present)} faults'}: {_listed(present)}"

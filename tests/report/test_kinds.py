@@ -159,7 +159,7 @@ def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
 def test_a_challenge_page_shows_scores_confusion_and_misses(tmp_path: Path) -> None:
     made = report(write_challenge, tmp_path)
     assert headline(made.material) == "45 of 60 hidden causes diagnosed correctly, 13 named wrongly"
-    assert titles(made)[1:4] == ["Right answers", "Confusion of causes", "Not right"]
+    assert titles(made)[1:4] == ["Right answers", "Confusion of causes", "Wrong answers"]
     assert "Trials" not in titles(made)
     assert {"challenge_1_right", "challenge_1_sure", "challenge_1_seconds", "challenge_4_seconds"} <= names(made)
     assert {"challenge_confusion_1", "challenge_unknown", "challenge_left_out"} <= names(made)
