@@ -59,7 +59,7 @@ def blind_benchmark(
     `diagnose` can name; they are not drawn as unknown laws. leave_out: effects to remove from its library, one per
     case. rivals: further diagnoses, in addition to two trivial ones. each: map over tasks, for example that of an
     executor. minutes: no case is started after that time, and only answered cases are scored. code: state of the code,
-    stored with each answer. tell(share, text): progress. Returns one scored row per answer; see `rows`.
+    stored with each answer. tell(share, text): progress. Returns one scored row per answer; see `scored_rows`.
     """
     rig, out = rig or three_tank(), Path(out)
     usual = ON_NETWORKS if isinstance(rig, Networks) else STANDARD

@@ -16,12 +16,13 @@ from fdi_torch.plant.description import PlantDescription
 
 @dataclass(frozen=True)
 class Kind:
-    """strength of its full effects (1 is usual). causes: how many. perhaps: how many more in every other case.
-    faint: how many more at an eighth of usual strength. unseen: whether a law is added that no library holds.
+    """A kind of cases.
 
-    inputs: as in `draw_conditions`. coloured: chance of correlated noise. disturbed: whether flows are disturbed at
-    random. unmeasured: share of the levels. looped: whether a level is controlled. shows: whether causes are drawn
-    anew until each moves the readings.
+    strength: of full effects (1 is usual). causes: number of full effects; perhaps: further ones in every other case;
+    faint: further ones of an eighth of the usual strength. unseen: whether a law outside the library is added. inputs:
+    see `draw_conditions`. coloured: probability of correlated noise. disturbed: random disturbance flows. unmeasured:
+    share of levels without a sensor. looped: whether a level is controlled. shows: whether causes are drawn again until
+    each is visible in the readings.
     """
 
     name: str

@@ -19,11 +19,12 @@ RESET = 120.0
 
 @dataclass(frozen=True)
 class LevelControl:
-    """pump, tank: which ones, counted in their rig. set_points (T,) m. low, high: m^3/s between which the pump runs.
+    """Level control by one pump.
 
-    two_point: all or little, switched `band` m off the set point, at every second.
-    proportional_integral: q = middle + gain (e + integral of e / reset), each `INTERVAL` s; the integral stands still
-    while the pump is at a limit. gain m^2/s. quantum: m^3/s to which commands are rounded.
+    law 'two_point': high or low flow, switched `band` m from the set point, every second. law 'proportional_integral':
+    q = middle + gain (e + integral of e / reset) every `INTERVAL` s, with the integral frozen while the pump is at a
+    limit. pump, tank: indices in the rig. set_points (T,) m. low, high: limits of the flow, m^3/s. gain: m^2/s.
+    quantum: resolution of commands, m^3/s.
     """
 
     law: str

@@ -27,9 +27,9 @@ _SMALLEST_HEAD = 1e-4  # m
 
 @dataclass(frozen=True)
 class EquationErrors:
-    """y (K, N): a row a block, NaN at tanks that cannot be balanced. nuisance: columns of what may be off anyway, one a
-    discharge coefficient. columns: of each effect at each place. local: what a place sees, (K,), and how a flow there
-    enters the balances, (N,).
+    """y (K, N): integrated balance error of each block and tank, NaN for tanks that cannot be balanced. nuisance:
+    columns of the discharge coefficients. columns: of each effect at each location. local: by location, its variable
+    (K,) and how a flow there enters the balances (N,).
     """
 
     y: Array

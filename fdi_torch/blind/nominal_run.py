@@ -13,10 +13,10 @@ from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Ta
 
 @dataclass(frozen=True)
 class NominalRun:
-    """One case's sound rig.
+    """Run of a case's rig without deviations.
 
-    plant: as built. levels (T, N) m and asked (T, M) m^3/s of the recording; seconds: its length.
-    strength: 1 usual, 0.2 weak. rng: this case's own.
+    plant: as built. levels (T, N) m and asked (T, M) m^3/s: levels and requested flows of the recording. strength: of
+    the effects, 1 usual, 0.2 weak. rng: random generator of the case.
     """
 
     plant: PlantDescription

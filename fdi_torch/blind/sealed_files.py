@@ -1,12 +1,12 @@
-"""A blind benchmark on disk: recordings as CSV, sealed causes, and the manifest that holds the hashes of both.
+"""Files of a blind benchmark: recordings as CSV, sealed causes, and the manifest with the hashes of both.
 
-spec.json          what was asked for: seed, kinds, rig
-cases/caseNNNN_plant.json: the nominal plant that the diagnosis is given (the same as .yaml, for use by hand)
-cases/caseNNNN_recording.csv.gz, cases/caseNNNN_holdout.csv.gz: the SHA-256 of the sealed key stands above the header
-manifest.jsonl     a line a case: SHA-256 of the plant, of both recordings and of the sealed key
-key.jsonl          a line a case: the truth; opened after the diagnosis
-answers_WHO.jsonl  a line a case: what was answered, in how many seconds, by which state of the code
-rows.jsonl         a line an answer: how it was judged; see `rows`
+spec.json          settings: seed, kinds, rig
+cases/caseNNNN_plant.json: nominal plant for the diagnosis (also as .yaml, for manual use)
+cases/caseNNNN_recording.csv.gz, cases/caseNNNN_holdout.csv.gz: above the header, the SHA-256 of the sealed key
+manifest.jsonl     one line per case: SHA-256 of the plant, of both recordings and of the sealed key
+key.jsonl          one line per case: the truth; opened after the diagnosis
+answers_WHO.jsonl  one line per case: the answer, its computing time and the state of the code
+rows.jsonl         one line per answer: its scores; see `scored_rows`
 """
 
 from __future__ import annotations
