@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdi_torch.blind import cases
+from fdi_torch.blind import case_drafts, cases
 from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.case_kinds import ON_NETWORKS
 from fdi_torch.blind.cases import make
@@ -62,7 +62,9 @@ def test_what_disturbances_bring_is_in_the_tank() -> None:
 
 def test_disturbances_move_levels_as_far_as_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cases, "STEP", 0.5)
-    monkeypatch.setattr(cases, "draw_disturbance", lambda rng, tanks: Disturbance("held", 15.0, np.ones(tanks), 1.7))
+    monkeypatch.setattr(
+        case_drafts, "draw_disturbance", lambda rng, tanks: Disturbance("held", 15.0, np.ones(tanks), 1.7)
+    )
     (case,) = make(plans(1, 1, ("dnull",)), three_tank(), 1)
     assert case.truth["causes"] == [] and case.truth["gap_rms_m"]["recording"] == 0
     assert case.truth["disturbance"] == {

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from fdi_torch.blind import cases
+from fdi_torch.blind import case_drafts, cases
 from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.case_kinds import KINDS, STANDARD, choose
 from fdi_torch.blind.cases import make
@@ -402,7 +402,7 @@ def test_a_cause_that_another_hides_is_not_asked_for(monkeypatch: pytest.MonkeyP
     rig, plan = three_tank(), plans(1, 1, ("pair",))
     shows = Deviation("leak", "T1", "floor_hole", {"conductance": 3e-5})
     never = Deviation("overflow", "T3", "brim", {"crest": 0.99, "depth": 0.01, "flow": 7e-5})
-    monkeypatch.setattr(cases, "_drawn", lambda draft, *_: replace(draft, deviations=(shows, never)))
+    monkeypatch.setattr(case_drafts, "_with_sizes", lambda draft, *_: replace(draft, deviations=(shows, never)))
     monkeypatch.setattr(cases, "STEP", 0.5)
     truth = make(plan, rig, 1)[0].truth
     assert truth["causes"] == [{"effect": "leak", "location": "T1"}]
