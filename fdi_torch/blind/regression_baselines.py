@@ -1,4 +1,5 @@
-"""Rivals that regress the equation errors of a recording: sample-split F tests, sparse regression, Gaussian processes.
+"""Baselines that regress the equation errors of a recording: split-sample F tests, sparse regression, Gaussian
+processes.
 
 None simulates; each gives an answer in the format of a diagnosis.
 """
@@ -18,7 +19,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
 LEVEL = 0.01
-"""Of the F test, shared out over all candidates (Bonferroni)."""
+"""Level of the F test, divided among all candidates (Bonferroni)."""
 MOST_CAUSES = 3
 SEGMENT = 20  # blocks of one half of the data in turn
 RIDGE, TRIALS = 1e-2, 50
@@ -29,7 +30,7 @@ _TOLERANCE = 0.03
 
 
 class Regression:
-    """y (n,) and its columns, whitened tank by tank; discharge coefficients have their tolerance as a prior."""
+    """y (n,) and its columns, whitened tank by tank; discharge coefficients have their tolerances as priors."""
 
     def __init__(self, errors: EquationErrors, leave_out: Collection[str]) -> None:
         self.causes = [cause for cause in errors.columns if cause[0] not in leave_out]
@@ -44,7 +45,7 @@ class Regression:
         self.columns /= np.maximum(np.sqrt(np.mean(self.columns**2, axis=0)), 1e-300)
 
     def residual(self, chosen: Sequence[int], rows: Array) -> tuple[float, Array]:
-        """Residual sum of squares of these rows, and the coefficients of the chosen columns, then of the nuisance."""
+        """Residual sum of squares of these rows, and the coefficients of chosen and nuisance columns."""
         x = np.concatenate([self.columns[rows][:, list(chosen)], self.nuisance[rows]], axis=1)
         prior = np.zeros((self.nuisance.shape[1], x.shape[1]))
         prior[:, len(chosen) :] = np.eye(self.nuisance.shape[1]) / _TOLERANCE
@@ -54,7 +55,9 @@ class Regression:
 
 
 def noise_of(y: Array) -> Array:
-    """(N,): standard deviation of equation errors (K, N) by second differences, as of e_k - e_(k-1) with e white."""
+    """(N,): standard deviation of equation errors (K, N) from second differences, assuming e_k - e_(k-1)
+    with white e.
+    """
     spread: Array = np.sqrt(np.mean(np.diff(y, 2, axis=0) ** 2, axis=0) / 10) + 1e-15
     return spread
 
@@ -126,7 +129,7 @@ def gaussian_process(
 
 
 def _gain(y: Array, seen: Array, balance: Array) -> float:
-    """Log marginal likelihood of the whitened balances that a flow at this place enters, less that without it."""
+    """Log marginal likelihood ratio for a flow at this location, over the balances that the flow enters."""
     tanks = np.flatnonzero((balance != 0) & np.isfinite(y).all(axis=0))
     if not len(tanks):
         return -np.inf
