@@ -163,7 +163,7 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["gap", "--help"])
     shown = capsys.readouterr().out
-    assert "examples:" in shown and "--holdout other.csv" in shown and "The answer is one of four" in shown
+    assert "examples:" in shown and "--holdout other.csv" in shown and "The verdict is one of four" in shown
 
 
 def test_an_adopted_leak_flows_as_before_where_its_reference_was_recalibrated() -> None:

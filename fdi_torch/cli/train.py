@@ -22,8 +22,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     job = load_run(arguments.config, overrides(arguments))
     if job.config.estimate.windows is not None:
         with screen.progress(job.name) as advance:
-            found = fit_windows(job, advance)
-        show_windows(found, screen)
+            windowed_fit = fit_windows(job, advance)
+        show_windows(windowed_fit, screen)
         return DONE
     with live(arguments, job.name, screen) as listener, screen.progress(job.name) as advance:
         done = train(job, advance, arguments.resume, listener)

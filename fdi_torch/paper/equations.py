@@ -1,4 +1,4 @@
-"""Where each equation of the paper lives in the code."""
+"""Table of the paper's equations and the code that implements them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Equation:
-    """numbers: as the paper counts. says: in our words. places: 'module:name' below fdi_torch; none: not built."""
+    """numbers: of the paper's equations. says: their meaning. places: 'module:name' below fdi_torch;
+    empty: not built.
+    """
 
     numbers: tuple[int, ...]
     says: str
@@ -69,7 +71,7 @@ STATEMENTS = (
     ("Theorem 1", "what must hold for that, and what correlation alone never sees",
      ("monitor.diagnosability:diagnosability", "monitor.diagnosability:without_gain_and_offset")),
 )  # fmt: skip
-"""(what, in our words, places) of what the paper states without a number of its own."""
+"""(what, meaning, places) of statements that the paper makes without an equation number."""
 
 ERRATA = (
     ("(29), (31), section 5", "With the signs of (29) the net outlet's parameter is −1 without a fault and stands "
@@ -93,4 +95,4 @@ ERRATA = (
     ("Table 3, SNR 40", "The estimate of θ₂ is off by 0.04, some seventy times what noise of that level explains.",
      "Printed as it is."),
 )  # fmt: skip
-"""(where, what is wrong, what is built)."""
+"""(where, what is wrong in the paper, what is implemented)."""

@@ -1,4 +1,4 @@
-"""Where the parts of any rig stand in a drawing: what falls into what decides the rows, what is joined the columns."""
+"""Layout of a rig's drawing: flow directions set the rows, connections the columns."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ Place = tuple[int, int]  # row from the top, column from the left
 
 
 def tank_places(plant: PlantDescription) -> dict[str, Place]:
-    """Row and column of every tank; no two share a place.
+    """Row and column of every tank, all different.
 
-    A tank stands below all that pours into it, and as near as can be to the tanks it is joined to.
+    A tank is below all tanks that flow into it, and as close as possible to the tanks it is connected to.
     """
     rows = _rows([t.name for t in plant.tanks], _falls(plant))
     neighbours = _neighbours(plant)
@@ -27,13 +27,13 @@ def tank_places(plant: PlantDescription) -> dict[str, Place]:
 
 
 def _falls(plant: PlantDescription) -> list[tuple[str, str]]:
-    """(above, below) for every pipe and rim that pours from above into a tank."""
+    """(upper, lower) tank for every pipe in free fall and every overflow."""
     pipes = [(p.source, p.target) for p in plant.pipes if p.free_fall and p.target != OUTSIDE]
     return pipes + [(t.name, t.overflow_to) for t in plant.tanks if t.overflow_to not in (OUTSIDE, t.name)]
 
 
 def _rows(names: Iterable[str], falls: list[tuple[str, str]]) -> dict[str, int]:
-    """Longest way down to each tank; a circle of falls is cut after as many steps as there are tanks."""
+    """Length of the longest path down to each tank; cycles are cut after as many steps as there are tanks."""
     rows = dict.fromkeys(names, 0)
     for _ in range(len(rows) - 1):
         for above, below in falls:
@@ -52,14 +52,14 @@ def _neighbours(plant: PlantDescription) -> dict[str, list[str]]:
 
 
 def _walk(plant: PlantDescription, neighbours: dict[str, list[str]]) -> list[str]:
-    """Tanks along their pipes, each chain from one of its ends."""
+    """The tanks in order along their pipes, each chain starting at one of its ends."""
     ends_first = sorted((t.name for t in plant.tanks), key=lambda name: len(neighbours[name]) > 1)
     order: dict[str, None] = {}
     for start in ends_first:
-        ahead = [start]
-        while ahead:
-            name = ahead.pop()
+        pending = [start]
+        while pending:
+            name = pending.pop()
             if name not in order:
                 order[name] = None
-                ahead += [n for n in reversed(neighbours[name]) if n not in order]
+                pending += [n for n in reversed(neighbours[name]) if n not in order]
     return list(order)

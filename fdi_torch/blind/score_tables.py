@@ -1,4 +1,4 @@
-"""Scores as tables: on the screen, on a page, and in Markdown."""
+"""Scores as tables for terminal, report page and Markdown."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fdi_torch.blind.rows import Scores, Tables, group_of
 from fdi_torch.blind.score import Row
+from fdi_torch.blind.scored_rows import Scores, Tables, group_of
 
 OWN = "fdi"
 NAMES = {
@@ -35,7 +35,7 @@ MOST_MISSES = 200
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table: words about it, and rows under a header; the first `left` columns are words."""
+    """A table with a title; the first `left` columns are text."""
 
     title: str
     header: Sequence[str]
@@ -44,22 +44,22 @@ class Sheet:
 
 
 def sheets(by: Mapping[str, Scores]) -> list[Sheet]:
-    """All scores of one rig: whose answers -> scores."""
+    """All score tables of one rig, from the scores by diagnosis."""
     own, others = by[OWN], [name for name in by if name != OWN]
     strata = own["strata"]
     beside = [[s, *(in_words(by[n]["strata"].get(s, {}).get("right")) for n in (OWN, *others))] for s in strata]
     over_all = [
         [name, *(in_words(by[name]["strata"]["all"].get(c)) for c in (*NAMES, "utility"))] for name in (OWN, *others)
     ]
-    found = [
+    tables = [
         Sheet("Names and places, by kind", ("kind", *NAMES.values()), _rows(strata, NAMES)),
         Sheet("Alarm, size of the answer set and utility, by kind", ("kind", *SIZES.values()), _rows(strata, SIZES)),
         Sheet("Closure and time, by kind", ("kind", *CLOSURE.values()), _rows(strata, CLOSURE)),
-        Sheet("Right answers beside those of the baselines", ("kind", OWN, *others), beside),
-        Sheet("All kinds together, beside the baselines", ("", *NAMES.values(), "utility"), over_all),
+        Sheet("Right answers, and those of the baselines", ("kind", OWN, *others), beside),
+        Sheet("All kinds together, and the baselines", ("", *NAMES.values(), "utility"), over_all),
         Sheet(
-            "How often the best explanation is the true one, by the probability that it was given",
-            ("probability given", "mean", "is true"),
+            "Calibration: how often the best explanation is true, by its stated probability",
+            ("stated probability", "mean", "is true"),
             [[f"{b['low']:g} to {b['high']:g}", f"{b['stated']:.3f}", in_words(b)] for b in own["calibration"]],
         ),
         Sheet(
@@ -68,19 +68,19 @@ def sheets(by: Mapping[str, Scores]) -> list[Sheet]:
             _rows(own["sizes"], ("rms", "within")),
         ),
         Sheet(
-            "Cases with one cause, by effect; those without a name by the law that the rig follows",
+            "Cases with one cause, by effect; laws outside the library by their own name",
             ("effect", *NAMES.values()),
             _rows(own["by_effect"], NAMES),
         ),
     ]
-    return [sheet for sheet in found if sheet.rows]
+    return [sheet for sheet in tables if sheet.rows]
 
 
 def misses(rows: Iterable[Row]) -> Sheet:
-    """Every case of ours that was not right."""
+    """Wrong answers of our diagnosis."""
     wrong = [row for row in rows if row["by"] == OWN and not row["right"]]
     return Sheet(
-        "Not right",
+        "Wrong answers",
         ("kind", "rig", "seed", "case", "truth", "verdict", "best explanation"),
         [
             [r["kind"], r["rig"], str(r["seed"]), r["case"], _truth(r), r["verdict"], listed(r["causes"])]
@@ -91,7 +91,7 @@ def misses(rows: Iterable[Row]) -> Sheet:
 
 
 def origin(rows: Iterable[Row]) -> str:
-    """How many cases, of which seeds, answered by which states of the code."""
+    """Number of cases, their seeds, and the states of the code that answered."""
     own = list(rows)
     seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in own}))
     by_code = Counter(row["code"] or "an unknown state" for row in own)
@@ -104,14 +104,14 @@ def listed(causes: Iterable[Sequence[str]]) -> str:
 
 
 def _truth(row: Row) -> str:
-    """Causes by name; what has none by its law."""
+    """True causes; laws outside the library by their own name."""
     return listed((row["effect"] if e == "unknown" else e, p) for e, p in row["truth"]) or "nothing"
 
 
-def markdown(found: Tables, rows: Sequence[Row]) -> str:
-    """All tables of all rigs, then every miss."""
+def markdown(scores: Tables, rows: Sequence[Row]) -> str:
+    """All tables of all rigs, then the wrong answers, as Markdown."""
     parts = []
-    for group, by in found.items():
+    for group, by in scores.items():
         parts += [f"## {group}", origin(row for row in rows if row["by"] == OWN and group_of(row) == group)]
         for sheet in sheets(by):
             parts += [f"{sheet.title}:", _table(sheet)]
@@ -120,7 +120,7 @@ def markdown(found: Tables, rows: Sequence[Row]) -> str:
 
 
 def in_words(score: Mapping[str, Any] | None) -> str:
-    """Hits of cases and the interval in per cent; a mean or a median with its interval."""
+    """Hits of cases with their interval in per cent; or a mean or median with its interval."""
     if not score:
         return ""
     low, high = score["ci95"]

@@ -16,12 +16,12 @@ Diagnosis = Callable[..., dict[str, Any]]
 
 
 def always_null(plant: PlantDescription, recording: Recording, holdout: Recording, **options: Any) -> dict[str, Any]:
-    """Nothing is ever wrong."""
+    """Always answers that there is no gap."""
     return {"verdict": "no_gap", "where": [], "causes": [], "ambiguity_set": [], "posterior": []}
 
 
 def random_pair(seed: int) -> Diagnosis:
-    """Names an effect and a place at random; the same for the same recording."""
+    """Names a random effect and location; the same for the same recording."""
 
     def diagnose(plant: PlantDescription, recording: Recording, holdout: Recording, **options: Any) -> dict[str, Any]:
         pairs = effect_places(plant)

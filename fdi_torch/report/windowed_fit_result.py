@@ -1,4 +1,4 @@
-"""What a fit window by window found, as the result of a log holds it. The file is untrusted input."""
+"""Result of a window-by-window fit in a log. The file is untrusted input."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from fdi_torch.report.material import Material
 Records = list[dict[str, Any]]
 
 
-def told_windows(material: Material) -> tuple[Records, Records]:
-    """Windows, and the stretches in which a fault was there; none where there are none, or none that can be read."""
+def logged_windows(material: Material) -> tuple[Records, Records]:
+    """Windows, and the periods in which a fault was present; empty if they are missing or unreadable."""
     windows, stretches = (_records(material, name) for name in ("windows", "stretches"))
     return [w for w in windows if _spans(w)], [s for s in stretches if _spans(s) and isinstance(s.get("name"), str)]
 

@@ -1,12 +1,12 @@
-"""A blind benchmark on disk: recordings as CSV, sealed causes, and the manifest that holds the hashes of both.
+"""Files of a blind benchmark: recordings as CSV, sealed causes, and the manifest with the hashes of both.
 
-spec.json          what was asked for: seed, kinds, rig
-cases/caseNNNN_plant.json: the nominal plant that the diagnosis is given (the same as .yaml, for use by hand)
-cases/caseNNNN_recording.csv.gz, cases/caseNNNN_holdout.csv.gz: the SHA-256 of the sealed key stands above the header
-manifest.jsonl     a line a case: SHA-256 of the plant, of both recordings and of the sealed key
-key.jsonl          a line a case: the truth; opened after the diagnosis
-answers_WHO.jsonl  a line a case: what was answered, in how many seconds, by which state of the code
-rows.jsonl         a line an answer: how it was judged; see `rows`
+spec.json          settings: seed, kinds, rig
+cases/caseNNNN_plant.json: nominal plant for the diagnosis (also as .yaml, for manual use)
+cases/caseNNNN_recording.csv.gz, cases/caseNNNN_holdout.csv.gz: above the header, the SHA-256 of the sealed key
+manifest.jsonl     one line per case: SHA-256 of the plant, of both recordings and of the sealed key
+key.jsonl          one line per case: the truth; opened after the diagnosis
+answers_WHO.jsonl  one line per case: the answer, its computing time and the state of the code
+rows.jsonl         one line per answer: its scores; see `scored_rows`
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.blind.cases import PARTS, Case
+from fdi_torch.blind.case_readings import PARTS
+from fdi_torch.blind.cases import Case
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import DECIMALS, command_unit
 from fdi_torch.blind.plants import Rig
@@ -123,15 +124,15 @@ def read_plant(out: Path, line: Mapping[str, Any]) -> PlantDescription:
 def read_recording(out: Path, line: Mapping[str, Any], part: str, plant: PlantDescription) -> Recording:
     """One recording of a case, checked against its line of the manifest. Its source names the case and nothing else."""
     path = out / "cases" / f"{line['case']}_{part}.csv.gz"
-    found = read_csv(path, plant.channels(), [s.column for s in plant.sensors])
-    _expect_unchanged(line, part, found.sha256)
-    return replace(found, source=f"{line['case']}/{part}")
+    recording = read_csv(path, plant.channels(), [s.column for s in plant.sensors])
+    _expect_unchanged(line, part, recording.sha256)
+    return replace(recording, source=f"{line['case']}/{part}")
 
 
-def _expect_unchanged(line: Mapping[str, Any], part: str, found: str) -> None:
-    if found != line[part]:
+def _expect_unchanged(line: Mapping[str, Any], part: str, actual: str) -> None:
+    if actual != line[part]:
         raise ValueError(
-            f"{line['case']}: expected a {part} of SHA-256 {line[part][:12]}..., got {found[:12]}...; "
+            f"{line['case']}: expected a {part} of SHA-256 {line[part][:12]}..., got {actual[:12]}...; "
             "it was changed after it was sealed: make the benchmark anew"
         )
 
@@ -153,10 +154,10 @@ def open_key(out: Path) -> dict[str, dict[str, Any]]:
     for case, line in manifest(out).items():
         if case not in keys:
             raise ValueError(f"{case}: expected a sealed key, got none; make the benchmark anew")
-        found = digest(sealed_line(keys[case]))
-        if found != line["key"]:
+        actual = digest(sealed_line(keys[case]))
+        if actual != line["key"]:
             raise ValueError(
-                f"{case}: expected a key of SHA-256 {line['key'][:12]}..., got {found[:12]}...; "
+                f"{case}: expected a key of SHA-256 {line['key'][:12]}..., got {actual[:12]}...; "
                 "it was changed after it was sealed: make the benchmark anew"
             )
     return keys

@@ -1,4 +1,4 @@
-"""The blind benchmark: make and seal, diagnose without the key, open, score."""
+"""The blind benchmark: simulate and seal the cases, diagnose them without the key, open the key, score."""
 
 from __future__ import annotations
 
@@ -11,8 +11,14 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
-from fdi_torch.blind.cases import make, plans
-from fdi_torch.blind.files import (
+from fdi_torch.blind.baselines import Diagnosis, always_null, random_pair
+from fdi_torch.blind.case_drafts import plans
+from fdi_torch.blind.case_kinds import ON_NETWORKS, STANDARD
+from fdi_torch.blind.cases import make
+from fdi_torch.blind.networks import Networks
+from fdi_torch.blind.plants import Rig, three_tank
+from fdi_torch.blind.scored_rows import Row, judged
+from fdi_torch.blind.sealed_files import (
     answers,
     append,
     lines_of,
@@ -21,14 +27,9 @@ from fdi_torch.blind.files import (
     read_recording,
     write_cases,
 )
-from fdi_torch.blind.kinds import ON_NETWORKS, STANDARD
-from fdi_torch.blind.networks import Networks
-from fdi_torch.blind.plants import Rig, three_tank
-from fdi_torch.blind.rivals import Diagnosis, always_null, random_pair
-from fdi_torch.blind.rows import Row, judged
 
 Task = tuple[str, Mapping[str, Any]]
-"""Whose diagnosis, and a case's line of the manifest."""
+"""Name of the diagnosis, and a case's line of the manifest."""
 Done = tuple[str, dict[str, Any]]
 Each = Callable[[Callable[[Task], Done], Iterable[Task]], Iterable[Done]]
 Tell = Callable[[float, str], None]
@@ -51,16 +52,14 @@ def blind_benchmark(
     code: str = "",
     tell: Tell = lambda share, text: None,
 ) -> list[Row]:
-    """Has `diagnose` and its rivals answer `cases` recordings, kinds in turn; resumes where it was interrupted.
+    """Let `diagnose` and competing methods answer `cases` recordings; an interrupted benchmark is resumed.
 
-    diagnose(plant, recording, holdout[, leave_out=(effect,)]) -> answer in the format `fdi_torch.gap/1` or `/2`.
-    rig: one, or random networks. kinds: by default those usual for it.
-    library: effects that `diagnose` can name; those are not drawn as unknown.
-    leave_out: effects to deny it, one a case.
-    rivals: further diagnoses scored beside the two without skill. each: map over tasks, for example an executor's.
-    minutes: after which no further case is begun; what is answered by then is judged. code: state of the code that
-    answers, kept with each answer. tell(share, text): how far it is.
-    Returns a judged row an answer; see `rows`.
+    diagnose(plant, recording, holdout[, leave_out=(effect,)]) -> answer in the format `fdi_torch.gap/1` or `/2`. rig:
+    one rig, or random networks. kinds: of cases, by default the usual ones for the rig. library: effects that
+    `diagnose` can name; they are not drawn as unknown laws. leave_out: effects to remove from its library, one per
+    case. rivals: further diagnoses, in addition to two trivial ones. each: map over tasks, for example that of an
+    executor. minutes: no case is started after that time, and only answered cases are scored. code: state of the code,
+    stored with each answer. tell(share, text): progress. Returns one scored row per answer; see `scored_rows`.
     """
     rig, out = rig or three_tank(), Path(out)
     usual = ON_NETWORKS if isinstance(rig, Networks) else STANDARD
@@ -82,9 +81,9 @@ def seal(
     leave_out: Sequence[str] = (),
     tell: Tell = lambda share, text: None,
 ) -> None:
-    """Makes what is missing of the first `cases` cases and seals it.
+    """Simulate and seal the missing ones of the first `cases` cases.
 
-    Raises ValueError where `out` holds another benchmark.
+    Raises ValueError if `out` contains another benchmark.
     """
     out.mkdir(parents=True, exist_ok=True)
     spec = {
@@ -94,10 +93,10 @@ def seal(
         "library": sorted(library),
         "leave_out": list(leave_out),
     } | ({"tanks": [rig.fewest, rig.most]} if isinstance(rig, Networks) else {})
-    known = out / "spec.json"
-    if known.exists() and json.loads(known.read_text()) != spec:
-        raise ValueError(f"{out}: expected the benchmark {spec}, got {known.read_text().strip()}; take another folder")
-    known.write_text(json.dumps(spec) + "\n")
+    stored = out / "spec.json"
+    if stored.exists() and json.loads(stored.read_text()) != spec:
+        raise ValueError(f"{out}: expected the benchmark {spec}, got {stored.read_text().strip()}; take another folder")
+    stored.write_text(json.dumps(spec) + "\n")
     done = manifest(out)
     todo = [plan for plan in plans(cases, seed, kinds) if plan.name not in done]
     for at in range(0, len(todo), CHUNK):
@@ -116,21 +115,20 @@ def answer_all(
     code: str,
     tell: Tell,
 ) -> None:
-    """Answers what has no answer yet, case by case, a JSON line each, until the clock says `stop`.
-
-    The key stays shut.
+    """Diagnose the cases without an answer, and append one JSON line each, until the time `stop`. The
+    key stays sealed.
     """
     lines = list(manifest(out).values())[:cases]
-    known = {(name, line["case"]) for name in diagnoses for line in lines_of(answers(out, name))}
-    todo = [(name, line) for line in lines for name in diagnoses if (name, line["case"]) not in known]
+    answered = {(name, line["case"]) for name in diagnoses for line in lines_of(answers(out, name))}
+    todo = [(name, line) for line in lines for name in diagnoses if (name, line["case"]) not in answered]
     start, total = time.perf_counter(), len(lines) * len(diagnoses)
     todo = todo if start < stop else []
-    for n, (name, found) in enumerate(each(partial(answer, diagnoses, out), todo), start=1):
-        append(answers(out, name), json.dumps(found | {"code": code}))
+    for n, (name, result) in enumerate(each(partial(answer, diagnoses, out), todo), start=1):
+        append(answers(out, name), json.dumps(result | {"code": code}))
         done, now = total - len(todo) + n, time.perf_counter()
-        left = min((now - start) / n * (len(todo) - n), max(stop - now, 0.0))
-        said = f"{name} says {found['answer'].get('verdict')} of {found['case']} in {found['sec']:.1f} s"
-        tell(done / total, f"{said}; {done} of {total} answers, {_span(left)} left")
+        remaining = min((now - start) / n * (len(todo) - n), max(stop - now, 0.0))
+        text = f"{name} says {result['answer'].get('verdict')} of {result['case']} in {result['sec']:.1f} s"
+        tell(done / total, f"{text}; {done} of {total} answers, {_span(remaining)} left")
         if now > stop:
             break
 
@@ -140,21 +138,21 @@ def _span(seconds: float) -> str:
 
 
 def answer(diagnoses: Mapping[str, Diagnosis], out: Path, task: Task) -> Done:
-    """One case by one of them; an exception of the diagnosis is an answer too, and a wrong one."""
+    """The answer of one diagnosis to one case; an exception counts as a wrong answer."""
     name, line = task
     plant = read_plant(out, line)
     recording, holdout = (read_recording(out, line, part, plant) for part in ("recording", "holdout"))
     options = {"leave_out": tuple(line["leave_out"])} if line["leave_out"] else {}
     start = time.perf_counter()
     try:
-        found = diagnoses[name](plant, recording, holdout, **options)
-    except Exception as error:  # a crash is scored, not raised: one case must not end the benchmark
-        found = {"verdict": "crash", "error": f"{type(error).__name__}: {error}"}
-    return name, {"case": line["case"], "sec": round(time.perf_counter() - start, 3), "answer": without_nan(found)}
+        result = diagnoses[name](plant, recording, holdout, **options)
+    except Exception as error:  # scored, not raised: one crash must not end the benchmark
+        result = {"verdict": "crash", "error": f"{type(error).__name__}: {error}"}
+    return name, {"case": line["case"], "sec": round(time.perf_counter() - start, 3), "answer": without_nan(result)}
 
 
 def without_nan(value: Any) -> Any:
-    """NaN and infinities as null: JSON has none."""
+    """The value with NaN and infinities replaced by None, because JSON has none."""
     if isinstance(value, Mapping):
         return {k: without_nan(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

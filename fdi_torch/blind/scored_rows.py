@@ -1,4 +1,4 @@
-"""Judged answers: a row each, of one benchmark or of several joined, and the scores of all that belong together."""
+"""Scored answers as rows, of one benchmark or several, and the scores of rows that belong together."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.blind.files import answers, lines_of, manifest, open_key, read_plant
 from fdi_torch.blind.score import Row, by_effect, judge, summary
+from fdi_torch.blind.sealed_files import answers, lines_of, manifest, open_key, read_plant
 from fdi_torch.blind.sizes import sizes
 from fdi_torch.blind.statistics import clopper_pearson
 from fdi_torch.disk import write_text
@@ -18,17 +18,17 @@ from fdi_torch.plant.description import PlantDescription
 
 ROWS = "rows.jsonl"
 EDGES = (0.0, 0.5, 0.9, 0.99, 1.0)
-"""Of the bins of the probability that the best explanation was given."""
+"""Edges of the bins of the stated probability of the best explanation."""
 _SAME = ("rig", "seed", "kind", "index", "by")
 
 Scores = dict[str, Any]
-"""strata: {kind or 'all': scores}; by_effect: {effect: scores}; sizes: {effect: z-scores}; calibration: a bin each."""
+"""strata: {kind or 'all': scores}; by_effect: {effect: scores}; sizes: {effect: z-scores}; calibration: bins."""
 Tables = dict[str, dict[str, Scores]]
-"""{rig, with or without its effect denied: {whose answers: their scores}}."""
+"""{rig, or rig with effects left out: {name of the diagnosis: scores}}."""
 
 
 def judged(names: Sequence[str], cases: int, out: Path) -> list[Row]:
-    """Opens the key and judges all answers; the rows are in the folder too."""
+    """Open the key, score all answers, and write the rows to the folder."""
     truths, spec = open_key(out), json.loads((out / "spec.json").read_text())
     plants = {case: read_plant(out, line) for case, line in list(manifest(out).items())[:cases]}
     rows = []
@@ -56,25 +56,25 @@ def write_rows(out: Path, rows: Iterable[Row]) -> None:
 
 
 def joined(folders: Iterable[Path]) -> list[Row]:
-    """The rows of several folders. A case that several hold counts once, as it was answered last.
+    """The rows of several folders. A case that is in several folders counts once, with its last answer.
 
-    Raises ValueError for a folder without judged answers.
+    Raises ValueError for a folder without scored answers.
     """
-    found: dict[tuple[Any, ...], Row] = {}
+    merged: dict[tuple[Any, ...], Row] = {}
     for folder in folders:
         rows = lines_of(folder / ROWS)
         if not rows:
-            raise ValueError(f"{folder}: expected a benchmark's folder, got no answers in it; name an --out of before")
-        found |= {tuple(row[key] for key in _SAME): row for row in rows}
-    return list(found.values())
+            raise ValueError(f"{folder}: expected a benchmark's folder, got one without answers; name an earlier --out")
+        merged |= {tuple(row[key] for key in _SAME): row for row in rows}
+    return list(merged.values())
 
 
 def tables(rows: Iterable[Row]) -> Tables:
-    """Scores of each rig and of each diagnosis of it; cases whose effect is denied stand apart."""
+    """Scores by rig and diagnosis; cases with an effect left out of the library are a separate group."""
     groups: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
         groups.setdefault(group_of(row), {}).setdefault(row["by"], []).append(row)
-    return {group: {name: scores_of(own) for name, own in by.items()} for group, by in groups.items()}
+    return {group: {name: scores_of(answers_of) for name, answers_of in by.items()} for group, by in groups.items()}
 
 
 def group_of(row: Row) -> str:
@@ -91,9 +91,9 @@ def scores_of(rows: Sequence[Row]) -> Scores:
 
 
 def reliability(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """By the probability that the best explanation was given: how often it is the true one.
+    """Calibration: how often the best explanation is true, in bins of its stated probability.
 
-    A bin each, where there is any case: from and to, mean probability, hits of cases, exact 95 % interval.
+    Each non-empty bin has its limits, mean probability, hits, number of cases, and exact 95 % interval.
     """
     stated = [(float(r["stated"]), bool(r["stated_right"])) for r in rows if r.get("stated") is not None]
     bins = []

@@ -1,4 +1,4 @@
-"""Long signals as few points that look the same."""
+"""Downsampling of long signals for drawing, without visible change."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ BINS = 400
 
 
 def thinned(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
-    """A signal (T,) as the lowest and the highest sample of each of `bins` stretches, in their order; spikes stay.
+    """A signal (T,) reduced to the minimum and maximum of each of `bins` segments, in order, so that spikes remain.
 
-    A stretch without any number becomes a gap (NaN).
+    A segment without finite values becomes a gap (NaN).
     """
     if len(time) <= 2 * bins:
         return time, values
@@ -27,8 +27,8 @@ def thinned(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.
     return time[kept], values[kept]
 
 
-def held_steps(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Only the corners of a signal (T,) that is held between samples."""
+def corner_points(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The corners of a signal (T,) that is constant between changes."""
     if not len(time):
         return time, values
     changes = np.flatnonzero(values[1:] != values[:-1]) + 1

@@ -1,7 +1,7 @@
-"""What a study is to do: settings, each with its trials, cut into blocks, the unit of work.
+"""Plan of a study: settings with their trials, divided into blocks.
 
-A trial's draws are keyed by (seed, setting, trial) alone, so that it is the same in whatever block, order or process it
-is computed.
+The random draws of a trial depend on (seed, setting, trial) only, so that it is the same in any block, order or
+process.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ Estimator = Literal["free", "boxed", "correlation", "linearised", "search"]
 ESTIMATORS: tuple[Estimator, ...] = ("free", "boxed", "correlation", "linearised", "search")
 SnrDefinition = Literal["variance", "power"]
 
-# The independent streams of a study.
+# Independent random streams of a study.
 _FAULTS, _NOISE, _SEARCH = range(3)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One condition under which many trials are made.
+    """One condition with many trials.
 
-    faults (trials, P), SI: the truth of each trial. snr_db: of each output, None for readings without noise.
+    faults (trials, P), SI: true values of each trial. snr_db: of each output; None for readings without noise.
     """
 
     name: str
@@ -64,10 +64,10 @@ class Block:
 class Method:
     """How every trial is estimated.
 
-    estimators: which are reported. search, search_step (s), search_every: differential evolution on every so manieth
-    reading; starts: how many of its best, mutually distant members are refined. searches: how often a trial whose
-    residuals stay larger than its noise is searched, with other draws each time. steps (s): of the refinement, coarse
-    to fine. data_step (s): of the noise-free readings.
+    estimators: those that are reported. search, search_step (s), search_every: differential evolution on every n-th
+    reading; starts: number of its best distant members to refine. searches: largest number of searches for a trial
+    whose residuals exceed its noise. steps (s): integration steps of the refinement, coarse to fine. data_step (s): of
+    the noise-free readings.
     """
 
     estimators: tuple[Estimator, ...] = ESTIMATORS
@@ -84,7 +84,7 @@ class Method:
 
 @dataclass(frozen=True)
 class Plan:
-    """A whole study. fitting: plant, clock, inputs and parameters; the readings in it are not used."""
+    """The complete study. fitting: plant, clock, inputs and parameters; its readings are not used."""
 
     fitting: Fitting
     settings: tuple[Setting, ...]
@@ -105,27 +105,27 @@ class Plan:
             offset += setting.trials
 
     def blocks_of(self, numbers: Iterable[int]) -> Iterator[Block]:
-        """Blocks that hold these trials and no others. Raises ValueError for a trial that the study does not have."""
-        wanted = set(numbers)
-        for number in sorted(wanted):
+        """Blocks with exactly these trials. Raises ValueError for a trial that the study does not have."""
+        chosen_numbers = set(numbers)
+        for number in sorted(chosen_numbers):
             if not 0 <= number < self.trials:
                 raise ValueError(f"expected trials from 0 to {self.trials - 1}, got {number}")
         for block in self.blocks():
-            for gap, run in groupby(block.numbers, lambda number: number not in wanted):
-                chosen = [] if gap else list(run)
+            for left_out, run in groupby(block.numbers, lambda number: number not in chosen_numbers):
+                chosen = [] if left_out else list(run)
                 if chosen:
                     yield replace(block, first=chosen[0] - block.offset, last=chosen[-1] + 1 - block.offset)
 
     def noise(self, block: Block, shape: tuple[int, ...]) -> Tensor:
-        """Standard normal draws (trials, *shape) of the block's trials, a generator each."""
+        """Standard normal draws (trials, *shape), with one generator per trial."""
         base = _key(self.seed, _NOISE, block.setting)
-        # The generator takes 32 bits of its seed: counted from the key, no two trials of a setting share them.
+        # The generator uses 32 bits of its seed; consecutive seeds give each trial of a setting its own.
         seeds = [(base + trial) % 2**32 for trial in range(block.first, block.last)]
         made = [torch.Generator().manual_seed(seed) for seed in seeds]
         return torch.stack([torch.randn(shape, generator=g, dtype=torch.float64) for g in made])
 
     def search_seeds(self, block: Block, again: int = 0) -> Tensor:
-        """(trials,) int64; other ones for each time that a trial is searched again."""
+        """Seeds (trials,) int64 of a search; each repetition has other ones."""
         base = _key(self.seed, _SEARCH, block.setting, again)
         return stream(torch.arange(block.first, block.last) + base)
 
@@ -152,7 +152,7 @@ def mode_faults(
 ) -> Tensor:
     """Faults of the parameters of `mode` only, (trials, P), the others nominal.
 
-    Each is drawn evenly from what of its box lies at least `smallest` of the box's width away from nominal.
+    Each is uniform over the part of its box that is at least `smallest` of the box's width away from nominal.
     """
     unit = _unit_draws(seed, setting, trials, len(space))
     theta = space.nominal().expand(trials, -1).clone()
@@ -173,5 +173,5 @@ def _unit_draws(seed: int, setting: int, trials: int, width: int) -> Tensor:
 
 
 def _key(seed: int, *counters: int) -> int:
-    """48 bits, so that trial numbers can be added."""
+    """A 48-bit key, so that trial numbers can be added."""
     return int(stream(torch.tensor(seed), *counters)) & (2**48 - 1)

@@ -1,4 +1,4 @@
-"""The readings of a block's trials, and what the best estimators could make of them."""
+"""Simulated readings of a block's trials, and the bounds of their estimation."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from fdi_torch.estimate.batch_algebra import apply
 from fdi_torch.estimate.information import Certainty, certainty
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.simulated_recording import noise_level
-from fdi_torch.study.plan import Block, Plan
+from fdi_torch.study.study_plan import Block, Plan
 
-# The noise (m) that bounds are stated for where the readings have none.
+# Noise (m) for which bounds are stated if the readings have none.
 NOMINAL_NOISE = 1e-3
 
 
@@ -29,7 +29,7 @@ class Trials:
 
 
 def make_trials(plan: Plan, block: Block) -> Trials:
-    """Noise-free readings at fine steps, and each trial's own noise."""
+    """Noise-free readings at fine steps, plus each trial's noise."""
     setting = plan.settings[block.setting]
     readings = sum(part.outputs.numel() for part in plan.fitting.recordings)
     trials = block.last - block.first
@@ -37,15 +37,15 @@ def make_trials(plan: Plan, block: Block) -> Trials:
     truth = setting.faults[block.first : block.last]
     clean = _clean(plan.fitting.engines(plan.method.data_step)[0], truth)
     if setting.snr_db is None:
-        none = torch.zeros_like(clean)
-        return Trials(truth, clean, none, torch.full_like(clean[:, 0], NOMINAL_NOISE))
+        zeros = torch.zeros_like(clean)
+        return Trials(truth, clean, zeros, torch.full_like(clean[:, 0], NOMINAL_NOISE))
     std = noise_level(clean, setting.snr_db, plan.snr_definition)
     noise = plan.noise(block, tuple(clean.shape[1:])) * std[:, None, :]
     return Trials(truth, clean + noise, noise, std)
 
 
 def _clean(engine: Engine, truth: Tensor) -> Tensor:
-    """Noise-free readings (B, S, C); a fault that all trials share is simulated once."""
+    """Noise-free readings (B, S, C); a fault that all trials have in common is simulated once."""
     if bool((truth == truth[:1]).all()):
         return engine.readings(truth[:1]).expand(len(truth), -1, -1)
     return engine.readings(truth)
@@ -53,10 +53,10 @@ def _clean(engine: Engine, truth: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Limits:
-    """What no estimator can beat, at the truth of each trial, (B, P) each.
+    """Bounds of unbiased estimation at the truth of each trial, (B, P) each.
 
-    bound: the Cramer-Rao bound, start levels and noise level known; infinite where a parameter is not determined.
-    correlation_bound: the same where gain and offset of each channel are unknown, which correlation cannot see.
+    bound: Cramer-Rao bound with known initial levels and noise level; infinite for an undetermined parameter.
+    correlation_bound: the same if gain and offset of each channel are unknown, as for the correlation objective.
     linearised: theta_0 + (J' W J)^-1 J' W noise, the efficient estimator of the linearised model on the same draws.
     """
 
@@ -66,35 +66,36 @@ class Limits:
 
 
 def limits(engine: Engine, trials: Trials) -> Limits:
-    """Cramer-Rao bounds of all trials, and what the linearised efficient estimator makes of their own noise."""
+    """Cramer-Rao bounds of all trials, and the linearised efficient estimator on their noise."""
     predicted = engine.readings(trials.truth)
     shifted = predicted + trials.noise
     gram = engine.gram(trials.truth[:, None], Readings(shifted, torch.ones_like(shifted)))[:, 0]
     weight = (trials.std**-2)[..., None, None]
     information, score = _summed(weight * gram[..., :-3, :-3]), _summed(weight * gram[..., :-3, -3:-2])[..., 0]
-    sure = certainty(information)
-    return Limits(sure.std, _blind_to_scale(engine, trials, predicted).std, trials.truth + _solved(sure, score))
+    joint = certainty(information)
+    correlation_std = _without_gain_and_offset(engine, trials, predicted).std
+    return Limits(joint.std, correlation_std, trials.truth + _solved(joint, score))
 
 
-def _blind_to_scale(engine: Engine, trials: Trials, predicted: Tensor) -> Certainty:
-    """What is known once a constant and the prediction itself are projected out of each channel's Jacobian."""
+def _without_gain_and_offset(engine: Engine, trials: Trials, predicted: Tensor) -> Certainty:
+    """Certainty after projecting a constant and the prediction itself out of each channel's Jacobian."""
     gram = engine.gram(trials.truth[:, None], Readings(predicted, torch.ones_like(predicted)))[:, 0]
     count = gram[..., -1:, -1:]
     centred = gram - gram[..., :, -1:] * gram[..., -1:, :] / count
-    along, own = centred[..., :-3, -2], centred[..., -2, -2]
-    varies = own > 0
-    share = along / torch.where(varies, own, 1.0)[..., None]
-    left = centred[..., :-3, :-3] - along[..., :, None] * share[..., None, :]
-    return certainty(_summed((trials.std**-2)[..., None, None] * left))
+    along, power = centred[..., :-3, -2], centred[..., -2, -2]
+    varies = power > 0
+    share = along / torch.where(varies, power, 1.0)[..., None]
+    projected = centred[..., :-3, :-3] - along[..., :, None] * share[..., None, :]
+    return certainty(_summed((trials.std**-2)[..., None, None] * projected))
 
 
-def _solved(sure: Certainty, score: Tensor) -> Tensor:
-    """Covariance times score; NaN where the covariance has no number."""
-    return apply(sure.covariance, score)
+def _solved(joint: Certainty, score: Tensor) -> Tensor:
+    """Covariance times score; NaN where the covariance is not defined."""
+    return apply(joint.covariance, score)
 
 
 def _summed(per_channel: Tensor) -> Tensor:
-    """(B, C, ...) -> (B, ...), channel by channel, so that the order of the sum is always the same."""
+    """(B, C, ...) -> (B, ...), summed channel by channel in a fixed order for reproducibility."""
     total = per_channel[:, 0]
     for channel in per_channel.unbind(1)[1:]:
         total = total + channel

@@ -1,4 +1,4 @@
-"""Which parameters are called faulty, against which are: isolation of fault modes, counted."""
+"""Isolation of fault modes in a study: stated against true sets of faults."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ from fdi_torch.study.summary import column
 
 @dataclass(frozen=True)
 class Isolation:
-    """labels (M,): 'none', 'theta_1', 'theta_1 + theta_3' ... confusion (M, M): trials with true mode (row) and stated
-    mode (column). missed, false: how often a parameter was wrongly called sound, or faulty. right: whole modes."""
+    """Counts of stated modes.
+
+    labels (M,): 'none', 'theta_1', 'theta_1 + theta_3' ... confusion (M, M): trials by true mode (row) and stated mode
+    (column). missed, false: parameters wrongly stated as fault-free, or as faulty. right: correctly stated modes.
+    """
 
     labels: tuple[str, ...]
     confusion: tuple[tuple[int, ...], ...]
@@ -27,9 +30,11 @@ class Isolation:
     false: int
 
 
-def isolate(space: ParameterSpace, trials: Sequence[Trial], confidence: float = 0.95) -> Isolation:
-    """A parameter is called faulty where it differs from nominal by more than its standard error explains, at a
-    confidence that is shared out over the parameters (Bonferroni)."""
+def count_modes(space: ParameterSpace, trials: Sequence[Trial], confidence: float = 0.95) -> Isolation:
+    """State a parameter as faulty if it differs from nominal significantly, and count the modes.
+
+    The confidence is divided among the parameters (Bonferroni).
+    """
     truth, value, std = (column(trials, name) for name in ("truth", "free", "free_std"))
     reach = NormalDist().inv_cdf(1.0 - (1.0 - confidence) / (2 * len(space)))
     faulty = truth != space.nominal()
@@ -49,7 +54,7 @@ def isolate(space: ParameterSpace, trials: Sequence[Trial], confidence: float = 
 
 
 def _codes(faulty: Tensor) -> list[int]:
-    """(trials, P) bool as one number a trial, a bit a parameter."""
+    """(trials, P) bool as one integer per trial, one bit per parameter."""
     return (faulty.to(torch.int64) << torch.arange(faulty.shape[-1])).sum(-1).tolist()
 
 

@@ -1,4 +1,4 @@
-"""The page: everything solved from the run files, then written as Markdown with its pictures."""
+"""The page about the paper: all run files are computed, then written as Markdown with pictures."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from fdi_torch.disk import write_text
-from fdi_torch.paper import tables
-from fdi_torch.paper.cases import Case, shipped_run, solve
+from fdi_torch.paper import paper_tables
 from fdi_torch.paper.modes import Modes, confusion, diagnose_modes, mode_name
 from fdi_torch.paper.online import TIME_BETWEEN_FALSE_ALARMS, OnLine, follow
 from fdi_torch.paper.published import SYMBOLS, TABLE_2, TABLE_3
+from fdi_torch.paper.table_cases import Case, shipped_run, solve
 from fdi_torch.report.paper_figures import (
     confusion_figure,
     convergence_figure,
@@ -24,7 +24,7 @@ from fdi_torch.report.paper_figures import (
 from fdi_torch.report.style import save
 
 WINDOWS = ("nominal", "table2_2d", "table3_snr50")
-"""Run files of Figures 6 and 7, one a window."""
+"""Run files of Figures 6 and 7, one per window."""
 MODES, DRAWS = "modes", 4
 TO_CM = 100.0
 
@@ -33,7 +33,7 @@ Tell = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class Results:
-    """Everything that the page shows."""
+    """All results that the page shows."""
 
     table_2: tuple[Case, ...]
     table_3: tuple[Case, ...]
@@ -42,7 +42,7 @@ class Results:
 
 
 def make_page(folder: Path, tell: Tell) -> list[Path]:
-    """Solves and writes; tell(share, text) is called as work goes on. Returns the files, the page first."""
+    """Compute and write the page. tell(share, text): progress. Returns the files, the page first."""
     results = solve_all(tell)
     tell(0.97, "drawing")
     pictures = draw(results, folder)
@@ -64,7 +64,7 @@ def solve_all(tell: Tell) -> Results:
 
 
 def draw(results: Results, folder: Path) -> list[Path]:
-    """Every figure as PNG."""
+    """Write every figure as PNG."""
     low, high = results.table_3[-1], results.table_3[0]
     online = results.online
     time, read = online.recording.time.numpy(), TO_CM * online.recording.outputs.numpy()
@@ -85,9 +85,9 @@ def draw(results: Results, folder: Path) -> list[Path]:
 
 
 def _correlation(cases: tuple[Case, ...]):  # type: ignore[no-untyped-def]
-    snr, found = np.array([c.snr_db for c in cases]), np.array([c.correlation for c in cases])
+    snr, correlations = np.array([c.snr_db for c in cases]), np.array([c.correlation for c in cases])
     axis = np.linspace(0.0, 60.0, 200)
-    return correlation_figure(snr, found, axis, 3.0 / np.sqrt(1.0 + 10.0 ** (-axis / 10.0)))
+    return correlation_figure(snr, correlations, axis, 3.0 / np.sqrt(1.0 + 10.0 ** (-axis / 10.0)))
 
 
 def _convergence(case: Case):  # type: ignore[no-untyped-def]
@@ -101,30 +101,30 @@ def text_of(results: Results) -> str:
     searched = max(float((c.searched - c.truth).abs().max()) for c in results.table_2)
     right = float(results.modes.right.double().mean())
     return PAGE.format(
-        worst=tables.error(worst),
-        searched=tables.error(searched),
-        table_2=tables.table_2(results.table_2, TABLE_2),
-        correlations_2=tables.correlations(results.table_2),
-        table_3=tables.table_3(results.table_3, TABLE_3),
-        correlations_3=tables.correlations(results.table_3),
-        windows=tables.windows(results.online),
+        worst=paper_tables.error(worst),
+        searched=paper_tables.error(searched),
+        table_2=paper_tables.table_2(results.table_2, TABLE_2),
+        correlations_2=paper_tables.correlations(results.table_2),
+        table_3=paper_tables.table_3(results.table_3, TABLE_3),
+        correlations_3=paper_tables.correlations(results.table_3),
+        windows=paper_tables.windows(results.online),
         run_length=f"{TIME_BETWEEN_FALSE_ALARMS:g}",
         alarms=_alarms(results.online),
         draws=DRAWS,
         right=f"{100 * right:.1f} %",
-        wrong=tables.wrongly_named(results.modes),
-        dimensions=tables.by_dimension(results.modes),
-        equations=tables.equations(),
-        errata=tables.errata(),
+        wrong=paper_tables.wrongly_named(results.modes),
+        dimensions=paper_tables.by_dimension(results.modes),
+        equations=paper_tables.equations(),
+        errata=paper_tables.errata(),
     )
 
 
-def _alarms(found: OnLine) -> str:
-    early = [w for w in found.windows[:1] if w.alarm is not None]
+def _alarms(online: OnLine) -> str:
+    early = [w for w in online.windows[:1] if w.alarm is not None]
     first = "One false alarm was raised in it." if early else "No alarm was raised in it."
     scores = [
         float(((w.result.estimate.value[:5] - w.truth) / w.result.estimate.std[:5]).abs().max())
-        for w in found.windows
+        for w in online.windows
         if w.result is not None
     ]
     return f"{first} Every parameter lies within {max(scores):.1f} standard errors of the truth."

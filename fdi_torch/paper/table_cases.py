@@ -1,4 +1,4 @@
-"""One row of Table 2 or 3: a run file simulated and estimated, with the search alone and the bound beside it."""
+"""One row of Table 2 or 3: a run file simulated and estimated, with the search alone and the Cramer-Rao bound."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of,
 from fdi_torch.paper.published import PARAMETERS
 
 BOUND_SNR = 50.0
-"""dB; the noise for which the bound of a noise-free row is given."""
+"""SNR in dB for which the bound of a noise-free row is stated."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """All (P,) in the order of `PARAMETERS`.
+    """Results, all (P,) in the order of `PARAMETERS`.
 
     searched: where differential evolution on the sum of correlations alone ends. refined, std: the hybrid estimate
     within the paper's box. free: the same without a box. bound: the Cramer-Rao bound at the truth. history
@@ -47,12 +47,12 @@ class Case:
 
 
 def shipped_run(name: str) -> Run:
-    """A run file of configs/paper by its name."""
+    """The run file of configs/paper with this name."""
     return load_run(SHIPPED / "paper" / f"{name}.yaml")
 
 
 def solve(run: Run) -> Case:
-    """Simulates, searches, refines and bounds what one run file describes."""
+    """Simulate, search, refine and bound the run file."""
     space = requested_space(run)
     if space.names != PARAMETERS:
         raise ValueError(
@@ -88,14 +88,14 @@ def solve(run: Run) -> Case:
 
 
 def without_box(fitting: Fitting, start: Tensor, step: float) -> Tensor:
-    """The most likely parameters (P,) wherever they lie."""
+    """The most likely parameters (P,) without bounds."""
     nowhere = torch.full_like(start, math.inf)
     linearise = fitting.problem(step, "likelihood").linearise
     return levenberg_marquardt(linearise, start.unsqueeze(0), -nowhere, nowhere).theta[0]
 
 
 def bound_at(fitting: Fitting, truth: Tensor, step: float, snr_db: float) -> Tensor:
-    """The Cramer-Rao bound (P,) at the truth for white noise at a known level, of this SNR against the variance."""
+    """Cramer-Rao bound (P,) at the truth for white noise of this SNR (against the variance) at a known level."""
     clean = fitting.engines(step)[0].readings(truth.unsqueeze(0))[0]
     noise = noise_std(NoiseConfig(snr_db=snr_db), fitting.plant, clean)
     return information_std(fitting.problem(step).at_noise([noise]), truth.unsqueeze(0))

@@ -1,4 +1,4 @@
-"""Oscillating faults: their period found in a long window, their phase told long after t = 0."""
+"""Oscillation faults: period from a long window, and phase long after t = 0."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PLANT = load_plant("three_tank")
 INPUTS = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
 
 
-def test_the_period_of_a_faint_swing_is_among_the_strongest_of_a_long_window() -> None:
+def test_the_period_of_a_weak_oscillation_is_among_the_strongest_of_a_long_window() -> None:
     time = torch.arange(2000, dtype=torch.float64)
     noise = torch.randn(2000, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     swing = 0.3 * torch.sin(2.0 * math.pi * time / 7.3)
@@ -36,7 +36,7 @@ def test_the_period_of_a_faint_swing_is_among_the_strongest_of_a_long_window() -
     assert strongest_periods(noise[:5], 1.0, 60.0, 60.0, 8).tolist() == [60.0]
 
 
-def test_an_oscillating_pump_is_followed_a_day_after_the_clock_began() -> None:
+def test_an_oscillating_pump_is_isolated_a_day_after_the_start() -> None:
     names = with_shapes(["T1.leak.size", "Q1.pump_gain.factor", "Q1.pump_oscillation.amplitude"], PLANT)
     network = build_network(PLANT, placements_for(names))
     space = ParameterSpace(network.constants[n] for n in names)

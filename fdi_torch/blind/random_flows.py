@@ -34,7 +34,7 @@ class Disturbance:
     ratio: float
 
     def values(self, rng: np.random.Generator, samples: int) -> Array:
-        """(T, N) of standard deviations `intensities`."""
+        """Random flows (T, N) with standard deviations `intensities`."""
         wide = len(self.intensities)
         if self.kind == "slow":
             keep = math.exp(-1.0 / self.time)
@@ -51,7 +51,7 @@ class Disturbance:
 
 
 def draw_disturbance(rng: np.random.Generator, tanks: int) -> Disturbance:
-    """All three kinds alike often; sizes even on a logarithmic scale from 0.3 to 3 times the noise."""
+    """A kind with equal probabilities; sizes log-uniform from 0.3 to 3 times the noise."""
     kind = str(rng.choice(KINDS))
     times = {
         "white": 1.0,

@@ -1,4 +1,4 @@
-"""What a run found, whatever kind of run it was: effects at places, with their sizes."""
+"""Diagnosed effects of a run of any kind: effect, location and size."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ NAN = float("nan")
 
 
 @dataclass(frozen=True)
-class Finding:
-    """effect at location. quantity: which parameter `size` is, with its std in `unit` (SI).
+class DiagnosedEffect:
+    """An effect at a location. quantity: name of the parameter whose value is `size`, with its std in `unit` (SI).
 
-    flow m^3/s, hole m where it moves water; NaN: unknown.
+    flow in m^3/s and hole diameter in m for effects that move water; NaN if unknown.
     """
 
     effect: str
@@ -41,26 +41,28 @@ class Finding:
 
     @property
     def sized(self) -> str:
-        """'leak at T1 (size 0.3000 ± 0.0020, 33.1 cm³/s)': its size, and the flow of it where it moves water."""
+        """'leak at T1 (size 0.3000 ± 0.0020, 33.1 cm³/s)': the effect with its size and, if it has one, its flow."""
         unit, scale = shown_unit(self.unit)
         value = with_error(scale * self.size, scale * self.std)
-        told = f"{self.quantity.replace('_', ' ')} {value}" if unit in ("", "1") else f"{value} {unit}"
-        sizes = [told] if math.isfinite(self.size) else []
+        size = f"{self.quantity.replace('_', ' ')} {value}" if unit in ("", "1") else f"{value} {unit}"
+        sizes = [size] if math.isfinite(self.size) else []
         sizes += [f"{number(1e6 * self.flow, 3)} cm³/s"] if math.isfinite(self.flow) else []
         return f"{self.words} ({', '.join(sizes)})" if sizes else self.words
 
 
-def findings(material: Material) -> list[Finding]:
-    """Faults of a diagnosis (the last word on each), then the causes of a gap."""
+def diagnosed_effects(material: Material) -> list[DiagnosedEffect]:
+    """Faults of a diagnosis (the last message about each), then the causes of a gap."""
     faults = {(m.get("fault"), m.get("location")): _fault(m) for m in material.of("/diagnosis/fault")}
     return [*faults.values(), *(_cause(cause, material.plant) for cause in material.answer.get("causes", []))]
 
 
-def _fault(message: Mapping[str, Any]) -> Finding:
+def _fault(message: Mapping[str, Any]) -> DiagnosedEffect:
     size, std, flow, hole = (as_number(message.get(name)) for name in ("size", "size_std", "flow", "hole_diameter"))
     name, location, unit = (str(message.get(key, "")) for key in ("fault", "location", "unit"))
     quantity = name.partition(".")[2] or "size"
-    return Finding(_effect_name(name), location, message.get("present") is True, size, std, unit, flow, hole, quantity)
+    return DiagnosedEffect(
+        _effect_name(name), location, message.get("present") is True, size, std, unit, flow, hole, quantity
+    )
 
 
 def fault_at(name: str) -> tuple[str, str]:
@@ -74,14 +76,14 @@ def _effect_name(name: str) -> str:
     return name.partition(".")[0]
 
 
-def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> Finding:
+def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> DiagnosedEffect:
     """A log may hold the parameters in any order: which is the size, the effect itself says."""
     name, location, parameters = str(cause["effect"]), str(cause["location"]), cause.get("parameters", {})
     quantity = _size_of(name, location, plant)
     quantity = quantity if quantity in parameters else next(iter(parameters), "size")
     size: Mapping[str, Any] = parameters.get(quantity, {})
     value, std = as_number(size.get("value")), as_number(size.get("std"))
-    return Finding(name, location, True, value, std, str(size.get("unit", "")), quantity=quantity)
+    return DiagnosedEffect(name, location, True, value, std, str(size.get("unit", "")), quantity=quantity)
 
 
 def _size_of(name: str, location: str, plant: PlantDescription | None) -> str:

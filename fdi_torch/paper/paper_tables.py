@@ -6,32 +6,32 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from torch import Tensor
 
-from fdi_torch.paper.cases import BOUND_SNR, Case
 from fdi_torch.paper.equations import EQUATIONS, ERRATA, STATEMENTS
 from fdi_torch.paper.modes import Modes, mode_name
 from fdi_torch.paper.online import OnLine
 from fdi_torch.paper.published import SYMBOLS
+from fdi_torch.paper.table_cases import BOUND_SNR, Case
 
 MISPRINT = "misprint"
 ROUNDING = 1e-7
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
-    """A table, the first `left` columns flush left."""
+    """A Markdown table whose first `left` columns are left-aligned."""
     rule = [":---" if i < left else "---:" for i in range(len(header))]
     lines = [header, rule, *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def table_2(cases: Sequence[Case], published: Mapping[str, Sequence[float | None]]) -> str:
-    """One line for each parameter of each noise-free fault."""
+    """One row per parameter of each noise-free fault."""
     header = ("fault", "", "true", "paper", "DE alone", "refined", "paper's error", "DE's error", "refined error",
               "standard error", f"bound at {BOUND_SNR:g} dB")  # fmt: skip
     return markdown(header, (row for case in cases for row in _rows(case, published[case.name], _dimension(case))), 2)
 
 
 def table_3(cases: Sequence[Case], published: Mapping[str, Sequence[float | None]]) -> str:
-    """One line for each parameter at each SNR; with the estimate free of the box beside the boxed one."""
+    """One row per parameter and SNR, with the bounded and the unbounded estimate."""
     header = ("SNR", "", "true", "paper", "DE alone", "refined", "paper's error", "DE's error", "refined error",
               "standard error", "bound", "free of the box", "its error / bound")  # fmt: skip
     rows = []
@@ -43,7 +43,7 @@ def table_3(cases: Sequence[Case], published: Mapping[str, Sequence[float | None
 
 
 def correlations(cases: Sequence[Case]) -> str:
-    """The sum of correlations after the search and at the refined estimate, and how the estimate ended."""
+    """Sum of correlations after the search and at the refined estimate, and status of the estimate."""
     header = ("run file", "after DE", "refined", "generations", "step of search, refinement", "status")
     rows = [
         (
@@ -60,7 +60,7 @@ def correlations(cases: Sequence[Case]) -> str:
 
 
 def by_dimension(result: Modes) -> str:
-    """How often the mode was named exactly, and root mean square errors, by the number of faults."""
+    """Share of correctly named modes and root mean square errors, by number of faults."""
     header = ("faults at once", "modes", "draws", "named exactly", "faults missed", "faults invented", "DE alone, RMSE",
               "refined, RMSE", "errors / standard error, RMS")  # fmt: skip
     size = result.modes.sum(-1)
@@ -70,7 +70,7 @@ def by_dimension(result: Modes) -> str:
 
 
 def _group(result: Modes, chosen: Tensor, name: str) -> list[str]:
-    there, said = result.modes[chosen].unsqueeze(1), result.said[chosen]
+    there, said = result.modes[chosen].unsqueeze(1), result.stated[chosen]
     searched, refined = (part[chosen] - result.truth[chosen].unsqueeze(1) for part in (result.searched, result.refined))
     # At an end of the box an estimate is held, and its error is not that of a free one.
     inside = there.expand_as(refined) & (result.refined[chosen] < 1.0) & (result.refined[chosen] > 0.0)
@@ -89,17 +89,17 @@ def _group(result: Modes, chosen: Tensor, name: str) -> list[str]:
 
 
 def wrongly_named(result: Modes) -> str:
-    """Every draw whose faults were not named exactly, in words."""
+    """Every draw whose faults were not named correctly."""
     wrong = (~result.right).nonzero().tolist()
-    said = [f"{mode_name(result.modes[m])} as {mode_name(result.said[m, d])}" for m, d in wrong]
+    said = [f"{mode_name(result.modes[m])} as {mode_name(result.stated[m, d])}" for m, d in wrong]
     return f"Named otherwise: {'; '.join(said)}." if said else "None was named otherwise."
 
 
-def windows(found: OnLine) -> str:
-    """Alarms, delays and what was estimated in each window."""
+def windows(online: OnLine) -> str:
+    """Alarms, delays and estimates of each window."""
     header = ("window, s", "alarm", "", "true", "estimate", "standard error", "error / standard error", "correlation")
     rows = []
-    for window in found.windows:
+    for window in online.windows:
         span = f"{window.begin:g} to {window.end:g}"
         alarm = "none" if window.alarm is None else f"{window.alarm:g} s (delay {window.delay:g} s)"
         if window.result is None:
@@ -130,7 +130,7 @@ def errata() -> str:
 
 
 def error(value: float | Tensor, sign: str = "") -> str:
-    """Two digits; what is below rounding is said to be so, for its digits are another machine's already."""
+    """Two digits; smaller values are reported as below rounding, because their digits depend on the machine."""
     return f"< {ROUNDING:g}" if abs(float(value)) < ROUNDING else f"{float(value):{sign}.1e}"
 
 

@@ -1,4 +1,5 @@
-"""Rivals that regress the equation errors of a recording: sample-split F tests, sparse regression, Gaussian processes.
+"""Baselines that regress the equation errors of a recording: split-sample F tests, sparse regression, Gaussian
+processes.
 
 None simulates; each gives an answer in the format of a diagnosis.
 """
@@ -18,7 +19,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
 LEVEL = 0.01
-"""Of the F test, shared out over all candidates (Bonferroni)."""
+"""Level of the F test, divided among all candidates (Bonferroni)."""
 MOST_CAUSES = 3
 SEGMENT = 20  # blocks of one half of the data in turn
 RIDGE, TRIALS = 1e-2, 50
@@ -29,7 +30,7 @@ _TOLERANCE = 0.03
 
 
 class Regression:
-    """y (n,) and its columns, whitened tank by tank; discharge coefficients have their tolerance as a prior."""
+    """y (n,) and its columns, whitened tank by tank; discharge coefficients have their tolerances as priors."""
 
     def __init__(self, errors: EquationErrors, leave_out: Collection[str]) -> None:
         self.causes = [cause for cause in errors.columns if cause[0] not in leave_out]
@@ -44,7 +45,7 @@ class Regression:
         self.columns /= np.maximum(np.sqrt(np.mean(self.columns**2, axis=0)), 1e-300)
 
     def residual(self, chosen: Sequence[int], rows: Array) -> tuple[float, Array]:
-        """Residual sum of squares of these rows, and the coefficients of the chosen columns, then of the nuisance."""
+        """Residual sum of squares of these rows, and the coefficients of chosen and nuisance columns."""
         x = np.concatenate([self.columns[rows][:, list(chosen)], self.nuisance[rows]], axis=1)
         prior = np.zeros((self.nuisance.shape[1], x.shape[1]))
         prior[:, len(chosen) :] = np.eye(self.nuisance.shape[1]) / _TOLERANCE
@@ -54,7 +55,9 @@ class Regression:
 
 
 def noise_of(y: Array) -> Array:
-    """(N,): standard deviation of equation errors (K, N) by second differences, as of e_k - e_(k-1) with e white."""
+    """(N,): standard deviation of equation errors (K, N) from second differences, assuming e_k - e_(k-1)
+    with white e.
+    """
     spread: Array = np.sqrt(np.mean(np.diff(y, 2, axis=0) ** 2, axis=0) / 10) + 1e-15
     return spread
 
@@ -65,18 +68,18 @@ def split_f_test(
     """Chooses effects one by one on one half of the data, and keeps them as long as the F test on the other half says
     that they are needed ("Where is my physics wrong?", arXiv 2606.23215, in its simplest form).
     """
-    found = Regression(equation_errors(plant, recording), leave_out)
+    regression = Regression(equation_errors(plant, recording), leave_out)
     chosen: list[int] = []
-    left, samples = found.residual(chosen, ~found.half)[0], int((~found.half).sum())
+    left, samples = regression.residual(chosen, ~regression.half)[0], int((~regression.half).sum())
     while len(chosen) < MOST_CAUSES:
-        free = [k for k in range(len(found.causes)) if k not in chosen]
-        best = min(free, key=lambda k: found.residual([*chosen, k], found.half)[0])
-        after = found.residual([*chosen, best], ~found.half)[0]
-        p = f_test(left - after, after, 1, samples - len(chosen) - found.nuisance.shape[1])
-        if p > LEVEL / len(found.causes):
+        free = [k for k in range(len(regression.causes)) if k not in chosen]
+        best = min(free, key=lambda k: regression.residual([*chosen, k], regression.half)[0])
+        after = regression.residual([*chosen, best], ~regression.half)[0]
+        p = f_test(left - after, after, 1, samples - len(chosen) - regression.nuisance.shape[1])
+        if p > LEVEL / len(regression.causes):
             break
         chosen, left = [*chosen, best], after
-    return _answer([found.causes[k] for k in chosen])
+    return _answer([regression.causes[k] for k in chosen])
 
 
 def sparse_regression(
@@ -85,22 +88,24 @@ def sparse_regression(
     """Sequentially thresholded least squares over all columns (Brunton, Proctor and Kutz, 2016, SINDy); the threshold
     comes from the Bayesian information criterion.
     """
-    found = Regression(equation_errors(plant, recording), leave_out)
-    rows, n = np.ones(len(found.y), dtype=bool), len(found.y)
+    regression = Regression(equation_errors(plant, recording), leave_out)
+    rows, n = np.ones(len(regression.y), dtype=bool), len(regression.y)
     candidates: list[list[int]] = [[]]
     for threshold in THRESHOLDS:
-        kept = list(range(len(found.causes)))
+        kept = list(range(len(regression.causes)))
         for _ in range(TRIALS):
-            x = np.concatenate([found.columns[:, kept], found.nuisance], axis=1)
-            ridge = np.concatenate([np.full(len(kept), n * RIDGE), np.full(found.nuisance.shape[1], _TOLERANCE**-2)])
-            size = np.abs(np.linalg.solve(x.T @ x + np.diag(ridge), x.T @ found.y))[: len(kept)]
+            x = np.concatenate([regression.columns[:, kept], regression.nuisance], axis=1)
+            ridge = np.concatenate(
+                [np.full(len(kept), n * RIDGE), np.full(regression.nuisance.shape[1], _TOLERANCE**-2)]
+            )
+            size = np.abs(np.linalg.solve(x.T @ x + np.diag(ridge), x.T @ regression.y))[: len(kept)]
             large = [k for k, s in zip(kept, size, strict=True) if s > threshold]
             if large == kept:
                 break
             kept = large
         candidates.append(kept)
-    best = min(candidates, key=lambda own: n * np.log(found.residual(own, rows)[0] / n) + len(own) * np.log(n))
-    return _answer([found.causes[k] for k in best])
+    best = min(candidates, key=lambda own: n * np.log(regression.residual(own, rows)[0] / n) + len(own) * np.log(n))
+    return _answer([regression.causes[k] for k in best])
 
 
 def gaussian_process(
@@ -110,10 +115,10 @@ def gaussian_process(
     the highest marginal likelihood, and never a cause.
     """
     errors = equation_errors(plant, recording)
-    found = Regression(errors, leave_out)
-    rows = np.ones(len(found.y), dtype=bool)
+    regression = Regression(errors, leave_out)
+    rows = np.ones(len(regression.y), dtype=bool)
     y, noise = np.full_like(errors.y, np.nan), noise_of(errors.y)
-    calibrated = found.y - found.nuisance @ found.residual([], rows)[1]
+    calibrated = regression.y - regression.nuisance @ regression.residual([], rows)[1]
     y[:, np.isfinite(errors.y).all(axis=0)] = calibrated.reshape(len(y), -1)
     gains = {place: _gain(y, seen, balance / noise) for place, (seen, balance) in errors.local.items()}
     ranked = sorted(gains, key=lambda place: gains[place], reverse=True)
@@ -124,7 +129,7 @@ def gaussian_process(
 
 
 def _gain(y: Array, seen: Array, balance: Array) -> float:
-    """Log marginal likelihood of the whitened balances that a flow at this place enters, less that without it."""
+    """Log marginal likelihood ratio for a flow at this location, over the balances that the flow enters."""
     tanks = np.flatnonzero((balance != 0) & np.isfinite(y).all(axis=0))
     if not len(tanks):
         return -np.inf

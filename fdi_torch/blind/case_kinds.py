@@ -1,4 +1,4 @@
-"""The kinds of cases (strata), and which causes a case of each kind gets: names and places only, before any number."""
+"""Kinds of cases (strata), and the choice of causes for a case of each kind: names and locations, without numbers."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from fdi_torch.plant.description import PlantDescription
 
 @dataclass(frozen=True)
 class Kind:
-    """strength of its full effects (1 is usual). causes: how many. perhaps: how many more in every other case.
-    faint: how many more at an eighth of usual strength. unseen: whether a law is added that no library holds.
+    """A kind of cases.
 
-    inputs: as in `draw_conditions`. coloured: chance of correlated noise. disturbed: whether flows are disturbed at
-    random. unmeasured: share of the levels. looped: whether a level is controlled. shows: whether causes are drawn
-    anew until each moves the readings.
+    strength: of full effects (1 is usual). causes: number of full effects; perhaps: further ones in every other case;
+    faint: further ones of an eighth of the usual strength. unseen: whether a law outside the library is added. inputs:
+    see `draw_conditions`. coloured: probability of correlated noise. disturbed: random disturbance flows. unmeasured:
+    share of levels without a sensor. looped: whether a level is controlled. shows: whether causes are drawn again until
+    each is visible in the readings.
     """
 
     name: str
@@ -62,15 +63,15 @@ KINDS = {
     )
 }
 ON_NETWORKS = ("site", "hidden", "law", "mixed", "null", "loop", "dnull", "dsingle")
-"""The kinds that random networks get by default."""
+"""Default kinds for random networks."""
 _EXTRA = {"left_out", "site", "hidden", "law", "mixed", "loop"}
 STANDARD = tuple(name for name in KINDS if name not in _EXTRA)
-"""The kinds that every other rig gets by default."""
+"""Default kinds for all other rigs."""
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """What is wrong with a rig, by name: `full` causes, then faint ones; `unknown`: a law that no library names."""
+    """Causes of a case by name: `full` ones, then faint ones. `unknown`: a law outside the library."""
 
     causes: tuple[Cause, ...] = ()
     full: int = 0
@@ -80,12 +81,12 @@ class Chosen:
 
 
 def case_generator(seed: int, kind: str, index: int, *more: int) -> np.random.Generator:
-    """The generator of one case: it depends on no other case, nor on how many there are."""
+    """Random generator of one case, independent of all other cases and of their number."""
     return np.random.default_rng([seed, zlib.crc32(kind.encode()), index, *more])
 
 
 def in_turn(items: Sequence[str], seed: int, kind: str, index: int) -> str:
-    """Item of this index in a sequence of shuffled rounds, so that all come up equally often."""
+    """The item at this index of a sequence of shuffled rounds, so that all items are equally frequent."""
     turn, at = divmod(index, len(items))
     order = case_generator(seed, kind, turn, 1).permutation(len(items))
     return items[int(order[at])]
@@ -100,7 +101,7 @@ def choose(
     leave_out: Sequence[str],
     trial: int = 0,
 ) -> Chosen:
-    """The causes of case `index` of this kind. trial: how often its causes were drawn already and did not show."""
+    """The causes of case `index` of this kind. trial: number of earlier draws whose causes were not visible."""
     rng, plant = case_generator(seed, kind.name, index, 2, *([trial] if trial else [])), rig.plant
     if kind.name == "twins":
         return Chosen((_twin(plant, index, rng),), 1)
@@ -122,7 +123,7 @@ def choose(
 
 
 def _another(plant: PlantDescription, causes: Sequence[Cause], rng: np.random.Generator) -> Cause:
-    """A further cause: another effect, and not a twin of one that is there."""
+    """A further cause: another effect that is not collinear with those chosen."""
     free = [c for c in effect_places(plant) if all(c[0] != o[0] and not are_twins(c, o, plant) for o in causes)]
     return free[int(rng.integers(len(free)))]
 
@@ -136,11 +137,11 @@ def _unseen(
     trial: int,
     rng: np.random.Generator,
 ) -> Unknown:
-    """A law that no library holds. Those that show only where a flow turns round need inputs that stand still."""
-    found = {u.law: u for u in unknown_to(library) if places(plant, u.at)}
+    """A law outside the library. Laws that need reversing flow require inputs that are at rest for a while."""
+    laws = {u.law: u for u in unknown_to(library) if places(plant, u.at)}
     if kind.inputs != "rich" or not any(not p.is_outlet for p in plant.pipes):
-        found = {name: u for name, u in found.items() if not u.reversing}
-    return found[in_turn(sorted(found), seed, kind.name, index) if trial < 2 else str(rng.choice(sorted(found)))]
+        laws = {name: u for name, u in laws.items() if not u.reversing}
+    return laws[in_turn(sorted(laws), seed, kind.name, index) if trial < 2 else str(rng.choice(sorted(laws)))]
 
 
 def _twin(plant: PlantDescription, index: int, rng: np.random.Generator) -> Cause:
@@ -152,10 +153,10 @@ def _twin(plant: PlantDescription, index: int, rng: np.random.Generator) -> Caus
 def _left_out(
     plant: PlantDescription, seed: int, index: int, leave_out: Sequence[str], rng: np.random.Generator
 ) -> Chosen:
-    """An effect the diagnosis is denied, where nothing left is the same thing under another name."""
+    """An effect to leave out of the library, for which no equivalent effect remains in it."""
     alike = {canonical(c, plant) for c in effect_places(plant) if canonical(c, plant) != c}
-    found = {e: places(plant, EFFECTS.get(e, ())) for e in leave_out}
-    free = {e: [p for p in at if canonical((e, p), plant) not in alike] for e, at in found.items()}
+    candidates = {e: places(plant, EFFECTS.get(e, ())) for e in leave_out}
+    free = {e: [p for p in at if canonical((e, p), plant) not in alike] for e, at in candidates.items()}
     possible = [e for e in leave_out if free[e]]
     if not possible:
         raise ValueError("expected an effect to leave out that has a place in this plant, got none; name one")
