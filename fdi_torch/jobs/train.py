@@ -54,10 +54,7 @@ class TrainResult(Shown):
         diagnosis = self.result.diagnosis
         names = ", ".join(fault.name for fault in diagnosis.present)
         text = f"{diagnosis.kind}: {names}" if names else diagnosis.kind
-        if diagnosis.explained:
-            return text
-        ratio = diagnosis.unexplained_ratio
-        return f"the model does not explain the recording (residuals {ratio:.2g} times the noise); {text}"
+        return "; ".join(filter(None, (diagnosis.warning, text)))
 
     def table(self) -> Table:
         """One row per parameter, SI."""

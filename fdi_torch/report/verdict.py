@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fdi_torch.estimate.diagnosis import UNRELIABLE
 from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.report.diagnosed_effects import DiagnosedEffect, diagnosed_effects, fault_at
 from fdi_torch.report.material import Material
@@ -36,9 +37,10 @@ def headline(material: Material) -> str:
         rehearsal_words,
         study_words,
     )
+    warning = f"{UNRELIABLE}. " if material.about("result").get("explained") == "false" else ""
     for words in (of(material) for of in (*sentences, windows_words)):
         if words:
-            return words
+            return warning + words
     return material.about("status").get("status", "did not end").replace("_", " ").capitalize()
 
 
@@ -145,8 +147,6 @@ def how_it_ended(material: Material) -> list[str]:
     parts += [f"started {run['started'][:19].replace('T', ' ')} UTC"] if run.get("started") else []
     parts += [f"took {status['wall_seconds']} s"] if status.get("wall_seconds") else []
     sentences = [" · ".join(parts)]
-    if material.about("result").get("explained") == "false":
-        sentences.append("This model does not explain the recording: residuals are larger than the sensors' noise.")
     return sentences
 
 
