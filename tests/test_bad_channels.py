@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.acquisition import examined, usable
 from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.preprocess.acquisition import examined, usable
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 from tests.test_gap import SMALL, believed, noise, recorded
@@ -79,7 +79,7 @@ EACH_SENSOR = [(0, None, 0), (1, None, 800), (2, 0.0, 800), pytest.param(1, 0.0,
 def test_a_sensor_that_is_stuck_is_masked_and_told(column: int, value: float | None, first: int) -> None:
     found = examined(believed(), from_sample(sound(), column, first, value))
     assert [(s.sensor.name, s.first, s.for_good) for s in found.stuck] == [(f"h{column + 1}", first, True)]
-    assert found.slip is None
+    assert found.fault is None
     counted = found.recording.mask.sum(dim=0).tolist()
     assert counted[column] == first
     assert [n for c, n in enumerate(counted) if c != column] == [2000, 2000]
@@ -89,7 +89,7 @@ def test_a_sensor_that_is_stuck_is_masked_and_told(column: int, value: float | N
 @pytest.mark.parametrize("factor", [1e-3, 0.1, *(pytest.param(f, marks=pytest.mark.slow) for f in (1e-2, 10.0, 1e3))])
 def test_a_unit_that_slipped_is_refused(factor: float) -> None:
     run = sound()
-    with pytest.raises(ValueError, match=r"h3: its unit seems wrong, for its numbers are \d+ times too"):
+    with pytest.raises(ValueError, match=r"h3: its unit seems wrong: its values are \d+ times too"):
         usable(believed(), with_channel(run, 2, factor * run.outputs[:, 2]))
 
 
@@ -97,7 +97,7 @@ def test_a_command_in_the_wrong_unit_is_refused() -> None:
     run = sound()
     inputs = run.inputs.clone()
     inputs[:, 0] *= 0.1
-    with pytest.raises(ValueError, match="Q1: its unit seems wrong, for its numbers are 10 times too small"):
+    with pytest.raises(ValueError, match="Q1: its unit seems wrong: its values are 10 times too small"):
         usable(believed(), replace(run, inputs=inputs))
 
 
@@ -139,7 +139,7 @@ def test_a_sensor_that_reads_ahead_of_the_others_is_refused() -> None:
 def test_a_sensor_that_reads_late_is_left_to_who_knows_the_delay_of_a_sensor() -> None:
     run, delay = sound(), 60
     late_one = with_channel(run, 1, torch.cat([run.outputs[:delay, 1], run.outputs[:-delay, 1]])).stretch(delay, 2000)
-    assert usable(believed(), late_one, effects=True).slip is not None
+    assert usable(believed(), late_one, effects=True).fault is not None
     with pytest.raises(ValueError, match=r"h2: the clock seems to run \S+ s behind that of the other channels"):
         usable(believed(), late_one)
 
@@ -154,7 +154,7 @@ def test_random_readings_are_refused() -> None:
 def test_what_is_trusted_is_not_refused() -> None:
     run = sound()
     wrong = with_channel(run, 2, 10.0 * run.outputs[:, 2])
-    assert usable(believed(), replace(wrong, trusted=True)).slip is None
+    assert usable(believed(), replace(wrong, trusted=True)).fault is None
 
 
 FAULTS = [
@@ -173,7 +173,7 @@ FAULTS = [
 @pytest.mark.parametrize("values", FAULTS, ids=lambda v: "+".join(v))
 def test_a_fault_however_large_is_no_slip(values: dict[str, float]) -> None:
     found = examined(believed(), recorded(values, 5, samples=2000))
-    assert found.slip is None and not found.stuck
+    assert found.fault is None and not found.stuck
 
 
 def test_a_stuck_sensor_is_the_cause_and_hides_no_other() -> None:

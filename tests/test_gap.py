@@ -12,9 +12,9 @@ from torch import Tensor
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.gap.answer import adopted
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, slow_excess
+from fdi_torch.gap.identifiability import planned_identifiability
 from fdi_torch.gap.library import STANDARD, canonical, library_of
-from fdi_torch.gap.plan import plan
+from fdi_torch.gap.noise_model import Noise, estimate_noise, low_frequency_excess, quantization_step
 from fdi_torch.gap.screening import Pairs
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
@@ -109,7 +109,7 @@ def test_a_transmitter_that_averages_is_told_and_undone(samples: int, slow: floa
 
 
 def test_a_constant_offset_is_slow_and_counts_with_all_its_squares() -> None:
-    assert slow_excess(torch.full((600, 2), 3.0, dtype=torch.float64)) == pytest.approx(2 * 600 * 3.0**2)
+    assert low_frequency_excess(torch.full((600, 2), 3.0, dtype=torch.float64)) == pytest.approx(2 * 600 * 3.0**2)
 
 
 def test_rounded_readings_are_no_mean_of_several() -> None:
@@ -123,9 +123,9 @@ def test_rounded_readings_are_no_mean_of_several() -> None:
 
 def test_a_rounded_channel_shows_its_step_and_a_printed_one_does_not() -> None:
     x = 0.3 + 0.1 * torch.sin(torch.arange(2000, dtype=torch.float64) / 90) + noise(2000, 0.0, 0.001, 1)[:, 0]
-    assert lattice_step((x / 0.013).round() * 0.013, 0.001) == pytest.approx(0.013, rel=1e-6)
-    assert lattice_step((x * 1e6).round() / 1e6, 0.001) == 0.0
-    assert lattice_step(x, 0.001) == 0.0
+    assert quantization_step((x / 0.013).round() * 0.013, 0.001) == pytest.approx(0.013, rel=1e-6)
+    assert quantization_step((x * 1e6).round() / 1e6, 0.001) == 0.0
+    assert quantization_step(x, 0.001) == 0.0
 
 
 def test_a_pair_promises_nothing_where_one_of_the_two_would_have_to_turn_round() -> None:
@@ -224,9 +224,9 @@ def test_a_recording_without_a_sensor_is_refused() -> None:
 def test_a_plan_knows_what_stays_hidden() -> None:
     library = ("pump_gain", "pump_dead_zone@Q1", "sensor_bias@h2", "sensor_saturation@h1")
     steady = constant_inputs(believed(), 600.0)
-    at_rest = plan(believed(), steady, 1e-3, library)
+    at_rest = planned_identifiability(believed(), steady, 1e-3, library)
     assert ("pump_gain", "Q1") in at_rest.hidden  # three constants with 3 % tolerance take it all
-    lively = plan(believed(), recorded({"P13.discharge_coefficient": 0.6}, 61), 1e-3, library)
+    lively = planned_identifiability(believed(), recorded({"P13.discharge_coefficient": 0.6}, 61), 1e-3, library)
     assert ("pump_gain", "Q1") not in lively.hidden
     assert ("sensor_saturation", "h1") in at_rest.hidden
 

@@ -10,10 +10,10 @@ import torch
 
 from fdi_torch.effects import placements_for
 from fdi_torch.gap.answer import Answer
-from fdi_torch.gap.closure import Model, carried_over, run_all
+from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.floor import Noise
-from fdi_torch.gap.subject import subject_of
+from fdi_torch.gap.holdout import Model, run_reference_models, transferable_values
+from fdi_torch.gap.noise_model import Noise
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlacedEffect
 from fdi_torch.recording import Recording
@@ -81,18 +81,18 @@ def test_what_has_no_name_closes_a_gap_elsewhere_too_as_far_as_it_depends_on_loc
 def test_another_day_has_a_free_form_s_mean_course_and_none_of_its_waves() -> None:
     form = {"head_0": 0.1, "time_0": 0.2, "time_1": 0.4, "sine_0": 0.3, "cosine_0": 0.3}
     values = {f"P13.free_flow.{name}": value for name, value in form.items()} | {"Q1.pump_gain.time_0": 5.0}
-    carried = carried_over(values)
+    carried = transferable_values(values)
     expected = {"head_0": 0.1, "time_0": 0.3, "time_1": 0.3, "sine_0": 0.0, "cosine_0": 0.0}
     assert {n.removeprefix("P13.free_flow."): v for n, v in carried.items() if "P13" in n} == pytest.approx(expected)
     assert carried["Q1.pump_gain.time_0"] == 5.0, "no free form's"
 
 
 def test_the_floor_of_a_hold_out_is_the_noise_even_where_the_augmented_model_runs_away() -> None:
-    held = subject_of(believed(), (), recorded({}, 5, samples=600), 1.0)
+    held = data_set_of(believed(), (), recorded({}, 5, samples=600), 1.0)
     noise = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     swinging = {"h1.sensor_oscillation.amplitude": 0.05, "h1.sensor_oscillation.period": 5.0}
     models = {"recalibrated": Model(), "augmented": Model(placements_for(swinging), swinging)}
-    found = run_all(held, noise, models, [0.0, 0.0, 0.0])
+    found = run_reference_models(held, noise, models, [0.0, 0.0, 0.0])
     assert found.squares("augmented").sum() > 1.5 * found.squares("recalibrated").sum()
     assert found.noise.std.tolist() == pytest.approx([1e-3] * 3, rel=0.1)
 

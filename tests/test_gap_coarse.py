@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from fdi_torch.config.plant import load_plant
-from fdi_torch.gap.case import laid_out
-from fdi_torch.gap.floor import estimate_noise
+from fdi_torch.gap.noise_model import estimate_noise
+from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.plant.operating_range import operating_range_of, with_simulated_levels
 from fdi_torch.recording import Recording
 from tests.test_gap import believed, recorded
@@ -40,5 +40,8 @@ def test_a_tank_without_a_sensor_reaches_as_far_as_the_model_has_it() -> None:
 
 def test_samples_far_apart_are_simulated_in_shorter_steps() -> None:
     recording = recorded({"P13.discharge_coefficient": 0.615}, 11)
-    steps = [float(laid_out(believed(), (), [recording.every(n)], None).experiment.steps.max()) for n in (1, 5, 10, 12)]
+    steps = [
+        float(checked_data_set(believed(), (), [recording.every(n)], None).experiment.steps.max())
+        for n in (1, 5, 10, 12)
+    ]
     assert steps == pytest.approx([1.0, 2.5, 2.5, 2.4], abs=1e-12)

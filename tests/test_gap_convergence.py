@@ -13,10 +13,9 @@ from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import effect
 from fdi_torch.estimate.fitting import set_up
-from fdi_torch.gap.case import PLAIN, case_of
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
 from fdi_torch.gap.diagnose import _recalibrated
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter
-from fdi_torch.gap.standard_errors import standard_errors
+from fdi_torch.gap.problem import PLAIN, problem_of
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
@@ -39,7 +38,7 @@ SIZE = "P32.plugging.size"
 
 
 def recalibrated(plant: PlantDescription, recording: Recording) -> tuple[Fitter, Fit]:
-    fitter, null, _ = _recalibrated(case_of(plant, [recording], [], PLAIN).subject)
+    fitter, null, _ = _recalibrated(problem_of(plant, [recording], [], PLAIN).data)
     return fitter, null
 
 
@@ -130,7 +129,7 @@ def test_a_recalibration_at_nearly_equal_levels_gains_nothing_from_an_effect_tha
     inputs = torch.tensor(flows, dtype=torch.float64).T[(time / 1200.1).long()]
     off = {"P3_4.discharge_coefficient": 0.582, "OUT6.discharge_coefficient": 0.627}
     fitter, null = recalibrated(plant, recorded(plant, blank_recording(plant, inputs, time), off, seed=0))
-    readings = float(fitter.subject.mask.sum())
+    readings = float(fitter.data.mask.sum())
     assert null.converged and null.cost < readings + 5.0 * (2.0 * readings) ** 0.5
     flow = Placement(effect("unmetered_flow"), "T6")
     beside = fitter.fit(Candidate((flow,), ({"T6.unmetered_flow.flow": 1e-7},)), null)

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.case import laid_out
-from fdi_torch.gap.curves import curves_at
-from fdi_torch.gap.fitting import Candidate, Fitter
-from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.discrepancy_curves import curves_at
+from fdi_torch.gap.noise_model import Noise
+from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
 from tests.test_gap import believed, recorded
@@ -32,7 +32,7 @@ def test_the_free_curve_agrees_with_the_effect_that_is_there(
     truth = {f"{place}.{name}.{key}": value for key, value in values.items()}
     recording = recorded(truth, 13, samples=600)
     white = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    fitter = Fitter(laid_out(believed(), (), [recording], None), white)
+    fitter = Fitter(checked_data_set(believed(), (), [recording], None), white)
     fit = fitter.fit(Candidate((Placement(effect(name), place),), (truth,)))
     first, *_, last = curves_at(fitter, fit, place, operating_range_of(recording, believed()))
     assert (first.quantity, first.variable, last.variable) == (quantity, variable, "time")

@@ -8,14 +8,13 @@ import pytest
 import torch
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.case import laid_out
+from fdi_torch.gap.candidate_fit import Candidate, Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.excitation import excitation
-from fdi_torch.gap.fitting import Candidate, Fitter
-from fdi_torch.gap.floor import Noise
-from fdi_torch.gap.impostors import DRAWS, simulated_impostors
-from fdi_torch.gap.next_input import HIGH, next_input, planned
-from fdi_torch.gap.screening import Option, Pairs, Screen
+from fdi_torch.gap.experiment_design import HIGH, discriminating_input, planned_recording
+from fdi_torch.gap.identifiability import DRAWS, identifiability, simulated_confusions
+from fdi_torch.gap.noise_model import Noise
+from fdi_torch.gap.problem import checked_data_set
+from fdi_torch.gap.screening import Option, Pairs, ScreeningResult
 from fdi_torch.plant.effect import Placement
 from tests.test_gap import believed, recorded
 
@@ -38,7 +37,7 @@ def test_a_twin_passes_when_the_true_cause_is_missing_and_half_the_time_when_it_
     # The first two columns are one and the same but for a ten-thousandth; the third has nothing to do with them.
     columns = torch.zeros(4, 3, dtype=torch.float64)
     columns[0, :2], columns[1, 1], columns[2, 2] = 30.0, 3e-3, 30.0
-    told = simulated_impostors(made_up(columns), ("pump_gain", "Q1"), 900.0, believed())
+    told = simulated_confusions(made_up(columns), ("pump_gain", "Q1"), 900.0, believed())
     assert told is not None
     assert told["rivals"] == 2 and told["draws"] == 2 * DRAWS
     assert told["passed"] == DRAWS and told["passed_for"] == [{"effect": "pump_gain", "location": "Q2"}]
@@ -46,7 +45,7 @@ def test_a_twin_passes_when_the_true_cause_is_missing_and_half_the_time_when_it_
 
 
 def test_effects_that_move_the_readings_differently_never_pass_for_one_another() -> None:
-    told = simulated_impostors(
+    told = simulated_confusions(
         made_up(30.0 * torch.eye(3, dtype=torch.float64)), ("pump_gain", "Q1"), 900.0, believed()
     )
     assert told is not None and told["passed"] == told["confused"] == 0
@@ -54,7 +53,7 @@ def test_effects_that_move_the_readings_differently_never_pass_for_one_another()
 
 def test_a_gap_that_no_other_effect_can_make_has_no_impostor() -> None:
     pairs = made_up(1e-2 * torch.eye(3, dtype=torch.float64))
-    assert simulated_impostors(pairs, ("pump_gain", "Q1"), 1e9, believed()) is None
+    assert simulated_confusions(pairs, ("pump_gain", "Q1"), 1e9, believed()) is None
 
 
 def test_twins_and_hidden_effects_follow_from_the_columns() -> None:
@@ -62,9 +61,9 @@ def test_twins_and_hidden_effects_follow_from_the_columns() -> None:
     columns[0, :2], columns[1, 1], columns[2, 2] = 30.0, 3.0, 4.0
     pairs = made_up(columns)
     strength = torch.diagonal(pairs.gram)
-    found = excitation(Screen(pairs.options, pairs.score, strength, pairs), believed())
+    found = identifiability(ScreeningResult(pairs.options, pairs.score, strength, pairs), believed())
     assert found.hidden == (("pump_lag", "Q1"),)
-    ((first, second, left),) = found.twins
+    ((first, second, left),) = found.equivalent_causes
     assert {first, second} == {("pump_gain", "Q1"), ("pump_gain", "Q2")}
     # What is left of the weaker beside the stronger: |a|^2 sin^2 of the angle between them.
     assert left == pytest.approx(900.0 * math.sin(math.atan2(3.0, 30.0)) ** 2)
@@ -75,7 +74,7 @@ def rivals() -> Fitter:
     """A recording under steady inputs: lag and delay of a pump are one there."""
     recording = recorded({"Q1.pump_lag.time_constant": 10.0}, 9, samples=300, steady=True)
     white = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    return Fitter(laid_out(believed(), (), [recording], None), white)
+    return Fitter(checked_data_set(believed(), (), [recording], None), white)
 
 
 def test_the_next_input_parts_what_the_recording_cannot(rivals: Fitter) -> None:
@@ -84,10 +83,10 @@ def test_the_next_input_parts_what_the_recording_cannot(rivals: Fitter) -> None:
         for name, size in (("pump_lag", "time_constant"), ("pump_delay", "delay"))
     ]
     assert abs(fits[0].cost - fits[1].cost) < 10.0
-    found = next_input(rivals, fits[0], fits[1])
+    found = discriminating_input(rivals, fits[0], fits[1])
     assert found is not None and found["separation"] > 20.0
     assert found["parted_after_samples"] == round(found["parted_after"]) + 1 < 1500
-    wanted = planned(found["input"], believed())
+    wanted = planned_recording(found["input"], believed())
     assert wanted.input_names == ("Q1", "Q2") and len(wanted) == 1500
     full = torch.tensor([p.max_flow for p in believed().pumps], dtype=torch.float64)
     assert bool((wanted.inputs > 0.0).all()) and bool((wanted.inputs <= HIGH * full).all())
@@ -97,7 +96,7 @@ def test_the_next_input_parts_what_the_recording_cannot(rivals: Fitter) -> None:
 
 def test_explanations_that_predict_the_same_are_not_parted(rivals: Fitter) -> None:
     fit = rivals.fit(Candidate())
-    found = next_input(rivals, fit, fit)
+    found = discriminating_input(rivals, fit, fit)
     assert found is not None
     assert found["separation"] == pytest.approx(0.0, abs=1e-9)
     assert found["parted_after"] is None and found["parted_after_samples"] is None

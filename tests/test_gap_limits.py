@@ -9,7 +9,7 @@ import torch
 from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import place
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.limits import limits_of, told_limits
+from fdi_torch.gap.preprocess.sensor_limits import limits_from_readings, limits_of
 from fdi_torch.recording import Recording
 from tests.test_gap import believed, noise, recorded
 
@@ -38,11 +38,11 @@ def test_a_limit_that_the_plant_has_already_or_that_is_not_searched_is_not_told(
     time = torch.arange(len(values), dtype=torch.float64)
     recording = Recording(time, values[:, :0], values, (), (sensor.column,), (), (sensor.unit,))
     saturation = place("sensor_saturation", sensor.name)
-    (told,) = told_limits(plant, [recording], [], [saturation])
+    (told,) = limits_from_readings(plant, [recording], [], [saturation])
     assert told.prefix == saturation.prefix
     assert told.values == {"limit": pytest.approx(8.0)}
-    assert told_limits(plant, [recording], [saturation], [saturation]) == []
-    assert told_limits(plant, [recording], [], []) == []
+    assert limits_from_readings(plant, [recording], [saturation], [saturation]) == []
+    assert limits_from_readings(plant, [recording], [], []) == []
 
 
 @pytest.mark.parametrize("behind", [False, True])

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.case import case_of
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
 from fdi_torch.gap.diagnose import Settings, _recalibrated
-from fdi_torch.gap.disturbances import with_own_noise
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter
-from fdi_torch.gap.where import promise
-from fdi_torch.gap.where.survey import Survey
+from fdi_torch.gap.localization import single_regressor_gain as promise
+from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.marginal_likelihood import with_estimated_noise
+from fdi_torch.gap.problem import problem_of
 from fdi_torch.plant.effect import Placement
 from tests.test_gap import believed, recorded
 
@@ -20,35 +20,37 @@ PLACES = ("Q1", "T1", "P13", "OUT2", "T1-T3", "h2")
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["plain", "with a lag of a sensor"])
-def surveyed(request: pytest.FixtureRequest) -> tuple[Survey, Fitter, Fit]:
-    case = case_of(believed(), (recorded({"Q1.pump_lag.time_constant": 8.0}, seed=3),), (), Settings())
-    fitter, null, _ = _recalibrated(case.subject)
-    under, _ = with_own_noise(fitter, null)
+def surveyed(request: pytest.FixtureRequest) -> tuple[DiscrepancyRegression, Fitter, Fit]:
+    case = problem_of(believed(), (recorded({"Q1.pump_lag.time_constant": 8.0}, seed=3),), (), Settings())
+    fitter, null, _ = _recalibrated(case.data)
+    under, _ = with_estimated_noise(fitter, null)
     if request.param:
         lag = Candidate((Placement(effect("sensor_lag"), "h2"),), ({"h2.sensor_lag.time_constant": 3.0},))
         null = under.fit(lag, null)
-    return Survey(under, null, (), 40), under, null
+    return DiscrepancyRegression(under, null, (), 40), under, null
 
 
-def products(surveyed: tuple[Survey, Fitter, Fit], place: str, monkeypatch: pytest.MonkeyPatch) -> Tensor:
+def products(
+    surveyed: tuple[DiscrepancyRegression, Fitter, Fit], place: str, monkeypatch: pytest.MonkeyPatch
+) -> Tensor:
     """Of the forms with the residual and random signs."""
     survey, under, null = surveyed
     found: list[Tensor] = []
     monkeypatch.setattr(promise, "_likeliest", lambda p: found.append(p) or 0.0)
-    promise.promised(survey, under, null, [place], torch.Generator().manual_seed(5))
+    promise.single_regressor_gains(survey, under, null, [place], torch.Generator().manual_seed(5))
     return found[0]
 
 
 @pytest.mark.parametrize("place", PLACES)
 def test_products_are_those_of_the_columns(
-    place: str, surveyed: tuple[Survey, Fitter, Fit], monkeypatch: pytest.MonkeyPatch
+    place: str, surveyed: tuple[DiscrepancyRegression, Fitter, Fit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     survey, under, null = surveyed
     own = survey.of(place)
     scale, pull, off = under.priors(null.space, null.theta)
-    rows = torch.cat([(under.white(null.near)[1][0] * scale).flatten(0, 1), torch.diag(pull + 1e-9)])
+    rows = torch.cat([(under.white(null.linearised)[1][0] * scale).flatten(0, 1), torch.diag(pull + 1e-9)])
     basis = torch.linalg.qr(rows)[0]
-    residual = torch.cat([under.white(own.near)[0][0].flatten(), -off])
+    residual = torch.cat([under.white(own.linearised)[0][0].flatten(), -off])
     columns = under.whiten(own.columns).flatten(0, 1)
     columns = torch.cat([columns, columns.new_zeros(len(pull), columns.shape[1])])
     columns -= basis @ (basis.T @ columns)
@@ -63,7 +65,7 @@ def test_products_are_those_of_the_columns(
     assert float(share.mean()) == pytest.approx(1.0, abs=0.15)
 
 
-def test_the_guilty_place_promises_most(surveyed: tuple[Survey, Fitter, Fit]) -> None:
+def test_the_guilty_place_promises_most(surveyed: tuple[DiscrepancyRegression, Fitter, Fit]) -> None:
     survey, under, null = surveyed
-    found = promise.promised(survey, under, null, PLACES, torch.Generator().manual_seed(5))
+    found = promise.single_regressor_gains(survey, under, null, PLACES, torch.Generator().manual_seed(5))
     assert max(found, key=lambda place: found[place]) == "Q1"

@@ -11,7 +11,7 @@ import torch
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant import load_plant
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.where.forms import memories, slews
+from fdi_torch.gap.localization.regressors import memories, slews
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording

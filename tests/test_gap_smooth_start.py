@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import torch
 
-from fdi_torch.gap import smooth_start as module
-from fdi_torch.gap.case import Settings, case_of
-from fdi_torch.gap.fitting import Candidate, Fit
-from fdi_torch.gap.smooth_start import WIDENINGS, first_fit, followed
+from fdi_torch.gap.candidate_fit import Candidate, Fit
+from fdi_torch.gap.free_runs import refit as module
+from fdi_torch.gap.free_runs.refit import WIDENINGS, fit_by_continuation, trajectory_found
+from fdi_torch.gap.problem import Settings, problem_of
 from tests.test_gap_search import PLANT, STANDING, recorded, wandering
 
 
@@ -20,14 +20,14 @@ class Stiff:
     asked: list[tuple[float, bool]]
     sharp: float
 
-    def __init__(self, subject: Any, noise: Any) -> None:
-        self.subject, self.noise = subject, noise
+    def __init__(self, data: Any, noise: Any) -> None:
+        self.data, self.noise = data, noise
 
     def fit(self, candidate: Candidate, base: Any = None) -> Any:
-        resolution = float(self.subject.experiment.resolution)
+        resolution = float(self.data.experiment.resolution)
         Stiff.asked.append((resolution / Stiff.sharp, base is not None))
-        near = base.resolution <= 4.0 * resolution if base else resolution > 20.0 * Stiff.sharp
-        return SimpleNamespace(cost=1.0 if near else float("nan"), near=NEAR, resolution=resolution)
+        linearised = base.resolution <= 4.0 * resolution if base else resolution > 20.0 * Stiff.sharp
+        return SimpleNamespace(cost=1.0 if linearised else float("nan"), linearised=NEAR, resolution=resolution)
 
 
 NEAR = SimpleNamespace(jacobian=torch.zeros(1))
@@ -35,13 +35,13 @@ NEAR = SimpleNamespace(jacobian=torch.zeros(1))
 
 def test_a_course_is_followed_from_the_smoothest_plant_to_the_sharp_one(monkeypatch: pytest.MonkeyPatch) -> None:
     recording = recorded(STANDING, wandering(1024, 4)[256:400])
-    subject = case_of(PLANT, (recording,), (), Settings()).subject
-    Stiff.asked, Stiff.sharp = [], float(subject.experiment.resolution)
+    data = problem_of(PLANT, (recording,), (), Settings()).data
+    Stiff.asked, Stiff.sharp = [], float(data.experiment.resolution)
     monkeypatch.setattr(module, "Fitter", Stiff)
-    found: Fit = first_fit(Stiff(subject, None), Candidate())  # type: ignore[arg-type]
-    assert followed(found)
+    found: Fit = fit_by_continuation(Stiff(data, None), Candidate())  # type: ignore[arg-type]
+    assert trajectory_found(found)
     assert Stiff.asked == [(1.0, False), (WIDENINGS[0], False), *((w, True) for w in WIDENINGS[1:]), (1.0, True)]
     Stiff.asked = []
-    easy = replace(subject, experiment=replace(subject.experiment, resolution=30.0 * subject.experiment.resolution))
-    assert followed(first_fit(Stiff(easy, None), Candidate()))  # type: ignore[arg-type]
+    easy = replace(data, experiment=replace(data.experiment, resolution=30.0 * data.experiment.resolution))
+    assert trajectory_found(fit_by_continuation(Stiff(easy, None), Candidate()))  # type: ignore[arg-type]
     assert len(Stiff.asked) == 1

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.case import laid_out
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.strays import Stray, Strays, jumps_and_returns, strays_of
+from fdi_torch.gap.preprocess.outliers import Outlier, SensorOutliers, jumps_and_returns, outliers_of
+from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.recording import Recording
 from tests.test_gap import SMALL, believed, noise, recorded
 
@@ -53,7 +53,7 @@ def with_spikes(recording: Recording, channel: int, every: int) -> Recording:
 
 def test_what_strays_is_masked_in_its_own_channel_alone() -> None:
     recording = with_spikes(recorded({"T1.leak.size": 0.1}, 51), 1, 90)
-    (found,) = strays_of(laid_out(believed(), (), [recording], None))
+    (found,) = outliers_of(checked_data_set(believed(), (), [recording], None))
     assert found.sensor == believed().sensors[1].name and found.clear
     assert [s.rows.start for s in found.each] == list(range(37, 1000, 90))
     assert [s.times[0] for s in found.each] == [float(recording.time[s.rows.start]) for s in found.each]
@@ -87,6 +87,6 @@ def test_noise_with_heavy_tails_is_nothing_wrong_with_a_sensor() -> None:
     parts = torch.randn(4, 20000, generator=generator, dtype=torch.float64)
     student = parts[0] / (parts[1:] ** 2).mean(dim=0).sqrt()  # of three degrees of freedom
     found = jumps_and_returns(student, torch.zeros(19999, dtype=torch.float64), 0.0)
-    each = tuple(Stray(slice(a, b), (float(a), float(b - 1)), height) for a, b, height in found)
+    each = tuple(Outlier(slice(a, b), (float(a), float(b - 1)), height) for a, b, height in found)
     assert len(each) >= 3  # or this would test nothing
-    assert not Strays("h1", "memory", each).clear
+    assert not SensorOutliers("h1", "memory", each).clear

@@ -5,20 +5,29 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fdi_torch.gap.case import case_of
+from fdi_torch.gap.dataset import interpolate
 from fdi_torch.gap.diagnose import Settings, _recalibrated, diagnose
-from fdi_torch.gap.disturbances import with_own_noise
-from fdi_torch.gap.subject import between
-from fdi_torch.gap.where.forms import bends, faded, jerked, lagged, relays, slewed, stuck, switched
-from fdi_torch.gap.where.line import spectral_line
-from fdi_torch.gap.where.localization import localized
-from fdi_torch.gap.where.sparse import sparse
+from fdi_torch.gap.localization.localize import localize
+from fdi_torch.gap.localization.regressors import (
+    bends,
+    dominant_period,
+    faded,
+    jerked,
+    lagged,
+    relays,
+    slewed,
+    stuck,
+    switched,
+)
+from fdi_torch.gap.localization.sparse_regression import sparse
+from fdi_torch.gap.marginal_likelihood import with_estimated_noise
+from fdi_torch.gap.problem import problem_of
 from tests.test_gap import believed, noise, recorded
 
 
 def test_values_between_samples_lie_on_the_line_and_stay_beyond_the_ends() -> None:
     at, times = torch.tensor([-1.0, 0.5, 3.0, 9.0]), torch.tensor([0.0, 1.0, 4.0])
-    assert between(at, times, torch.tensor([0.0, 2.0, 5.0])).tolist() == [0.0, 1.0, 4.0, 5.0]
+    assert interpolate(at, times, torch.tensor([0.0, 2.0, 5.0])).tolist() == [0.0, 1.0, 4.0, 5.0]
 
 
 def test_forms_with_memory_are_what_their_equations_say() -> None:
@@ -66,10 +75,10 @@ def test_the_forms_that_made_a_signal_have_more_evidence_than_as_many_others() -
 
 def test_a_sluggish_pump_is_told_from_its_tank() -> None:
     """Both make one balance; coarse steps in time, at the tank, do nearly as well as the pump's own forms."""
-    case = case_of(believed(), (recorded({"Q2.actuator_slew.slowness": 3e6}, 4),), (), Settings())
-    fitter, null, _ = _recalibrated(case.subject)
-    own, likely = with_own_noise(fitter, null)
-    found = localized(own, null, likely.noise, ("Q2", "T2", "OUT2"))
+    case = problem_of(believed(), (recorded({"Q2.actuator_slew.slowness": 3e6}, 4),), (), Settings())
+    fitter, null, _ = _recalibrated(case.data)
+    own, likely = with_estimated_noise(fitter, null)
+    found = localize(own, null, likely.noise, ("Q2", "T2", "OUT2"))
     assert found[0].location == "Q2"
     assert sorted(place.location for place in found) == ["OUT2", "Q2", "T2"]
 
@@ -78,7 +87,7 @@ def test_a_line_in_the_spectrum_is_found_beside_a_slow_misfit() -> None:
     times = torch.arange(3000, dtype=torch.float64)
     slow = 0.01 * torch.sin(times / 200.0).unsqueeze(1) + noise(3000, 0.0, 0.002, 3)
     line = slow + 0.002 * torch.sin(2 * torch.pi * times / 47.3).unsqueeze(1)
-    assert spectral_line(line, 1.0) == pytest.approx(47.3, rel=2e-3)
+    assert dominant_period(line, 1.0) == pytest.approx(47.3, rel=2e-3)
 
 
 @pytest.mark.parametrize("values", [{"Q1.pump_lag.time_constant": 15.0}, {"h2.sensor_hysteresis.play": 0.02}])
@@ -107,16 +116,16 @@ def test_the_error_of_rounding_is_nothing_unknown() -> None:
     """It changes as slowly as the level does, but by no more than half a step."""
     run = recorded({}, 7, samples=1500)
     run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
-    fitter, fit, steps = _recalibrated(case_of(believed(), (run,), (), Settings()).subject)
+    fitter, fit, steps = _recalibrated(problem_of(believed(), (run,), (), Settings()).data)
     assert [step > 0.0 for step in steps] == [False, False, True]
-    under, likely = with_own_noise(fitter, fit)
-    assert all(place.gain < 0.0 for place in localized(under, fit, likely.noise, ["h3"]))
+    under, likely = with_estimated_noise(fitter, fit)
+    assert all(place.gain < 0.0 for place in localize(under, fit, likely.noise, ["h3"]))
 
 
 def test_a_sensor_that_wanders_by_more_than_its_rounding_is_unknown() -> None:
     run = recorded({}, 7, samples=1500)
     run.outputs[:, 2] += noise(1500, 0.95, 0.02, 3)[:, 0]
     run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
-    fitter, fit, _ = _recalibrated(case_of(believed(), (run,), (), Settings()).subject)
-    under, likely = with_own_noise(fitter, fit)
-    assert localized(under, fit, likely.noise, ["h3"])[0].gain > 10.0
+    fitter, fit, _ = _recalibrated(problem_of(believed(), (run,), (), Settings()).data)
+    under, likely = with_estimated_noise(fitter, fit)
+    assert localize(under, fit, likely.noise, ["h3"])[0].gain > 10.0

@@ -108,7 +108,7 @@ def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:
     return cause
 
 
-def twins(cause: CauseName, plant: PlantDescription) -> tuple[CauseName, ...]:
+def equivalent_causes(cause: CauseName, plant: PlantDescription) -> tuple[CauseName, ...]:
     """Other names of the same thing."""
     name, place = canonical(cause, plant)
     others = [("plugging", p.name) for p in plant.pipes if canonical(("plugging", p.name), plant) == (name, place)]

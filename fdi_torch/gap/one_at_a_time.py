@@ -15,11 +15,11 @@ import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter
-from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.library import library_of
-from fdi_torch.gap.screening import Option, Screen, options_of, screen
-from fdi_torch.gap.subject import subject_of
+from fdi_torch.gap.noise_model import Noise
+from fdi_torch.gap.screening import Option, ScreeningResult, options_of, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
@@ -36,13 +36,13 @@ def one_at_a_time(
 ) -> dict[str, Any]:
     """The answer, in the format of a diagnosis, of fitting those effects singly that promise most to first order."""
     found = library_of(plant, library, leave_out)
-    believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     step = recording.interval
-    subject = subject_of(plant, believed, recording, step)
-    spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    null = Fitter(subject, _white(1e-2 * spread)).fit(Candidate())
-    residual = torch.where(subject.mask, subject.readings - null.near.readings[0], 0.0)
-    fitter = Fitter(subject, _white(residual.std(dim=0).clamp(min=1e-12)))
+    data = data_set_of(plant, nominal_effects, recording, step)
+    spread = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+    null = Fitter(data, _white(1e-2 * spread)).fit(Candidate())
+    residual = torch.where(data.mask, data.readings - null.linearised.readings[0], 0.0)
+    fitter = Fitter(data, _white(residual.std(dim=0).clamp(min=1e-12)))
     null = fitter.fit(Candidate(), null)
     options = options_of([p for p in found if not p.effect.quantizes], fitter, operating_range_of(recording, plant))
     fits = [null, *(fitter.fit(c, null) for c in _singles(screen(fitter, null, options, pairs=False)))]
@@ -54,7 +54,7 @@ def _white(std: torch.Tensor) -> Noise:
     return Noise(std, torch.zeros_like(std))
 
 
-def _singles(screened: Screen) -> list[Candidate]:
+def _singles(screened: ScreeningResult) -> list[Candidate]:
     """The effects that promise most, each from its best starts."""
     by_cause: dict[CauseName, list[Option]] = {}
     for i in torch.argsort(screened.gain, descending=True).tolist():
@@ -66,7 +66,7 @@ def _singles(screened: Screen) -> list[Candidate]:
 
 
 def _bic(fitter: Fitter, fit: Fit) -> float:
-    n = float(fitter.subject.mask.sum())
+    n = float(fitter.data.mask.sum())
     return n * math.log(fit.cost / n) + len(fit.effect_values) * math.log(n)
 
 

@@ -17,23 +17,23 @@ from dataclasses import dataclass
 
 from fdi_torch.estimate.evidence import ODDS, RARE, posterior
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.fitting import Fit, Fitter
+from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.library import canonical
-from fdi_torch.gap.search import Explanation, Judged, Search
-from fdi_torch.gap.where.localization import Place, localized
+from fdi_torch.gap.localization.localize import LocalizedDiscrepancy, localize
+from fdi_torch.gap.search import ExplanationPool, RankedExplanation, SearchResult
 from fdi_torch.plant.description import PlantDescription
 
 
 @dataclass(frozen=True)
-class Hypothesis:
+class CauseHypothesis:
     """An explanation with an unknown discrepancy beside it, or without. causes: as the fit places them, without those
     that the unknown replaces. weight: log of the posterior, not normalised.
     """
 
-    explanation: Explanation
+    explanation: RankedExplanation
     causes: tuple[CauseName, ...]
     weight: float
-    place: Place | None = None
+    place: LocalizedDiscrepancy | None = None
 
     @property
     def unknown_at(self) -> str | None:
@@ -50,16 +50,16 @@ class Posterior:
     places: marginal probability that something is wrong there, the likeliest first.
     """
 
-    hypotheses: tuple[Hypothesis, ...]
+    hypotheses: tuple[CauseHypothesis, ...]
     probabilities: tuple[float, ...]
     unexamined: float
     places: tuple[tuple[str, float], ...]
 
     @property
-    def best(self) -> Hypothesis:
+    def best(self) -> CauseHypothesis:
         return self.hypotheses[0]
 
-    def content(self, level: float) -> tuple[Hypothesis, ...]:
+    def content(self, level: float) -> tuple[CauseHypothesis, ...]:
         """The fewest hypotheses that hold so much together of what was examined."""
         held, kept = 0.0, []
         for hypothesis, probability in zip(self.hypotheses, self.probabilities, strict=True):
@@ -71,15 +71,15 @@ class Posterior:
 
 
 def weighed(
-    judged: Judged, found: Search, plant: PlantDescription, places: Sequence[str], named_only: bool
+    judged: ExplanationPool, found: SearchResult, plant: PlantDescription, places: Sequence[str], named_only: bool
 ) -> Posterior:
     """judged: what the search has judged, which may grow. named_only: without any unknown."""
-    hypotheses = [Hypothesis(e, in_order(e.fit), e.log_evidence) for e in found.explanations]
+    hypotheses = [CauseHypothesis(e, causes_in_order(e.fit), e.log_evidence) for e in found.explanations]
     if not named_only:
         for explanation in {e.key: e for e in (found.best, found.null)}.values():
             hypotheses += _beside(judged, found, explanation, places, len(places), _best(hypotheses))
         hypotheses += _pruned(judged, found, _best(hypotheses), len(places))
-    best: dict[tuple[frozenset[CauseName], str | None], Hypothesis] = {}
+    best: dict[tuple[frozenset[CauseName], str | None], CauseHypothesis] = {}
     for h in hypotheses:
         key = frozenset(canonical(c, plant) for c in h.causes), h.unknown_at
         if key not in best or h.weight > best[key].weight:
@@ -92,30 +92,37 @@ def weighed(
     return Posterior(tuple(ranked), tuple(probabilities), unexamined, _guilty(ranked, probabilities, places))
 
 
-def _best(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
+def _best(hypotheses: Sequence[CauseHypothesis]) -> CauseHypothesis:
     return max(hypotheses, key=lambda h: h.weight)
 
 
 def _beside(
-    judged: Judged, found: Search, explanation: Explanation, at: Sequence[str], places: int, best: Hypothesis
-) -> list[Hypothesis]:
+    judged: ExplanationPool,
+    found: SearchResult,
+    explanation: RankedExplanation,
+    at: Sequence[str],
+    places: int,
+    best: CauseHypothesis,
+) -> list[CauseHypothesis]:
     """Something unknown at some of the places beside an explanation, where it could matter beside the best."""
     needed = best.weight + math.log(RARE) - explanation.log_evidence - math.log(ODDS.unknown / places)
-    found_there = localized(explanation.fitter, explanation.fit, explanation.noise, at, needed)
+    found_there = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed)
     return [_with_unknown(judged.fitter, found, explanation, place, places) for place in found_there]
 
 
-def _with_unknown(fitter: Fitter, found: Search, explanation: Explanation, place: Place, places: int) -> Hypothesis:
-    causes = in_order(explanation.fit)
+def _with_unknown(
+    fitter: Fitter, found: SearchResult, explanation: RankedExplanation, place: LocalizedDiscrepancy, places: int
+) -> CauseHypothesis:
+    causes = causes_in_order(explanation.fit)
     here = [c for c in causes if c[1] == place.location]
     weight = explanation.log_evidence + place.gain
     if here and _small(fitter, found, explanation, place):
-        return Hypothesis(explanation, causes, weight)
+        return CauseHypothesis(explanation, causes, weight)
     weight += math.log(ODDS.unknown / places)
-    return Hypothesis(explanation, tuple(c for c in causes if c not in here), weight, place)
+    return CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight, place)
 
 
-def _small(fitter: Fitter, found: Search, explanation: Explanation, place: Place) -> bool:
+def _small(fitter: Fitter, found: SearchResult, explanation: RankedExplanation, place: LocalizedDiscrepancy) -> bool:
     """Whether a discrepancy is small beside what the explanation's effects at its place do to the readings."""
     rest = frozenset(c for c in explanation.key if c[1] != place.location)
     without = min((e for e in found.explanations if e.key <= rest), key=lambda e: _cost(fitter, e.fit))
@@ -124,12 +131,12 @@ def _small(fitter: Fitter, found: Search, explanation: Explanation, place: Place
 
 
 def _cost(fitter: Fitter, fit: Fit) -> float:
-    return float(fitter.white(fit.near)[0].square().sum())
+    return float(fitter.white(fit.linearised)[0].square().sum())
 
 
-def _pruned(judged: Judged, found: Search, best: Hypothesis, places: int) -> list[Hypothesis]:
+def _pruned(judged: ExplanationPool, found: SearchResult, best: CauseHypothesis, places: int) -> list[CauseHypothesis]:
     """Fewer effects: one may only have stood in for the unknown, or for what the law of another effect gets wrong."""
-    kept: list[Hypothesis] = []
+    kept: list[CauseHypothesis] = []
     while len(best.fit.key) > (0 if best.place else 1):
         tried = []
         for cause in best.fit.key:
@@ -144,7 +151,7 @@ def _pruned(judged: Judged, found: Search, best: Hypothesis, places: int) -> lis
 
 
 def _guilty(
-    ranked: Iterable[Hypothesis], probabilities: Iterable[float], places: Sequence[str]
+    ranked: Iterable[CauseHypothesis], probabilities: Iterable[float], places: Sequence[str]
 ) -> tuple[tuple[str, float], ...]:
     share = dict.fromkeys(places, 0.0)
     for h, probability in zip(ranked, probabilities, strict=True):
@@ -153,6 +160,6 @@ def _guilty(
     return tuple(sorted(share.items(), key=lambda item: -item[1]))
 
 
-def in_order(fit: Fit) -> tuple[CauseName, ...]:
+def causes_in_order(fit: Fit) -> tuple[CauseName, ...]:
     """The causes of a fit as it places them."""
     return tuple((p.effect.name, p.location) for p in fit.candidate.placements)

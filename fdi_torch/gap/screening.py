@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.fitting import Fit, Fitter
+from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.forcing import Forcing
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.effect import Placement, Stage
@@ -60,7 +60,7 @@ class Pairs:
 
 
 @dataclass(frozen=True)
-class Screen:
+class ScreeningResult:
     """What options would close beside a fit: with their columns C, less the nuisances' part, and what the fit leaves r,
     score (M,) = C'r and strength (M,), the diagonal of C'C."""
 
@@ -90,7 +90,7 @@ class Screen:
 
 def options_of(placements: Sequence[Placement], fitter: Fitter, reach: OperatingRange) -> list[Option]:
     """All starts of all placements."""
-    plant = fitter.subject.plant
+    plant = fitter.data.plant
     return [
         Option(p, {f"{p.prefix}.{name}": value for name, value in start.items()}, parameters)
         for p in placements
@@ -99,17 +99,17 @@ def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Operating
     ]
 
 
-def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], pairs: bool = True) -> Screen:
+def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], pairs: bool = True) -> ScreeningResult:
     """All options about a fit, beside its own parameters with their priors. pairs: whether to say what pairs do."""
-    beside = _Beside.of(fitter, fit)
+    beside = _ProjectedRegression.of(fitter, fit)
     found = [beside.screened(options[k : k + AT_ONCE]) for k in range(0, len(options), AT_ONCE)]
     score, strength = (torch.cat([f[k] for f in found]) if found else torch.zeros(0).double() for k in range(2))
-    whole = Screen(tuple(options), score, strength)
+    whole = ScreeningResult(tuple(options), score, strength)
     return replace(whole, found_pairs=beside.pairs(whole)) if pairs else whole
 
 
 @dataclass(frozen=True)
-class _Beside:
+class _ProjectedRegression:
     """A regression beside the parameters of a fit. left (S, C): its whitened residual without what they can do; basis
     (S, C, P) of that."""
 
@@ -119,8 +119,8 @@ class _Beside:
     basis: Tensor
 
     @staticmethod
-    def of(fitter: Fitter, fit: Fit) -> _Beside:
-        residual, jacobian = (x[0] for x in fitter.white(fit.near))
+    def of(fitter: Fitter, fit: Fit) -> _ProjectedRegression:
+        residual, jacobian = (x[0] for x in fitter.white(fit.linearised))
         scale, pull, off = fitter.priors(fit.space, fit.theta)
         # The priors' rows of the columns are zero: no constant's tolerance speaks of an effect.
         rows = torch.diag(pull), 1e-6 * torch.eye(len(pull), dtype=pull.dtype)
@@ -128,7 +128,7 @@ class _Beside:
         r = torch.cat([residual.flatten(), -off, torch.zeros_like(off)])
         seen = residual.numel()
         left = (r - q @ (q.T @ r))[:seen]
-        return _Beside(fitter, fit, left.reshape(residual.shape), q[:seen].reshape(*residual.shape, -1))
+        return _ProjectedRegression(fitter, fit, left.reshape(residual.shape), q[:seen].reshape(*residual.shape, -1))
 
     def screened(self, options: Sequence[Option]) -> tuple[Tensor, Tensor]:
         """Score and strength, (M,) each."""
@@ -142,7 +142,7 @@ class _Beside:
             shared += own @ self.basis[:, c]
         return score, strength - torch.linalg.vecdot(shared, shared)
 
-    def pairs(self, found: Screen) -> Pairs:
+    def pairs(self, found: ScreeningResult) -> Pairs:
         chosen: set[int] = set()
         for value in (found.strength, found.gain):
             best: dict[tuple[str, str], int] = {}
@@ -161,16 +161,16 @@ def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tenso
     """(S, C, M): whitened changes of the readings at the size of each start."""
     own = fitter.engine(fit.candidate, list(fit.effect_values))
     pieces = (
-        own.apart(fit.theta.unsqueeze(0), fit.near)
+        own.apart(fit.theta.unsqueeze(0), fit.linearised)
         if isinstance(own, JointCollocation)
-        else [(own, fit.theta, fit.near)]
+        else [(own, fit.theta, fit.linearised)]
     )
     columns = with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
     return fitter.whiten(columns)
 
 
 def _columns(
-    fitter: Fitter, fit: Fit, options: Sequence[Option], own: Collocation, theta: Tensor, near: Linearised
+    fitter: Fitter, fit: Fit, options: Sequence[Option], own: Collocation, theta: Tensor, linearised: Linearised
 ) -> Tensor:
     """(S, C, M) of one recording."""
     experiment = own.experiment
@@ -180,12 +180,12 @@ def _columns(
     known = {n: v for n, v in values if n in union.constants}
     theta = theta.reshape(1, -1)
     present = {p.prefix for p in own.network.placements} - tried.keys()
-    forced = Forcing(union, present, union.bind(*_named(union, known)), near.levels[0].T.contiguous(), experiment)
+    forced = Forcing(union, present, union.bind(*_named(union, known)), linearised.levels[0].T.contiguous(), experiment)
     groups = _groups(options)
     moving = [i for group in groups if options[group[0]].placement.effect.stage is not Stage.READING for i in group]
-    sensors, count = len(fitter.subject.plant.sensors), len(options)
+    sensors, count = len(fitter.data.plant.sensors), len(options)
     columns = theta.new_zeros(sensors, count, len(experiment.sample_times))
-    forcing = theta.new_zeros(1, near.levels.shape[-1], len(moving), len(experiment.steps))
+    forcing = theta.new_zeros(1, linearised.levels.shape[-1], len(moving), len(experiment.steps))
     row = {option: k for k, option in enumerate(moving)}
     for group in groups:
         placement = options[group[0]].placement
@@ -196,10 +196,10 @@ def _columns(
             first = row[group[0]]
             forcing[0, :, first : first + len(group)] = forced.rates(placement, starts)
     if moving:
-        gain, transition = near.gain.permute(0, 2, 3, 1), near.transition.permute(0, 2, 3, 1)
+        gain, transition = linearised.gain.permute(0, 2, 3, 1), linearised.transition.permute(0, 2, 3, 1)
         still = forcing.new_zeros(1, forcing.shape[1], len(moving))
         paths = scan_in_time(transition, forcing, still, gain)
-        columns[:, moving] = own.look(near.levels, theta).along(paths, [-1] * len(moving))[0]
+        columns[:, moving] = own.look(linearised.levels, theta).along(paths, [-1] * len(moving))[0]
     return columns.permute(2, 0, 1)
 
 

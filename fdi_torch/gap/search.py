@@ -21,10 +21,9 @@ import torch
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.disturbances import with_own_noise
-from fdi_torch.gap.evidence import log_evidence, log_prior
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter, Key
-from fdi_torch.gap.screening import Option, Pairs, Screen, screen
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, Key
+from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
+from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, screen
 
 DEEPEST = 4
 BEAM = 2  # explanations of one size that are taken further
@@ -38,7 +37,7 @@ PAIRS = 3  # pairs fitted that promise most together
 
 
 @dataclass(frozen=True)
-class Explanation:
+class RankedExplanation:
     """A fit, under the fitter with its own noise. log_evidence: prior odds included."""
 
     fit: Fit
@@ -52,24 +51,24 @@ class Explanation:
 
 
 @dataclass(frozen=True)
-class Search:
+class SearchResult:
     """explanations: those judged, the likeliest first; null: the recalibrated plant among them. shown: the library
     about the recalibrated plant under the noise of the best explanation; alarm: under its own. unexamined: odds of what
     was not fitted, against the best explanation.
     """
 
-    null: Explanation
-    explanations: tuple[Explanation, ...]
-    shown: Screen
-    alarm: Screen
+    null: RankedExplanation
+    explanations: tuple[RankedExplanation, ...]
+    shown: ScreeningResult
+    alarm: ScreeningResult
     unexamined: float
 
     @property
-    def best(self) -> Explanation:
+    def best(self) -> RankedExplanation:
         return self.explanations[0]
 
 
-def search(found: Judged, null: Fit, options: Sequence[Option], most: int = DEEPEST) -> Search:
+def search(found: ExplanationPool, null: Fit, options: Sequence[Option], most: int = DEEPEST) -> SearchResult:
     """null: under the sensors' noise alone. most: effects in one explanation."""
     base = found.judge(null)
     alarm = screen(base.fitter, base.fit, options)
@@ -81,34 +80,34 @@ def search(found: Judged, null: Fit, options: Sequence[Option], most: int = DEEP
         for parent in frontier:
             found.extend_by(parent, options)
         frontier = found.best_of(depth)[:BEAM]
-    found.float_best(options)
+    found.exchange_effects(options)
     for _ in range(TURNS):
         if found.unexamined() < RARE:
             break
-        found.examine()
+        found.fit_unexamined()
     explanations = sorted(found.each.values(), key=lambda e: -e.log_evidence)
     shown = alarm if explanations[0] is base else screen(explanations[0].fitter, base.fit, options)
-    return Search(base, tuple(explanations), shown, alarm, found.unexamined())
+    return SearchResult(base, tuple(explanations), shown, alarm, found.unexamined())
 
 
-class Judged:
+class ExplanationPool:
     """The explanations judged so far, by their effects. fitter: under the sensors' noise alone. choices: how many
     effects at places the library holds.
     """
 
     def __init__(self, fitter: Fitter, choices: int) -> None:
         self.fitter, self.choices = fitter, choices
-        self.each: dict[Key, Explanation] = {}
+        self.each: dict[Key, RankedExplanation] = {}
         self._promised: dict[Key, dict[Key, _Promise]] = {}
         self._failed: set[Key] = set()
 
-    def judge(self, fit: Fit, start: StateNoise | None = None) -> Explanation:
+    def judge(self, fit: Fit, start: StateNoise | None = None) -> RankedExplanation:
         """Works out the noise and the evidence of a fit, which goes on under that noise."""
-        judged: Explanation | None = None
+        judged: RankedExplanation | None = None
         while True:
-            own, likely = with_own_noise(self.fitter, fit, start, climb=judged is None)
+            own, likely = with_estimated_noise(self.fitter, fit, start, climb=judged is None)
             fit = own.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
-            again = Explanation(fit, own, likely.noise, log_evidence(own, fit, self.choices))
+            again = RankedExplanation(fit, own, likely.noise, log_evidence(own, fit, self.choices))
             if judged and not again.log_evidence > judged.log_evidence + SETTLED:
                 break
             judged, start = again, likely.noise
@@ -116,7 +115,7 @@ class Judged:
             self.each[fit.key] = judged
         return judged
 
-    def without(self, explanation: Explanation, cause: CauseName) -> Explanation:
+    def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
         """The explanation without one of its effects, the others begun where they are."""
         fit, key = explanation.fit, explanation.key - {cause}
         if key not in self.each:
@@ -126,15 +125,15 @@ class Judged:
             self.judge(explanation.fitter.fit(Candidate(rest, (start,)), fit), explanation.noise)
         return self.each[key]
 
-    def best_of(self, effects: int) -> list[Explanation]:
+    def best_of(self, effects: int) -> list[RankedExplanation]:
         return sorted((e for e in self.each.values() if len(e.key) == effects), key=lambda e: -e.log_evidence)
 
-    def extend_by(self, parent: Explanation, options: Sequence[Option]) -> None:
+    def extend_by(self, parent: RankedExplanation, options: Sequence[Option]) -> None:
         """Fits and judges what promises most beside an explanation under its own noise."""
         beside = [o for o in options if o.cause not in parent.key]
         self.extend(parent, screen(parent.fitter, parent.fit, beside, pairs=False))
 
-    def extend(self, parent: Explanation, own: Screen, still: Screen | None = None) -> None:
+    def extend(self, parent: RankedExplanation, own: ScreeningResult, still: ScreeningResult | None = None) -> None:
         """Fits and judges what promises most beside an explanation, screened under its own noise, and under that of the
         sensors alone."""
         fits = self._fitted(parent, parent.fitter, self._further(parent, own, own=True))[:JUDGED]
@@ -146,7 +145,7 @@ class Judged:
         for fit in sorted(fits, key=lambda f: len(f.key)):
             self.judge(fit, parent.noise)
 
-    def _fitted(self, parent: Explanation, fitter: Fitter, candidates: Sequence[Candidate]) -> list[Fit]:
+    def _fitted(self, parent: RankedExplanation, fitter: Fitter, candidates: Sequence[Candidate]) -> list[Fit]:
         """The best first. What ends above the explanation that it contains has failed."""
         known, fits = fitter.cost(parent.fit), list[Fit]()
         for candidate in candidates:
@@ -169,7 +168,7 @@ class Judged:
             if key < fit.key
         )
 
-    def _further(self, parent: Explanation, found: Screen, own: bool) -> list[Candidate]:
+    def _further(self, parent: RankedExplanation, found: ScreeningResult, own: bool) -> list[Candidate]:
         """The explanation with one effect more, if what it promises can pay for it: the first few, from their best
         starts."""
         by_cause: dict[tuple[str, str], list[int]] = {}
@@ -188,7 +187,7 @@ class Judged:
                 candidates.append(candidate)
         return candidates
 
-    def float_best(self, options: Sequence[Option]) -> None:
+    def exchange_effects(self, options: Sequence[Option]) -> None:
         """Takes each effect of the best explanation away, and tries others in its stead, while that is better."""
         while True:
             best = max(self.each.values(), key=lambda e: e.log_evidence)
@@ -202,14 +201,14 @@ class Judged:
         """Odds of what was promised less, and so was not fitted, against the best explanation."""
         return sum(math.exp(min(ahead, 0.0)) for ahead, _, _ in self._expected())
 
-    def examine(self) -> None:
+    def fit_unexamined(self) -> None:
         """Fits and judges what of the rest is expected to be likeliest."""
         left = [e for e in self._expected() if e[2].candidate.key not in self._failed]
         for _, parent, promise in sorted(left, key=lambda e: -e[0])[:FITTED]:
             for fit in self._fitted(parent, parent.fitter, [promise.candidate]):
                 self.judge(fit, parent.noise)
 
-    def _expected(self) -> Iterator[tuple[float, Explanation, _Promise]]:
+    def _expected(self) -> Iterator[tuple[float, RankedExplanation, _Promise]]:
         """What was not fitted: by how much its log evidence should be ahead of the best, and beside what.
 
         Fits gain more than they promise, for the noise is narrower beside them: all of those beside one explanation are
@@ -238,7 +237,7 @@ class _Promise:
     prior: float
 
 
-def _spread(found: Screen, i: int) -> float:
+def _spread(found: ScreeningResult, i: int) -> float:
     """What the size of an option costs, whose prior is as wide as its range: log of the range in standard errors."""
     option = found.options[i]
     name, start = next(iter(option.start.items()))
@@ -250,7 +249,7 @@ def _spread(found: Screen, i: int) -> float:
     return 0.5 * math.log(max(strength * (width / unit) ** 2 / (2.0 * math.pi), 1.0))
 
 
-def _with(fit: Fit, found: Screen, group: Sequence[int]) -> Candidate:
+def _with(fit: Fit, found: ScreeningResult, group: Sequence[int]) -> Candidate:
     """The fit with one of the options more; each start once with the size that the screen suggests."""
     starts = [fit.effect_values | sized(found.options[i], float(found.size[i])) for i in group]
     return Candidate((*fit.candidate.placements, found.options[group[0]].placement), tuple(starts))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.config.monitor import MonitorRun
-from fdi_torch.gap.acquisition import usable
+from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.monitor.diagnosability import diagnosability
 from fdi_torch.monitor.events import FORMAT, Event
@@ -116,11 +116,11 @@ class LoggedMonitor:
             samples = samples.segment(1, len(samples))
         events: list[Event] = []
         if len(samples):
-            traces: list[ResidualTrace] = []
+            prediction_arrays: list[ResidualTrace] = []
             try:
-                self.state, events = self.monitor.advance(self.state, samples, traces.append)
+                self.state, events = self.monitor.advance(self.state, samples, prediction_arrays.append)
             finally:  # written in one call, which takes a third of the time
-                self._log_residuals(traces)
+                self._log_residuals(prediction_arrays)
             self._now = float(samples.time[-1])
         for event in events:
             self._report(event)
@@ -205,14 +205,15 @@ class LoggedMonitor:
             hold=samples.hold,
         )
 
-    def _log_residuals(self, traces: Sequence[ResidualTrace]) -> None:
+    def _log_residuals(self, prediction_arrays: Sequence[ResidualTrace]) -> None:
         """Log the residuals, the detector's statistic and its threshold."""
-        if not traces:
+        if not prediction_arrays:
             return
         names, units = [s.column for s in self.plant.sensors], [s.unit for s in self.plant.sensors]
         chart = self.monitor.detector.chart
         time, residual, statistic = (
-            torch.cat(parts) for parts in zip(*((t.time, t.residual, t.statistic) for t in traces), strict=True)
+            torch.cat(parts)
+            for parts in zip(*((t.time, t.residual, t.statistic) for t in prediction_arrays), strict=True)
         )
         threshold = torch.full_like(statistic, self.monitor.detector.threshold)
         table = torch.cat([residual, torch.stack([statistic, threshold], dim=1)], dim=1)

@@ -1,0 +1,129 @@
+"""Least squares over parameters and trajectories: the problem that Levenberg-Marquardt solves.
+
+The collocation engine improves a trajectory by one Newton step per evaluation. The costs of two points can therefore be
+compared only where both trajectories satisfy the model: a step whose trajectory does not converge is rejected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.levenberg_marquardt import Linearisation
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.joint_collocation import JointCollocation
+
+CORRECTIONS = 6  # of a trajectory that a step of the parameters moved
+FAR = 1e-3  # in units of the plant's length scale: a defect from which a correction is worth its cost
+LONG, NEARLY = 4.0, 10.0  # in the same: a shift that needs a correction, and a defect that one more makes good
+LOST, STALLED = 100.0, 0.9  # a trajectory so many times too far off that a correction brings no nearer has no end
+
+
+class Objective(Protocol):
+    """Chi-square of a data set, with the priors of the parameters; `candidate_fit.Fitter` is one.
+
+    far: largest defect (m) of a trajectory that counts as converged.
+    """
+
+    far: float
+
+    def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]: ...
+
+    def normal(
+        self, space: ParameterSpace, theta: Tensor, linearised: Linearised, scale: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]: ...
+
+    def white(self, linearised: Linearised) -> tuple[Tensor, Tensor]: ...
+
+
+class TrajectoryProblem:
+    """Half of chi-square as a problem for least squares; every point keeps its trajectory's neighbourhood."""
+
+    def __init__(self, objective: Objective, engine: Collocation | JointCollocation, levels: Tensor) -> None:
+        self.objective, self.engine, self.levels = objective, engine, levels
+        self.box = objective.box(engine.space)
+
+    def linearise(self, theta: Tensor, lanes: Tensor) -> Linearisation:
+        """The model at the starts theta (L, P)."""
+        linearised = self.engine.linearise(theta, self.levels[lanes])
+        return self._model(theta, _correct(self.engine, theta, linearised, self.objective.far))
+
+    def follow(self, theta: Tensor, known: Linearisation, step: Tensor) -> Linearisation:
+        """The model at theta, a step away from what is known; its cost is infinite where no trajectory leads there."""
+        linearised, far = _linearised(known), self.objective.far
+        shift = (linearised.slopes * step[:, None, None, :]).sum(-1)
+        found = follow_trajectories(self.engine, theta, linearised.levels + shift, shift, far)
+        model = self._model(theta, found)
+        lost = ~(found.defect <= linearised.defect.clamp(min=far))
+        return replace(model, cost=torch.where(lost, torch.inf, model.cost))
+
+    def bend(self, known: Linearisation, trial: Linearisation, step: Tensor) -> Tensor:
+        """J'c (L, P) for the bend c of the whitened readings along the step; priors do not bend."""
+        linearised = _linearised(known)
+        bend = (
+            _linearised(trial).readings - linearised.readings - (linearised.jacobian * step[:, None, None, :]).sum(-1)
+        )
+        columns = torch.cat([linearised.jacobian, bend.unsqueeze(-1)], dim=-1)
+        white = self.objective.white(replace(linearised, jacobian=columns))[1].flatten(1, 2)
+        return (white[..., :-1] * white[..., -1:]).sum(1)
+
+    def _model(self, theta: Tensor, linearised: Linearised) -> Linearisation:
+        scale = self.box[2]
+        cost, descent, curvature = self.objective.normal(self.engine.space, theta, linearised, scale)
+        # What nothing determines stays where it is.
+        weakest = 1e-9 * torch.diagonal(curvature, dim1=-2, dim2=-1).amax(-1, keepdim=True) + 1e-12
+        curvature = curvature + torch.diag_embed(weakest.expand_as(theta))
+        return Linearisation(0.5 * cost, -descent / scale, curvature / (scale * scale.unsqueeze(-1)), linearised)
+
+
+def _linearised(model: Linearisation) -> Linearised:
+    assert isinstance(model.state, Linearised)
+    return model.state
+
+
+def follow_trajectories(
+    engine: Collocation | JointCollocation, theta: Tensor, guess: Tensor, shift: Tensor, far: float
+) -> Linearised:
+    """The neighbourhood of trajectories that are guessed to be `shift` from known ones; slopes are worked out once a
+    guess is good.
+    """
+    levels, lost = guess, torch.zeros(len(theta), dtype=torch.bool)
+    lanes = (shift.abs().amax(dim=(-1, -2)) > LONG * far).nonzero().flatten()
+    defect = torch.full((len(theta),), torch.inf, dtype=guess.dtype)
+    for _ in range(CORRECTIONS - 1):
+        if not len(lanes):
+            break
+        before = defect[lanes]
+        path, moved = engine.corrected(theta[lanes], levels[lanes])
+        levels, defect = levels.index_copy(0, lanes, path), defect.index_copy(0, lanes, moved)
+        lost[lanes] = _diverged(moved, before, far)
+        lanes = lanes[(moved > NEARLY * far) & ~lost[lanes]]
+    return _correct(engine, theta, engine.linearise(theta, levels), far, lost)
+
+
+def _correct(
+    engine: Collocation | JointCollocation,
+    theta: Tensor,
+    linearised: Linearised,
+    far: float,
+    lost: Tensor | None = None,
+) -> Linearised:
+    """The lanes whose trajectories were still far from the model's corrected until they are not, or no more."""
+    lost = torch.zeros_like(linearised.defect, dtype=torch.bool) if lost is None else lost
+    for _ in range(CORRECTIONS):
+        lanes = (~lost & (linearised.defect > far)).nonzero().flatten()
+        if not len(lanes):
+            break
+        before = linearised.defect
+        linearised = linearised.replaced(lanes, engine.linearise(theta[lanes], linearised.levels[lanes]))
+        lost = lost | _diverged(linearised.defect, before, far)
+    return linearised
+
+
+def _diverged(defect: Tensor, before: Tensor, far: float) -> Tensor:
+    """Which lanes (L,) a correction has not brought nearer to a trajectory that they are lost from."""
+    return ~((defect < LOST * far) | (defect < STALLED * before))
