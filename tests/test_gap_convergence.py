@@ -14,7 +14,7 @@ from fdi_torch.config.plant import load_plant
 from fdi_torch.effects import effect
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
-from fdi_torch.gap.diagnose import _recalibrated
+from fdi_torch.gap.diagnose import recalibrate
 from fdi_torch.gap.problem import PLAIN, problem_of
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
@@ -38,7 +38,7 @@ SIZE = "P32.plugging.size"
 
 
 def recalibrated(plant: PlantDescription, recording: Recording) -> tuple[Fitter, Fit]:
-    fitter, null, _ = _recalibrated(problem_of(plant, [recording], [], PLAIN).data)
+    fitter, null, _ = recalibrate(problem_of(plant, [recording], [], PLAIN).data)
     return fitter, null
 
 

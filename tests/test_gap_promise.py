@@ -8,7 +8,7 @@ from torch import Tensor
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
-from fdi_torch.gap.diagnose import Settings, _recalibrated
+from fdi_torch.gap.diagnose import Settings, recalibrate
 from fdi_torch.gap.localization import single_regressor_gain as promise
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.marginal_likelihood import with_estimated_noise
@@ -22,7 +22,7 @@ PLACES = ("Q1", "T1", "P13", "OUT2", "T1-T3", "h2")
 @pytest.fixture(scope="module", params=[False, True], ids=["plain", "with a lag of a sensor"])
 def surveyed(request: pytest.FixtureRequest) -> tuple[DiscrepancyRegression, Fitter, Fit]:
     case = problem_of(believed(), (recorded({"Q1.pump_lag.time_constant": 8.0}, seed=3),), (), Settings())
-    fitter, null, _ = _recalibrated(case.data)
+    fitter, null, _ = recalibrate(case.data)
     under, _ = with_estimated_noise(fitter, null)
     if request.param:
         lag = Candidate((Placement(effect("sensor_lag"), "h2"),), ({"h2.sensor_lag.time_constant": 3.0},))
@@ -36,7 +36,7 @@ def products(
     """Of the forms with the residual and random signs."""
     survey, under, null = surveyed
     found: list[Tensor] = []
-    monkeypatch.setattr(promise, "_likeliest", lambda p: found.append(p) or 0.0)
+    monkeypatch.setattr(promise, "_best_gain", lambda p: found.append(p) or 0.0)
     promise.single_regressor_gains(survey, under, null, [place], torch.Generator().manual_seed(5))
     return found[0]
 

@@ -11,7 +11,7 @@ import torch
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant import load_plant
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.localization.regressors import memories, slews
+from fdi_torch.gap.localization.regressors import lags_and_decays, rate_limits
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
@@ -39,9 +39,9 @@ def scaled(recording: Recording) -> Recording:
 def test_what_has_a_memory_has_it_for_as_long_as_the_plant_is_slow() -> None:
     x = torch.rand(50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     step, ends = torch.full_like(x, 2.0), (0.0, 1.0)
-    for slow, fast in zip(memories(x, 10.0 * step, 10.0), memories(x, step, 1.0), strict=True):
+    for slow, fast in zip(lags_and_decays(x, 10.0 * step, 10.0), lags_and_decays(x, step, 1.0), strict=True):
         assert slow == pytest.approx(fast, abs=1e-12)
-    for slow, fast in zip(slews(x, 10.0 * step, ends, 10.0), slews(x, step, ends, 1.0), strict=True):
+    for slow, fast in zip(rate_limits(x, 10.0 * step, ends, 10.0), rate_limits(x, step, ends, 1.0), strict=True):
         assert slow == pytest.approx(fast, abs=1e-12)
     assert time_scale(scaled_plant()) == 10.0 * time_scale(believed())  # the power of ten next to 20
 

@@ -6,18 +6,18 @@ import pytest
 import torch
 
 from fdi_torch.gap.dataset import interpolate
-from fdi_torch.gap.diagnose import Settings, _recalibrated, diagnose
+from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.localization.localize import localize
 from fdi_torch.gap.localization.regressors import (
-    bends,
+    backlash,
+    decayed,
     dominant_period,
-    faded,
-    jerked,
+    hinges,
     lagged,
+    rate_limited,
+    relay,
     relays,
-    slewed,
-    stuck,
-    switched,
+    stiction,
 )
 from fdi_torch.gap.localization.sparse_regression import sparse
 from fdi_torch.gap.marginal_likelihood import with_estimated_noise
@@ -34,26 +34,26 @@ def test_forms_with_memory_are_what_their_equations_say() -> None:
     x, step = torch.tensor([0.0, 1.0, 1.0, 1.0], dtype=torch.float64), torch.full((4,), 2.0, dtype=torch.float64)
     decay = torch.exp(torch.tensor(-0.5, dtype=torch.float64))
     assert lagged(x, step, 4.0) == pytest.approx(torch.stack([0 * decay, 1 - decay, 1 - decay**2, 1 - decay**3]))
-    assert faded(torch.diff(x, prepend=x[:1]), step, 4.0) == pytest.approx(
+    assert decayed(torch.diff(x, prepend=x[:1]), step, 4.0) == pytest.approx(
         torch.stack([0 * decay, decay**0, decay, decay**2])
     )
-    assert stuck(torch.tensor([0.0, 0.5, 2.0, 1.5, 0.0]), torch.tensor([[1.0], [0.25]])).tolist() == [
+    assert backlash(torch.tensor([0.0, 0.5, 2.0, 1.5, 0.0]), torch.tensor([[1.0], [0.25]])).tolist() == [
         [0.0, 0.0, 1.0, 1.0, 1.0],
         [0.0, 0.25, 1.75, 1.75, 0.25],
     ]
-    assert slewed(torch.tensor([0.0, 5.0, 5.0, 1.0]), step, 1.0).tolist() == [0.0, 2.0, 4.0, 2.0]
+    assert rate_limited(torch.tensor([0.0, 5.0, 5.0, 1.0]), step, 1.0).tolist() == [0.0, 2.0, 4.0, 2.0]
 
 
 def test_what_switches_stays_between_its_thresholds_as_it_was() -> None:
     x = torch.tensor([0.0, 0.5, 0.9, 0.5, 0.1, 0.5])
-    assert switched(x, 0.2, 0.8).tolist() == [0.0, 0.0, 1.0, 1.0, 0.0, 0.0]
-    assert jerked(x, 0.45).tolist() == pytest.approx([0.0, 0.5, 0.5, 0.5, 0.5, 0.5])
+    assert relay(x, 0.2, 0.8).tolist() == [0.0, 0.0, 1.0, 1.0, 0.0, 0.0]
+    assert stiction(x, 0.45).tolist() == pytest.approx([0.0, 0.5, 0.5, 0.5, 0.5, 0.5])
     assert [low for low, _ in relays(x, (0.0, 1.0), 3)] == pytest.approx([1 / 6, 1 / 6, 0.5])
 
 
 def test_bends_span_every_piecewise_linear_function_of_their_values() -> None:
     x = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
-    basis = torch.stack(bends(x, (0.0, 1.0), 5), dim=1)
+    basis = torch.stack(hinges(x, (0.0, 1.0), 5), dim=1)
     kinked = (x - 0.25).abs() - 2.0 * (x - 0.75).clamp(min=0.0)
     found = torch.linalg.lstsq(basis, kinked.unsqueeze(1)).solution
     assert (basis @ found).squeeze(1) == pytest.approx(kinked, abs=1e-10)
@@ -76,7 +76,7 @@ def test_the_forms_that_made_a_signal_have_more_evidence_than_as_many_others() -
 def test_a_sluggish_pump_is_told_from_its_tank() -> None:
     """Both make one balance; coarse steps in time, at the tank, do nearly as well as the pump's own forms."""
     case = problem_of(believed(), (recorded({"Q2.actuator_slew.slowness": 3e6}, 4),), (), Settings())
-    fitter, null, _ = _recalibrated(case.data)
+    fitter, null, _ = recalibrate(case.data)
     own, likely = with_estimated_noise(fitter, null)
     found = localize(own, null, likely.noise, ("Q2", "T2", "OUT2"))
     assert found[0].location == "Q2"
@@ -116,7 +116,7 @@ def test_the_error_of_rounding_is_nothing_unknown() -> None:
     """It changes as slowly as the level does, but by no more than half a step."""
     run = recorded({}, 7, samples=1500)
     run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
-    fitter, fit, steps = _recalibrated(problem_of(believed(), (run,), (), Settings()).data)
+    fitter, fit, steps = recalibrate(problem_of(believed(), (run,), (), Settings()).data)
     assert [step > 0.0 for step in steps] == [False, False, True]
     under, likely = with_estimated_noise(fitter, fit)
     assert all(place.gain < 0.0 for place in localize(under, fit, likely.noise, ["h3"]))
@@ -126,6 +126,6 @@ def test_a_sensor_that_wanders_by_more_than_its_rounding_is_unknown() -> None:
     run = recorded({}, 7, samples=1500)
     run.outputs[:, 2] += noise(1500, 0.95, 0.02, 3)[:, 0]
     run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
-    fitter, fit, _ = _recalibrated(problem_of(believed(), (run,), (), Settings()).data)
+    fitter, fit, _ = recalibrate(problem_of(believed(), (run,), (), Settings()).data)
     under, likely = with_estimated_noise(fitter, fit)
     assert localize(under, fit, likely.noise, ["h3"])[0].gain > 10.0

@@ -11,7 +11,7 @@ from torch import Tensor
 from fdi_torch.gap.answer import UNKNOWN, Amount, Answer, Cause, CauseName, Explanation, names
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.dataset import DataSet
-from fdi_torch.gap.diagnosis_result import DiagnosisResult, chance
+from fdi_torch.gap.diagnosis_result import DiagnosisResult, p_value
 from fdi_torch.gap.discrepancy_curves import curves_at
 from fdi_torch.gap.experiment_design import discriminating_input
 from fdi_torch.gap.free_form import discrepancy_tables
@@ -45,14 +45,14 @@ def build_answer(found: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer:
         p_value=_p_value(found),
         where=_where(found),
         causes=_causes(found),
-        ambiguity_set=[_names(found, h) for h in found.content] if has_causes else [],
-        posterior=[Explanation((*h.causes, *found.rounded), p, h.unknown_at) for h, p in shown],
+        ambiguity_set=[_names(found, h) for h in found.credible_set] if has_causes else [],
+        posterior=[Explanation((*h.causes, *found.from_readings), p, h.unknown_at) for h, p in shown],
         unexamined=believed.unexamined,
         converged=found.best.converged,
         closure=closure_to_dict(held, found) if held else {},
         noise=_noise(found.fitter, found.quantization_steps),
         disturbances=_disturbances(found),
-        shape=discrepancy_tables(found.unnamed) if found.unnamed else None,
+        shape=discrepancy_tables(found.free_form_fit) if found.free_form_fit else None,
         next_input=_next(found) if found.verdict == "ambiguous" else None,
         impostors=_impostors(found) if has_causes else None,
         excitation=_excitation(found),
@@ -66,7 +66,7 @@ def build_answer(found: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer:
 def _names(found: DiagnosisResult, hypothesis: CauseHypothesis) -> tuple[CauseName, ...]:
     """All that a hypothesis holds, something unknown among it."""
     unknown = ((UNKNOWN, hypothesis.unknown_at),) if hypothesis.unknown_at else ()
-    return (*hypothesis.causes, *unknown, *found.rounded)
+    return (*hypothesis.causes, *unknown, *found.from_readings)
 
 
 def _where(found: DiagnosisResult) -> list[tuple[str, float]]:
@@ -74,7 +74,7 @@ def _where(found: DiagnosisResult) -> list[tuple[str, float]]:
     all that is wrong."""
     places = list(found.posterior.places)
     best = found.posterior.best
-    if found.verdict == "unknown" and not best.place and (straying := sensor_with_outliers(found.strays[0])):
+    if found.verdict == "unknown" and not best.place and (straying := sensor_with_outliers(found.outliers[0])):
         places = [(straying, 1.0), *((p, share) for p, share in places if p != straying)]
     return places
 
@@ -127,9 +127,9 @@ def _next(found: DiagnosisResult) -> Mapping[str, Any] | None:
 
 def _impostors(found: DiagnosisResult) -> dict[str, object]:
     """How often another cause would have passed for one that was named alone, simulated."""
-    if len(found.named.key) != 1:
+    if len(found.effects_fit.key) != 1:
         return {}
-    (cause,) = found.named.key
+    (cause,) = found.effects_fit.key
     gap = max(found.gap, 1.0)
     return {"simulated": simulated_confusions(found.search.shown.pairs, cause, gap, found.fitter.data.plant)}
 
@@ -142,7 +142,7 @@ def _excitation(found: DiagnosisResult) -> dict[str, Any]:
 
 
 def _causes(found: DiagnosisResult) -> tuple[Cause, ...]:
-    fitter, fit = found.fitter, found.named
+    fitter, fit = found.fitter, found.effects_fit
     plant, stds = fitter.data.plant, standard_errors(fitter, fit)
     causes = []
     named = [p for p in fit.candidate.placements if (p.effect.name, p.location) in found.posterior.best.causes]
@@ -155,9 +155,9 @@ def _causes(found: DiagnosisResult) -> tuple[Cause, ...]:
     if found.posterior.best.unknown_at:
         causes.append(Cause(UNKNOWN, found.posterior.best.unknown_at))
     steps = {s.name: ("step", step) for s, step in zip(plant.sensors, found.quantization_steps, strict=True)}
-    told = {(p.effect.name, p.location): p for p in found.told}
+    told = {(p.effect.name, p.location): p for p in found.limits}
     units = {s.name: s.unit for s in plant.sensors}
-    for name, place in found.rounded:
+    for name, place in found.from_readings:
         if (name, place) in told:
             causes.append(Cause(name, place, _as_told(told[name, place], plant)))
         else:
@@ -174,9 +174,9 @@ def _as_told(placement: Placement, plant: PlantDescription) -> dict[str, Amount]
 
 def _p_value(found: DiagnosisResult) -> float:
     """Chance that it is noise; what the values themselves tell is none."""
-    if found.rounded or (found.verdict == "unknown" and sensor_with_outliers(found.strays[0])):
+    if found.from_readings or (found.verdict == "unknown" and sensor_with_outliers(found.outliers[0])):
         return 0.0
-    return chance(found.search)
+    return p_value(found.search)
 
 
 def _disturbances(found: DiagnosisResult) -> dict[str, dict[str, object]]:

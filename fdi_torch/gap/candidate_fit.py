@@ -1,7 +1,9 @@
-"""Fits of one model, from many starts at once, to one recording: least squares on whole trajectories.
+"""Least-squares fit of a candidate, a set of effects at places, to a data set, from many starts at once.
 
-The collocation corrects a trajectory by one Newton step per evaluation. Costs of two points are therefore compared only
-where both trajectories obey the model: a point whose trajectory does not settle is refused.
+    chi^2(theta) = |W (y - y(theta))|^2 + sum ((theta - nominal) / tolerance)^2
+
+W whitens the residual with the sensor noise and, where there are random flows, with a Kalman filter. Trajectories are
+fitted together with the parameters (`trajectory_problem.py`).
 """
 
 from __future__ import annotations
@@ -26,18 +28,19 @@ from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation, name_in_recording
 
-# What the model still predicts to gain where a fit has converged, in units of chi-square per reading, or of one where
-# that is more: parameters a tenth of a standard error away, by the noise or by the residuals if they are larger.
+# A fit has converged if a further step is predicted to gain less than this share of the chi-square per reading, or of
+# one if that is more. Parameters are then within a tenth of a standard error, misfit included.
 DECREMENT = 0.01
 CAP = 200  # evaluations, a guard against descents without an end
-# A start is given up that is so many chi-square units behind and gains less than a quarter of its arrears in a step.
+# A start is given up if it is so many chi-square units behind and gains less than a quarter of that in a step.
 BEHIND, SHARE = 30.0, 0.25
 Key = frozenset[tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Effects at places. starts: which of their parameters are fitted, and from where ('Q1.pump_lag.time_constant')."""
+    """Effects at places. starts: the fitted parameters of these effects with initial values
+    ('Q1.pump_lag.time_constant')."""
 
     placements: tuple[Placement, ...] = ()
     starts: tuple[Mapping[str, float], ...] = ({},)
@@ -49,9 +52,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Fit:
-    """The best fit of a candidate: parameters by name, cost (chi-square with priors) and its neighbourhood.
+    """The best fit of a candidate: parameters theta (P,), cost (chi-square with priors), linearised trajectory.
 
-    converged: whether no more than DECREMENT was left to gain. One that was given up or ran out of evaluations has not.
+    converged: whether less than DECREMENT remained to gain. False if the fit was given up or ran out of evaluations.
     """
 
     candidate: Candidate
@@ -76,7 +79,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class DescentResult:
-    """Where descents ended: theta (L, P), cost (L,) in chi-square units, their neighbourhoods, converged (L,) bool."""
+    """End points of descents: theta (L, P), cost (L,) chi-square, linearised trajectories, converged (L,) bool."""
 
     theta: Tensor
     cost: Tensor
@@ -85,7 +88,7 @@ class DescentResult:
 
 
 class Fitter:
-    """Fits candidates to one subject under one noise: of the sensors, and of random flows where there are any."""
+    """Fits candidates to one data set under one noise: of the sensors, and of random flows if `whitening` is given."""
 
     def __init__(self, data: DataSet, noise: Noise, whitening: KalmanWhitening | None = None) -> None:
         self.data, self.noise, self.whitening = data, noise, whitening
@@ -93,13 +96,13 @@ class Fitter:
 
     @property
     def log_det(self) -> float:
-        """Of the variances of what `whiten` makes unit, summed over all readings."""
+        """Log determinant of the covariance that `whiten` reduces to the identity, over all readings."""
         if self.whitening:
             return self.whitening.log_det
         return float((2.0 * torch.log(self.noise.innovation) * self.data.mask.sum(dim=0)).sum())
 
     def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation | JointCollocation:
-        """The plant with the candidate's effects; its space holds the nuisances and what is free."""
+        """The plant with the candidate's effects. Its parameters are the nuisance parameters and those in `free`."""
         network = self.network(candidate.placements)
         names = tuple(dict.fromkeys([*self.data.nuisance, *free]))
         space = ParameterSpace(network.constants[n] for n in names if "@" not in n)
@@ -109,10 +112,10 @@ class Fitter:
         return JointCollocation(parts, ParameterSpace(replace(space[n.partition("@")[0]], name=n) for n in names))
 
     def network(self, placements: Sequence[Placement]) -> TankNetwork:
-        """The plant with further effects beside those it is believed to have, or in their stead."""
-        known = {p.prefix for p in placements}
-        nominal_effects = [p for p in self.data.nominal_effects if p.prefix not in known]
-        return TankNetwork(self.data.plant, _in_library_order([*nominal_effects, *placements]))
+        """The plant with these effects added to its nominal effects, or in their place."""
+        replaced = {p.prefix for p in placements}
+        remaining = [p for p in self.data.nominal_effects if p.prefix not in replaced]
+        return TankNetwork(self.data.plant, _in_library_order([*remaining, *placements]))
 
     def fit(
         self,
@@ -121,9 +124,9 @@ class Fitter:
         target: float = math.inf,
         cap: int = CAP,
     ) -> Fit:
-        """The best of the candidate's starts; nuisances and trajectory begin where `base` found them.
+        """Fit all starts of a candidate and return the best. Nuisance parameters and trajectory start from `base`.
 
-        target: the cost to compete with; starts that come near it too slowly are given up. cap: evaluations at most.
+        target: cost of the competitor; starts that approach it too slowly are given up. cap: most evaluations.
         """
         by_free: dict[tuple[str, ...], list[Mapping[str, float]]] = {}
         for start in candidate.starts:
@@ -141,63 +144,68 @@ class Fitter:
         cap: int,
     ) -> Fit:
         engine = self.engine(candidate, free)
-        theta, levels = self._begin(engine, starts, base)
-        found = self.descend(engine, theta, levels, target, cap)
-        best = int(torch.nan_to_num(found.cost, nan=torch.inf).argmin())
-        linearised = found.linearised.lanes(torch.tensor([best]))
+        theta, levels = self._initial_points(engine, starts, base)
+        descents = self.descend(engine, theta, levels, target, cap)
+        best = int(torch.nan_to_num(descents.cost, nan=torch.inf).argmin())
+        linearised = descents.linearised.lanes(torch.tensor([best]))
         return Fit(
-            candidate, engine.space, found.theta[best], float(found.cost[best]), linearised, bool(found.converged[best])
+            candidate,
+            engine.space,
+            descents.theta[best],
+            float(descents.cost[best]),
+            linearised,
+            bool(descents.converged[best]),
         )
 
-    def _begin(
+    def _initial_points(
         self, engine: Collocation | JointCollocation, starts: Sequence[Mapping[str, float]], base: Fit | None
     ) -> tuple[Tensor, Tensor]:
-        known = base.values if base else self.first_levels()
-        rows = [engine.space.vector({n: v for n, v in {**known, **s}.items() if n in engine.space}) for s in starts]
+        initial = base.values if base else self.first_levels()
+        rows = [engine.space.vector({n: v for n, v in {**initial, **s}.items() if n in engine.space}) for s in starts]
         theta = torch.stack(rows)
         if base is None:
             return theta, self.first_trajectory(engine, theta)
         return theta, base.linearised.levels.expand(len(starts), -1, -1)
 
     def first_trajectory(self, engine: Collocation | JointCollocation, theta: Tensor) -> Tensor:
-        """The model's levels (L, K+1, n) at theta (L, P), found from what the sensors show of them.
+        """The model's levels (L, K+1, n) at theta (L, P), found from the levels that the sensors show.
 
-        Newton's steps from levels that stay where they start miss the trajectory where levels become equal, or meet a
-        rim: its roots bend sharply there. They are the second choice, for readings that lead nowhere.
+        Newton's method from constant levels is the second choice: it misses trajectories where levels become equal or
+        reach a rim, because the flow has a sharp bend there.
         """
         constant = engine.constant_guess(theta)
-        shown = torch.cat([self._shown(part) for part in self.data.parts])
-        found = engine.converge(theta, torch.where(shown.isfinite(), shown, constant))
-        lost = (~(found.defect <= self.far)).nonzero().flatten()
+        measured = torch.cat([self._measured_levels(part) for part in self.data.parts])
+        first = engine.converge(theta, torch.where(measured.isfinite(), measured, constant))
+        lost = (~(first.defect <= self.far)).nonzero().flatten()
         if not len(lost):
-            return found.levels
+            return first.levels
         second = engine.converge(theta[lost], constant[lost])
-        better = second.defect < found.defect[lost].nan_to_num(nan=torch.inf)
-        return found.levels.index_copy(0, lost[better], second.levels[better])
+        better = second.defect < first.defect[lost].nan_to_num(nan=torch.inf)
+        return first.levels.index_copy(0, lost[better], second.levels[better])
 
-    def _shown(self, part: RecordingPart) -> Tensor:
-        """Levels that the sensors show at the ends of the steps (K+1, n), not a number for a tank that none sees."""
+    def _measured_levels(self, part: RecordingPart) -> Tensor:
+        """Measured levels at the ends of the steps (K+1, n); NaN for a tank without a sensor."""
         plant, nodes = self.data.plant, part.experiment.nodes
         names = [t.name for t in plant.tanks]
-        shown = nodes.new_full((len(nodes), len(names)), math.nan)
+        measured = nodes.new_full((len(nodes), len(names)), math.nan)
         for i, sensor in enumerate(plant.sensors):
-            tank, seen = names.index(sensor.tank), part.mask[:, i]
-            if bool(seen.any()):
-                level = (part.readings[seen, i] - sensor.offset) / sensor.gain
+            tank, valid = names.index(sensor.tank), part.mask[:, i]
+            if bool(valid.any()):
+                level = (part.readings[valid, i] - sensor.offset) / sensor.gain
                 level = level.clamp(0.0, plant.tanks[tank].height)
-                shown[:, tank] = interpolate(nodes, part.experiment.sample_times[seen], level)
-        return shown
+                measured[:, tank] = interpolate(nodes, part.experiment.sample_times[valid], level)
+        return measured
 
     def first_levels(self) -> dict[str, float]:
-        """Start levels from the mean of the first few readings."""
-        found = {}
+        """Initial levels from the mean of the first readings, by name."""
+        levels = {}
         for k, part in enumerate(self.data.parts):
             for i, sensor in enumerate(self.data.plant.sensors):
-                seen = part.readings[:5, i][part.mask[:5, i]]
-                if len(seen):
-                    level = max(float(seen.mean() - sensor.offset) / sensor.gain, 0.0)
-                    found[name_in_recording(f"{sensor.tank}.start_level", k)] = level
-        return found
+                readings = part.readings[:5, i][part.mask[:5, i]]
+                if len(readings):
+                    level = max(float(readings.mean() - sensor.offset) / sensor.gain, 0.0)
+                    levels[name_in_recording(f"{sensor.tank}.start_level", k)] = level
+        return levels
 
     def descend(
         self,
@@ -207,28 +215,28 @@ class Fitter:
         target: float = math.inf,
         cap: int = CAP,
     ) -> DescentResult:
-        """theta (L, P), levels (L, K+1, n) a guess of the trajectories there -> where least squares end."""
+        """Least squares from theta (L, P), with guesses of the trajectories, levels (L, K+1, n)."""
         problem = TrajectoryProblem(self, engine, levels)
         competition = Competition(0.5 * BEHIND, SHARE, 0.5 * target)
-        # The core's cost is a negative log-likelihood, half of chi-square.
+        # The optimiser's cost is a negative log-likelihood, half of chi-square.
         share = DECREMENT / max(int(self.data.mask.sum()), 1)
         settings = RefineSettings(cap, 0.5 * DECREMENT, share, step_tolerance=0.0, competition=competition)
         low, high, _ = problem.box
-        found = levenberg_marquardt(problem.linearise, theta, low, high, settings, neighbourhood=problem)
-        assert isinstance(found.state, Linearised)
-        return DescentResult(found.theta, 2.0 * found.cost, found.state, found.converged)
+        minimum = levenberg_marquardt(problem.linearise, theta, low, high, settings, neighbourhood=problem)
+        assert isinstance(minimum.state, Linearised)
+        return DescentResult(minimum.theta, 2.0 * minimum.cost, minimum.state, minimum.converged)
 
     def normal(
         self, space: ParameterSpace, theta: Tensor, linearised: Linearised, scale: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost (L,), half its gradient (L, P) and curvature (L, P, P), in scaled parameters."""
+        """Cost (L,), half its gradient (L, P), and curvature (L, P, P), in scaled parameters."""
         residual, jacobian = self.white(linearised)
-        pull = 1.0 / space.std(theta)
-        off = (theta - space.nominal(theta)) * pull
+        weight = 1.0 / space.std(theta)
+        deviation = (theta - space.nominal(theta)) * weight
         j, r = (jacobian * scale).permute(0, 3, 2, 1).flatten(2), residual.transpose(1, 2).flatten(1)  # time last
-        cost = (r * r).sum(-1) + (off * off).sum(-1)
-        gradient = (j @ r.unsqueeze(-1)).squeeze(-1) - off * pull * scale
-        curvature = j @ j.mT + torch.diag_embed((pull * scale) ** 2)
+        cost = (r * r).sum(-1) + (deviation * deviation).sum(-1)
+        gradient = (j @ r.unsqueeze(-1)).squeeze(-1) - deviation * weight * scale
+        curvature = j @ j.mT + torch.diag_embed((weight * scale) ** 2)
         return cost, gradient, curvature
 
     def cost(self, fit: Fit) -> float:
@@ -241,17 +249,17 @@ class Fitter:
         return residual, self.whiten(linearised.jacobian)
 
     def whiten(self, x: Tensor) -> Tensor:
-        """x (*lanes, S, C) or (*lanes, S, C, P) -> the same in units of the noise, without its correlation."""
+        """Whiten x (*lanes, S, C) or (*lanes, S, C, P): unit variance, no correlation."""
         return self.whitening(x) if self.whitening else self.noise.whiten(x, self.data.mask)
 
     def priors(self, space: ParameterSpace, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Scales of the parameters (P,), and their normal priors in these: roots of the precision, and how many
-        standard deviations theta is off."""
+        """Scales of the parameters (P,), and their normal priors in these scales: root of the precision (P,), and
+        deviation of theta from nominal in standard deviations (P,)."""
         scale, std = self.box(space)[2], space.std(theta)
         return scale, (scale / std).nan_to_num(0.0), ((theta - space.nominal(theta)) / std).nan_to_num(0.0)
 
     def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]:
-        """Bounds, and the scale on which each parameter varies."""
+        """Lower and upper bounds of the parameters, and the scale on which each varies, (P,) each."""
         duration = max(float(part.experiment.nodes[-1]) for part in self.data.parts)
         low, high, scale = [], [], []
         for p in space:
@@ -266,7 +274,7 @@ class Fitter:
 
 
 def unexplained_chi_square(fitter: Fitter, fit: Fit) -> float:
-    """What a fit leaves open, chi-square units."""
+    """Chi-square that a fit leaves at low frequencies, beyond noise."""
     return max(low_frequency_excess(fitter.white(fit.linearised)[0][0]), 0.0)
 
 
@@ -276,13 +284,13 @@ def _in_library_order(placements: Sequence[Placement]) -> list[Placement]:
 
 
 def covariance(fitter: Fitter, fit: Fit) -> Tensor:
-    """(P, P) of the fit's parameters, in their units."""
+    """Covariance (P, P) of a fit's parameters: the inverse of the curvature, priors included."""
     scale = fitter.box(fit.space)[2]
     curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.linearised, scale)[2][0]
     return torch.linalg.pinv(curvature, hermitian=True) * scale * scale.unsqueeze(1)
 
 
 def standard_errors(fitter: Fitter, fit: Fit) -> dict[str, float]:
-    """By full name."""
+    """Standard errors by full name."""
     variance = torch.diagonal(covariance(fitter, fit)).clamp(min=0.0)
     return dict(zip(fit.space.names, torch.sqrt(variance).tolist(), strict=True))

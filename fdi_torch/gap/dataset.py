@@ -1,4 +1,4 @@
-"""What is diagnosed: a plant file as it is believed, and one or several recordings laid out for it."""
+"""The data set of a diagnosis: a plant, and one or several recordings on the grid of their simulation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fdi_torch.simulate.joint_collocation import name_in_recording
 
 @dataclass(frozen=True)
 class RecordingPart:
-    """One recording of what is diagnosed: laid out, its sensors (S, C) in the plant's order."""
+    """One recording of a data set on its simulation grid. readings, mask: (S, C), in the order of the plant's sensors."""
 
     recording: Recording
     experiment: Experiment
@@ -30,9 +30,10 @@ class RecordingPart:
 
 @dataclass(frozen=True)
 class DataSet:
-    """What is diagnosed: a plant (with the effects it is believed to have) and one or several recordings of it.
+    """A plant with its nominal effects, and one or several recordings of it.
 
-    recording, experiment: of the first. readings, mask (S, C): of all, one blank sample between recordings.
+    recording, experiment: of the first recording. readings, mask (S, C): of all, with one masked row between
+    recordings. further: the other recordings.
     """
 
     plant: PlantDescription
@@ -55,15 +56,15 @@ class DataSet:
 
     @property
     def rows(self) -> tuple[slice, ...]:
-        """Where each recording's samples stand among all."""
-        found, first = [], 0
+        """The rows of each recording among all."""
+        slices, first = [], 0
         for part in self.parts:
-            found.append(slice(first, first + len(part.recording)))
+            slices.append(slice(first, first + len(part.recording)))
             first += len(part.recording) + 1
-        return tuple(found)
+        return tuple(slices)
 
     def alone(self, recording: int) -> DataSet:
-        """One of the recordings without the others."""
+        """A data set of one of the recordings."""
         part = self.parts[recording]
         return replace(
             self,
@@ -75,17 +76,17 @@ class DataSet:
         )
 
     @cached_property
-    def own(self) -> tuple[str, ...]:
-        """What each recording has for itself: start levels, and constants that vary from recording to recording."""
+    def per_recording(self) -> tuple[str, ...]:
+        """Parameters that each recording has for itself: initial levels, constants that vary between recordings."""
         return (*self.plant.varying, *(f"{t.name}.start_level" for t in self.plant.tanks))
 
     @cached_property
     def nuisance(self) -> tuple[str, ...]:
-        """Constants and effects' parameters with a tolerance, and start levels: refitted with every candidate."""
+        """Parameters refitted with every candidate: constants and effect parameters with a tolerance, initial levels."""
         constants = TankNetwork(self.plant, self.nominal_effects).constants
-        common = [p.name for p in constants if math.isfinite(p.std) and p.name not in self.own]
-        own = [name_in_recording(n, k) for k in range(len(self.further) + 1) for n in self.own]
-        return (*common, *own)
+        common = [p.name for p in constants if math.isfinite(p.std) and p.name not in self.per_recording]
+        per_recording = [name_in_recording(n, k) for k in range(len(self.further) + 1) for n in self.per_recording]
+        return (*common, *per_recording)
 
 
 def data_set_of(
@@ -94,7 +95,7 @@ def data_set_of(
     recordings: Recording | Sequence[Recording],
     step: float,
 ) -> DataSet:
-    """Lays recordings out; their sensors in the plant's order. Raises ValueError where one is missing."""
+    """Lay recordings out on their simulation grid, step s. Raises ValueError if one lacks a sensor."""
     each = [recordings] if isinstance(recordings, Recording) else recordings
     first, *further = [_part(plant, recording, step) for recording in each]
     readings, mask = [first.readings], [first.mask]
@@ -116,17 +117,17 @@ def _part(plant: PlantDescription, recording: Recording, step: float) -> Recordi
     names = [s.column for s in plant.sensors]
     missing = [n for n in names if n not in recording.output_names]
     if missing:
-        known = ", ".join(recording.output_names) or "none"
-        raise ValueError(f"{recording.source}: expected a sensor '{missing[0]}', got {known}; map the column to it")
+        columns = ", ".join(recording.output_names) or "none"
+        raise ValueError(f"{recording.source}: expected a sensor '{missing[0]}', got {columns}; map the column to it")
     order = [recording.output_names.index(n) for n in names]
     experiment = lay_out(recording, plant.channels(), step)
     return RecordingPart(recording, experiment, recording.outputs[:, order], recording.mask[:, order])
 
 
 def interpolate(at: Tensor, times: Tensor, values: Tensor) -> Tensor:
-    """values (S,) at increasing times (S,), straight between them and level beyond, at times `at` (K,)."""
+    """Linear interpolation of values (S,) at increasing times (S,) to times `at` (K,); constant beyond the ends."""
     after = torch.searchsorted(times, at).clamp(max=len(times) - 1)
     before = (after - 1).clamp(min=0)
-    span = (times[after] - times[before]).clamp(min=1e-300)
-    share = ((at - times[before]) / span).clamp(0.0, 1.0)
+    width = (times[after] - times[before]).clamp(min=1e-300)
+    share = ((at - times[before]) / width).clamp(0.0, 1.0)
     return torch.lerp(values[before], values[after], share)

@@ -1,4 +1,4 @@
-"""All that the diagnosis of one recording came to, before it is put into numbers and words."""
+"""The complete result of a diagnosis, from which the answer is built."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from fdi_torch.gap.search import SearchResult
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import OperatingRange
 
-UNEXPLAINED = 0.1  # share of the gap left open at which nothing has been explained
+UNEXPLAINED = 0.1  # largest share of the gap that may remain if it counts as explained
 
 
 @dataclass(frozen=True)
 class DiagnosisResult:
-    """sensors: the fitter under the sensors' noise alone. library: what was searched. content: the hypotheses that hold
-    95 % together. unnamed: the fit with the free discrepancy of the likeliest hypothesis, if it has one. rounded: what
-    the values themselves tell; lattice (C,): the step of each rounded sensor, or 0; told: the limits of sensors, with
-    their values; strays: what was masked in the recordings, and in the hold-outs.
-    """
+    """undisturbed: fitter with sensor noise alone. library: the effects searched. reach: ranges of the signals.
+    credible_set: the fewest hypotheses that have 95 % together. free_form_fit: fit of the free discrepancy, if the
+    likeliest hypothesis has an unknown. from_readings: causes that the readings show without a model (quantization,
+    limits, stuck sensors). quantization_steps (C,): 0 where there is none. limits: limits of sensors with their values.
+    outliers: masked readings of the recordings, and of the hold-outs."""
 
-    sensors: Fitter
+    undisturbed: Fitter
     library: tuple[Placement, ...]
     reach: OperatingRange
     search: SearchResult
     posterior: Posterior
-    content: Sequence[CauseHypothesis]
-    unnamed: Fit | None
+    credible_set: Sequence[CauseHypothesis]
+    free_form_fit: Fit | None
     verdict: Verdict
-    rounded: Sequence[CauseName]
+    from_readings: Sequence[CauseName]
     quantization_steps: Sequence[float]
-    told: Sequence[Placement] = ()
-    strays: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]] = ((), ())
+    limits: Sequence[Placement] = ()
+    outliers: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]] = ((), ())
 
     @property
     def fitter(self) -> Fitter:
-        """Under the noise of the likeliest hypothesis."""
+        """With the disturbance noise of the likeliest hypothesis."""
         return self.posterior.best.explanation.fitter
 
     @property
@@ -49,29 +49,29 @@ class DiagnosisResult:
         return self.search.null.fit
 
     @property
-    def named(self) -> Fit:
-        """The effects of the likeliest hypothesis."""
+    def effects_fit(self) -> Fit:
+        """The fit of the likeliest hypothesis' effects."""
         return self.posterior.best.fit
 
     @property
     def best(self) -> Fit:
-        """What explains the recording best: with a name, or without one."""
-        return self.unnamed or self.named
+        """The best fit of the recording: with the free discrepancy if there is one."""
+        return self.free_form_fit or self.effects_fit
 
     @property
     def gap(self) -> float:
-        """What the recalibrated plant leaves open, chi-square units of the sensors' noise."""
-        return unexplained_chi_square(self.sensors, self.null)
+        """Unexplained chi-square of the recalibrated plant, in units of the sensor noise."""
+        return unexplained_chi_square(self.undisturbed, self.null)
 
     @property
     def explained(self) -> bool:
-        """Whether the best explanation leaves little of the gap, or little beside the noise."""
-        return unexplained_chi_square(self.sensors, self.best) < UNEXPLAINED * max(
-            self.gap, float(self.sensors.data.mask.sum())
+        """Whether the best fit leaves only a small share of the gap, or little compared with the noise."""
+        return unexplained_chi_square(self.undisturbed, self.best) < UNEXPLAINED * max(
+            self.gap, float(self.undisturbed.data.mask.sum())
         )
 
 
-def chance(found: SearchResult) -> float:
-    """That noise alone lets some option of the library gain as much as the best one does (Bonferroni)."""
-    gain = float(found.alarm.gain.max())
-    return min(1.0, len(found.alarm.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))
+def p_value(result: SearchResult) -> float:
+    """Probability that noise alone lets some option of the library gain as much as the best one (Bonferroni)."""
+    gain = float(result.alarm.gain.max())
+    return min(1.0, len(result.alarm.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))

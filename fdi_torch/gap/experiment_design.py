@@ -106,7 +106,7 @@ def _known(fitter: Fitter, fit: Fit) -> Tensor:
         scale * scale.unsqueeze(1)
     )
     kept = [fit.space.index(n) for n in _in_one_run(fit)]
-    own = fitter.data.own
+    own = fitter.data.per_recording
     without_time_course = torch.tensor([n not in own for n in _in_one_run(fit)])
     return torch.where(without_time_course & without_time_course.unsqueeze(1), curvature[kept][:, kept], 0.0)
 

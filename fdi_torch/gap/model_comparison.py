@@ -53,7 +53,7 @@ def constants_of(fit: Fit) -> dict[str, float]:
 def reference_model(found: DiagnosisResult) -> Model:
     """The best explanation with free functions beside it, where it has a name; else it is the free form itself."""
     best, plant = found.best, found.fitter.data.plant
-    if found.unnamed:
+    if found.free_form_fit:
         return model_of(best)
     free = without_time_course([p for place in causal_places(found) for p in free_form(place, plant, found.reach)])
     taken: Mapping[str, float] = coefficients_of(found.fitter, best, free, found.reach).by_name()

@@ -1,4 +1,4 @@
-"""What is to be diagnosed, examined before any fit: what cannot be diagnosed is said in one sentence."""
+"""The problem of a diagnosis, checked before any fit: what cannot be diagnosed raises an error of one sentence."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
 
 LEAST = 60
-"""Readings of a sensor below which its noise cannot be told from what a model gets wrong: two of the slowest periods
-that still count as noise."""
+"""Fewest readings of a sensor; with fewer, noise cannot be separated from a model error. Two of the slowest periods
+that count as noise."""
 
-LONGEST_STEP = 2.5  # s, for tanks on a bench: where a rim is met, fits in longer ones end wherever they began
+LONGEST_STEP = 2.5  # s, for bench-scale tanks; with longer steps, fits that meet a rim depend on their start
 
 
 @dataclass(frozen=True)
 class Settings:
-    """library, leave_out: as in `library_of`. step: of the simulation, s; None: as in `laid_out`.
+    """library, leave_out: as in `library_of`. step: of the simulation, s; None: as in `checked_data_set`.
 
-    most: effects that one explanation may have. named_only: the best of what has a name, however much it leaves open:
-    a step on the way where many causes come together. trusted: as in `Recording`, of all of them.
+    most: effects in one explanation. named_only: report the best set of named effects, however much it leaves
+    unexplained; an intermediate step if many causes act together. trusted: as in `Recording`, for all of them.
     """
 
     library: tuple[str, ...] | None = None
@@ -46,26 +46,28 @@ PLAIN = Settings()
 
 @dataclass(frozen=True)
 class DiagnosisProblem:
-    """library: the effects at places to search. subject: the recordings, for the plant with the limits of its sensors
-    that their values tell, and sensors that are stuck (`told`), without sensors that are stuck throughout; held: the
-    hold-outs. strays: what was masked in the recordings, and in the hold-outs. most, named_only: as in `Settings`.
-    """
+    """library: the effects to search. known_effects: limits of sensors, and stuck sensors, that the readings show
+    without a model. data: the recordings, for the plant with these effects and without sensors that are stuck
+    throughout. holdouts: the hold-outs, likewise. outliers: masked readings of the recordings, and of the hold-outs.
+    most, named_only: as in `Settings`."""
 
     library: tuple[Placement, ...]
     recordings: tuple[Recording, ...]
-    told: list[Placement]
+    known_effects: list[Placement]
     data: DataSet
-    held: tuple[DataSet, ...]
+    holdouts: tuple[DataSet, ...]
     most: int
     named_only: bool = False
-    strays: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]] = ((), ())
+    outliers: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]] = ((), ())
 
 
 def problem_of(
     plant: PlantDescription, recordings: Sequence[Recording], holdouts: Sequence[Recording], settings: Settings
 ) -> DiagnosisProblem:
-    """Raises ValueError for what cannot be diagnosed: effects or places that there are not, sensors or inputs that the
-    recordings lack, too few readings, a hold-out that is the recording itself.
+    """Check the recordings and lay them out.
+
+    Raises ValueError for unknown effects or places, missing sensors or inputs, too few readings, and a hold-out that is
+    one of the recordings.
     """
     for one in holdouts:
         check_holdout_differs(one, recordings)
@@ -76,64 +78,65 @@ def problem_of(
     recordings, stuck = _examined(plant, recordings, settings.trusted)
     holdouts, _ = _examined(plant, holdouts, settings.trusted)
     offered = {p.prefix for p in library}
-    frozen = {s.sensor.name: s for s in stuck if s.for_good and f"{s.sensor.name}.sensor_stuck" in offered}
-    plant = _with_sensors_that_read(plant, recordings, stuck)
+    stuck_for_good = {s.sensor.name: s for s in stuck if s.for_good and f"{s.sensor.name}.sensor_stuck" in offered}
+    plant = _without_stuck_sensors(plant, recordings, stuck)
     library = tuple(p for p in library if p.location in plant.locations())
     nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
-    recordings, strays = _without_strays(plant, nominal_effects, recordings, settings.step)
-    holdouts, strays_held = _without_strays(plant, nominal_effects, holdouts, settings.step)
-    told = limits_from_readings(plant, recordings, nominal_effects, library)
-    nominal_effects += told
-    told += [Placement(effect("sensor_stuck"), n, {"size": 1.0, "onset": s.start}) for n, s in frozen.items()]
-    strays = _as_strays([s for s in stuck if s.sensor.name not in frozen]) + strays
-    data, *held = (
+    recordings, outliers = _without_outliers(plant, nominal_effects, recordings, settings.step)
+    holdouts, holdout_outliers = _without_outliers(plant, nominal_effects, holdouts, settings.step)
+    known_effects = limits_from_readings(plant, recordings, nominal_effects, library)
+    nominal_effects += known_effects
+    known_effects += [
+        Placement(effect("sensor_stuck"), n, {"size": 1.0, "onset": s.start}) for n, s in stuck_for_good.items()
+    ]
+    outliers = _as_outliers([s for s in stuck if s.sensor.name not in stuck_for_good]) + outliers
+    data, *holdout_data = (
         checked_data_set(plant, nominal_effects, r, settings.step) for r in (recordings, *((h,) for h in holdouts))
     )
-    apart = (strays, strays_held)
-    asked = settings.most, settings.named_only
-    return DiagnosisProblem(library, tuple(recordings), told, data, tuple(held), *asked, apart)
+    masked = (outliers, holdout_outliers)
+    options = settings.most, settings.named_only
+    return DiagnosisProblem(library, tuple(recordings), known_effects, data, tuple(holdout_data), *options, masked)
 
 
-def _without_strays(
+def _without_outliers(
     plant: PlantDescription, nominal_effects: Sequence[Placement], recordings: Sequence[Recording], step: float | None
 ) -> tuple[list[Recording], list[SensorOutliers]]:
-    """The recordings, what strays in them masked, and that."""
-    kept: list[Recording] = []
-    found: list[SensorOutliers] = []
+    """The recordings with outliers masked, and these outliers."""
+    masked: list[Recording] = []
+    all_outliers: list[SensorOutliers] = []
     columns = {s.name: s.column for s in plant.sensors}
     for recording in recordings:
-        mask, own = (
+        mask, of_recording = (
             recording.mask,
             outliers_of(data_set_of(plant, nominal_effects, recording, step or _step(plant, recording))),
         )
-        for strays in own:
-            mask = without(mask, strays.each, recording.output_names.index(columns[strays.sensor]))
-        kept.append(replace(recording, mask=mask) if own else recording)
-        found += own
-    return kept, found
+        for of_sensor in of_recording:
+            mask = without(mask, of_sensor.each, recording.output_names.index(columns[of_sensor.sensor]))
+        masked.append(replace(recording, mask=mask) if of_recording else recording)
+        all_outliers += of_recording
+    return masked, all_outliers
 
 
 def _examined(
     plant: PlantDescription, recordings: Sequence[Recording], trusted: bool
 ) -> tuple[list[Recording], list[StuckSegment]]:
-    """The recordings without readings of sensors that are stuck, and these. Raises ValueError for one that is not
-    what it seems."""
-    found = [usable(plant, replace(r, trusted=r.trusted or trusted), effects=True) for r in recordings]
-    return [f.recording for f in found], [s for f in found for s in f.stuck]
+    """The recordings without readings of stuck sensors, and these. Raises ValueError for a faulty recording."""
+    checked = [usable(plant, replace(r, trusted=r.trusted or trusted), effects=True) for r in recordings]
+    return [f.recording for f in checked], [s for f in checked for s in f.stuck]
 
 
-def _with_sensors_that_read(
+def _without_stuck_sensors(
     plant: PlantDescription, recordings: Sequence[Recording], stuck: Sequence[StuckSegment]
 ) -> PlantDescription:
-    """The plant without sensors of which little is left beside what stood still.
+    """The plant without sensors that have too few readings besides those that are stuck.
 
-    Raises ValueError where no sensor is left.
+    Raises ValueError if no sensor is left.
     """
-    left = {
+    remaining = {
         s.sensor.name: sum(int(r.mask[:, r.output_names.index(s.sensor.column)].sum()) for r in recordings)
         for s in stuck
     }
-    silent = {name for name, count in left.items() if count < LEAST}
+    silent = {name for name, count in remaining.items() if count < LEAST}
     if not silent:
         return plant
     if len(silent) == len(plant.sensors):
@@ -144,16 +147,16 @@ def _with_sensors_that_read(
     return without_sensors(plant, silent)
 
 
-def _as_strays(stuck: Sequence[StuckSegment]) -> list[SensorOutliers]:
-    """Readings that stood still for a while, or of a sensor that nothing else may be said of."""
-    each: dict[str, list[Outlier]] = {}
+def _as_outliers(stuck: Sequence[StuckSegment]) -> list[SensorOutliers]:
+    """Segments in which a sensor is stuck for some time, as outliers of that sensor."""
+    by_sensor: dict[str, list[Outlier]] = {}
     for s in stuck:
-        each.setdefault(s.sensor.name, []).append(Outlier(slice(s.first, s.beyond), (s.start, s.stop), math.inf))
-    return [SensorOutliers(name, "", tuple(own)) for name, own in each.items()]
+        by_sensor.setdefault(s.sensor.name, []).append(Outlier(slice(s.first, s.beyond), (s.start, s.stop), math.inf))
+    return [SensorOutliers(name, "", tuple(segments)) for name, segments in by_sensor.items()]
 
 
 def check_holdout_differs(holdout: Recording, recordings: Sequence[Recording]) -> None:
-    """Raises ValueError where a hold-out is one of the recordings that are diagnosed."""
+    """Raises ValueError if a hold-out is one of the recordings that are diagnosed."""
     same_file = bool(holdout.sha256) and any(_overlap(holdout, r) for r in recordings)
     if same_file or any(holdout is r for r in recordings):
         raise ValueError(
@@ -163,15 +166,17 @@ def check_holdout_differs(holdout: Recording, recordings: Sequence[Recording]) -
 
 
 def _overlap(a: Recording, b: Recording) -> bool:
-    """Whether both are stretches of one file that have time in common."""
+    """Whether both are cut from one file and overlap in time."""
     return a.sha256 == b.sha256 and bool(a.time[0] < b.time[-1]) and bool(b.time[0] < a.time[-1])
 
 
 def checked_data_set(
     plant: PlantDescription, nominal_effects: Sequence[Placement], recordings: Sequence[Recording], step: float | None
 ) -> DataSet:
-    """The recordings on the grid of their simulation. step: s; None for the sampling interval of the first, or a whole
-    part of it that is no longer than LONGEST_STEP.
+    """Lay the recordings out on the grid of their simulation.
+
+    step: s; None for the sampling interval of the first recording, or the largest whole fraction of it that is not
+    longer than LONGEST_STEP.
     """
     data = data_set_of(plant, nominal_effects, recordings, step or _step(plant, recordings[0]))
     check_enough_readings(data)
@@ -179,13 +184,13 @@ def checked_data_set(
 
 
 def _step(plant: PlantDescription, recording: Recording) -> float:
-    """A whole part of the sampling interval, s."""
+    """A whole fraction of the sampling interval, s."""
     interval = recording.interval
     return interval / math.ceil(interval / (LONGEST_STEP * time_scale(plant)) - 1e-9)
 
 
 def check_enough_readings(data: DataSet) -> None:
-    """Raises ValueError where a sensor has too few readings."""
+    """Raises ValueError if a sensor has too few readings."""
     recording, plant = data.recording, data.plant
     for sensor, count in zip(plant.sensors, data.mask.sum(dim=0).tolist(), strict=True):
         if count < LEAST:

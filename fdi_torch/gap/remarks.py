@@ -48,9 +48,9 @@ def remarks_on(found: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
             "the fit of the likeliest explanation has not converged: its sizes may be off by more than their standard "
             "errors; a longer recording, or --library with fewer effects, may settle it"
         )
-    remarks += [_astray(s) for group in found.strays for s in group]
+    remarks += [_astray(s) for group in found.outliers for s in group]
     remarks += [*_believed_outside(data.plant), *_at_their_ends(found), *_period(found)]
-    remarks += [_carries_nothing(found, h) for h in held if found.unnamed and _worse(h)]
+    remarks += [_carries_nothing(found, h) for h in held if found.free_form_fit and _worse(h)]
     return remarks + [sentence for h in held if (sentence := rig_difference(found, h))]
 
 
@@ -84,7 +84,7 @@ def _carries_nothing(found: DiagnosisResult, held: HeldOut) -> str:
 
 def _period(found: DiagnosisResult) -> list[str]:
     """Whether what has no name comes and goes by itself."""
-    shape: Any = discrepancy_tables(found.unnamed)["tables"] if found.unnamed else {}
+    shape: Any = discrepancy_tables(found.free_form_fit)["tables"] if found.free_form_fit else {}
     waves = [(t["at"][0], t["share"][0]) for name, t in shape.items() if name.endswith(".period")]
     return [
         f"what is unknown at {place} comes and goes with a period of {period:.3g} s; its phase belongs to each "
@@ -116,7 +116,7 @@ def _believed_outside(plant: PlantDescription) -> list[str]:
 
 def _at_their_ends(found: DiagnosisResult) -> list[str]:
     """Parameters that were stopped by the end of their sensible range."""
-    told, fit = [], found.named
+    told, fit = [], found.effects_fit
     for name, value in fit.effect_values.items():
         parameter, (unit, scale) = fit.space[name], display_unit(fit.space[name].unit)
         width = parameter.high - parameter.low
@@ -137,7 +137,7 @@ APART = 5.0  # standard errors
 
 def rig_difference(found: DiagnosisResult, held: HeldOut) -> str | None:
     """One sentence where the hold-out does not fit to what was found in the recording, else None."""
-    if found.unnamed or not found.explained:
+    if found.free_form_fit or not found.explained:
         return None
     mask, noise = held.data.mask, held.noise
     white = noise.whiten(held.data.readings - held.runs["augmented"], mask)

@@ -17,10 +17,10 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation
 
-CORRECTIONS = 6  # of a trajectory that a step of the parameters moved
-FAR = 1e-3  # in units of the plant's length scale: a defect from which a correction is worth its cost
-LONG, NEARLY = 4.0, 10.0  # in the same: a shift that needs a correction, and a defect that one more makes good
-LOST, STALLED = 100.0, 0.9  # a trajectory so many times too far off that a correction brings no nearer has no end
+CORRECTIONS = 6  # most Newton steps after the parameters moved a trajectory
+FAR = 1e-3  # largest defect of a converged trajectory, in units of the plant's length scale
+LONG, NEARLY = 4.0, 10.0  # in units of FAR: a shift that needs corrections, a defect that one more correction removes
+LOST, STALLED = 100.0, 0.9  # a defect above LOST * FAR that one correction reduces by less than 10 % has diverged
 
 
 class Objective(Protocol):
@@ -41,7 +41,7 @@ class Objective(Protocol):
 
 
 class TrajectoryProblem:
-    """Half of chi-square as a problem for least squares; every point keeps its trajectory's neighbourhood."""
+    """Half of chi-square as a least-squares problem, in which every point keeps its linearised trajectory."""
 
     def __init__(self, objective: Objective, engine: Collocation | JointCollocation, levels: Tensor) -> None:
         self.objective, self.engine, self.levels = objective, engine, levels
@@ -53,16 +53,16 @@ class TrajectoryProblem:
         return self._model(theta, _correct(self.engine, theta, linearised, self.objective.far))
 
     def follow(self, theta: Tensor, known: Linearisation, step: Tensor) -> Linearisation:
-        """The model at theta, a step away from what is known; its cost is infinite where no trajectory leads there."""
+        """The model at theta, a `step` away from `known`. The cost is infinite if the trajectory does not converge."""
         linearised, far = _linearised(known), self.objective.far
         shift = (linearised.slopes * step[:, None, None, :]).sum(-1)
-        found = follow_trajectories(self.engine, theta, linearised.levels + shift, shift, far)
-        model = self._model(theta, found)
-        lost = ~(found.defect <= linearised.defect.clamp(min=far))
+        moved = follow_trajectories(self.engine, theta, linearised.levels + shift, shift, far)
+        model = self._model(theta, moved)
+        lost = ~(moved.defect <= linearised.defect.clamp(min=far))
         return replace(model, cost=torch.where(lost, torch.inf, model.cost))
 
     def bend(self, known: Linearisation, trial: Linearisation, step: Tensor) -> Tensor:
-        """J'c (L, P) for the bend c of the whitened readings along the step; priors do not bend."""
+        """J'c (L, P) for the second-order change c of the whitened readings along the step; priors are linear."""
         linearised = _linearised(known)
         bend = (
             _linearised(trial).readings - linearised.readings - (linearised.jacobian * step[:, None, None, :]).sum(-1)
@@ -74,7 +74,7 @@ class TrajectoryProblem:
     def _model(self, theta: Tensor, linearised: Linearised) -> Linearisation:
         scale = self.box[2]
         cost, descent, curvature = self.objective.normal(self.engine.space, theta, linearised, scale)
-        # What nothing determines stays where it is.
+        # A parameter that nothing determines stays at its value.
         weakest = 1e-9 * torch.diagonal(curvature, dim1=-2, dim2=-1).amax(-1, keepdim=True) + 1e-12
         curvature = curvature + torch.diag_embed(weakest.expand_as(theta))
         return Linearisation(0.5 * cost, -descent / scale, curvature / (scale * scale.unsqueeze(-1)), linearised)
@@ -88,8 +88,9 @@ def _linearised(model: Linearisation) -> Linearised:
 def follow_trajectories(
     engine: Collocation | JointCollocation, theta: Tensor, guess: Tensor, shift: Tensor, far: float
 ) -> Linearised:
-    """The neighbourhood of trajectories that are guessed to be `shift` from known ones; slopes are worked out once a
-    guess is good.
+    """Linearised trajectories near a guess that is `shift` away from converged ones.
+
+    Slopes are computed only once the guess has been corrected.
     """
     levels, lost = guess, torch.zeros(len(theta), dtype=torch.bool)
     lanes = (shift.abs().amax(dim=(-1, -2)) > LONG * far).nonzero().flatten()
@@ -112,7 +113,7 @@ def _correct(
     far: float,
     lost: Tensor | None = None,
 ) -> Linearised:
-    """The lanes whose trajectories were still far from the model's corrected until they are not, or no more."""
+    """Correct the lanes whose defect is too large until they converge or diverge."""
     lost = torch.zeros_like(linearised.defect, dtype=torch.bool) if lost is None else lost
     for _ in range(CORRECTIONS):
         lanes = (~lost & (linearised.defect > far)).nonzero().flatten()
@@ -125,5 +126,5 @@ def _correct(
 
 
 def _diverged(defect: Tensor, before: Tensor, far: float) -> Tensor:
-    """Which lanes (L,) a correction has not brought nearer to a trajectory that they are lost from."""
+    """Lanes (L,) with a large defect that a correction did not reduce."""
     return ~((defect < LOST * far) | (defect < STALLED * before))

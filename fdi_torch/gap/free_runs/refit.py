@@ -125,7 +125,7 @@ def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
 
 def _errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
     """Values with standard errors, misfit included, of what all recordings have in common."""
-    own = set(fitter.data.own)
+    own = set(fitter.data.per_recording)
     return {n: each for n, each in _all_errors(fitter, fit).items() if n.partition("@")[0] not in own}
 
 

@@ -1,7 +1,7 @@
-"""What each kind of component knows of where it sits, and of which forms its discrepancy may be.
+"""Local signals of each kind of component, and the regressors of its discrepancy.
 
-A pump knows its command and its tank's level, a pipe its head and its valve, a tank its level, a pair of tanks their
-difference, a sensor its reading; pumps, pipes and sensors also what these have been.
+A pump depends on its command and its tank's level, a pipe on its head and its valve, a tank on its level, a pair of
+tanks on their difference, a sensor on its reading. Pumps, pipes and sensors may also depend on the past of these.
 """
 
 from __future__ import annotations
@@ -16,52 +16,59 @@ from fdi_torch.gap.forcing import Forcing
 from fdi_torch.gap.localization.regressors import (
     LAGS,
     RAMPS,
-    bends,
-    jerks,
-    jumps,
+    backlashes,
+    fatigues,
+    hinges,
     lagged,
-    memories,
+    lags_and_decays,
+    rate_limits,
     relays,
-    slews,
-    sticks,
-    tirings,
+    steps_in_value,
+    stictions,
 )
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump
 from fdi_torch.plant.effect import place_kind
 from fdi_torch.plant.scales import time_scale
 
 Signals = dict[str, Tensor]
-RELAYS = 6  # values between which a place may switch
-SLOW = (100.0, 300.0)  # s, of a chamber beside a tank
+RELAYS = 6  # thresholds of relays
+SLOW = (100.0, 300.0)  # time constants (s) of a side chamber of a tank
 
 
 class SignalRanges:
-    """The least and the greatest value of each signal in all recordings, and forms between them."""
+    """Least and greatest value of each signal over all recordings, and regressors between them."""
 
-    def __init__(self, seen: Sequence[Signals]) -> None:
-        self.seen = seen
+    def __init__(self, recordings: Sequence[Signals]) -> None:
+        self.recordings = recordings
 
     def __call__(self, name: str) -> tuple[float, float]:
-        low, high = min(float(s[name].min()) for s in self.seen), max(float(s[name].max()) for s in self.seen)
+        low, high = (
+            min(float(s[name].min()) for s in self.recordings),
+            max(float(s[name].max()) for s in self.recordings),
+        )
         return low, max(high, low + 1e-9 * (max(abs(low), abs(high)) or 1.0))
 
-    def bends(self, s: Signals, name: str, count: int) -> list[Tensor]:
-        return bends(s[name], self(name), 2 * count)
+    def hinges(self, s: Signals, name: str, count: int) -> list[Tensor]:
+        return hinges(s[name], self(name), 2 * count)
 
-    def jumps(self, s: Signals, name: str, count: int) -> list[Tensor]:
-        return jumps(s[name], self(name), 3 * count)
+    def steps_in_value(self, s: Signals, name: str, count: int) -> list[Tensor]:
+        return steps_in_value(s[name], self(name), 3 * count)
 
     def relays(self, s: Signals, name: str) -> list[tuple[float, Tensor]]:
         return relays(s[name], self(name), RELAYS)
 
 
-RegressorFunction = Callable[[Signals, Tensor, SignalRanges], list[Tensor]]  # signals (K,), steps (K,) s -> (K,) each
+# Local signals (K,), step lengths (K,) s -> regressors (K,) each
+RegressorFunction = Callable[[Signals, Tensor, SignalRanges], list[Tensor]]
 
 
 @dataclass(frozen=True)
 class DiscrepancyModel:
-    """signals: what it knows along a recording. flows: forms in m^3/s, or to be scaled to it, from `source` to
-    `target`; in_time: the signal that a course in time multiplies. areas: forms of a change of the target's level, m/s.
+    """Regressors of one component's discrepancy.
+
+    signals: the local signals along a recording. flows: regressors in m^3/s, or to be scaled to it, of a flow from
+    `source` to `target`. in_time: name of the signal that functions of time multiply. areas: regressors of a relative
+    change of the target's area, as level rates in m/s.
     """
 
     signals: Callable[[Forcing], Signals]
@@ -72,64 +79,68 @@ class DiscrepancyModel:
     areas: RegressorFunction | None = None
 
 
-def component_at(place: str, plant: PlantDescription) -> DiscrepancyModel:
-    """Of everything but sensors."""
+def discrepancy_model_at(place: str, plant: PlantDescription) -> DiscrepancyModel:
+    """The discrepancy model of a place that is no sensor."""
     kind = place_kind(plant, place)
     if kind == "tank_pair":
         return _pair(place, plant)
     if kind == "tank":
         return _tank(place, plant)
-    found = plant.component(place)
-    if isinstance(found, Pump):
-        return _pump(found, plant)
-    assert isinstance(found, Pipe)
-    return _pipe(found, plant)
+    component = plant.component(place)
+    if isinstance(component, Pump):
+        return _pump(component, plant)
+    assert isinstance(component, Pipe)
+    return _pipe(component, plant)
 
 
-def of_reading(s: Signals, step: Tensor, ends: SignalRanges, pace: float) -> list[Tensor]:
-    """Forms of a sensor's discrepancy; step: between samples, s; pace: of the plant."""
-    own = [*ends.bends(s, "reading", 12), s["reading"] * s["time"] / ends("time")[1]]
-    lag = lagged(s["reading"], step, pace * LAGS[0]) - s["reading"]
-    own += [lag * (s["time"] / ends("time")[1] - j / RAMPS).clamp(min=0.0) for j in range(RAMPS)]  # a clock that drifts
-    return [*own, *memories(s["reading"], step, pace), *sticks(s["reading"], ends("reading"))]
+def reading_regressors(s: Signals, step: Tensor, ends: SignalRanges, scale: float) -> list[Tensor]:
+    """Regressors of a sensor's discrepancy. step: sampling intervals, s. scale: time scale of the plant."""
+    regressors = [*ends.hinges(s, "reading", 12), s["reading"] * s["time"] / ends("time")[1]]
+    lag = lagged(s["reading"], step, scale * LAGS[0]) - s["reading"]
+    regressors += [lag * (s["time"] / ends("time")[1] - j / RAMPS).clamp(min=0.0) for j in range(RAMPS)]  # clock drift
+    return [*regressors, *lags_and_decays(s["reading"], step, scale), *backlashes(s["reading"], ends("reading"))]
 
 
 def _pump(pump: Pump, plant: PlantDescription) -> DiscrepancyModel:
-    which, tank, pace = plant.pumps.index(pump), _index(plant, pump.target), time_scale(plant)
+    index, tank, scale = plant.pumps.index(pump), _index(plant, pump.target), time_scale(plant)
 
-    def signals(along: Forcing) -> Signals:
-        return {"command": along.commands[which], "flow": along.pumps[which], "level": along.levels[tank]}
+    def signals(trajectory: Forcing) -> Signals:
+        return {
+            "command": trajectory.commands[index],
+            "flow": trajectory.pumps[index],
+            "level": trajectory.levels[tank],
+        }
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        own = [*ends.bends(s, "command", 9), *memories(s["flow"], step, pace)]
-        own += [s["flow"] * b for b in ends.bends(s, "level", 6)]
-        own += slews(s["flow"], step, ends("flow"), pace)
-        own += jerks(s["flow"], ends("flow"))
-        return [*own, *sticks(s["flow"], ends("flow")), *tirings(s["flow"], step, ends("flow"), pace)]
+        regressors = [*ends.hinges(s, "command", 9), *lags_and_decays(s["flow"], step, scale)]
+        regressors += [s["flow"] * b for b in ends.hinges(s, "level", 6)]
+        regressors += rate_limits(s["flow"], step, ends("flow"), scale)
+        regressors += stictions(s["flow"], ends("flow"))
+        return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
     return DiscrepancyModel(signals, flows, "flow", OUTSIDE, pump.target)
 
 
 def _pipe(pipe: Pipe, plant: PlantDescription) -> DiscrepancyModel:
-    which, pace = plant.pipes.index(pipe), time_scale(plant)
-    valve = len(plant.pumps) + sum(1 for p in plant.pipes[:which] if p.valve)
+    index, scale = plant.pipes.index(pipe), time_scale(plant)
+    valve = len(plant.pumps) + sum(1 for p in plant.pipes[:index] if p.valve)
 
-    def signals(along: Forcing) -> Signals:
-        head = along.levels[_index(plant, pipe.source)] - pipe.elevation
+    def signals(trajectory: Forcing) -> Signals:
+        head = trajectory.levels[_index(plant, pipe.source)] - pipe.elevation
         if not pipe.is_outlet:
-            far = along.levels[_index(plant, pipe.target)] - pipe.elevation
-            head = head.clamp(min=0.0) - far.clamp(min=0.0) if pipe.elevation else head - far
-        known = {"root": _root(head), "flow": along.pipes[which]}
-        return known | ({"opening": along.commands[valve]} if pipe.valve else {})
+            far_head = trajectory.levels[_index(plant, pipe.target)] - pipe.elevation
+            head = head.clamp(min=0.0) - far_head.clamp(min=0.0) if pipe.elevation else head - far_head
+        signals_here = {"root": _root(head), "flow": trajectory.pipes[index]}
+        return signals_here | ({"opening": trajectory.commands[valve]} if pipe.valve else {})
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        own = [*ends.bends(s, "root", 16), *memories(s["flow"], step, pace)]
-        own += [s["flow"] * j for j in ends.jumps(s, "root", 24)]
-        own += [s["flow"] * on for _, on in ends.relays(s, "root")]
+        regressors = [*ends.hinges(s, "root", 16), *lags_and_decays(s["flow"], step, scale)]
+        regressors += [s["flow"] * j for j in ends.steps_in_value(s, "root", 24)]
+        regressors += [s["flow"] * on for _, on in ends.relays(s, "root")]
         if pipe.valve:
-            own += [s["root"] * b for b in ends.bends(s, "opening", 9)]
-            own += memories(s["root"] * s["opening"], step, pace)
-        return [*own, *sticks(s["flow"], ends("flow")), *tirings(s["flow"], step, ends("flow"), pace)]
+            regressors += [s["root"] * b for b in ends.hinges(s, "opening", 9)]
+            regressors += lags_and_decays(s["root"] * s["opening"], step, scale)
+        return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
     return DiscrepancyModel(signals, flows, "flow", pipe.source, pipe.target)
 
@@ -137,33 +148,33 @@ def _pipe(pipe: Pipe, plant: PlantDescription) -> DiscrepancyModel:
 def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
     first, second = place.split("-")
 
-    def signals(along: Forcing) -> Signals:
-        head = along.levels[_index(plant, first)] - along.levels[_index(plant, second)]
+    def signals(trajectory: Forcing) -> Signals:
+        head = trajectory.levels[_index(plant, first)] - trajectory.levels[_index(plant, second)]
         return {"head": head, "root": _root(head)}
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        return [*ends.bends(s, "head", 10), *ends.bends(s, "root", 10)]
+        return [*ends.hinges(s, "head", 10), *ends.hinges(s, "root", 10)]
 
     return DiscrepancyModel(signals, flows, "root", first, second)
 
 
 def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
-    tank, pace = _index(plant, place), time_scale(plant)
+    tank, scale = _index(plant, place), time_scale(plant)
 
-    def signals(along: Forcing) -> Signals:
-        level = along.levels[tank]
-        return {"level": level, "rate": along.still[tank], "one": torch.ones_like(level)}
+    def signals(trajectory: Forcing) -> Signals:
+        level = trajectory.levels[tank]
+        return {"level": level, "rate": trajectory.still[tank], "one": torch.ones_like(level)}
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        own = [*ends.bends(s, "level", 12), *ends.jumps(s, "level", 24)]
-        for low, on in ends.relays(s, "level"):  # a draw, an orifice at the floor, and one that low
-            own += [on, on * _root(s["level"]), on * _root((s["level"] - low).clamp(min=0.0))]
-        # No short lags: how the level lags behind itself is its own rate, which is all that there is to explain.
-        own += [lagged(s["level"], step, pace * tau) - s["level"] for tau in SLOW]
-        return [*own, *sticks(s["level"], ends("level"))]
+        regressors = [*ends.hinges(s, "level", 12), *ends.steps_in_value(s, "level", 24)]
+        for low, on in ends.relays(s, "level"):  # a constant draw, an orifice at the floor, and one at that height
+            regressors += [on, on * _root(s["level"]), on * _root((s["level"] - low).clamp(min=0.0))]
+        # No short lags: a short lag of the level is its rate, which the balance explains already.
+        regressors += [lagged(s["level"], step, scale * tau) - s["level"] for tau in SLOW]
+        return [*regressors, *backlashes(s["level"], ends("level"))]
 
     def areas(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        return [s["rate"] * b for b in ends.bends(s, "level", 12)]
+        return [s["rate"] * b for b in ends.hinges(s, "level", 12)]
 
     return DiscrepancyModel(signals, flows, "one", OUTSIDE, place, areas)
 

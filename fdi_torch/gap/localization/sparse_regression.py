@@ -16,8 +16,8 @@ from torch import Tensor
 
 VISIBLE = 1e-6  # chi-square units; columns with less influence are ignored
 LOW, HIGH = 1e-8, 1e12  # bounds of the precisions
-FIRST_ROUNDS = 12  # iterations with all columns; then those with little influence are removed
-VANISHED = 1e-3  # a column is removed if the data determine less than this share of its coefficient
+FIRST_ROUNDS = 12  # iterations with all columns; then vanished columns are removed
+VANISHED = 1e-3  # share of a coefficient that the data determine, below which it has vanished
 RIDGES = tuple(10.0**k for k in range(-8, 2))  # as shares of the diagonal
 
 
@@ -25,8 +25,8 @@ RIDGES = tuple(10.0**k for k in range(-8, 2))  # as shares of the diagonal
 class SparseFit:
     """Solutions of B problems.
 
-    evidence (B,): log evidence against no coefficients. closes (B,): reduction of chi-square. needs (B,): effective number
-    of coefficients. mean (B, M): posterior means of the coefficients.
+    evidence (B,): log evidence against no coefficients. closes (B,): reduction of chi-square. needs (B,): effective
+    number of coefficients. mean (B, M): posterior means of the coefficients.
     """
 
     evidence: Tensor

@@ -63,7 +63,7 @@ class StuckSegment:
 
 @dataclass(frozen=True)
 class CheckedRecording:
-    """A recording whose stuck readings are masked. fault: what is wrong with all of it, if anything."""
+    """A recording whose stuck readings are masked. fault: a fault of the whole recording, or None."""
 
     recording: Recording
     stuck: tuple[StuckSegment, ...]
@@ -95,7 +95,7 @@ def usable(plant: PlantDescription, recording: Recording, effects: bool = False)
     checked = examined(plant, recording)
     if checked.fault and not (effects and checked.fault.physical):
         raise ValueError(
-            f"{recording.source}: {checked.fault.text}; if the recording is correct, state trusted: true beside the file"
+            f"{recording.source}: {checked.fault.text}; if the recording is right, state trusted: true beside the file"
         )
     return checked
 
@@ -217,7 +217,7 @@ def _level_inside_range(
 ) -> bool:
     """Whether the predicted level lies inside the range by more than the model error.
 
-    All segments at this value count together. The log odds are those of `blockwise_likelihood` against a clipped reading.
+    All segments at this value count together. Log odds as in `blockwise_likelihood`, against a clipped reading.
     """
     i = plant.sensors.index(stuck.sensor)
     blocked, model = fitted.blocked, fitted.readings[:, i]
