@@ -96,9 +96,9 @@ def test_a_transmitter_that_averages_is_told_and_undone(samples: int, slow: floa
     found = estimate_noise(mean + misfit, mask)
     assert found.mean_of == samples
     assert found.std.tolist() == pytest.approx([0.002 / math.sqrt(samples)] * 3, rel=0.06)
-    assert found.alike.tolist() == pytest.approx([1.0 - 1.0 / samples] * 3, abs=0.01)
+    assert found.lag_one.tolist() == pytest.approx([1.0 - 1.0 / samples] * 3, abs=0.01)
     repeats = 1.0 + 2.0 * sum((1.0 - k / samples) ** 2 for k in range(1, samples))
-    assert found.repeats.tolist() == pytest.approx([repeats] * 3, rel=0.02)
+    assert found.squared_correlations.tolist() == pytest.approx([repeats] * 3, rel=0.02)
     white = found.whiten(mean, mask)
     power = torch.fft.rfft(white, dim=0).abs() ** 2 / len(white)
     assert float(power[1:200].mean()) == pytest.approx(1.0, abs=0.13)  # 600 values of variance 1, and what was undone

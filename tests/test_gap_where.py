@@ -19,7 +19,7 @@ from fdi_torch.gap.localization.regressors import (
     relays,
     stiction,
 )
-from fdi_torch.gap.localization.sparse_regression import sparse
+from fdi_torch.gap.localization.sparse_regression import sparse_fit
 from fdi_torch.gap.marginal_likelihood import with_estimated_noise
 from fdi_torch.gap.problem import problem_of
 from tests.test_gap import believed, noise, recorded
@@ -65,7 +65,7 @@ def test_the_forms_that_made_a_signal_have_more_evidence_than_as_many_others() -
     noise = torch.randn(400, generator=generator, dtype=torch.float64)
     signal = 3.0 * true[:, 4] - 2.0 * true[:, 11] + noise
     both = torch.stack([true, other])
-    found = sparse(both.mT @ both, (both.mT @ signal.unsqueeze(-1)).squeeze(-1), 40)
+    found = sparse_fit(both.mT @ both, (both.mT @ signal.unsqueeze(-1)).squeeze(-1), 40)
     assert float(found.evidence[0] - found.evidence[1]) > 1000.0
     least_squares = torch.linalg.lstsq(true[:, [4, 11]], signal.unsqueeze(1)).solution
     closed = float(signal @ signal - ((signal - (true[:, [4, 11]] @ least_squares).squeeze(1)) ** 2).sum())
@@ -107,7 +107,7 @@ def test_a_curvature_that_rounding_spoilt_harms_no_neighbour() -> None:
     gram, score = columns.mT @ columns, torch.full((3, 6), 100.0, dtype=torch.float64)
     spoilt = gram.clone()
     spoilt[1, 0, 1] = spoilt[1, 1, 0] = 1.01 * torch.sqrt(gram[1, 0, 0] * gram[1, 1, 1])
-    found, expected = sparse(spoilt, score, 20), sparse(gram, score, 20)
+    found, expected = sparse_fit(spoilt, score, 20), sparse(gram, score, 20)
     assert bool(torch.isfinite(found.evidence).all())
     assert torch.equal(found.evidence[[0, 2]], expected.evidence[[0, 2]])
 

@@ -195,7 +195,7 @@ def _noise(fitter: Fitter, quantization_steps: Sequence[float]) -> Mapping[str, 
     return {
         s.name: {
             "std": float(std[i]),
-            "ar1": float(fitter.noise.alike[i]),
+            "ar1": float(fitter.noise.lag_one[i]),
             "rounded_to": quantization_steps[i],
             "unit": s.unit,
         }

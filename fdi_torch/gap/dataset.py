@@ -20,7 +20,7 @@ from fdi_torch.simulate.joint_collocation import name_in_recording
 
 @dataclass(frozen=True)
 class RecordingPart:
-    """One recording of a data set on its simulation grid. readings, mask: (S, C), in the order of the plant's sensors."""
+    """One recording of a data set on its simulation grid. readings, mask: (S, C), in the plant's order of sensors."""
 
     recording: Recording
     experiment: Experiment
@@ -82,7 +82,7 @@ class DataSet:
 
     @cached_property
     def nuisance(self) -> tuple[str, ...]:
-        """Parameters refitted with every candidate: constants and effect parameters with a tolerance, initial levels."""
+        """Parameters refitted with every candidate: initial levels, constants and effect parameters with a tolerance."""
         constants = TankNetwork(self.plant, self.nominal_effects).constants
         common = [p.name for p in constants if math.isfinite(p.std) and p.name not in self.per_recording]
         per_recording = [name_in_recording(n, k) for k in range(len(self.further) + 1) for n in self.per_recording]

@@ -174,7 +174,7 @@ def _closed(held: Sequence[HeldOut]) -> tuple[float | None, tuple[float, float] 
 def _floor_variance(held: HeldOut) -> float:
     """Of the sum of squares that the noise alone gives."""
     std, count = held.noise.std * torch.sqrt(held.weight), held.data.mask.sum(dim=0)
-    return float((2.0 * std**4 * count * held.noise.repeats).sum())
+    return float((2.0 * std**4 * count * held.noise.squared_correlations).sum())
 
 
 def _blocks(x: Tensor) -> Tensor:

@@ -119,7 +119,7 @@ def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised,
 
 
 def _sensors(fitter: Fitter) -> SensorNoise:
-    return SensorNoise(fitter.noise.std, fitter.noise.alike)
+    return SensorNoise(fitter.noise.std, fitter.noise.lag_one)
 
 
 def _areas(fitter: Fitter) -> Tensor:

@@ -118,7 +118,8 @@ def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], pairs: bool = Tr
 class _ProjectedRegression:
     """A regression with the parameters of a fit projected out.
 
-    remaining (S, C): whitened residual after projection. basis (S, C, P): orthonormal basis of the parameters' influence.
+    remaining (S, C): whitened residual after the projection. basis (S, C, P): orthonormal basis of the parameters'
+    influence.
     """
 
     fitter: Fitter

@@ -1,8 +1,8 @@
-"""What the values themselves tell of a sensor's range: readings that stand still at one end of it and nowhere else.
+"""Limits of a sensor's range that the readings show without a model: constant values at an end of the range only.
 
-A rig clips its noisy reading, so that a clipped stretch shows no noise at all. This is told without a model, as
-rounding is; a limit that the level meets before the noise is added is left to the search. Near such an end the mean of
-a reading is not what the level says, by up to 0.4 of the noise's deviation: with 3600 samples a gap by itself.
+A rig that clips the noisy reading shows no noise in a clipped segment. A limit that applies before the noise is added
+is left to the search for effects. Near a limit the mean of the reading differs from the level by up to 0.4 standard
+deviations of the noise, which with 3600 samples is a gap by itself.
 """
 
 from __future__ import annotations
@@ -22,134 +22,139 @@ from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
 
 LIMITS = ("sensor_saturation", "sensor_floor")
-LONGEST_BY_CHANCE = 5  # samples in a row of one value
-CLEAR = 4.0  # standard deviations from an end of the range, from which noise is not clipped
-FEWEST = 0.1  # share of a sensor's samples that tell of its noise
-STILL = 0.05  # share of steps without change, the ends left out, above which a channel may just be at rest
+LONGEST_BY_CHANCE = 5  # equal samples in a row that chance explains
+CLEAR = 4.0  # standard deviations from a limit beyond which noise is not clipped
+FEWEST = 0.1  # smallest share of a sensor's samples from which its noise is estimated
+AT_REST = 0.05  # share of equal neighbours inside the range above which the level may simply be at rest
 
 
 def limits_of(values: Tensor) -> dict[str, float]:
-    """values (S,) of one sensor -> where it ends: 'sensor_saturation' and 'sensor_floor', as far as it was seen to."""
-    same = torch.diff(values) == 0.0
-    found = {}
+    """Limits that values (S,) of one sensor show, by effect name: 'sensor_saturation' and 'sensor_floor'."""
+    equal = torch.diff(values) == 0.0
+    limits = {}
     ends = dict(zip(LIMITS, (float(values.max()), float(values.min())), strict=True))
     at_end = (values[1:] == values.max()) | (values[1:] == values.min())
-    elsewhere = same[~at_end]
-    if len(elsewhere) == 0 or float(elsewhere.double().mean()) > STILL:
+    inside = equal[~at_end]
+    if len(inside) == 0 or float(inside.double().mean()) > AT_REST:
         return {}
     for name, end in ends.items():
         if _longest_run(values == end) > LONGEST_BY_CHANCE:
-            found[name] = end
-    return found
+            limits[name] = end
+    return limits
 
 
 def limits_from_readings(
     plant: PlantDescription,
     recordings: Sequence[Recording],
-    believed: Sequence[Placement],
+    nominal_effects: Sequence[Placement],
     library: Sequence[Placement],
 ) -> list[Placement]:
-    """Limits of sensors that the plant does not have yet, as effects with their values; of all recordings together."""
-    told = []
-    known, offered = {p.prefix for p in believed}, {p.prefix for p in library}
+    """Limits of sensors that all recordings together show and the plant does not have yet, as effects."""
+    limits = []
+    present, offered = {p.prefix for p in nominal_effects}, {p.prefix for p in library}
     for sensor in plant.sensors:
         values = [r.outputs[r.mask[:, i], i] for r in recordings for i in _columns(r, sensor.column)]
         if not values:
             continue
-        given = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
+        of_plant = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
         for name, limit in limits_of(torch.cat(values)).items():
             placement = Placement(effect(name), sensor.name, {"limit": limit})
-            if given[name] is None and placement.prefix in offered - known:
-                told.append(placement)
-    return told
+            if of_plant[name] is None and placement.prefix in offered - present:
+                limits.append(placement)
+    return limits
 
 
 def _columns(recording: Recording, name: str) -> list[int]:
     return [i for i, column in enumerate(recording.output_names) if column == name]
 
 
-def noise_before_clipping(noise: Noise, data: DataSet, believed: Tensor) -> Noise:
-    """The noise before the range clips it: each sensor's level as the samples far from its ends tell it, by how much
-    neighbours differ, of which little is the model's. The colour is that of all samples: pieces tell it badly.
+def noise_before_clipping(noise: Noise, data: DataSet, predicted: Tensor) -> Noise:
+    """The noise before clipping: its level is estimated from the samples far from the limits, by differences of
+    neighbours, which contain little model error. The correlation is that of all samples, since short segments determine
+    it badly.
 
-    believed (S, C): about what would be read.
+    predicted (S, C): about the readings without noise.
     """
-    innovation, residual = noise.innovation.clone(), data.readings - believed
-    for c, ends in enumerate(_ends(data)):
-        seen = free = data.mask[:, c]
+    innovation, residual = noise.innovation.clone(), data.readings - predicted
+    for c, ends in enumerate(_limits_per_sensor(data)):
+        valid = unclipped = data.mask[:, c]
         for name, end in ends.items():
-            free = free & (_beyond(name, believed[:, c], end) < -CLEAR * float(noise.std[c]))
-        if ends and int(free.sum()) > FEWEST * int(seen.sum()):
-            innovation[c] *= _roughness(residual[:, c], free) / _roughness(residual[:, c], seen, data.rows)
+            unclipped = unclipped & (_beyond(name, predicted[:, c], end) < -CLEAR * float(noise.std[c]))
+        if ends and int(unclipped.sum()) > FEWEST * int(valid.sum()):
+            innovation[c] *= _rms_difference(residual[:, c], unclipped) / _rms_difference(
+                residual[:, c], valid, data.rows
+            )
     return replace(noise, innovation=innovation)
 
 
-def _roughness(x: Tensor, which: Tensor, tapered: Sequence[slice] = ()) -> float:
-    """How much neighbours among some samples (S,) differ: the root of their mean square.
+def _rms_difference(x: Tensor, selected: Tensor, tapered: Sequence[slice] = ()) -> float:
+    """Root mean square difference of neighbouring samples among some (S,).
 
-    tapered: stretches whose middle counts most, as in the noise's spectrum.
+    tapered: segments weighted by the taper that the noise spectrum uses.
     """
     weight = torch.ones_like(x) if not tapered else torch.zeros_like(x)
     for rows in tapered:
         weight[rows] = torch.hann_window(len(x[rows]), periodic=False, dtype=x.dtype) ** 2
-    weight = weight[1:] * (which[1:] & which[:-1])
+    weight = weight[1:] * (selected[1:] & selected[:-1])
     return float((weight * torch.diff(x) ** 2).sum() / weight.sum()) ** 0.5
 
 
 def with_noise_limits(data: DataSet, null: Fit, noise: Noise) -> DataSet:
-    """The same, in which limits that the readings show, and the plant file or `told_limits` name, clip the noise too.
+    """The data set with limits that clip the noise as well, for limits that the readings show and the plant file or
+    `limits_from_readings` has.
 
-    null: a fit of the subject without further effects.
+    null: fit of the data set without further effects.
     """
-    if not any(_ends(data)):
+    if not any(_limits_per_sensor(data)):
         return data
     levels = _unlimited(data, null, noise)
-    left = torch.where(data.mask, data.readings - null.linearised.readings[0], 0.0)
-    most = torch.sqrt(left.square().sum(dim=0) / data.mask.sum(dim=0))  # a slow colour's level is told badly
-    believed = {p.prefix: p for p in data.nominal_effects}
-    for c, (sensor, ends) in enumerate(zip(data.plant.sensors, _ends(data), strict=True)):
-        std = min(float(noise.std[c]), float(most[c]))
-        given = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
+    residual = torch.where(data.mask, data.readings - null.linearised.readings[0], 0.0)
+    rms = torch.sqrt(residual.square().sum(dim=0) / data.mask.sum(dim=0))  # the level of slow noise is determined badly
+    effects = {p.prefix: p for p in data.nominal_effects}
+    for c, (sensor, ends) in enumerate(zip(data.plant.sensors, _limits_per_sensor(data), strict=True)):
+        std = min(float(noise.std[c]), float(rms[c]))
+        of_plant = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
         for name, end in ends.items():
-            placement = believed.get(f"{sensor.name}.{name}", Placement(effect(name), sensor.name))
+            placement = effects.get(f"{sensor.name}.{name}", Placement(effect(name), sensor.name))
             values = dict(placement.values or {})
-            known = [limit for limit in (values.get("limit"), given[name]) if limit is not None]
-            if known and all(abs(limit - end) < std for limit in known):
+            stated = [limit for limit in (values.get("limit"), of_plant[name]) if limit is not None]
+            if stated and all(abs(limit - end) < std for limit in stated):
                 beyond = data.mask[:, c] & (_beyond(name, levels[:, c], end) > CLEAR * std)
-                behind = _met_again(data.readings[beyond, c] == end)
+                behind = _share_after_limit(data.readings[beyond, c] == end)
                 values = {"limit": end, **values, "noise": std, "behind": behind}
-                believed[placement.prefix] = replace(placement, values=values)
-    return replace(data, nominal_effects=tuple(believed.values()))
+                effects[placement.prefix] = replace(placement, values=values)
+    return replace(data, nominal_effects=tuple(effects.values()))
 
 
 def _unlimited(data: DataSet, null: Fit, noise: Noise) -> Tensor:
-    """What a fit would read if no sensor had a limit, (S, C), in the readings' unit."""
+    """Readings (S, C) of a fit if no sensor had a limit."""
     sensors = tuple(replace(s, low=None, high=None) for s in data.plant.sensors)
-    believed = tuple(p for p in data.nominal_effects if p.effect.name not in LIMITS)
-    free = replace(data, plant=replace(data.plant, sensors=sensors), nominal_effects=believed)
-    return Fitter(free, noise).engine(null.candidate, ()).read(null.linearised.levels, null.theta.unsqueeze(0))[0]
+    nominal_effects = tuple(p for p in data.nominal_effects if p.effect.name not in LIMITS)
+    unlimited = replace(data, plant=replace(data.plant, sensors=sensors), nominal_effects=nominal_effects)
+    return Fitter(unlimited, noise).engine(null.candidate, ()).read(null.linearised.levels, null.theta.unsqueeze(0))[0]
 
 
 def _beyond(name: str, values: Tensor, end: float) -> Tensor:
-    """How far outside of an end of the range, in the readings' unit."""
+    """Distance outside a limit, in the readings' unit."""
     return values - end if name == LIMITS[0] else end - values
 
 
-def _met_again(at_end: Tensor) -> float:
-    """Which share of the noise comes behind the limit: of samples far beyond, half of those with it are off the end."""
+def _share_after_limit(at_end: Tensor) -> float:
+    """Share of the noise that is added after the limit: half of the samples far beyond with such noise are off the
+    limit."""
     return min(2.0 * float((~at_end).double().mean()), 1.0) if len(at_end) else 0.0
 
 
-def _ends(data: DataSet) -> list[dict[str, float]]:
-    """Of each sensor, as in `limits_of`."""
+def _limits_per_sensor(data: DataSet) -> list[dict[str, float]]:
+    """Limits of each sensor, as in `limits_of`."""
     return [limits_of(data.readings[seen, c]) for c, seen in enumerate(data.mask.T)]
 
 
-def _longest_run(yes: Tensor) -> int:
-    """How many samples in a row, at most, say yes."""
-    edges = torch.diff(yes.to(torch.int64), prepend=yes.new_zeros(1, dtype=torch.int64))
+def _longest_run(flags: Tensor) -> int:
+    """Length of the longest run of true samples."""
+    edges = torch.diff(flags.to(torch.int64), prepend=flags.new_zeros(1, dtype=torch.int64))
     starts = (edges == 1).nonzero().flatten()
     ends = (edges == -1).nonzero().flatten()
     if len(ends) < len(starts):
-        ends = torch.cat([ends, ends.new_tensor([len(yes)])])
+        ends = torch.cat([ends, ends.new_tensor([len(flags)])])
     return int((ends - starts).max()) if len(starts) else 0
