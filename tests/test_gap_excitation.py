@@ -63,7 +63,7 @@ def test_twins_and_hidden_effects_follow_from_the_columns() -> None:
     strength = torch.diagonal(pairs.gram)
     found = identifiability(ScreeningResult(pairs.options, pairs.score, strength, pairs), believed())
     assert found.hidden == (("pump_lag", "Q1"),)
-    ((first, second, left),) = found.equivalent_causes
+    ((first, second, left),) = found.inseparable
     assert {first, second} == {("pump_gain", "Q1"), ("pump_gain", "Q2")}
     # What is left of the weaker beside the stronger: |a|^2 sin^2 of the angle between them.
     assert left == pytest.approx(900.0 * math.sin(math.atan2(3.0, 30.0)) ** 2)

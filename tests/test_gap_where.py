@@ -107,7 +107,7 @@ def test_a_curvature_that_rounding_spoilt_harms_no_neighbour() -> None:
     gram, score = columns.mT @ columns, torch.full((3, 6), 100.0, dtype=torch.float64)
     spoilt = gram.clone()
     spoilt[1, 0, 1] = spoilt[1, 1, 0] = 1.01 * torch.sqrt(gram[1, 0, 0] * gram[1, 1, 1])
-    found, expected = sparse_fit(spoilt, score, 20), sparse(gram, score, 20)
+    found, expected = sparse_fit(spoilt, score, 20), sparse_fit(gram, score, 20)
     assert bool(torch.isfinite(found.evidence).all())
     assert torch.equal(found.evidence[[0, 2]], expected.evidence[[0, 2]])
 

@@ -31,7 +31,7 @@ Task = tuple[str, Mapping[str, Any]]
 """Whose diagnosis, and a case's line of the manifest."""
 Done = tuple[str, dict[str, Any]]
 Each = Callable[[Callable[[Task], Done], Iterable[Task]], Iterable[Done]]
-ProgressCallback = Callable[[float, str], None]
+Tell = Callable[[float, str], None]
 CHUNK = 200
 
 
@@ -49,7 +49,7 @@ def blind_benchmark(
     each: Each = map,
     minutes: float = math.inf,
     code: str = "",
-    tell: ProgressCallback = lambda share, text: None,
+    tell: Tell = lambda share, text: None,
 ) -> list[Row]:
     """Has `diagnose` and its rivals answer `cases` recordings, kinds in turn; resumes where it was interrupted.
 
@@ -80,7 +80,7 @@ def seal(
     kinds: Sequence[str],
     library: Collection[str] = (),
     leave_out: Sequence[str] = (),
-    tell: ProgressCallback = lambda share, text: None,
+    tell: Tell = lambda share, text: None,
 ) -> None:
     """Makes what is missing of the first `cases` cases and seals it.
 
@@ -114,7 +114,7 @@ def answer_all(
     each: Each,
     stop: float,
     code: str,
-    tell: ProgressCallback,
+    tell: Tell,
 ) -> None:
     """Answers what has no answer yet, case by case, a JSON line each, until the clock says `stop`.
 

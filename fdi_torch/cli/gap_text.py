@@ -68,14 +68,14 @@ def next_steps(
         steps.append(f"next: {written or f'--adopt FILE writes the plant file with the causes; with it {benefit}'}")
     if not has_holdout and answer.verdict != "no_gap":
         steps.append("next: --holdout FILE, another recording of the same rig, measures how far the gap closes")
-    hidden, equivalent_causes = answer.excitation.get("hidden", []), answer.excitation.get("inseparable", [])
+    hidden, inseparable = answer.excitation.get("hidden", []), answer.excitation.get("inseparable", [])
     if hidden:
         shown = ", ".join(f"{c['effect']} at {c['location']}" for c in hidden[:3])
         more = f" and {len(hidden) - 3} more" if len(hidden) > 3 else ""
         steps.append(f"these inputs cannot show at their typical size: {shown}{more}")
-    if equivalent_causes:
-        first = " and ".join(f"{c['effect']} at {c['location']}" for c in equivalent_causes[0]["between"])
-        many = f"{len(equivalent_causes)} pairs of effects, such as {first}" if len(equivalent_causes) > 1 else first
+    if inseparable:
+        first = " and ".join(f"{c['effect']} at {c['location']}" for c in inseparable[0]["between"])
+        many = f"{len(inseparable)} pairs of effects, such as {first}" if len(inseparable) > 1 else first
         steps.append(f"these inputs cannot distinguish {many}")
     return steps
 
@@ -84,13 +84,13 @@ def show_plan(found: Identifiability, screen: Screen) -> int:
     """Print which effects the planned inputs do not show and which they cannot distinguish."""
     for name, place in found.hidden:
         screen.say(f"does not show at its typical size: {name} at {place}")
-    for (a, at), (b, there), distance in found.equivalent_causes:
+    for (a, at), (b, there), distance in found.inseparable:
         screen.say(f"cannot be distinguished: {a} at {at} and {b} at {there} (chi-square distance {distance:.1f})")
-    if not found.hidden and not found.equivalent_causes:
+    if not found.hidden and not found.inseparable:
         screen.say("every effect of the library shows at its typical size and is distinguishable from every other")
     shown = {f"{place}.{name}": residual for (name, place), residual in found.shown.items()}
     screen.result(
-        {"format": "fdi_torch.gap_plan/1", "hidden": found.hidden, "twins": found.equivalent_causes, "shown": shown}
+        {"format": "fdi_torch.gap_plan/1", "hidden": found.hidden, "twins": found.inseparable, "shown": shown}
     )
     return DONE
 

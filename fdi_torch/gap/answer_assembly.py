@@ -1,4 +1,4 @@
-"""From what was found to what is handed over: causes with their errors, shares, rivals, closure, remarks."""
+"""Assembly of the answer from the result of a diagnosis: causes with errors, probabilities, closure, remarks."""
 
 from __future__ import annotations
 
@@ -34,76 +34,78 @@ from fdi_torch.plant.effect import Placement
 MOST_EXPLANATIONS = 12
 
 
-def build_answer(found: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer:
-    """holdouts: laid out for the same plant."""
-    has_causes = found.verdict in ("named", "ambiguous")
-    believed = found.posterior
-    held = _held_out(found, holdouts)
-    shown = zip(believed.hypotheses[:MOST_EXPLANATIONS], believed.probabilities, strict=False)
+def build_answer(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer:
+    """Build the answer. holdouts: laid out for the same plant."""
+    has_causes = result.verdict in ("named", "ambiguous")
+    posterior = result.posterior
+    runs = _holdout_runs(result, holdouts)
+    hypotheses = zip(posterior.hypotheses[:MOST_EXPLANATIONS], posterior.probabilities, strict=False)
     return Answer(
-        verdict=found.verdict,
-        p_value=_p_value(found),
-        where=_where(found),
-        causes=_causes(found),
-        ambiguity_set=[_names(found, h) for h in found.credible_set] if has_causes else [],
-        posterior=[Explanation((*h.causes, *found.from_readings), p, h.unknown_at) for h, p in shown],
-        unexamined=believed.unexamined,
-        converged=found.best.converged,
-        closure=closure_to_dict(held, found) if held else {},
-        noise=_noise(found.fitter, found.quantization_steps),
-        disturbances=_disturbances(found),
-        shape=discrepancy_tables(found.free_form_fit) if found.free_form_fit else None,
-        next_input=_next(found) if found.verdict == "ambiguous" else None,
-        impostors=_impostors(found) if has_causes else None,
-        excitation=_excitation(found),
-        constants=_constants(found),
-        curves=_curves(found),
-        remarks=remarks_on(found, held),
-        arrays=prediction_arrays(found, held),
+        verdict=result.verdict,
+        p_value=_p_value(result),
+        where=_where(result),
+        causes=_causes(result),
+        ambiguity_set=[_names(result, h) for h in result.credible_set] if has_causes else [],
+        posterior=[Explanation((*h.causes, *result.from_readings), p, h.unknown_at) for h, p in hypotheses],
+        unexamined=posterior.unexamined,
+        converged=result.best.converged,
+        closure=closure_to_dict(runs, result) if runs else {},
+        noise=_noise(result.fitter, result.quantization_steps),
+        disturbances=_disturbances(result),
+        shape=discrepancy_tables(result.free_form_fit) if result.free_form_fit else None,
+        next_input=_next_input(result) if result.verdict == "ambiguous" else None,
+        impostors=_confusability(result) if has_causes else None,
+        excitation=_identifiability(result),
+        constants=_constants(result),
+        curves=_curves(result),
+        remarks=remarks_on(result, runs),
+        arrays=prediction_arrays(result, runs),
     )
 
 
-def _names(found: DiagnosisResult, hypothesis: CauseHypothesis) -> tuple[CauseName, ...]:
-    """All that a hypothesis holds, something unknown among it."""
+def _names(result: DiagnosisResult, hypothesis: CauseHypothesis) -> tuple[CauseName, ...]:
+    """All causes of a hypothesis, something unknown among them."""
     unknown = ((UNKNOWN, hypothesis.unknown_at),) if hypothesis.unknown_at else ()
-    return (*hypothesis.causes, *unknown, *found.from_readings)
+    return (*hypothesis.causes, *unknown, *result.from_readings)
 
 
-def _where(found: DiagnosisResult) -> list[tuple[str, float]]:
-    """Places by the probability that something is wrong there; first of all a sensor whose readings jump, where that is
-    all that is wrong."""
-    places = list(found.posterior.places)
-    best = found.posterior.best
-    if found.verdict == "unknown" and not best.place and (straying := sensor_with_outliers(found.outliers[0])):
-        places = [(straying, 1.0), *((p, share) for p, share in places if p != straying)]
+def _where(result: DiagnosisResult) -> list[tuple[str, float]]:
+    """Places by the probability of a cause there.
+
+    A sensor with outliers comes first if nothing else is wrong.
+    """
+    places = list(result.posterior.places)
+    best = result.posterior.best
+    if result.verdict == "unknown" and not best.place and (sensor := sensor_with_outliers(result.outliers[0])):
+        places = [(sensor, 1.0), *((p, share) for p, share in places if p != sensor)]
     return places
 
 
-def _held_out(found: DiagnosisResult, holdouts: Sequence[DataSet]) -> list[HeldOut]:
+def _holdout_runs(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> list[HeldOut]:
     """Free runs of all models on all hold-outs."""
     if not holdouts:
         return []
-    models, nominal_effects = reference_models(found), found.fitter.data.nominal_effects
+    models, nominal_effects = reference_models(result), result.fitter.data.nominal_effects
     return [
         run_reference_models(
-            replace(each, nominal_effects=nominal_effects), found.fitter.noise, models, found.quantization_steps
+            replace(each, nominal_effects=nominal_effects), result.fitter.noise, models, result.quantization_steps
         )
         for each in holdouts
     ]
 
 
-def _curves(found: DiagnosisResult) -> list[dict[str, Any]]:
-    """The discrepancy at every guilty place; not drawn for several recordings at once."""
-    if found.verdict == "no_gap" or found.fitter.data.further:
+def _curves(result: DiagnosisResult) -> list[dict[str, Any]]:
+    """Curves of the discrepancy at every place with a cause; not drawn for several recordings at once."""
+    if result.verdict == "no_gap" or result.fitter.data.further:
         return []
-    places = causal_places(found)
-    return [curve.to_dict() for place in places for curve in curves_at(found.fitter, found.best, place, found.reach)]
+    places = causal_places(result)
+    return [curve.to_dict() for place in places for curve in curves_at(result.fitter, result.best, place, result.reach)]
 
 
-def _constants(found: DiagnosisResult) -> dict[str, dict[str, object]]:
-    """What each calibration constant is believed to be, and what it becomes without and with the causes."""
-    errors = standard_errors(found.fitter, found.best)
-    null, best, space = constants_of(found.null), constants_of(found.best), found.best.space
+def _constants(result: DiagnosisResult) -> dict[str, dict[str, object]]:
+    """Each calibration constant: nominal, recalibrated, and fitted with the causes."""
+    errors = standard_errors(result.fitter, result.best)
+    null, best, space = constants_of(result.null), constants_of(result.best), result.best.space
     return {
         name: {
             "nominal": space[name].nominal,
@@ -117,75 +119,76 @@ def _constants(found: DiagnosisResult) -> dict[str, dict[str, object]]:
     }
 
 
-def _next(found: DiagnosisResult) -> Mapping[str, Any] | None:
-    """The input that would part the two likeliest explanations."""
-    first, second = found.posterior.hypotheses[:2]
-    parting = discriminating_input(found.fitter, first.fit, second.fit)
-    between = [names(_names(found, h)) for h in (first, second)]
-    return {"between": between, **parting} if parting else None
+def _next_input(result: DiagnosisResult) -> Mapping[str, Any] | None:
+    """The input that distinguishes the two likeliest hypotheses."""
+    first, second = result.posterior.hypotheses[:2]
+    design = discriminating_input(result.fitter, first.fit, second.fit)
+    between = [names(_names(result, h)) for h in (first, second)]
+    return {"between": between, **design} if design else None
 
 
-def _impostors(found: DiagnosisResult) -> dict[str, object]:
-    """How often another cause would have passed for one that was named alone, simulated."""
-    if len(found.effects_fit.key) != 1:
+def _confusability(result: DiagnosisResult) -> dict[str, object]:
+    """How often another cause would have been named in place of a single named one, by simulation."""
+    if len(result.effects_fit.key) != 1:
         return {}
-    (cause,) = found.effects_fit.key
-    gap = max(found.gap, 1.0)
-    return {"simulated": simulated_confusions(found.search.shown.pairs, cause, gap, found.fitter.data.plant)}
+    (cause,) = result.effects_fit.key
+    gap = max(result.gap, 1.0)
+    return {"simulated": simulated_confusions(result.search.shown.pairs, cause, gap, result.fitter.data.plant)}
 
 
-def _excitation(found: DiagnosisResult) -> dict[str, Any]:
-    """What this recording's inputs cannot show or tell apart, by the names of the answer."""
-    shown = identifiability(found.search.shown, found.fitter.data.plant)
-    twins_found = [{"between": names((a, b)), "parted_by": left} for a, b, left in shown.equivalent_causes]
-    return {"hidden": names(shown.hidden), "inseparable": twins_found}
+def _identifiability(result: DiagnosisResult) -> dict[str, Any]:
+    """Effects that this recording's inputs cannot show or separate, by the names of the answer."""
+    shown = identifiability(result.search.shown, result.fitter.data.plant)
+    pairs = [{"between": names((a, b)), "parted_by": left} for a, b, left in shown.inseparable]
+    return {"hidden": names(shown.hidden), "inseparable": pairs}
 
 
-def _causes(found: DiagnosisResult) -> tuple[Cause, ...]:
-    fitter, fit = found.fitter, found.effects_fit
+def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
+    """Causes with parameters and standard errors; those that the readings show have none."""
+    fitter, fit = result.fitter, result.effects_fit
     plant, stds = fitter.data.plant, standard_errors(fitter, fit)
     causes = []
-    named = [p for p in fit.candidate.placements if (p.effect.name, p.location) in found.posterior.best.causes]
-    for p in named:
+    placements = [p for p in fit.candidate.placements if (p.effect.name, p.location) in result.posterior.best.causes]
+    for p in placements:
         amounts = {}
         for name, value in fit.effect_values.items():
             if name.rpartition(".")[0] == p.prefix:
                 amounts[name.rpartition(".")[2]] = Amount(value, stds[name], fit.space[name].unit)
         causes.append(Cause(p.effect.name, p.location, amounts, equivalent_causes((p.effect.name, p.location), plant)))
-    if found.posterior.best.unknown_at:
-        causes.append(Cause(UNKNOWN, found.posterior.best.unknown_at))
-    steps = {s.name: ("step", step) for s, step in zip(plant.sensors, found.quantization_steps, strict=True)}
-    told = {(p.effect.name, p.location): p for p in found.limits}
+    if result.posterior.best.unknown_at:
+        causes.append(Cause(UNKNOWN, result.posterior.best.unknown_at))
+    steps = {s.name: ("step", step) for s, step in zip(plant.sensors, result.quantization_steps, strict=True)}
+    limits = {(p.effect.name, p.location): p for p in result.limits}
     units = {s.name: s.unit for s in plant.sensors}
-    for name, place in found.from_readings:
-        if (name, place) in told:
-            causes.append(Cause(name, place, _as_told(told[name, place], plant)))
+    for name, place in result.from_readings:
+        if (name, place) in limits:
+            causes.append(Cause(name, place, _amounts_from_readings(limits[name, place], plant)))
         else:
             parameter, value = steps[place]
             causes.append(Cause(name, place, {parameter: Amount(value, 0.0, units[place])}))
     return tuple(causes)
 
 
-def _as_told(placement: Placement, plant: PlantDescription) -> dict[str, Amount]:
-    """What the values themselves tell of an effect."""
+def _amounts_from_readings(placement: Placement, plant: PlantDescription) -> dict[str, Amount]:
+    """Parameters of an effect that the readings show without a fit."""
     parameters, values = placement.effect.parameters(placement.location, plant), placement.values or {}
     return {p.name: Amount(values[p.name], 0.0, p.unit) for p in parameters if p.name in values}
 
 
-def _p_value(found: DiagnosisResult) -> float:
-    """Chance that it is noise; what the values themselves tell is none."""
-    if found.from_readings or (found.verdict == "unknown" and sensor_with_outliers(found.outliers[0])):
+def _p_value(result: DiagnosisResult) -> float:
+    """Probability that noise alone explains the gap; 0 if the readings themselves show a cause."""
+    if result.from_readings or (result.verdict == "unknown" and sensor_with_outliers(result.outliers[0])):
         return 0.0
-    return p_value(found.search)
+    return p_value(result.search)
 
 
-def _disturbances(found: DiagnosisResult) -> dict[str, dict[str, object]]:
-    """The random flow into each tank beside the likeliest hypothesis."""
-    best = found.posterior.best
+def _disturbances(result: DiagnosisResult) -> dict[str, dict[str, object]]:
+    """The random flow into each tank under the likeliest hypothesis."""
+    best = result.posterior.best
     noise = best.place.noise if best.place else best.explanation.noise
     return {
         t.name: {"std": float(noise.intensity[i]), "unit": "m^3/s", "correlation_time": noise.correlation_time}
-        for i, t in enumerate(found.fitter.data.plant.tanks)
+        for i, t in enumerate(result.fitter.data.plant.tanks)
     }
 
 

@@ -82,7 +82,7 @@ class DataSet:
 
     @cached_property
     def nuisance(self) -> tuple[str, ...]:
-        """Parameters refitted with every candidate: initial levels, constants and effect parameters with a tolerance."""
+        """Parameters refitted with every candidate: initial levels; constants and effect parameters with tolerance."""
         constants = TankNetwork(self.plant, self.nominal_effects).constants
         common = [p.name for p in constants if math.isfinite(p.std) and p.name not in self.per_recording]
         per_recording = [name_in_recording(n, k) for k in range(len(self.further) + 1) for n in self.per_recording]

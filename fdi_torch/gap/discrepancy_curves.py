@@ -1,10 +1,9 @@
-"""The discrepancy at one component as a curve: what a free form of its own variables finds there, with errors, and
-beside it what the named effect does.
+"""Curves of the discrepancy at one component: a free function of its local variables with errors, and the named effect.
 
-Everything is to first order about the trajectory of the best explanation, which follows the readings: the effect's own
-part is given back, and the free form beside the nuisances takes it up, so that no further fit is needed. A free form
-has several variables (a head, the time) that share what is common to them; what is compared is therefore what both do
-along the trajectory, averaged where the variable has the same value.
+All is to first order about the trajectory of the best explanation: the influence of the named effect is added to the
+residual again, and the free form is fitted to it with the nuisance parameters projected out. The variables of a free
+form (a head, the time) share what they have in common. The curves therefore compare what both do along the trajectory,
+averaged over samples with the same value of the variable.
 """
 
 from __future__ import annotations
@@ -23,12 +22,13 @@ from fdi_torch.plant.description import Pipe, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.operating_range import OperatingRange
 
-BINS = 24
+BINS = 24  # points of a curve
 
 
 @dataclass(frozen=True)
 class Curve:
-    """at (K,): of `variable`, in `unit`. free, free_std (K,): the free form's; effect (K,): the named effects', if any.
+    """at (K,): values of `variable`, in `unit`. free, free_std (K,): free form and standard error. effect (K,): named
+    effects, if any.
 
     quantity: 'flow' (m^3/s, into the tank or along the pipe), 'area' (a share) or 'reading' (the sensor's unit).
     """
@@ -44,19 +44,22 @@ class Curve:
     effect: Tensor | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        told: dict[str, Any] = {"location": self.location, "variable": self.variable, "unit": self.unit}
-        told |= {"quantity": self.quantity, "quantity_unit": self.quantity_unit, "at": self.at.tolist()}
-        told |= {"free": self.free.tolist(), "free_std": self.free_std.tolist()}
-        return told | ({"effect": self.effect.tolist()} if self.effect is not None else {})
+        curve: dict[str, Any] = {"location": self.location, "variable": self.variable, "unit": self.unit}
+        curve |= {"quantity": self.quantity, "quantity_unit": self.quantity_unit, "at": self.at.tolist()}
+        curve |= {"free": self.free.tolist(), "free_std": self.free_std.tolist()}
+        return curve | ({"effect": self.effect.tolist()} if self.effect is not None else {})
 
 
 def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> list[Curve]:
-    """One curve for each variable that a place can know. fit: its causes there are given back to the free form; where
-    it is a free form itself, that is shown."""
+    """One curve for each local variable of a place.
+
+    The causes that the fit has there are added to the residual of the free form; a free form that the fit contains is
+    shown itself.
+    """
     here = tuple(p for p in fit.candidate.placements if p.location == place)
-    own = any(p.effect.name.startswith("free_") for p in here)
-    free = here if own else _of_stage(free_form(place, fitter.data.plant, reach), here)
-    if own:
+    contains_free_form = any(p.effect.name.startswith("free_") for p in here)
+    free = here if contains_free_form else _of_stage(free_form(place, fitter.data.plant, reach), here)
+    if contains_free_form:
         coefficients, effect = fitted_coefficients(fitter, fit, free), None
     else:
         coefficients = coefficients_of(fitter, fit, free, reach, returned=here)
@@ -76,7 +79,7 @@ def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> li
 
 
 def _neutral(fitter: Fitter, placements: Sequence[Placement]) -> tuple[tuple[Placement, ...], Mapping[str, float]]:
-    """Placements with their sizes nominal: as if they were not there."""
+    """Placements with their sizes at nominal, which switches them off."""
     plant, sizes = fitter.data.plant, {}
     for p in placements:
         size = p.effect.parameters(p.location, plant)[0]
@@ -85,7 +88,7 @@ def _neutral(fitter: Fitter, placements: Sequence[Placement]) -> tuple[tuple[Pla
 
 
 def _effect(fitter: Fitter, fit: Fit, place: str, here: tuple[Placement, ...]) -> Tensor:
-    """(X,): what the fit's causes at the place do there."""
+    """What the fit's causes at the place do there, (X,)."""
     without = _local(fitter, fit, place, [_neutral(fitter, here)])[0]
     return -without / (1.0 + without) if any(p.effect.stage is Stage.STORAGE for p in here) else -without
 
@@ -97,7 +100,7 @@ def _unit(
 
 
 def _of_stage(free: Sequence[Placement], here: Sequence[Placement]) -> tuple[Placement, ...]:
-    """At a tank: the free cross-section for what changes the cross-section, the free inflow for all else."""
+    """At a tank: the free cross-section for effects on the cross-section, the free inflow for all others."""
     storage = any(p.effect.stage is Stage.STORAGE for p in here)
     return tuple(p for p in free if (p.effect.stage is Stage.STORAGE) == storage) or tuple(free)
 
@@ -105,28 +108,28 @@ def _of_stage(free: Sequence[Placement], here: Sequence[Placement]) -> tuple[Pla
 def _local(
     fitter: Fitter, fit: Fit, place: str, changed: Sequence[tuple[tuple[Placement, ...], Mapping[str, float]]]
 ) -> Tensor:
-    """(M, X): by how much each change alters what happens at the place along the fit's trajectory: the flow at the
-    middle of each step, the cross-section's share, or the reading at each sample.
+    """Change of what happens at the place along the fit's trajectory by each change, (M, X): of the flow at the middle
+    of each step, the share of the cross-section, or the reading at each sample.
 
-    changed: placements that replace the fit's own of the same name, and the values that change.
+    changed: placements that replace those of the same name in the fit, and the values that change.
     """
     plant, linearised = fitter.data.plant, fit.linearised
     middle = 0.5 * (linearised.levels[:, 1:] + linearised.levels[:, :-1])
-    own = fitter.engine(fit.candidate, [n for n in fit.space.names if n.count(".") == 2])
+    fitted_engine = fitter.engine(fit.candidate, [n for n in fit.space.names if n.count(".") == 2])
     theta = fit.theta.unsqueeze(0)
     placements = changed[0][0]
     prefixes = {p.prefix for p in placements}
     others = [p for p in fit.candidate.placements if p.prefix not in prefixes]
     free = {n for n in fit.space.names if n.count(".") == 2} | {n for _, values in changed for n in values}
     engine = fitter.engine(Candidate((*others, *placements)), sorted(free))
-    known = {n: v for n, v in fit.values.items() if n in engine.space}
+    fitted = {n: v for n, v in fit.values.items() if n in engine.space}
     base = {n: 0.0 for n in free if ".free_" in n}  # one coefficient at a time
-    rows = torch.stack([engine.space.vector({**known, **base, **values}) for _, values in changed])
+    rows = torch.stack([engine.space.vector({**fitted, **base, **values}) for _, values in changed])
     if ".free_" in next(iter(changed[0][1])):
-        before = engine.space.vector({**known, **base}).unsqueeze(0)
+        before = engine.space.vector({**fitted, **base}).unsqueeze(0)
         rates, readings = engine.rates(middle, before), engine.read(linearised.levels, before)
     else:
-        rates, readings = own.rates(middle, theta), own.read(linearised.levels, theta)
+        rates, readings = fitted_engine.rates(middle, theta), fitted_engine.read(linearised.levels, theta)
     component = None if "-" in place and place not in _names(fitter) else plant.component(place)
     if isinstance(component, Sensor):
         index = [s.name for s in plant.sensors].index(place)
@@ -146,7 +149,7 @@ def _names(fitter: Fitter) -> set[str]:
 
 
 def _tank_and_sign(component: Any, place: str) -> tuple[str, float]:
-    """The tank in whose balance the component's flow stands, and with which sign."""
+    """The tank whose balance contains the component's flow, and the sign of the flow there."""
     if isinstance(component, Pump):
         return component.target, 1.0
     if isinstance(component, Pipe):
@@ -164,7 +167,7 @@ def _quantity(fitter: Fitter, free: Sequence[Placement], place: str) -> tuple[st
 
 
 def _variables(fitter: Fitter, fit: Fit, place: str) -> list[tuple[str, str, Tensor]]:
-    """Name, SI unit and course (X,) of what the place can know, its time last."""
+    """Name, SI unit and values (X,) of the local variables of a place, time last."""
     data, linearised = fitter.data, fit.linearised
     plant, experiment = data.plant, data.experiment
     middle = 0.5 * (linearised.levels[0, 1:] + linearised.levels[0, :-1])
@@ -190,7 +193,7 @@ def _variables(fitter: Fitter, fit: Fit, place: str) -> list[tuple[str, str, Ten
 
 
 def _phases(fitter: Fitter, free: Sequence[Placement], place: str) -> list[tuple[str, str, Tensor]]:
-    """The time within one period, for a free form that comes and goes by itself."""
+    """The time within one period, for a free form with sinusoids."""
     periods = [period for p in free for period in getattr(p.effect, "periods", ())]
     if not periods:
         return []
@@ -201,13 +204,13 @@ def _phases(fitter: Fitter, free: Sequence[Placement], place: str) -> list[tuple
 
 
 def _bins(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Centres (K,) and averaging weights (K, X) of values grouped by equal counts, or one by one where they are few."""
-    grain = 1e-6 * float(x.max() - x.min())
-    values, which = torch.unique(torch.round(x / grain) if grain > 0.0 else x, return_inverse=True)
+    """Centres (K,) and averaging weights (K, X) of values in groups of equal size, or one by one if they are few."""
+    resolution = 1e-6 * float(x.max() - x.min())
+    values, groups = torch.unique(torch.round(x / resolution) if resolution > 0.0 else x, return_inverse=True)
     if len(values) > BINS:
         edges = torch.quantile(x, torch.linspace(0.0, 1.0, BINS + 1, dtype=x.dtype)[1:-1])
-        which = torch.searchsorted(edges, x.contiguous())
-    hot = torch.nn.functional.one_hot(which, int(which.max()) + 1).to(x.dtype).T
-    hot = hot[hot.sum(dim=1) > 0]
-    weights = hot / hot.sum(dim=1, keepdim=True)
+        groups = torch.searchsorted(edges, x.contiguous())
+    members = torch.nn.functional.one_hot(groups, int(groups.max()) + 1).to(x.dtype).T
+    members = members[members.sum(dim=1) > 0]
+    weights = members / members.sum(dim=1, keepdim=True)
     return weights @ x, weights

@@ -1,7 +1,7 @@
-"""A component's discrepancy without a name: free functions of its own local variables, as effects like any other.
+"""Free discrepancy of a component: piecewise linear functions of its local variables and of time, as effects.
 
-Piecewise linear in what the component can know (a pump its command and its tank's level, a pipe its head, a tank its
-level, a sensor its reading) and in time. Coefficients are shares of a typical flow (or reading) with a normal prior.
+A pump has functions of its command and its tank's level, a pipe of its head, a tank of its level, a sensor of its
+reading. Coefficients are shares of a typical flow (or reading) with a normal prior.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from fdi_torch.plant.signals import Clock
 
 LOCAL_NODES, TIME_NODES = 8, 16
 HEAD_NODES = 14
-PRIOR = 0.2
-NARROWEST = 1e-6  # of a grid, in units of the plant's scales
-UNIT = 0.01  # size of a coefficient at which its effect on the readings is taken
+PRIOR = 0.2  # standard deviation of a coefficient
+NARROWEST = 1e-6  # width of a grid, in units of the plant's scales
+UNIT = 0.01  # size of a coefficient at which its influence on the readings is computed
 
 
 class _Free(Effect):
-    """nodes: for each variable its grid. The coefficient 'head_3' belongs to the fourth node of the head's grid."""
+    """nodes: grid of each variable. The coefficient 'head_3' belongs to the fourth node of the head's grid."""
 
     nodes: dict[str, list[float]]
     scale: float
@@ -46,12 +46,12 @@ class _Free(Effect):
         return tuple(Parameter(name, "1", 0.0, std=self.prior) for name in names)
 
     def starts(self, place: str, plant: PlantDescription, reach: OperatingRange) -> list[dict[str, float]]:
-        """One for each coefficient, all of one form, so that they make one batch."""
+        """One start for each coefficient, all of one form, so that they make one batch."""
         names = [p.name for p in self.parameters(place, plant)]
         return [{name: UNIT if name == one else 0.0 for name in names} for one in names]
 
     def curve(self, variable: str, x: Tensor, p: Values) -> Tensor:
-        """The piecewise linear function of x, constant beyond its grid; 0 where the effect has no such variable."""
+        """Piecewise linear function of x, constant beyond its grid; 0 if the effect has no such variable."""
         if variable not in self.nodes:
             return torch.zeros_like(x)
         grid = x.new_tensor(self.nodes[variable])
@@ -65,7 +65,7 @@ class _Free(Effect):
         return total
 
     def waves(self, clock: Clock, p: Values) -> Tensor | float:
-        """Sines and cosines of the effect's periods, averaged over each step."""
+        """Sinusoids of the effect's periods, averaged over each step."""
         total: Tensor | float = 0.0
         for j, period in enumerate(self.periods):
             each = clock.start.new_tensor(period)
@@ -126,24 +126,24 @@ class FreeReading(_Free):
 def free_form(
     place: str, plant: PlantDescription, reach: OperatingRange, periods: Sequence[float] = ()
 ) -> tuple[Placement, ...]:
-    """The free discrepancy of a place; periods (s): of what comes and goes by itself."""
+    """The free discrepancy of a place. periods: of its sinusoids, s."""
     return tuple(Placement(e, place) for e in _free_at(place, plant, reach, periods))
 
 
 def fitted_free_form(
-    fitter: Fitter, fit: Fit, kept: Sequence[Placement], place: str, periods: Sequence[float], reach: OperatingRange
+    fitter: Fitter, fit: Fit, effects: Sequence[Placement], place: str, periods: Sequence[float], reach: OperatingRange
 ) -> Fit:
-    """The free discrepancy of one place beside the effects that are kept of a fit, about the moving trajectory."""
+    """Fit the free discrepancy of one place together with some effects of a fit."""
     plant = fitter.data.plant
     placements = free_form(place, plant, reach, periods)
     start = {f"{p.prefix}.{c.name}": 0.0 for p in placements for c in p.effect.parameters(p.location, plant)}
-    prefixes = {p.prefix for p in kept}
+    prefixes = {p.prefix for p in effects}
     start |= {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] in prefixes}
-    return fitter.fit(Candidate((*kept, *placements), (start,)), fit)
+    return fitter.fit(Candidate((*effects, *placements), (start,)), fit)
 
 
 def discrepancy_tables(fit: Fit) -> dict[str, object]:
-    """The discrepancy as tables against its local variables, in shares of `scale`."""
+    """The fitted discrepancy as tables over its local variables, in shares of `scale`."""
     values, tables = fit.effect_values, {}
     free = [p for p in fit.candidate.placements if isinstance(p.effect, _Free)]
     for placement in free:
@@ -182,22 +182,26 @@ def _free_at(place: str, plant: PlantDescription, reach: OperatingRange, periods
         nodes = {"command": command, "level": _grid(reach.levels[component.target], 5, length), "time": time}
         return [FreeFlow(nodes, component.gain * max(abs(command[0]), abs(command[-1])), periods)]
     assert isinstance(component, Pipe)
-    linearised = reach.levels[component.source]
-    far = reach.levels[component.target] if not component.is_outlet else (0.0, 0.0)
-    heads = linearised if component.is_outlet else (linearised[0] - far[1], linearised[1] - far[0])
+    source_levels = reach.levels[component.source]
+    target_levels = reach.levels[component.target] if not component.is_outlet else (0.0, 0.0)
+    heads = (
+        source_levels
+        if component.is_outlet
+        else (source_levels[0] - target_levels[1], source_levels[1] - target_levels[0])
+    )
     flow = 0.5 * flow_scale(plant, component.source)
     return [FreeFlow({"head": _root_grid(heads, HEAD_NODES, length), "time": time}, flow, periods)]
 
 
 def _grid(span: Range, count: int, scale: float) -> list[float]:
-    """scale: of the plant, in the unit of the span, which is drawn wider where hardly anything varied."""
+    """Even grid over a range, at least NARROWEST times `scale` wide."""
     low, high = span
     width = max(high - low, NARROWEST * scale)
     return [low + width * j / (count - 1) for j in range(count)]
 
 
 def _root_grid(span: Range, count: int, scale: float) -> list[float]:
-    """Even in the signed root of a head, where flows bend most, with zero among the nodes if it lies inside."""
+    """Grid that is even in the signed root of a head, where flows bend most; zero is a node if it lies inside."""
     ends = (math.copysign(math.sqrt(abs(span[0])), span[0]), math.copysign(math.sqrt(abs(span[1])), span[1]))
     roots = _grid(ends, count, math.sqrt(scale))
     if ends[0] < 0.0 < ends[1]:

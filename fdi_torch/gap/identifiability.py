@@ -1,8 +1,15 @@
-"""What an excitation can never show and never tell apart, whatever the readings turn out to be.
+"""Identifiability of the effects under given inputs: which are hidden, inseparable, or easily confused.
 
-Each effect at its typical size moves the readings by a column of the linearised plant. What is left of it beside the
-calibration constants and start levels, over the noise, is how well the effect shows; what is left beside another
-effect's column too is how well the two part.
+Each effect at its typical size changes the readings by a column of the linearised plant. Its norm in units of the
+noise, with calibration constants and initial levels projected out, says how visible the effect is; with another
+effect's column projected out as well, how separable the two are.
+
+`planned_identifiability` answers this before any recording, from the prediction of the plant file.
+
+`simulated_confusions` simulates how often another cause would have been named. In turn each other effect of the library
+causes a gap of the observed size, with fresh noise, and every effect is fitted to it by linear regression, with and
+without the true one in the library. Only single causes are simulated, at their start values, so that these are rates of
+a simpler search than the real one.
 """
 
 from __future__ import annotations
@@ -26,31 +33,35 @@ from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
 from fdi_torch.recording import Recording
 
-SHOWN = 25.0  # chi-square units: five standard errors
-PARTED = 25.0
+SHOWN = 25.0  # chi-square of a visible effect: five standard errors
+PARTED = 25.0  # chi-square that separates two effects
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """hidden: causes that do not show at their typical size. twins: pairs that do not part, with what parts them in
-    chi-square units, the closest first; shown: how well each shows, in the same units."""
+    """hidden: causes that are invisible at their typical size. inseparable: pairs of nearly collinear causes, with the
+    chi-square that separates them, the smallest first. shown: chi-square of each cause."""
 
     hidden: tuple[CauseName, ...]
-    equivalent_causes: tuple[tuple[CauseName, CauseName, float], ...]
+    inseparable: tuple[tuple[CauseName, CauseName, float], ...]
     shown: Mapping[CauseName, float]
 
 
-def identifiability(found: ScreeningResult, plant: PlantDescription) -> Identifiability:
-    """From the screen of a library beside the nuisances."""
-    pairs = found.pairs
+def identifiability(screening: ScreeningResult, plant: PlantDescription) -> Identifiability:
+    """Identifiability from the screening of a library."""
+    pairs = screening.pairs
     strength = torch.diagonal(pairs.gram)
-    best = _strongest(pairs.options, strength)
-    hidden = tuple(cause for cause, i in best.items() if float(strength[i]) < SHOWN)
-    return Identifiability(hidden, _twins(plant, best, pairs.gram), {c: float(strength[i]) for c, i in best.items()})
+    most_visible = _most_visible_starts(pairs.options, strength)
+    hidden = tuple(cause for cause, i in most_visible.items() if float(strength[i]) < SHOWN)
+    return Identifiability(
+        hidden,
+        _inseparable_pairs(plant, most_visible, pairs.gram),
+        {c: float(strength[i]) for c, i in most_visible.items()},
+    )
 
 
-def _strongest(options: Sequence[Option], strength: Tensor) -> dict[CauseName, int]:
-    """The start of each cause that shows most."""
+def _most_visible_starts(options: Sequence[Option], strength: Tensor) -> dict[CauseName, int]:
+    """The most visible start of each cause."""
     best: dict[CauseName, int] = {}
     for i, option in enumerate(options):
         if option.cause not in best or strength[i] > strength[best[option.cause]]:
@@ -58,40 +69,40 @@ def _strongest(options: Sequence[Option], strength: Tensor) -> dict[CauseName, i
     return best
 
 
-def _twins(
+def _inseparable_pairs(
     plant: PlantDescription, best: Mapping[CauseName, int], gram: Tensor
 ) -> tuple[tuple[CauseName, CauseName, float], ...]:
-    """Pairs of causes that show, of which one at any size leaves too little of the other."""
+    """Pairs of visible causes that are nearly collinear."""
     causes = [c for c, i in best.items() if float(gram[i, i]) >= SHOWN]
-    found = []
+    pairs = []
     for k, a in enumerate(causes):
         for b in causes[k + 1 :]:
             i, j = best[a], best[b]
             weaker = min(float(gram[i, i]), float(gram[j, j]))
-            left = weaker * (1.0 - float(gram[i, j]) ** 2 / (float(gram[i, i]) * float(gram[j, j])))
-            if left < PARTED and canonical(a, plant) != canonical(b, plant):
-                found.append((a, b, max(left, 0.0)))
-    return tuple(sorted(found, key=lambda pair: pair[2]))
+            separation = weaker * (1.0 - float(gram[i, j]) ** 2 / (float(gram[i, i]) * float(gram[j, j])))
+            if separation < PARTED and canonical(a, plant) != canonical(b, plant):
+                pairs.append((a, b, max(separation, 0.0)))
+    return tuple(sorted(pairs, key=lambda pair: pair[2]))
 
 
 def planned_identifiability(
     plant: PlantDescription, recording: Recording, noise: float, library: Sequence[str] | None = None
 ) -> Identifiability:
-    """recording: planned inputs; what was read, if anything, is not looked at. noise: std of a reading, its unit."""
+    """Identifiability under planned inputs; readings are ignored. noise: standard deviation of a reading."""
     nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     step = float(torch.median(torch.diff(recording.time)))
     fitter = _noise_free(plant, nominal_effects, recording, step, noise)
-    null = fitter.fit(Candidate())
-    seen = replace(fitter.data.recording, outputs=null.linearised.readings[0])
+    nominal_fit = fitter.fit(Candidate())
+    predicted = replace(fitter.data.recording, outputs=nominal_fit.linearised.readings[0])
     placements = [p for p in library_of(plant, library) if not p.effect.quantizes]
-    options = options_of(placements, fitter, operating_range_of(seen, plant))
-    return identifiability(screen(fitter, null, options), plant)
+    options = options_of(placements, fitter, operating_range_of(predicted, plant))
+    return identifiability(screen(fitter, nominal_fit, options), plant)
 
 
 def _noise_free(
     plant: PlantDescription, nominal_effects: Sequence[Placement], recording: Recording, step: float, noise: float
 ) -> Fitter:
-    """A fitter whose readings are what the plant file predicts, from its start levels or from rest."""
+    """A fitter whose readings are the plant file's prediction, from its initial levels or from rest."""
     sensors = len(plant.sensors)
     names = tuple(s.column for s in plant.sensors)
     units = tuple(s.unit for s in plant.sensors)
@@ -108,31 +119,32 @@ def _noise_free(
 
 
 DRAWS, SEED = 40, 0
-PASSES = 0.02  # share of the gap left open by an impostor that a fit test would let pass
-SEEN = 1e-6
+PASSES = 0.02  # share of the gap that a wrong cause may leave if a test of fit shall accept it
+VISIBLE = 1e-6
 
 
-def simulated_confusions(found: Pairs, named: CauseName, gap: float, plant: PlantDescription) -> dict[str, Any] | None:
-    """Of `draws` recordings in which another cause made a gap of this size (chi-square units), how many would have been
-    given the name `named`: 'confused' with the true cause in the library, 'passed' without it, with the causes it
-    passed for most often. None where no other effect can make such a gap within its range.
+def simulated_confusions(pairs: Pairs, named: CauseName, gap: float, plant: PlantDescription) -> dict[str, Any] | None:
+    """How often another cause of a gap of this size (chi-square) would have been named `named`.
+
+    'confused': with the true cause in the library. 'passed': without it; 'passed_for' lists the causes for which this
+    happens most often. None if no other effect can cause such a gap within its range.
     """
-    kinds = [canonical(o.cause, plant) for o in found.options]
-    ours = canonical(named, plant)
-    rivals = [i for i, o in enumerate(found.options) if kinds[i] != ours and _possible(o, found.gram[i, i], gap)]
+    kinds = [canonical(o.cause, plant) for o in pairs.options]
+    named_kind = canonical(named, plant)
+    rivals = [i for i, o in enumerate(pairs.options) if kinds[i] != named_kind and _possible(o, pairs.gram[i, i], gap)]
     if not rivals:
         return None
-    scores = _scores(found.gram, rivals, gap)  # (R, D, M)
-    strength = torch.diagonal(found.gram)
-    gains = torch.where((scores > 0) & (strength > SEEN), scores**2 / strength.clamp(min=SEEN), 0.0)
-    mine = torch.tensor([kind == ours for kind in kinds])
+    scores = _scores(pairs.gram, rivals, gap)  # (R, D, M)
+    strength = torch.diagonal(pairs.gram)
+    gains = torch.where((scores > 0) & (strength > VISIBLE), scores**2 / strength.clamp(min=VISIBLE), 0.0)
+    is_named = torch.tensor([kind == named_kind for kind in kinds])
     confused, passed = 0, dict.fromkeys((kinds[i] for i in rivals), 0)
     for row, i in enumerate(rivals):
-        true = torch.tensor([kind == kinds[i] for kind in kinds])
-        best, others = gains[row][:, mine].amax(1), gains[row][:, ~mine & ~true]
+        is_true = torch.tensor([kind == kinds[i] for kind in kinds])
+        best, others = gains[row][:, is_named].amax(1), gains[row][:, ~is_named & ~is_true]
         confused += int((gains[row].amax(1) <= best).sum())
-        leads = best >= others.amax(1) if others.shape[1] else torch.ones_like(best, dtype=torch.bool)
-        passed[kinds[i]] += int((leads & (best > (1.0 - PASSES) * gains[row][:, true].amax(1))).sum())
+        wins = best >= others.amax(1) if others.shape[1] else torch.ones_like(best, dtype=torch.bool)
+        passed[kinds[i]] += int((wins & (best > (1.0 - PASSES) * gains[row][:, is_true].amax(1))).sum())
     worst = sorted((c for c in passed if passed[c]), key=lambda c: -passed[c])[:5]
     return {
         "draws": DRAWS * len(rivals),
@@ -144,8 +156,8 @@ def simulated_confusions(found: Pairs, named: CauseName, gap: float, plant: Plan
 
 
 def _possible(option: Option, strength: Tensor, gap: float) -> bool:
-    """Whether the effect can make such a gap within its range, to first order from its start."""
-    if float(strength) <= SEEN:
+    """Whether an effect can cause such a gap within its range, to first order from its start."""
+    if float(strength) <= VISIBLE:
         return False
     name, start = next(iter(option.start.items()))
     size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
@@ -154,7 +166,7 @@ def _possible(option: Option, strength: Tensor, gap: float) -> bool:
 
 
 def _scores(gram: Tensor, rivals: Sequence[int], gap: float) -> Tensor:
-    """(R, D, M): what regression on each option's column sees of a rival at the size of the gap, and of the noise."""
+    """Scores (R, D, M) of all options for each rival at the size of the gap, with noise."""
     generator = torch.Generator().manual_seed(SEED)
     spectrum, basis = torch.linalg.eigh(gram)
     root = basis * torch.sqrt(spectrum.clamp(min=0.0))

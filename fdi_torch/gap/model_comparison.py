@@ -1,9 +1,14 @@
-"""The models whose free runs on a hold-out are compared: as believed, recalibrated, with the causes, with the causes
-but other constants, and the ceiling.
+"""The reference models: their definition, their errors on the hold-outs, and their predictions, as the answer shows
+them.
 
-The ceiling adds, to the causes, free functions of the guilty components' own variables: what no better equation of
-these components could close either, as far as it keeps no memory. Its course in time belongs to the recording's clock
-and stays out.
+    nominal         the plant file
+    recalibrated    with the constants fitted
+    augmented       with the causes
+    augmented_on_*  with the causes, but nominal or recalibrated constants
+    ceiling         with the causes, and free functions of the variables of their components
+
+The ceiling is the limit of any memoryless equation of these components. Functions of time belong to the clock of one
+recording and are left out.
 """
 
 from __future__ import annotations
@@ -28,67 +33,69 @@ from fdi_torch.plant.description import PlantDescription
 FROZEN = {"recalibrated": "augmented_on_recalibrated", "nominal": "augmented_on_nominal"}
 
 
-def reference_models(found: DiagnosisResult) -> dict[str, Model]:
-    """All models by the names of the answer."""
-    best = found.best
+def reference_models(result: DiagnosisResult) -> dict[str, Model]:
+    """All models, by the names of the answer."""
+    best = result.best
     return {
         "nominal": Model(),
-        "recalibrated": model_of(found.null),
+        "recalibrated": model_of(result.null),
         "augmented": model_of(best),
-        FROZEN["recalibrated"]: Model(best.candidate.placements, constants_of(found.null) | best.effect_values),
+        FROZEN["recalibrated"]: Model(best.candidate.placements, constants_of(result.null) | best.effect_values),
         FROZEN["nominal"]: Model(best.candidate.placements, best.effect_values),
-        "ceiling": reference_model(found),
+        "ceiling": ceiling_model(result),
     }
 
 
 def constants_of(fit: Fit) -> dict[str, float]:
-    """The calibration constants of a fit and what it refitted of effects that the plant file has, without start levels
-    and what further recordings have for themselves.
-    """
+    """Calibration constants and refitted effects of the plant file, without values specific to one recording."""
     new = {p.prefix for p in fit.candidate.placements}
-    lasting_names = [n for n in fit.space.names if "@" not in n and not n.endswith(".start_level")]
-    return {n: fit.values[n] for n in lasting_names if n.rpartition(".")[0] not in new}
+    constants = [n for n in fit.space.names if "@" not in n and not n.endswith(".start_level")]
+    return {n: fit.values[n] for n in constants if n.rpartition(".")[0] not in new}
 
 
-def reference_model(found: DiagnosisResult) -> Model:
-    """The best explanation with free functions beside it, where it has a name; else it is the free form itself."""
-    best, plant = found.best, found.fitter.data.plant
-    if found.free_form_fit:
+def ceiling_model(result: DiagnosisResult) -> Model:
+    """The best explanation with free functions added; if it has an unknown, its free form itself."""
+    best, plant = result.best, result.fitter.data.plant
+    if result.free_form_fit:
         return model_of(best)
-    free = without_time_course([p for place in causal_places(found) for p in free_form(place, plant, found.reach)])
-    taken: Mapping[str, float] = coefficients_of(found.fitter, best, free, found.reach).by_name()
-    return Model((*best.candidate.placements, *free), {**best.values, **taken})
+    free = without_time_course([p for place in causal_places(result) for p in free_form(place, plant, result.reach)])
+    coefficients: Mapping[str, float] = coefficients_of(result.fitter, best, free, result.reach).by_name()
+    return Model((*best.candidate.placements, *free), {**best.values, **coefficients})
 
 
-def causal_places(found: DiagnosisResult) -> list[str]:
-    """Where the best explanation's causes are; the likeliest place where it has none."""
-    places = list(dict.fromkeys(p.location for p in found.best.candidate.placements))
-    return places or [found.posterior.places[0][0]]
+def causal_places(result: DiagnosisResult) -> list[str]:
+    """Places of the best explanation's causes; the likeliest place if it has none."""
+    places = list(dict.fromkeys(p.location for p in result.best.candidate.placements))
+    return places or [result.posterior.places[0][0]]
 
 
-def closure_to_dict(held: Sequence[HeldOut], found: DiagnosisResult) -> dict[str, Any]:
-    """frozen: with the causes, but constants as recalibrated without them, or as believed: worse by what recalibration
-    had taken for the causes, which would count twice. ceiling_at: where free functions stand beside the causes.
+def closure_to_dict(holdouts: Sequence[HeldOut], result: DiagnosisResult) -> dict[str, Any]:
+    """The closure as the answer contains it: pooled, per sensor, per hold-out.
+
+    frozen: with the causes, but constants recalibrated without them, or nominal. ceiling_at: places of the free
+    functions.
     """
-    scales = _Scales.of(found.fitter.data.plant)
-    told = _numbers(closure(held), scales)
+    scales = _Scales.of(result.fitter.data.plant)
+    errors = _numbers(closure(holdouts), scales)
     answer = {
         "metric": "free-run RMSE on the hold-out, per sensor and pooled, in the sensor's unit",
         "unit": scales.unit,
         "units": dict(scales.units),
-        **told,
-        "augmented_with": [{"effect": n, "location": at} for n, at in causes_in_order(found.best)],
-        "ceiling_at": causal_places(found),
-        "holdouts": [h.data.recording.source for h in held],
+        **errors,
+        "augmented_with": [{"effect": n, "location": at} for n, at in causes_in_order(result.best)],
+        "ceiling_at": causal_places(result),
+        "holdouts": [h.data.recording.source for h in holdouts],
     }
-    if len(held) > 1:
-        answer["per_holdout"] = [{"source": h.data.recording.source, **_numbers(closure([h]), scales)} for h in held]
+    if len(holdouts) > 1:
+        answer["per_holdout"] = [
+            {"source": h.data.recording.source, **_numbers(closure([h]), scales)} for h in holdouts
+        ]
     return answer
 
 
 @dataclass(frozen=True)
 class _Scales:
-    """unit, scale: in which errors of all sensors together are told; units, each: those of every sensor."""
+    """unit, scale: of the pooled error. units, each: of every sensor."""
 
     unit: str
     scale: float
@@ -97,10 +104,10 @@ class _Scales:
 
     @classmethod
     def of(cls, plant: PlantDescription) -> _Scales:
-        shown = {s.name: display_unit(s.unit) for s in plant.sensors}
+        arranged = {s.name: display_unit(s.unit) for s in plant.sensors}
         alike = len({s.unit for s in plant.sensors}) == 1
-        unit, scale = next(iter(shown.values())) if alike else ("noise levels", 1.0)
-        return cls(unit, scale, {n: u for n, (u, _) in shown.items()}, {n: x for n, (_, x) in shown.items()})
+        unit, scale = next(iter(arranged.values())) if alike else ("noise levels", 1.0)
+        return cls(unit, scale, {n: u for n, (u, _) in arranged.items()}, {n: x for n, (_, x) in arranged.items()})
 
 
 def _numbers(done: Closure, scales: _Scales) -> dict[str, Any]:
@@ -121,27 +128,27 @@ def _without_frozen(errors: Mapping[str, float], scale: float) -> tuple[dict[str
     return plain, {names[m]: v * scale for m, v in errors.items() if m in names}
 
 
-KEPT = ("nominal", "recalibrated", "augmented", "ceiling")
+SHOWN = ("nominal", "recalibrated", "augmented", "ceiling")
 
 
-def prediction_arrays(found: DiagnosisResult, held: Sequence[HeldOut]) -> dict[str, Tensor]:
-    """Arrays by name, SI, sensors in the order of the recording; hold-outs from the second on carry their number."""
-    fitter = found.fitter
+def prediction_arrays(result: DiagnosisResult, holdouts: Sequence[HeldOut]) -> dict[str, Tensor]:
+    """Predictions by name, SI, sensors in the order of the recording; hold-outs after the first carry their number."""
+    fitter = result.fitter
     arrays: dict[str, Tensor] = {}
     for k, rows in enumerate(fitter.data.rows):
         data = fitter.data.alone(k)
         predicted = {
             "nominal": free_run(data, fitter.noise, Model())[0],
-            "recalibrated": found.null.linearised.readings[0, rows],
-            "augmented": found.best.linearised.readings[0, rows],
+            "recalibrated": result.null.linearised.readings[0, rows],
+            "augmented": result.best.linearised.readings[0, rows],
         }
         prefix = "" if k == 0 else f"recording_{k + 1}_"
         arrays |= {f"{prefix}{name}": _as_recorded(data, values) for name, values in predicted.items()}
-    for k, one in enumerate(held):
+    for k, holdout in enumerate(holdouts):
         prefix = "holdout" if k == 0 else f"holdout_{k + 1}"
-        arrays[f"{prefix}_time"] = one.data.recording.time
-        read = torch.where(one.data.mask, one.data.readings, torch.nan)
-        arrays |= _prefixed(prefix, {"read": read} | {n: one.runs[n] for n in KEPT}, one.data)
+        arrays[f"{prefix}_time"] = holdout.data.recording.time
+        read = torch.where(holdout.data.mask, holdout.data.readings, torch.nan)
+        arrays |= _prefixed(prefix, {"read": read} | {n: holdout.runs[n] for n in SHOWN}, holdout.data)
     return arrays
 
 
@@ -150,9 +157,9 @@ def _prefixed(prefix: str, values: Mapping[str, Tensor], data: DataSet) -> dict[
 
 
 def _as_recorded(data: DataSet, values: Tensor) -> Tensor:
-    """(S, C) in the plant's order of sensors -> in the recording's order, NaN for columns that no sensor has."""
+    """Map (S, C) in the plant's order of sensors to the recording's order; NaN for columns without a sensor."""
     names = data.recording.output_names
-    shown = values.new_full((len(values), len(names)), torch.nan)
+    arranged = values.new_full((len(values), len(names)), torch.nan)
     for i, sensor in enumerate(data.plant.sensors):
-        shown[:, names.index(sensor.column)] = values[:, i]
-    return shown
+        arranged[:, names.index(sensor.column)] = values[:, i]
+    return arranged

@@ -206,12 +206,10 @@ def _shapes(layout: Layout) -> _Shapes:
     """Cached for the last layouts, which all channels of a recording and the next estimate share."""
     cosine = torch.cat([_cosine(count, bins) for count, bins in layout])
     a, error = _CORRELATIONS.to(cosine).reshape(-1, 1, 1), _ERRORS.to(cosine).reshape(-1, 1)
-    without_time_course = _MEAN_LENGTHS.to(cosine).reshape(-1, 1, 1)
-    remainder = torch.where(without_time_course > 0, a**without_time_course, 0.0)
+    lengths = _MEAN_LENGTHS.to(cosine).reshape(-1, 1, 1)
+    remainder = torch.where(lengths > 0, a**lengths, 0.0)
     numerator = (
-        1.0
-        - 2.0 * remainder * torch.cos(without_time_course * torch.arccos(cosine.clamp(-1.0, 1.0)))
-        + remainder * remainder
+        1.0 - 2.0 * remainder * torch.cos(lengths * torch.arccos(cosine.clamp(-1.0, 1.0))) + remainder * remainder
     )
     shape = numerator / (1.0 - 2.0 * a * cosine + a * a) + error / (2.0 - 2.0 * cosine) ** 2
     return _Shapes(1.0 / shape, torch.log(shape).mean(dim=-1))

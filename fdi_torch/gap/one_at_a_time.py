@@ -1,9 +1,9 @@
-"""The textbook way, to compare with: every effect alone, white noise, the lowest BIC wins.
+"""Baseline for comparison: every effect alone, white noise, the lowest BIC wins.
 
     BIC = n log(RSS / n) + k log n        (Schwarz, 1978)
 
-for n readings, each scaled by the spread of its channel's residual, and k parameters besides the recalibrated ones.
-No pairs, no coloured noise, no "none of these", and always sure.
+for n readings, each divided by the standard deviation of its channel's residual, and k parameters besides the
+recalibrated ones. It considers neither pairs nor correlated noise nor unknown causes, and states no uncertainty.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def one_at_a_time(
     library: tuple[str, ...] | None = None,
     leave_out: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """The answer, in the format of a diagnosis, of fitting those effects singly that promise most to first order."""
-    found = library_of(plant, library, leave_out)
+    """Fit the most promising effects one by one and return an answer in the format of a diagnosis."""
+    placements = library_of(plant, library, leave_out)
     nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     step = recording.interval
     data = data_set_of(plant, nominal_effects, recording, step)
@@ -44,7 +44,9 @@ def one_at_a_time(
     residual = torch.where(data.mask, data.readings - null.linearised.readings[0], 0.0)
     fitter = Fitter(data, _white(residual.std(dim=0).clamp(min=1e-12)))
     null = fitter.fit(Candidate(), null)
-    options = options_of([p for p in found if not p.effect.quantizes], fitter, operating_range_of(recording, plant))
+    options = options_of(
+        [p for p in placements if not p.effect.quantizes], fitter, operating_range_of(recording, plant)
+    )
     fits = [null, *(fitter.fit(c, null) for c in _singles(screen(fitter, null, options, pairs=False)))]
     winner = min(fits, key=lambda fit: _bic(fitter, fit))
     return _named([(p.effect.name, p.location) for p in winner.candidate.placements])
@@ -55,7 +57,7 @@ def _white(std: torch.Tensor) -> Noise:
 
 
 def _singles(screened: ScreeningResult) -> list[Candidate]:
-    """The effects that promise most, each from its best starts."""
+    """The most promising effects, each with its best starts."""
     by_cause: dict[CauseName, list[Option]] = {}
     for i in torch.argsort(screened.gain, descending=True).tolist():
         by_cause.setdefault(screened.options[i].cause, []).append(screened.options[i])

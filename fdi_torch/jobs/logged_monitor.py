@@ -116,11 +116,11 @@ class LoggedMonitor:
             samples = samples.segment(1, len(samples))
         events: list[Event] = []
         if len(samples):
-            prediction_arrays: list[ResidualTrace] = []
+            traces: list[ResidualTrace] = []
             try:
-                self.state, events = self.monitor.advance(self.state, samples, prediction_arrays.append)
+                self.state, events = self.monitor.advance(self.state, samples, traces.append)
             finally:  # written in one call, which takes a third of the time
-                self._log_residuals(prediction_arrays)
+                self._log_residuals(traces)
             self._now = float(samples.time[-1])
         for event in events:
             self._report(event)
@@ -205,15 +205,14 @@ class LoggedMonitor:
             hold=samples.hold,
         )
 
-    def _log_residuals(self, prediction_arrays: Sequence[ResidualTrace]) -> None:
+    def _log_residuals(self, traces: Sequence[ResidualTrace]) -> None:
         """Log the residuals, the detector's statistic and its threshold."""
-        if not prediction_arrays:
+        if not traces:
             return
         names, units = [s.column for s in self.plant.sensors], [s.unit for s in self.plant.sensors]
         chart = self.monitor.detector.chart
         time, residual, statistic = (
-            torch.cat(parts)
-            for parts in zip(*((t.time, t.residual, t.statistic) for t in prediction_arrays), strict=True)
+            torch.cat(parts) for parts in zip(*((t.time, t.residual, t.statistic) for t in traces), strict=True)
         )
         threshold = torch.full_like(statistic, self.monitor.detector.threshold)
         table = torch.cat([residual, torch.stack([statistic, threshold], dim=1)], dim=1)

@@ -36,7 +36,7 @@ from fdi_torch.report.free_run_figure import free_run_figure
 from fdi_torch.report.style import inline_svg
 from fdi_torch.tables import Shown, Table
 
-ProgressCallback = Callable[[float, str], None]
+Tell = Callable[[float, str], None]
 AnyPlant = PlantDescription | str | Path
 AnyRecording = Recording | str | Path
 HERE = "session"
@@ -71,7 +71,7 @@ def simulate(
 
 def train(
     run: Run | Mapping[str, Any] | str | Path | None = None,
-    tell: ProgressCallback | None = None,
+    tell: Tell | None = None,
     resume: bool = False,
     listener: Any = None,
 ) -> train_job.TrainResult:
@@ -128,7 +128,7 @@ def gap(
     holdouts: AnyRecording | Sequence[AnyRecording] = (),
     *,
     out: str | Path = "logs",
-    tell: ProgressCallback = silent,
+    tell: Tell = silent,
     **settings: Any,
 ) -> GapResult:
     """Find where and by which effect the plant model deviates from recordings, as `fdi gap` does.
@@ -170,7 +170,7 @@ class MonitorResult(Shown):
         return Table({name: [getattr(event, name) for event in self.events] for name in names})
 
 
-def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: ProgressCallback = silent) -> MonitorResult:
+def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = silent) -> MonitorResult:
     """Run a monitor along a recording, as `fdi monitor` does.
 
     run: a monitor file, or a mapping such as {"plant": plant, "recording": recording, "fault_free": ["0 s", "300 s"]}.
@@ -245,7 +245,7 @@ def study(
     *,
     resume: bool = False,
     cluster: str | None = None,
-    tell: ProgressCallback | None = None,
+    tell: Tell | None = None,
 ) -> study_job.StudyResult:
     """Repeat an experiment many times and compare the estimates with their bounds, as `fdi study` does.
 
