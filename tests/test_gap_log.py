@@ -127,7 +127,7 @@ def test_rivals_leave_the_next_input_as_a_file(tmp_path: Path, capsys: pytest.Ca
     words = ["gap", "--plant", "three_tank", "--recording", file, "--library", "pump_lag,pump_delay", "--quiet"]
     assert cli.main([*words, "--out", str(tmp_path)]) == cli.DONE
     shown = capsys.readouterr().out
-    assert shown.startswith("There is a gap that ")
+    assert shown.startswith("There is a gap; ")
     assert "next_input.csv; it should distinguish the two likeliest explanations" in shown
     planned = (tmp_path / "next_input.csv").read_text().splitlines()
     assert planned[0] == "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm" and len(planned) == 1501

@@ -36,8 +36,8 @@ def test_the_terminal_says_what_is_unknown_beside_what_is_named(capsys: pytest.C
     show(BOTH, Screen())
     said = capsys.readouterr().out
     assert said.startswith(
-        "The gap comes from leak at T1 and something unknown at Q1, probability 97.0 %; no effect of the library has "
-        "the law that is there."
+        "The gap comes from leak at T1 and something unknown at Q1, probability 97.0 %; no effect of the library "
+        "describes it."
     )
     rows = [line.split() for line in said.splitlines()]
     assert ["T1", "2.5", "cm^3/s", "15", "s"] in rows and ["T2", "1", "cm^3/s", "none"] in rows
@@ -51,8 +51,8 @@ def test_ambiguity_says_what_is_certain_whatever_else_there_is() -> None:
     answer = replace(BOTH, verdict="ambiguous", ambiguity_set=sets, posterior=posterior)
     assert answer.certain == [("leak", "T1")]
     assert verdict_sentence(answer.to_dict()) == (
-        "There is a gap that 2 explanations share at 95 %; the likeliest is leak at T1 and something unknown at Q1, "
-        "probability 60.0 %. All that is likely holds leak at T1."
+        "There is a gap; 2 explanations are plausible at 95 %, the likeliest is leak at T1 and something unknown at "
+        "Q1, probability 60.0 %. Present with at least 95 %: leak at T1."
     )
 
 
@@ -60,8 +60,8 @@ def test_one_explanation_that_does_not_suffice_says_what_was_not_fitted() -> Non
     posterior = [Explanation((("leak", "T1"),), 0.8)]
     answer = replace(BOTH, verdict="ambiguous", ambiguity_set=[(("leak", "T1"),)], posterior=posterior, unexamined=0.2)
     assert verdict_sentence(answer.to_dict()) == (
-        "There is a gap; the likeliest is leak at T1, probability 80.0 %; "
-        "explanations that were not fitted have 20.0 %."
+        "There is a gap; the likeliest is leak at T1, probability 80.0 %. "
+        "Explanations that were not fitted have 20.0 % together."
     )
 
 

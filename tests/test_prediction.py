@@ -87,7 +87,10 @@ def test_a_refit_that_finds_no_course_of_the_levels_says_so(monkeypatch: pytest.
     plant = rig()
     run = replace(recording(plant), source="a.csv")
     monkeypatch.setattr(Fitter, "fit", lost)
-    with pytest.raises(ValueError, match=r"no course of the levels through a\.csv was found; begin with other values"):
+    with pytest.raises(
+        ValueError,
+        match=r"no trajectory of the levels along a\.csv was found from the plant file's values; start from other values",
+    ):
         refit(plant, run)
 
 
@@ -172,7 +175,7 @@ def test_a_tank_at_rest_in_steps_of_its_sensor_leaves_the_zero_where_it_is_belie
 def test_a_run_needs_something_to_settle_in_and_something_left() -> None:
     run = filling(1.1, 0.0, 1)
     for seconds in (0.0, 200.0, 1e4):
-        with pytest.raises(ValueError, match="a stretch to settle in of more than 0 s and less than the 200 s"):
+        with pytest.raises(ValueError, match="an initial segment of more than 0 s and less than the 200 s"):
             predict(tank(), run, settle=seconds)
     with pytest.raises(ValueError, match=r"with a tolerance to vary .*got 'Z.gain'; the nearest is 'Q.gain'"):
         predict(tank(), run, vary=("Z.gain",))

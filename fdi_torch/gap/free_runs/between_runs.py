@@ -1,4 +1,4 @@
-"""How much a constant differs from one recording to the next, and how well so few recordings tell."""
+"""Between-run variance of a constant: its standard deviation over recordings, with a confidence interval."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import torch
 
-DETERMINED = 0.5  # of its tolerance: a recording whose standard error is larger says nothing of the constant
+DETERMINED = 0.5  # share of the tolerance; a larger standard error means that the recording does not determine it
 HALVINGS = 60
 
 
 @dataclass(frozen=True)
 class RunConstant:
-    """A constant as one recording has it: source and start (s) of the recording, value and standard error in SI."""
+    """A constant in one recording: source and start (s) of the recording, value and standard error in SI."""
 
     name: str
     source: str
@@ -25,7 +25,7 @@ class RunConstant:
 
 @dataclass(frozen=True)
 class BetweenRunSpread:
-    """Of `count` recordings: mean, standard deviation and its 95 % interval."""
+    """Mean, standard deviation and its 95 % interval over `count` recordings."""
 
     count: int
     mean: float
@@ -35,9 +35,9 @@ class BetweenRunSpread:
 
 
 def between_run_spread(own: Sequence[RunConstant], tolerance: float) -> BetweenRunSpread | None:
-    """Standard deviation over the recordings that tell the constant; None where fewer than two do.
+    """Standard deviation over the recordings that determine the constant; None for fewer than two.
 
-    For independent normal values (n - 1) s^2 / sigma^2 is chi-square with n - 1 degrees of freedom (any textbook).
+    For independent normal values, (n - 1) s^2 / sigma^2 is chi-square with n - 1 degrees of freedom.
     """
     values = torch.tensor([o.value for o in own if o.std < DETERMINED * tolerance], dtype=torch.float64)
     count = len(values)
@@ -49,7 +49,7 @@ def between_run_spread(own: Sequence[RunConstant], tolerance: float) -> BetweenR
 
 
 def chi_square(share: float, freedom: int) -> float:
-    """The value below which `share` of a chi-square distribution lies; by bisection."""
+    """Quantile of the chi-square distribution at probability `share`, by bisection."""
     low, high = 0.0, 50.0 + 10.0 * freedom
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)

@@ -1,10 +1,10 @@
-"""What the first stretch of a run tells of it: start levels, what varies from run to run, and the levels at its end.
+"""Initial state of a free run, estimated from an initial segment of the recording.
 
-A plant's equations are wrong by more than its sensors' noise, and for long: were what they miss taken for noise, a hose
-or a zero would be bent until it made good for it. So water may come and go unseen while the plant settles, a constant
-flow into each tank for each part of the stretch. How much of it there may be, as a share of what runs out of a full
-tank, is told by the stretch itself: the size is taken under which its readings are likeliest (the evidence, MacKay
-1992, by Laplace's approximation). After the stretch there is none, and the levels go on from where it led them.
+The segment determines the initial levels, the constants that vary between recordings, and the levels at its end. A
+plant's equations are wrong by more than the sensor noise, and for longer; without allowance for it, a varying constant
+would be biased until it compensated the error. Each tank therefore has an unknown constant inflow in each part of the
+segment, normal about zero. Its standard deviation, as a share of the outflow of a full tank, maximises the evidence
+(MacKay, 1992; Laplace's approximation). After the segment there is none.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Placement, Stage, Values
 
-PARTS = 8  # of the stretch
-SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)  # of what runs out of a full tank
-FINEST, COARSEST = 1e-5, 1e-2  # of what a sensor reads from floor to rim: its noise lies between
+PARTS = 8  # parts of the segment
+SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)  # inflow over the outflow of a full tank
+FINEST, COARSEST = 1e-5, 1e-2  # bounds of the noise, as shares of the sensor's span
 
 
-class UnseenFlow(Effect):
-    """A constant inflow during each part of the stretch, normal about none; none after it."""
+class UnknownInflow(Effect):
+    """A constant inflow during each part of the segment, normal about zero; none after it."""
 
     name = "unseen_flow"
     stage = Stage.BALANCE
@@ -56,53 +56,55 @@ class UnseenFlow(Effect):
 
 @dataclass(frozen=True)
 class InitialStateFit:
-    """placements: what came and went unseen. values: by name, those of its flows among them, SI."""
+    """placements: the unknown inflows. values: fitted values by name, SI, those of the inflows included."""
 
     placements: tuple[Placement, ...]
     values: Mapping[str, float]
 
 
-def estimate_initial_state(stretch: DataSet, starts: Sequence[Mapping[str, float]], rough: Noise) -> InitialStateFit:
-    """stretch: the beginning of a recording, all of whose readings are used; what its plant has a tolerance for is
-    fitted. starts: of the start levels, m. rough: what the sensors' noise is taken for until the stretch has told it.
+def estimate_initial_state(segment: DataSet, starts: Sequence[Mapping[str, float]], rough: Noise) -> InitialStateFit:
+    """Fit the initial state to the beginning of a recording, with all that has a tolerance.
+
+    starts: of the initial levels, m. rough: sensor noise of the first fit, from which the noise is then estimated.
     """
-    plant, seconds = stretch.plant, float(stretch.experiment.nodes[-1])
-    parts = max(1, min(PARTS, len(stretch.recording) // 2))
-    fitter = Fitter(stretch, rough)
+    plant, seconds = segment.plant, float(segment.experiment.nodes[-1])
+    parts = max(1, min(PARTS, len(segment.recording) // 2))
+    fitter = Fitter(segment, rough)
     plain = fitter.fit(Candidate(starts=tuple(starts)))
-    fitter = Fitter(stretch, _fine_noise(stretch, plain))
+    fitter = Fitter(segment, _fine_noise(segment, plain))
     best = fitter.fit(Candidate(), plain)
-    bent = {n: best.values[n] for n in plant.varying}
-    believed = {n: best.space[n].nominal for n in plant.varying}
-    likeliest = _surprise(fitter, best)
+    fitted_values = {n: best.values[n] for n in plant.varying}
+    nominal = {n: best.space[n].nominal for n in plant.varying}
+    lowest = _negative_log_evidence(fitter, best)
     for share in SHARES:
-        unseen = UnseenFlow(seconds, parts, share)
-        placements = tuple(Placement(unseen, tank.name) for tank in plant.tanks)
-        none = {f"{p.prefix}.{q.name}": 0.0 for p in placements for q in unseen.parameters(p.location, plant)}
-        # What varies was bent as far as it goes where nothing flowed unseen: it also begins at what is believed.
-        both = tuple(none | varying for varying in (bent, believed))
-        fit = fitter.fit(Candidate(placements, both), plain)
-        if (found := _surprise(fitter, fit)) < likeliest:
-            best, likeliest = fit, found
+        inflow = UnknownInflow(seconds, parts, share)
+        placements = tuple(Placement(inflow, tank.name) for tank in plant.tanks)
+        zero = {f"{p.prefix}.{q.name}": 0.0 for p in placements for q in inflow.parameters(p.location, plant)}
+        # Without inflows, varying constants may have gone to a bound; so they also start at nominal.
+        both_starts = tuple(zero | varying for varying in (fitted_values, nominal))
+        fit = fitter.fit(Candidate(placements, both_starts), plain)
+        if (value := _negative_log_evidence(fitter, fit)) < lowest:
+            best, lowest = fit, value
     return InitialStateFit(best.candidate.placements, best.values)
 
 
-def _surprise(fitter: Fitter, fit: Fit) -> float:
-    """Twice the negative logarithm of the evidence, but for what all fits of the stretch have in common."""
+def _negative_log_evidence(fitter: Fitter, fit: Fit) -> float:
+    """Twice the negative log evidence, without terms that all fits of the segment share."""
     scale = fitter.box(fit.space)[2]
     _, _, curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.linearised, scale)
-    found = fit.cost + float(torch.logdet(curvature[0]))
-    return found if math.isfinite(found) else math.inf
+    value = fit.cost + float(torch.logdet(curvature[0]))
+    return value if math.isfinite(value) else math.inf
 
 
-def _fine_noise(stretch: DataSet, fit: Fit) -> Noise:
-    """White, told by how far of three residuals in a row the second lies from between its neighbours: what of a model's
-    error is as fast counts as noise. (Not by the median: a sensor of coarse steps stands still most of the time.)
+def _fine_noise(segment: DataSet, fit: Fit) -> Noise:
+    """White noise, estimated from second differences of the residual; fast model errors count as noise.
+
+    The median is not used, since a sensor with coarse steps has equal readings most of the time.
     """
-    span = torch.tensor([reading_span(stretch.plant, s) for s in stretch.plant.sensors], dtype=torch.float64)
-    left, size = stretch.readings - fit.linearised.readings[0], COARSEST * span
-    seen = stretch.mask[2:] & stretch.mask[1:-1] & stretch.mask[:-2]
-    off = (left[2:] - 2.0 * left[1:-1] + left[:-2]) / math.sqrt(6.0)
-    for c in seen.any(dim=0).nonzero().flatten().tolist():
-        size[c] = off[seen[:, c], c].square().mean().sqrt()
+    span = torch.tensor([reading_span(segment.plant, s) for s in segment.plant.sensors], dtype=torch.float64)
+    residual, size = segment.readings - fit.linearised.readings[0], COARSEST * span
+    valid = segment.mask[2:] & segment.mask[1:-1] & segment.mask[:-2]
+    differences = (residual[2:] - 2.0 * residual[1:-1] + residual[:-2]) / math.sqrt(6.0)
+    for c in valid.any(dim=0).nonzero().flatten().tolist():
+        size[c] = differences[valid[:, c], c].square().mean().sqrt()
     return Noise(torch.minimum(torch.maximum(size, FINEST * span), COARSEST * span), torch.zeros_like(span))

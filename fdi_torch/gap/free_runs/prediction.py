@@ -1,9 +1,12 @@
-"""A plant file on trial: its free run along a recording, whose first samples alone are used, for the start levels.
+"""Free run of a plant file along a recording; only the first samples of the recording are used.
 
-What the plant file says varies from recording to recording (the zero of a sensor that is zeroed before each run) is
-taken from the same samples, within its tolerance: a tank that reads less than nothing is empty, and its sensor off.
-Where the recording was cut from a longer one in which a pump had run, its hose is full. A longer stretch at the start
-tells more of what varies, and the levels at its end; it is then no part of what is predicted (`settling`).
+The first samples determine the initial levels and, within their tolerances, the constants that vary from recording to
+recording (such as the zero of a sensor that is zeroed before each run): a tank whose sensor reads below zero is empty,
+and the sensor has an offset. If the recording was cut from a longer one in which a pump had run, the pump's hose is
+full. A longer initial segment determines what varies more accurately, and the levels at its end; it is then no part of
+the prediction (`initial_state.py`).
+
+`leave_one_file_out` predicts each file by a plant fitted to all others.
 """
 
 from __future__ import annotations
@@ -29,21 +32,20 @@ from fdi_torch.plant.scales import length_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
 
-START_SAMPLES = 50
-CORRECTIONS, HALVINGS = 80, 4
-SETTLED = 1e-5  # m, on a bench
-NEARLY = 10.0  # so many times as far, and shorter steps do not help
-MOST_STEPS = 4000  # of the first try; samples may be closer, levels do not change as fast
-UNSEEN_STARTS = (0.1, 0.25, 0.5, 0.8)  # shares of the height, for a tank that no sensor sees
+START_SAMPLES = 50  # for the initial levels
+CORRECTIONS, HALVINGS = 80, 4  # Newton steps, and halvings of the simulation step
+CONVERGED = 1e-5  # largest defect of a converged trajectory, m, for bench-scale tanks
+NEARLY = 10.0  # in units of CONVERGED: a defect that shorter steps need not improve
+MOST_STEPS = 4000  # in the first attempt; levels change more slowly than close samples
+UNMEASURED_STARTS = (0.1, 0.25, 0.5, 0.8)  # initial levels, as shares of the height, of a tank without a sensor
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """readings (S, C) in SI as the plant's sensors have them; start_levels in m; own: what else was taken from the
-    first samples, SI; rmse by sensor, over all samples, or those after the stretch that the plant settled in.
+    """readings (S, C) in SI, in the order of the plant's sensors. start_levels: m. own: constants determined from the
+    first samples, SI. rmse: by sensor, over all samples or those after the initial segment.
 
-    settled: whether the trajectory is the model's to SETTLED, or as much more as tanks are larger; defect, m: by how
-    much it is not.
+    settled: whether the trajectory converged to CONVERGED, scaled with the size of the tanks. defect: what remains, m.
     """
 
     readings: Tensor
@@ -63,70 +65,71 @@ def predict(
     settle: float | None = None,
     vary: Collection[str] = (),
 ) -> Prediction:
-    """The free run of the plant as its file has it. step: of the simulation, s; None for half the sampling interval (in
-    a long run of close samples the MOST_STEPS-th part of it), and less where a rim that runs over, or another sharp
-    bend, keeps the trajectory from settling.
+    """Run the plant freely as its file has it.
 
-    settle: s; all of so much is used for the start, in place of start_samples: the run goes on from the levels at its
-    end, and errors are counted after it. vary: patterns of constants with a tolerance that are taken from there too,
-    beside those that the plant file says.
+    step: of the simulation, s; None for half the sampling interval (in long recordings the MOST_STEPS-th part of them),
+    and less if a rim or another sharp bend keeps the trajectory from converging.
 
-    Raises ValueError where there is no first sample to start from, or none left to predict.
+    settle: length of the initial segment (s), used in place of start_samples. The run continues from the levels at its
+    end, and errors are counted after it. vary: patterns of further constants with a tolerance that the first samples
+    determine.
+
+    Raises ValueError if there is no sample to start from, or none left to predict.
     """
-    counted = 0
+    skipped = 0
     if settle is not None:
-        start_samples = counted = _samples_within(recording, settle)
+        start_samples = skipped = _samples_within(recording, settle)
     if start_samples < 1:
         raise ValueError(f"expected at least 1 sample for the start levels, got {start_samples}")
     plant = without_startup_effects(_varying(plant, vary), recording.ran)
     nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
-    span = float(recording.time[-1] - recording.time[0])
-    step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), span / MOST_STEPS)
-    left = math.inf
+    duration = float(recording.time[-1] - recording.time[0])
+    step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), duration / MOST_STEPS)
+    defect = math.inf
     for _ in range(HALVINGS):
         data = data_set_of(plant, nominal_effects, recording, step)
-        found, before = _run(data, start_samples, counted), left
-        left = found.defect
-        stuck = left < NEARLY * SETTLED * length_scale(plant) and left > 0.5 * before
-        if found.settled or stuck:  # an empty tank flickers at its floor, whatever the step
+        prediction, previous = _run(data, start_samples, skipped), defect
+        defect = prediction.defect
+        stalled = defect < NEARLY * CONVERGED * length_scale(plant) and defect > 0.5 * previous
+        if prediction.settled or stalled:  # an empty tank oscillates at its floor with any step
             break
         step *= 0.5
-    return found
+    return prediction
 
 
 def _samples_within(recording: Recording, seconds: float) -> int:
-    """How many samples lie in the first so many seconds; some reading must be left to predict."""
+    """Number of samples in the first seconds. Raises ValueError unless readings are left to predict."""
     first = float(recording.time[0])
     samples = int((recording.time <= first + seconds).sum())
     if seconds <= 0 or not bool(recording.mask[samples:].any()):
         length = float(recording.time[-1]) - first
         raise ValueError(
-            f"{recording.source}: expected a stretch to settle in of more than 0 s and less than the {length:g} s of "
+            f"{recording.source}: expected an initial segment of more than 0 s and less than the {length:g} s of "
             f"the recording, got {seconds:g} s"
         )
     return samples
 
 
 def _varying(plant: PlantDescription, patterns: Collection[str]) -> PlantDescription:
-    """The plant of which more varies. Raises ValueError for a pattern that no constant with a tolerance has."""
+    """The plant with further varying constants. Raises ValueError for a pattern that matches none with a tolerance."""
     more = matching("a constant with a tolerance to vary", patterns, plant.tolerances)
     return replace(plant, varying=tuple(dict.fromkeys([*plant.varying, *more])))
 
 
-def _run(data: DataSet, start_samples: int, counted: int) -> Prediction:
+def _run(data: DataSet, start_samples: int, skipped: int) -> Prediction:
     plant = data.plant
     early = data.mask.clone()
     early[start_samples:] = False
     if not bool(early.any()):
         source = data.recording.source
         raise ValueError(f"{source}: expected readings among the first {start_samples} samples, got none")
-    spread = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    fitter = Fitter(replace(data, mask=early), Noise(1e-2 * spread, torch.zeros_like(spread)))
-    engine, theta, levels = _by_stretch(fitter, counted) if counted else _by_samples(fitter, data)
+    std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+    fitter = Fitter(replace(data, mask=early), Noise(1e-2 * std, torch.zeros_like(std)))
+    engine, theta, levels = _start_from_segment(fitter, skipped) if skipped else _start_from_samples(fitter, data)
     run = engine.converge(theta, levels, CORRECTIONS)
     readings = run.readings[0]
     residuals = torch.where(data.mask, data.readings - readings, torch.zeros_like(readings))
-    rmse = torch.sqrt((residuals[counted:] ** 2).sum(dim=0) / data.mask[counted:].sum(dim=0))
+    rmse = torch.sqrt((residuals[skipped:] ** 2).sum(dim=0) / data.mask[skipped:].sum(dim=0))
     values = dict(zip(engine.space.names, theta[0].tolist(), strict=True))
     return Prediction(
         readings,
@@ -134,35 +137,35 @@ def _run(data: DataSet, start_samples: int, counted: int) -> Prediction:
         {t.name: values[f"{t.name}.start_level"] for t in plant.tanks},
         {name: values[name] for name in plant.varying},
         dict(zip((s.name for s in plant.sensors), rmse.tolist(), strict=True)),
-        float(run.defect.max()) < SETTLED * length_scale(plant),
+        float(run.defect.max()) < CONVERGED * length_scale(plant),
         float(run.defect.max()),
     )
 
 
-Begun = tuple[Collocation, Tensor, Tensor]
+Start = tuple[Collocation, Tensor, Tensor]
 """The engine, parameters (1, P) and a guess of the levels (1, K+1, tanks)."""
 
 
-def _by_samples(fitter: Fitter, data: DataSet) -> Begun:
-    """Start levels, and what varies, from the readings that the fitter sees."""
+def _start_from_samples(fitter: Fitter, data: DataSet) -> Start:
+    """Initial levels and varying constants from the readings that the fitter sees."""
     plant = fitter.data.plant
     engine = _engine(fitter, (), [*(f"{t.name}.start_level" for t in plant.tanks), *plant.varying])
     theta = torch.stack([engine.space.vector(start) for start in _starts(plant, fitter.first_levels())])
-    guess = Fitter(data, fitter.noise).first_trajectory(engine, theta)
-    ends = fitter.descend(engine, theta, guess)
+    levels = Fitter(data, fitter.noise).first_trajectory(engine, theta)
+    ends = fitter.descend(engine, theta, levels)
     best = int(torch.nan_to_num(ends.cost, nan=torch.inf).argmin())
     return engine, ends.theta[best : best + 1], ends.linearised.levels[best : best + 1]
 
 
-def _by_stretch(fitter: Fitter, samples: int) -> Begun:
-    """The same from the first so many samples, in which water may come and go unseen."""
+def _start_from_segment(fitter: Fitter, samples: int) -> Start:
+    """The same from the first samples as an initial segment with unknown inflows."""
     data = fitter.data
     plant = replace(data.plant, tolerances={n: data.plant.tolerances[n] for n in data.plant.varying})
     first, step = data.recording.stretch(0, samples), float(data.experiment.steps.max())
-    stretch = data_set_of(plant, data.nominal_effects, first, step)
-    found = estimate_initial_state(stretch, _starts(plant, fitter.first_levels()), fitter.noise)
-    engine = _engine(fitter, found.placements, list(found.values))
-    theta = engine.space.vector(found.values).unsqueeze(0)
+    segment = data_set_of(plant, data.nominal_effects, first, step)
+    state = estimate_initial_state(segment, _starts(plant, fitter.first_levels()), fitter.noise)
+    engine = _engine(fitter, state.placements, list(state.values))
+    theta = engine.space.vector(state.values).unsqueeze(0)
     return engine, theta, engine.constant_guess(theta)
 
 
@@ -171,17 +174,18 @@ def _engine(fitter: Fitter, placements: Sequence[Placement], names: Sequence[str
     return Collocation(network, ParameterSpace(network.constants[n] for n in names), fitter.data.experiment)
 
 
-def _starts(plant: PlantDescription, seen: Mapping[str, float]) -> list[dict[str, float]]:
-    """Where the descent begins: levels as first read; several where no sensor tells."""
-    unseen = [t for t in plant.tanks if f"{t.name}.start_level" not in seen]
-    grids = [[(f"{t.name}.start_level", share * t.height) for share in UNSEEN_STARTS] for t in unseen]
-    return [{**seen, **dict(choice)} for choice in product(*grids)]
+def _starts(plant: PlantDescription, measured: Mapping[str, float]) -> list[dict[str, float]]:
+    """Initial values: measured levels, and a grid for tanks without a sensor."""
+    unmeasured = [t for t in plant.tanks if f"{t.name}.start_level" not in measured]
+    grids = [[(f"{t.name}.start_level", share * t.height) for share in UNMEASURED_STARTS] for t in unmeasured]
+    return [{**measured, **dict(choice)} for choice in product(*grids)]
 
 
 @dataclass(frozen=True)
 class LeftOutRun:
-    """A free run along one recording (start, stop in s): root mean square errors by sensor (SI) of the plant as it is
-    (`as_is`) and as fitted to all files but that one (`refitted`).
+    """A free run along one recording from start to stop (s): root mean square errors by sensor (SI).
+
+    as_is: of the plant as it is. refitted: of the plant fitted to all files but that of this recording.
     """
 
     source: str
@@ -197,23 +201,25 @@ def leave_one_file_out(
     trials: Sequence[Recording],
     fit: Callable[[Sequence[Recording]], PlantDescription],
     start_samples: int,
-    tell: Callable[[float, str], None] = lambda share, text: None,
+    progress: Callable[[float, str], None] = lambda share, text: None,
     settle: float | None = None,
 ) -> list[LeftOutRun]:
-    """trials: what is run freely; for each, `fit` sees the recordings of all other files. Recordings of one file are
-    told by the hash of its contents. settle: as `predict` has it, s. Raises ValueError where that would leave none to
-    fit.
+    """Predict each trial by the plant as it is, and by the plant that `fit` returns for the recordings of all other
+    files.
+
+    Files are identified by the hash of their contents. settle: as in `predict`, s. Raises ValueError if no recording
+    would be left to fit.
     """
     refitted: dict[str, PlantDescription] = {}
-    found = []
+    runs = []
     for k, run in enumerate(trials):
-        tell(k / len(trials), run.source)
+        progress(k / len(trials), run.source)
         if run.sha256 not in refitted:
-            rest = [r for r in recordings if r.sha256 != run.sha256]
-            if not rest:
+            others = [r for r in recordings if r.sha256 != run.sha256]
+            if not others:
                 raise ValueError(f"{run.source}: expected recordings of another file to fit to, got none; give more")
-            refitted[run.sha256] = fit(rest)
+            refitted[run.sha256] = fit(others)
         plants = plant, refitted[run.sha256]
         as_is, without = (predict(p, run, start_samples, settle=settle).rmse for p in plants)
-        found.append(LeftOutRun(run.source, float(run.time[0]), float(run.time[-1]), as_is, without))
-    return found
+        runs.append(LeftOutRun(run.source, float(run.time[0]), float(run.time[-1]), as_is, without))
+    return runs

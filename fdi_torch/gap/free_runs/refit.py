@@ -1,7 +1,10 @@
-"""All effects of a plant file fitted anew together, with its constants: the last step after causes were adopted.
+"""Refit of all effects of a plant file together with its constants; the last step after causes were adopted.
 
-A cause that was adopted early was fitted while others were still missing. No effect is searched here. A parameter with
-a tolerance stays near what the plant file says (valves of one make are nearly alike), one without is free.
+A cause that was adopted early was fitted while others were missing. No effect is searched here. A parameter with a
+tolerance stays near its value in the plant file; one without is free.
+
+`fit_by_continuation` finds a first trajectory where a sharp bend prevents it: rims and roots are first smoothed as for
+steps WIDENINGS times as long, and each solution is the start of the next (continuation: Allgower and Georg, 1990).
 """
 
 from __future__ import annotations
@@ -29,17 +32,15 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.joint_collocation import name_in_recording
 
-TURNS = 3  # of the noise and the fit under it
-WIDE = 0.5  # of a range
+TURNS = 3  # alternations between noise and fit
+WIDE = 0.5  # share of a range; a larger standard error means undetermined
 
 
 @dataclass(frozen=True)
 class Refit:
-    """plant: with effects and constants as fitted. rmse: by sensor, in SI; before: of the plant as it was, its
-    constants and start levels fitted. parameters: how many were fitted, start levels included. fitted: value and
-    standard error, misfit included, of what all recordings have in common. own: of what each has for itself, but for
-    start levels.
-    """
+    """plant: with fitted effects and constants. before, rmse: errors by sensor (SI) with constants only, and with all,
+    fitted. parameters: how many were fitted, initial levels included. fitted: value and standard error, misfit
+    included, of what all recordings share. own: constants specific to each recording, without initial levels."""
 
     plant: PlantDescription
     before: Mapping[str, float]
@@ -58,36 +59,36 @@ def refit(
     white: float | None = None,
     vary: Collection[str] = (),
 ) -> Refit:
-    """step: of the simulation, s; None for half the sampling interval. leave_out: effects that the plant is to lose.
+    """Fit all effects and constants of a plant to recordings.
 
-    hold: patterns of constants that stay as the plant file has them. white: errors count as white noise of that size
-    (SI) in every reading, whatever is left of the fast ones; that is what a free run asks for where equations are not
-    quite the rig's, while the noise itself lets fast errors count for more than slow ones. vary: patterns of constants
-    with a tolerance that each recording is to have for itself, beside those that the plant file says.
+    step: of the simulation, s; None for half the sampling interval. leave_out: effects to remove from the plant. hold:
+    patterns of constants that are not fitted. white: standard deviation (SI) of white noise that replaces the estimated
+    noise. Use it for free runs with equations that are not quite the rig's: the estimated noise weights fast errors
+    more than slow ones. vary: patterns of further constants with a tolerance that each recording has for itself.
 
-    Raises ValueError for a pattern of either that no name fits.
+    Raises ValueError for a pattern that matches no name.
     """
     kept = tuple(e for e in plant.effects if e.effect not in leave_out)
-    placed = [Placement(effect(e.effect), e.location, e.parameters) for e in kept]
-    prefixes = {p.prefix for p in placed}
+    placements = [Placement(effect(e.effect), e.location, e.parameters) for e in kept]
+    prefixes = {p.prefix for p in placements}
     tolerances = {n: v for n, v in plant.tolerances.items() if n.count(".") == 1 or n.rpartition(".")[0] in prefixes}
-    held = set(matching("a constant of the plant to hold", hold, build_network(plant).constants.names))
+    held_names = set(matching("a constant of the plant to hold", hold, build_network(plant).constants.names))
     varying = dict.fromkeys([*plant.varying, *matching("a constant with a tolerance to vary", vary, tolerances)])
-    bare = replace(
+    held_plant = replace(
         plant,
         effects=kept,
-        tolerances={n: v for n, v in tolerances.items() if n not in held},
-        varying=tuple(n for n in varying if n not in held),
+        tolerances={n: v for n, v in tolerances.items() if n not in held_names},
+        varying=tuple(n for n in varying if n not in held_names),
     )
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     step = step or 0.5 * recordings[0].interval
-    data = checked_data_set(bare, placed, recordings, step)
-    start = {n: v for n, v in _start(kept, plant, recordings).items() if n not in tolerances}
-    start = {n: v for n, v in start.items() if n not in held}
-    free = [p for p in placed if any(n.startswith(f"{p.prefix}.") for n in start)]
-    spread = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    size = 1e-2 * spread if white is None else torch.full_like(spread, white)
-    fitter = Fitter(data, Noise(size, torch.zeros_like(spread)))
+    data = checked_data_set(held_plant, placements, recordings, step)
+    start = {n: v for n, v in _initial_values(kept, plant, recordings).items() if n not in tolerances}
+    start = {n: v for n, v in start.items() if n not in held_names}
+    free = [p for p in placements if any(n.startswith(f"{p.prefix}.") for n in start)]
+    std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+    size = 1e-2 * std if white is None else torch.full_like(std, white)
+    fitter = Fitter(data, Noise(size, torch.zeros_like(std)))
     null = _with_a_trajectory(fit_by_continuation(fitter, Candidate()), recordings)
     fit, base = null, null if white is None else None
     for _ in range(TURNS if white is None else 1):
@@ -95,28 +96,31 @@ def refit(
             fitter = Fitter(data, estimate_noise(data.readings - fit.linearised.readings[0], data.mask))
         candidate = Candidate(tuple(free), (start,))
         fit = base = _with_a_trajectory(fit_by_continuation(fitter, candidate, base), recordings)
-        found = {n: v for n, v in fit.effect_values.items() if n in start}
-        start = {n: v for n, v in found.items() if n not in _undetermined(fitter, fit)}
-    own = _own(fitter, fit)
-    better = replace(_with(bare, fit, _typical(own, fit, bare)), tolerances=tolerances, varying=plant.varying)
-    return Refit(better, _rmse(fitter, null), _rmse(fitter, fit), len(fit.space), _errors(fitter, fit), own)
+        effect_values = {n: v for n, v in fit.effect_values.items() if n in start}
+        start = {n: v for n, v in effect_values.items() if n not in _undetermined(fitter, fit)}
+    run_constants = _run_constants(fitter, fit)
+    refitted = replace(
+        _refitted_plant(held_plant, fit, _typical(run_constants, fit, held_plant)),
+        tolerances=tolerances,
+        varying=plant.varying,
+    )
+    return Refit(refitted, _rmse(fitter, null), _rmse(fitter, fit), len(fit.space), _errors(fitter, fit), run_constants)
 
 
 def _with_a_trajectory(fit: Fit, recordings: Sequence[Recording]) -> Fit:
-    """The fit. Raises ValueError where its levels over time were never found, so that nothing can be said of it."""
+    """The fit. Raises ValueError if its trajectory did not converge."""
     if trajectory_found(fit):
         return fit
     named = ", ".join(dict.fromkeys(r.source for r in recordings if r.source)) or "the recordings"
     raise ValueError(
-        f"refit: from the plant file's values no course of the levels through {named} was found; begin with other"
+        f"refit: no trajectory of the levels along {named} was found from the plant file's values; start from other"
         " values of its effects, leave one of them out (--leave-out), or simulate in finer steps (--step)"
     )
 
 
 def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
-    """Parameters whose standard error, misfit included, is a good part of their range: the recording does not show
-    them, and what the plant file says is better than an end of the range.
-    """
+    """Parameters whose standard error, misfit included, is a large part of their range; they keep the plant file's
+    value."""
     low, high, _ = fitter.box(fit.space)
     errors = _errors(fitter, fit)
     widths = dict(zip(fit.space.names, (high - low).tolist(), strict=True))
@@ -124,9 +128,9 @@ def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
 
 
 def _errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
-    """Values with standard errors, misfit included, of what all recordings have in common."""
-    own = set(fitter.data.per_recording)
-    return {n: each for n, each in _all_errors(fitter, fit).items() if n.partition("@")[0] not in own}
+    """Values and standard errors, misfit included, of what all recordings share."""
+    per_recording = set(fitter.data.per_recording)
+    return {n: each for n, each in _all_errors(fitter, fit).items() if n.partition("@")[0] not in per_recording}
 
 
 def _all_errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
@@ -135,8 +139,8 @@ def _all_errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
     return {n: (v, misfit * stds[n]) for n, v in fit.values.items()}
 
 
-def _own(fitter: Fitter, fit: Fit) -> tuple[RunConstant, ...]:
-    """What varies from recording to recording, by name and then in the recordings' order."""
+def _run_constants(fitter: Fitter, fit: Fit) -> tuple[RunConstant, ...]:
+    """Constants that vary between recordings, by name and then in the order of the recordings."""
     errors, parts = _all_errors(fitter, fit), fitter.data.parts
     return tuple(
         RunConstant(name, part.recording.source, float(part.recording.time[0]), *errors[name_in_recording(name, k)])
@@ -145,51 +149,53 @@ def _own(fitter: Fitter, fit: Fit) -> tuple[RunConstant, ...]:
     )
 
 
-def _start(
+def _initial_values(
     kept: Collection[PlacedEffect], plant: PlantDescription, recordings: Sequence[Recording]
 ) -> dict[str, float]:
-    """Where each effect has what a fit may move of it; a limit that the values themselves tell is not fitted."""
+    """Present values of the effects' parameters that a fit may change; limits that the readings show are not fitted."""
     reach = operating_range_of_all(recordings, plant)
     start: dict[str, float] = {}
     for placed in kept:
         movable = {n for s in effect(placed.effect).starts(placed.location, plant, reach) for n in s}
-        if not effect(placed.effect).quantizes and not any(_told(placed, plant, r) for r in recordings):
+        if not effect(placed.effect).quantizes and not any(
+            _is_limit_from_readings(placed, plant, r) for r in recordings
+        ):
             values = {n: v for n, v in placed.parameters.items() if n in movable}
             start |= {f"{placed.location}.{placed.effect}.{n}": v for n, v in values.items()}
     return start
 
 
-def _told(placed: PlacedEffect, plant: PlantDescription, recording: Recording) -> bool:
+def _is_limit_from_readings(placed: PlacedEffect, plant: PlantDescription, recording: Recording) -> bool:
+    """Whether the effect is a limit of a sensor that the readings themselves show."""
     for sensor in plant.sensors:
         if sensor.name == placed.location and sensor.column in recording.output_names:
             i = recording.output_names.index(sensor.column)
-            found = limits_of(recording.outputs[recording.mask[:, i], i])
-            return found.get(placed.effect) == placed.parameters.get("limit", float("nan"))
+            limits = limits_of(recording.outputs[recording.mask[:, i], i])
+            return limits.get(placed.effect) == placed.parameters.get("limit", float("nan"))
     return False
 
 
-def _typical(own: Sequence[RunConstant], fit: Fit, plant: PlantDescription) -> dict[str, float]:
-    """What the next recording is best believed to have of what differs: the median of those that tell it and of what
-    the plant file says, which counts as one more: two recordings may both be odd.
-    """
-    found = {}
+def _typical(run_constants: Sequence[RunConstant], fit: Fit, plant: PlantDescription) -> dict[str, float]:
+    """Expected value of each varying constant in the next recording: the median of its well-determined values and of
+    the plant file's, which counts as one more."""
+    typical = {}
     for name in plant.varying:
-        told = [o.value for o in own if o.name == name and o.std < DETERMINED * plant.tolerances[name]]
-        if told:
-            found[name] = statistics.median([*told, fit.space[name].nominal])
-    return found
+        determined = [o.value for o in run_constants if o.name == name and o.std < DETERMINED * plant.tolerances[name]]
+        if determined:
+            typical[name] = statistics.median([*determined, fit.space[name].nominal])
+    return typical
 
 
-def _with(plant: PlantDescription, fit: Fit, typical: dict[str, float]) -> PlantDescription:
-    """Constants and effects as fitted; of what each recording has for itself what is typical."""
-    own = {*plant.varying, *(f"{tank.name}.start_level" for tank in plant.tanks)}
-    common = {n: v for n, v in fit.values.items() if n.partition("@")[0] not in own} | typical
+def _refitted_plant(plant: PlantDescription, fit: Fit, typical: dict[str, float]) -> PlantDescription:
+    """The plant with fitted constants and effects, and typical values of what varies between recordings."""
+    per_recording = {*plant.varying, *(f"{tank.name}.start_level" for tank in plant.tanks)}
+    common = {n: v for n, v in fit.values.items() if n.partition("@")[0] not in per_recording} | typical
     constants = {n: v for n, v in common.items() if n.count(".") == 1}
-    found = {n: v for n, v in common.items() if n.count(".") == 2}
+    effect_values = {n: v for n, v in common.items() if n.count(".") == 2}
     effects = []
     for placed in plant.effects:
         prefix = f"{placed.location}.{placed.effect}"
-        fitted = {n.rpartition(".")[2]: v for n, v in found.items() if n.rpartition(".")[0] == prefix}
+        fitted = {n.rpartition(".")[2]: v for n, v in effect_values.items() if n.rpartition(".")[0] == prefix}
         effects.append(replace(placed, parameters={**placed.parameters, **fitted}))
     return replace(with_constants(plant, constants), effects=tuple(effects))
 
@@ -205,24 +211,24 @@ WIDENINGS = (64.0, 16.0, 4.0, 2.0)
 
 
 def fit_by_continuation(fitter: Fitter, candidate: Candidate, base: Fit | None = None) -> Fit:
-    """The fit, as it is where its course of the levels is found at once."""
-    found = fitter.fit(candidate, base)
-    if trajectory_found(found):
-        return found
+    """Fit a candidate; by continuation from smoothed plants if its trajectory does not converge at once."""
+    direct = fitter.fit(candidate, base)
+    if trajectory_found(direct):
+        return direct
     for widening in WIDENINGS:
-        wide = Fitter(_drawn_smooth(fitter.data, widening), fitter.noise).fit(candidate, base)
-        if trajectory_found(wide):
-            base = wide
-    again = fitter.fit(candidate, base) if base is not None else found
-    return again if trajectory_found(again) else found
+        smooth = Fitter(_smoothed(fitter.data, widening), fitter.noise).fit(candidate, base)
+        if trajectory_found(smooth):
+            base = smooth
+    continued = fitter.fit(candidate, base) if base is not None else direct
+    return continued if trajectory_found(continued) else direct
 
 
 def trajectory_found(fit: Fit) -> bool:
-    """Whether the course of its levels was found."""
+    """Whether the fit's trajectory converged."""
     return math.isfinite(fit.cost) and bool(torch.isfinite(fit.linearised.jacobian).all())
 
 
-def _drawn_smooth(data: DataSet, widening: float) -> DataSet:
+def _smoothed(data: DataSet, widening: float) -> DataSet:
     def wider(experiment: Experiment) -> Experiment:
         return replace(experiment, resolution=widening * experiment.resolution)
 
