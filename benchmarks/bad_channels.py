@@ -26,7 +26,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from fdi_torch.blind.cases import Case, make, plans
+from fdi_torch.blind.case_drafts import plans
+from fdi_torch.blind.cases import Case, make
 from fdi_torch.blind.inputs import FACTORS, command_unit
 from fdi_torch.blind.plants import RIGS
 from fdi_torch.gap.diagnose import diagnose

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from benchmarks.physics import START, make_rates, make_step, widths
 from benchmarks.simulators import NAMES, Simulator, load_jax
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from benchmarks.timing import seconds_in_rounds
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.hypothesis import Fault

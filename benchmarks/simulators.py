@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.physics import INFLOW, START, make_rates, make_step, widths
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork

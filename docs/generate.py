@@ -16,7 +16,7 @@ from typing import Any
 
 import fdi_torch
 from fdi_torch.cli import COMMANDS
-from fdi_torch.config.reference import keys
+from fdi_torch.config.key_reference import keys
 from fdi_torch.logbook.schemas import TOPICS
 
 DOCS = Path(__file__).resolve().parent
@@ -60,8 +60,8 @@ def commands() -> str:
     parts = [
         "# Commands",
         "Generated from the argument parsers. Results go to standard output, progress to standard error. Exit codes: "
-        "0 done, 2 misuse, 3 ran but did not converge (recover, replay: something was lost, or differs), 130 "
-        "interrupted, 143 terminated.",
+        "0 done, 2 misuse, 3 ran but did not converge (recover, replay: something was lost, or differs), 4 "
+        "converged, but the model does not explain the recording (train), 130 interrupted, 143 terminated.",
         "\n".join(["| command | purpose |", "|---|---|", *(f"| {a} | {cell(b)} |" for a, b in rows)]),
         "Every command also has `--json` (print JSON and nothing else on standard output), `--quiet` (no progress) and "
         "`--traceback` (show where an error arose).",

@@ -1,8 +1,8 @@
 """Fault diagnosis and sim-to-real gap diagnosis of liquid-tank plants by differentiable simulation.
 
-The names in `__all__` are the public interface; each is loaded when first asked for, so that `import fdi_torch` is
-instant. Some functions have the name of the package that does their work: `fdi_torch.gap` is that package, and calling
-it, `fdi_torch.gap(plant, recording)`, calls the function.
+The names in `__all__` are the public interface. Each is loaded on first access, so that `import fdi_torch` is instant.
+Some functions share their name with the package that implements them: `fdi_torch.gap` is that package, and calling it,
+`fdi_torch.gap(plant, recording)`, calls the function.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ __all__ = sorted(_HOME_OF)
 
 
 class _CallableModule(ModuleType):
-    """A package below this one that is called like the public function of its name."""
+    """A subpackage that can be called like the public function of the same name."""
 
     @property
     def __wrapped__(self) -> Callable[..., Any]:
-        """The function, where `inspect.signature` and help look for it."""
+        """The function, for `inspect.signature` and help."""
         name = self.__name__.rpartition(".")[2]
         return getattr(import_module(_HOME_OF[name]), name)
 
@@ -62,7 +62,7 @@ class _CallableModule(ModuleType):
 
 
 class _Package(ModuleType):
-    """This package: what is imported below it under the name of a public function can be called."""
+    """This package: a subpackage with the name of a public function becomes callable when it is imported."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name in _HOME_OF and type(value) is ModuleType:
@@ -77,8 +77,8 @@ def __getattr__(name: str) -> Any:
         return version("fdi_torch")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'fdi_torch' has no attribute '{name}'")
-    own = f"fdi_torch.{name}"
-    return import_module(own) if find_spec(own) else getattr(import_module(_HOME_OF[name]), name)
+    subpackage = f"fdi_torch.{name}"
+    return import_module(subpackage) if find_spec(subpackage) else getattr(import_module(_HOME_OF[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""What the machine can hold: work that would take more is refused before anything is allocated for it."""
+"""The memory limit of the machine: larger work is refused before anything is allocated."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from functools import lru_cache
 from pathlib import Path
 
 NUMBER = 8
-"""Bytes of a number of double precision."""
+"""Bytes of a float64 number."""
 _CONTROL_GROUP = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
 @lru_cache(maxsize=1)
 def memory() -> int:
-    """Bytes: the machine's memory, or less where this process or its container may not have all of it."""
+    """The machine's memory, or the smaller limit of this process or its container, bytes."""
     limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
     for name in _CONTROL_GROUP:
         try:
@@ -27,7 +27,7 @@ def memory() -> int:
 
 
 def expect_room(numbers: float, what: str, remedy: str) -> None:
-    """Raises ValueError where that many numbers fill more than the memory there is. what: that takes them, in words."""
+    """Raises ValueError if that many numbers exceed the memory limit. what: the work that needs them, in words."""
     if not NUMBER * numbers <= memory():
         raise ValueError(
             f"expected work that fits into the {1e-9 * memory():.3g} GB of memory here, got {what}, which takes "

@@ -1,4 +1,4 @@
-"""Files that are written as a whole or not at all, and what goes wrong with the disk, as one sentence."""
+"""Atomic writing of files, and disk errors as one sentence with advice."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _CAUSES = {
 
 
 class DiskError(OSError):
-    """A file cannot be written. Its text is one sentence that names the file and what to do."""
+    """A file cannot be written. The text is one sentence that names the file and a remedy."""
 
 
 def sentence(place: Path | str, error: OSError) -> str:
-    """What the operating system's error on a file means."""
+    """The operating system's error on a file as a sentence with advice."""
     if error.errno == errno.EEXIST and Path(place).is_file():
         return f"{place}: it exists already; choose another name, or delete it"
     return f"{place}: {_CAUSES.get(error.errno or 0, (error.strerror or str(error)).lower())}"
@@ -37,22 +37,22 @@ def sentence(place: Path | str, error: OSError) -> str:
 
 @contextmanager
 def named_errors(place: Path | str) -> Iterator[None]:
-    """An error of the operating system inside names the file; it often does not where a write fails."""
+    """A context in which the operating system's errors name the file and become DiskErrors."""
     try:
         yield
     except BrokenPipeError:
         raise
     except OSError as error:
-        if error.errno is None:  # a sentence already
+        if error.errno is None:  # one of this program's errors, which is a sentence already
             raise
         raise DiskError(sentence(place, error)) from error
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """The path to write a new version of a file at; it takes the file's place where the block ends without an error.
+    """A context that yields a temporary path for a new version of a file, which replaces the file if no error occurs.
 
-    Folders are made. A device, such as /dev/stdout, is written at once. Raises DiskError.
+    Missing folders are created. A device, such as /dev/stdout, is written directly. Raises DiskError.
     """
     with named_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -69,7 +69,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> Path:
-    """A text file (UTF-8), whole or not at all; what UTF-8 cannot hold becomes a question mark. Raises DiskError."""
+    """Write a text file (UTF-8) atomically; characters outside UTF-8 become question marks. Raises DiskError."""
     with replacing(path) as new:
         new.write_text(text, encoding="utf-8", errors="replace")
     return path

@@ -1,7 +1,7 @@
-"""Ctrl-C and SIGTERM: each becomes an exception in the main thread, which lets an open log be finished in order.
+"""Ctrl-C and SIGTERM as exceptions in the main thread, so that an open log can be completed.
 
-A step that must not be cut in two, such as a write to a log, runs inside `UNDISTURBED` (or holds a `SteadyLock`): a
-signal that arrives meanwhile is raised when the step is done.
+An operation that must not be interrupted, such as a write to a log, runs inside `UNDISTURBED` (or holds a
+`SteadyLock`): a signal that arrives meanwhile is raised at its end.
 """
 
 from __future__ import annotations
@@ -12,14 +12,16 @@ from types import FrameType, TracebackType
 
 
 class Terminated(SystemExit):
-    """The process was asked to end (SIGTERM); the exit code is the shell's 128 + 15."""
+    """The process received SIGTERM; the exit code is the shell's 128 + 15."""
 
     def __init__(self) -> None:
         super().__init__(128 + signal.SIGTERM)
 
 
 class _Undisturbed:
-    """Context manager, to any depth. In other threads it does nothing: signals are raised in the main thread only."""
+    """Reentrant context manager that postpones signals. It has no effect in other threads, where no signals are
+    raised.
+    """
 
     def __init__(self) -> None:
         self._main = threading.main_thread().ident
@@ -49,7 +51,7 @@ UNDISTURBED = _Undisturbed()
 
 
 class SteadyLock:
-    """A reentrant lock; the main thread is undisturbed while it holds the lock or waits for it."""
+    """A reentrant lock; signals are postponed while the main thread holds the lock or waits for it."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -68,7 +70,7 @@ class SteadyLock:
 def catch_signals() -> None:
     """Raise SIGTERM as `Terminated` and Ctrl-C as KeyboardInterrupt. Does nothing outside the main thread.
 
-    Ctrl-C stays as it is where the caller ignores it or handles it.
+    Ctrl-C is left unchanged if the caller ignores or handles it.
     """
     if threading.current_thread() is not threading.main_thread():
         return

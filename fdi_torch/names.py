@@ -1,4 +1,4 @@
-"""Names asked for and names there are: what is said where the two do not meet."""
+"""Matching of requested names with known ones, and messages for those that do not match."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ MOST_SHOWN = 80
 
 
 def shortened(text: str) -> str:
-    """A text for a message: cut off where it is long."""
+    """A text for a message, cut to `MOST_SHOWN` characters."""
     return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """'; the nearest is X', or nothing where no known name is near."""
+    """'; the nearest is X', or an empty text if no known name is similar."""
     near = difflib.get_close_matches(name[:MOST_SHOWN], list(known), n=1, cutoff=0.5)
     return f"; the nearest is '{near[0]}'" if near else ""
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> str:
-    """The sentence for a name that is not among the known ones."""
+    """The message for an unknown name."""
     known = list(known)
     return f"expected {kind} ({', '.join(known) or 'there are none'}), got '{shortened(name)}'{nearest(name, known)}"
 
 
 def matching(kind: str, patterns: Iterable[str], known: Collection[str]) -> list[str]:
-    """The known names that the patterns ask for (* is any name), each once. Raises ValueError for a pattern that asks
-    for none.
+    """The known names that match the patterns (* is any name), each once. Raises ValueError for a pattern without a
+    match.
     """
-    found: dict[str, None] = {}
+    matches: dict[str, None] = {}
     for pattern in patterns:
-        fitting = [name for name in known if fnmatchcase(name, pattern)]
-        if not fitting:
+        matched = [name for name in known if fnmatchcase(name, pattern)]
+        if not matched:
             raise ValueError(unknown(kind, pattern, known))
-        found |= dict.fromkeys(fitting)
-    return list(found)
+        matches |= dict.fromkeys(matched)
+    return list(matches)

@@ -1,7 +1,7 @@
-"""What a physical number is: its name, unit, nominal value, range, tolerance and meaning.
+"""Parameters: physical numbers with name, unit, nominal value, range, prior and meaning.
 
-A `ParameterSpace` is an ordered set of `Parameter`s, the bridge between names and the last
-dimension of a tensor `(*batch, P)`. All values are SI.
+A `ParameterSpace` is an ordered set of `Parameter`s; it maps names to the last dimension of tensors (*batch, P). All
+values are SI.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One scalar that may be estimated.
+    """One scalar that can be estimated.
 
-    name: `component.field` or `component.effect.parameter`, unique in its space.
-    unit: SI unit of every number below. nominal: the value believed in. low, high: the box searched.
-    std: one standard deviation of the prior about nominal; infinite where nothing is known.
-    extremes: ends of the box beyond which physics does not go, such as a pipe that is closed; the others are guesses.
+    name: `component.field` or `component.effect.parameter`, unique in its space. unit: SI unit of all numbers below.
+    nominal: mean of the prior. low, high: bounds of the search. std: standard deviation of the prior; infinite for a
+    flat prior. extremes: bounds that are physical limits, such as a closed pipe; the other bounds are guesses.
     """
 
     name: str
@@ -52,7 +51,7 @@ class Parameter:
 
 
 class ParameterSpace:
-    """An ordered set of parameters; the names of the last dimension of `(*batch, P)`."""
+    """An ordered set of parameters, the names of the last dimension of tensors (*batch, P)."""
 
     def __init__(self, parameters: Iterable[Parameter] = ()) -> None:
         self.parameters = tuple(parameters)
@@ -107,14 +106,14 @@ class ParameterSpace:
         return torch.tensor(values, dtype=torch.float64) if like is None else like.new_tensor(values)
 
     def vector(self, values: Mapping[str, float]) -> Tensor:
-        """Nominal values with some replaced by name. Returns (P,)."""
+        """Nominal values (P,) with some replaced by name."""
         theta = self.nominal()
         for name, value in values.items():
             theta[self.index(name)] = value
         return theta
 
     def named(self, theta: Tensor) -> dict[str, Tensor]:
-        """Splits (*batch, P) into one tensor (*batch) per name."""
+        """Split (*batch, P) into one tensor (*batch) per name."""
         if theta.shape[-1] != len(self):
             raise ValueError(
                 f"expected a last dimension of {len(self)} ({', '.join(self.names)}), got {theta.shape[-1]}"
@@ -124,9 +123,9 @@ class ParameterSpace:
 
 @lru_cache(maxsize=4096)
 def parse_quantity(text: str, unit: str) -> float:
-    """'160 cm^2' -> 0.016 for unit 'm^2'. A bare number is taken only where the unit is '1'.
+    """'160 cm^2' -> 0.016 for unit 'm^2'. A bare number is accepted only for the unit '1'.
 
-    Raises ValueError where the text is no quantity or has another dimension.
+    Raises ValueError for text that is not a quantity, or has another dimension.
     """
     try:
         return in_unit(*number_and_unit(text), unit)
@@ -136,7 +135,7 @@ def parse_quantity(text: str, unit: str) -> float:
 
 @lru_cache(maxsize=256)
 def unit_factor(unit: str, si_unit: str) -> float:
-    """How many `si_unit` one `unit` is: unit_factor('cm', 'm') = 0.01."""
+    """The value of one `unit` in `si_unit`: unit_factor('cm', 'm') = 0.01."""
     try:
         return factor(unit, si_unit)
     except UnitError as error:
@@ -144,7 +143,7 @@ def unit_factor(unit: str, si_unit: str) -> float:
 
 
 def si_unit_of(unit: str) -> str:
-    """The SI unit in which this project keeps a quantity given in `unit`: 'cm3_s' -> 'm^3/s'."""
+    """The SI unit of a quantity given in `unit`: 'cm3_s' -> 'm^3/s'."""
     for candidate in SI_UNITS if is_unit(unit) else ():
         try:
             unit_factor(unit, candidate)
@@ -158,17 +157,18 @@ def si_unit_of(unit: str) -> str:
 
 
 def display_unit(si_unit: str) -> tuple[str, float]:
-    """The unit in which people read such a quantity, and how many of it one SI unit is: 'm' -> ('cm', 100.0)."""
+    """The unit for display, and the value of one SI unit in it: 'm' -> ('cm', 100.0)."""
     unit = _SHOWN.get(si_unit, si_unit)
     return ("" if unit == "1" else unit), 1.0 if unit == si_unit else 1.0 / unit_factor(unit, si_unit)
 
 
 @lru_cache(maxsize=1024)
 def header_unit(header: str) -> tuple[str, str] | None:
-    """Splits a CSV header of the form name_unit, name [unit] or name (unit): 'Q1_cm3_s' -> ('Q1', 'cm3_s').
+    """Split a CSV header of the form name_unit, name [unit] or name (unit): 'Q1_cm3_s' -> ('Q1', 'cm3_s'); None without
+    a unit.
 
-    None where no unit stands in it. The shortest name whose rest is a unit wins: `qL_cmd_lps` is (`qL_cmd`, `lps`),
-    `Q1_cm3_s` is (`Q1`, `cm3_s`). `tank_A` is a name: amperes are written mA, or in brackets.
+    The shortest name followed by a unit wins: `qL_cmd_lps` is (`qL_cmd`, `lps`), `Q1_cm3_s` is (`Q1`, `cm3_s`).
+    `tank_A` is a name without unit: write amperes as mA, or in brackets.
     """
     cuts = [i for i in range(max(0, len(header) - MOST_CHARACTERS - 1), len(header)) if header[i] == "_"]
     splits = [(header[:i], header[i + 1 :]) for i in cuts if header[i + 1 :] != "A"]

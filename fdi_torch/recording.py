@@ -1,4 +1,4 @@
-"""Recording: time, inputs, outputs and where they came from; the one thing rooms hand each other. All is SI."""
+"""Recording: time, inputs, outputs and their origin, in SI."""
 
 from __future__ import annotations
 
@@ -15,20 +15,19 @@ from fdi_torch.tables import Shown, Table, needed
 
 Hold = Literal["zero_order", "linear"]
 LONGEST, LARGEST = 5e9, 1e12
-"""Times (s, since 1970 too) and channels (SI) of a recording lie within: beyond is a slip of the unit or no number."""
+"""Limits of |time| (s, including seconds since 1970) and of |channels| (SI); larger numbers have a wrong unit."""
 
 
 @dataclass(frozen=True, repr=False)
 class Recording(Shown):
-    """What was commanded and read on a rig, on its own clock.
+    """Commands and readings of a rig, on one clock.
 
-    time (T,) in s, strictly increasing. inputs (T, M) and outputs (T, N) in the SI units named beside them.
-    mask (T, N): True where a reading counts; a missing reading is NaN in outputs and False here.
-    An unknown input is NaN; `known_stretches` cuts the recording there. hold: how inputs run between samples.
-    began: its time 0 in seconds since 1970, where its clock tells.
-    notes: what the reader did to the file's rows, in sentences.
-    ran: inputs that were on, or may have been, before the first sample, as far as what it was cut from tells.
-    trusted: whether its units, channels and clocks are as they should be, whatever they look like.
+    time (T,), s: strictly increasing. inputs (T, M) and outputs (T, N): in the SI units `input_units`, `output_units`.
+    mask (T, N): True for valid readings; a missing reading is NaN in outputs and False here. An unknown input is NaN;
+    `known_segments` cuts the recording there. hold: course of the inputs between samples. began: time 0 as seconds
+    since 1970, if known. notes: corrections by the reader, as sentences. ran: inputs that were, or may have been, on
+    before the first sample, according to the recording from which this one was cut. trusted: whether checks for wrong
+    units, swapped channels and clock errors are skipped.
     """
 
     time: Tensor
@@ -89,7 +88,7 @@ class Recording(Shown):
         return f"{self.source}: {len(self)} samples, {lasts:g} s, one every {self.interval:g} s"
 
     def table(self) -> Table:
-        """A row a channel: what it is, its range and how many samples lack it, in SI."""
+        """One row per channel: role, unit, range and number of missing samples, SI."""
         readings = torch.where(self.mask, self.outputs, torch.nan)
         rows = [
             (name, role, unit, *_range(values), int((~torch.isfinite(values)).sum()))
@@ -102,9 +101,10 @@ class Recording(Shown):
         return Table.of_rows(("channel", "role", "unit", "lowest", "highest", "missing"), rows)
 
     def to_pandas(self) -> Any:
-        """A pandas.DataFrame (extra `pandas`): a column a channel in SI, indexed by time in s; masked readings are NaN.
+        """A pandas.DataFrame (extra `pandas`): one column per channel in SI, indexed by time in s; masked readings are
+        NaN.
 
-        Its `attrs["units"]` names the unit of each column.
+        Its `attrs["units"]` holds the unit of each column.
         """
         frame = needed("pandas").DataFrame(self._columns(), index=self.time.cpu().numpy())
         frame.index.name = "t"
@@ -112,16 +112,18 @@ class Recording(Shown):
         return frame
 
     def to_xarray(self) -> Any:
-        """An xarray.Dataset (extra `xarray`): a variable a channel in SI over `time` in s; masked readings are NaN."""
+        """An xarray.Dataset (extra `xarray`): one variable per channel in SI over `time` in s; masked readings
+        are NaN.
+        """
         units = self._units()
         variables = {name: ("time", column, {"units": units[name]}) for name, column in self._columns().items()}
         coordinates = {"time": ("time", self.time.cpu().numpy(), {"units": "s"})}
         return needed("xarray").Dataset(variables, coordinates, {"source": self.source})
 
     def compared(self, predicted: Tensor) -> Any:
-        """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI.
+        """An xarray.Dataset (extra `xarray`) of measured, predicted and residual outputs over time and sensor, SI.
 
-        predicted (T, N): what a model says of the outputs.
+        predicted (T, N): outputs of a model.
         """
         measured = torch.where(self.mask, self.outputs, torch.nan)
         series = {"measured": measured, "predicted": predicted, "residual": measured - predicted}
@@ -144,44 +146,44 @@ class Recording(Shown):
 
     @property
     def interval(self) -> float:
-        """The usual sampling interval, s: of the sensor that is read most often, by the median between its readings.
+        """The usual sampling interval, s: the least median interval between the readings of any sensor.
 
-        Rows that hold another sensor's reading, or only an input, say nothing of it.
+        Rows with readings of other sensors only, or with inputs only, do not count.
         """
         times = [self.time[column] for column in self.mask.T if int(column.sum()) > 1] or [self.time]
         return min(float(torch.median(torch.diff(each))) for each in times) if len(self) > 1 else 0.0
 
     def to(self, device: torch.device) -> Recording:
-        """The same with its tensors on a device."""
+        """The recording with its tensors on a device."""
         tensors = {name: getattr(self, name).to(device) for name in ("time", "inputs", "outputs", "mask")}
         return replace(self, **tensors)
 
     def selected(self, inputs: Sequence[str], outputs: Sequence[str]) -> Recording:
-        """The same with these channels, in this order. Raises ValueError for one that it lacks."""
-        for kind, wanted, there in (("an input", inputs, self.input_names), ("an output", outputs, self.output_names)):
-            for name in wanted:
-                if name not in there:
-                    raise ValueError(f"{self.source}: {unknown(kind, name, there)}")
-        kept = [self.input_names.index(name) for name in inputs]
-        read = [self.output_names.index(name) for name in outputs]
+        """The recording with these channels only, in this order. Raises ValueError for a missing one."""
+        for kind, names, present in (("an input", inputs, self.input_names), ("an output", outputs, self.output_names)):
+            for name in names:
+                if name not in present:
+                    raise ValueError(f"{self.source}: {unknown(kind, name, present)}")
+        input_columns = [self.input_names.index(name) for name in inputs]
+        output_columns = [self.output_names.index(name) for name in outputs]
         return replace(
             self,
-            inputs=self.inputs[:, kept],
-            outputs=self.outputs[:, read],
-            mask=self.mask[:, read],
+            inputs=self.inputs[:, input_columns],
+            outputs=self.outputs[:, output_columns],
+            mask=self.mask[:, output_columns],
             input_names=tuple(inputs),
             output_names=tuple(outputs),
-            input_units=tuple(self.input_units[k] for k in kept),
-            output_units=tuple(self.output_units[k] for k in read),
+            input_units=tuple(self.input_units[k] for k in input_columns),
+            output_units=tuple(self.output_units[k] for k in output_columns),
         )
 
     def stretch(self, first: int, last: int) -> Recording:
-        """Samples first..last-1, with the same clock."""
+        """Samples first..last-1, on the same clock."""
         part = slice(first, last)
-        on = (~(self.inputs[:first] <= 0.0)).any(dim=0).tolist()
+        was_on = (~(self.inputs[:first] <= 0.0)).any(dim=0).tolist()
         return replace(
             self,
-            ran=self.ran | {name for name, ever in zip(self.input_names, on, strict=True) if ever},
+            ran=self.ran | {name for name, on in zip(self.input_names, was_on, strict=True) if on},
             time=self.time[part],
             inputs=self.inputs[part],
             outputs=self.outputs[part],
@@ -189,7 +191,7 @@ class Recording(Shown):
         )
 
     def window(self, start: float = -math.inf, stop: float = math.inf) -> Recording:
-        """Samples with start <= time <= stop (s), on the same clock. Raises ValueError where fewer than two are."""
+        """Samples with start <= time <= stop (s), on the same clock. Raises ValueError for fewer than two."""
         first = int((self.time < start).sum())
         last = int((self.time <= stop).sum())
         if last - first < 2:
@@ -200,7 +202,7 @@ class Recording(Shown):
         return self.stretch(first, last)
 
     def masked(self, intervals: Iterable[tuple[float, float]]) -> Recording:
-        """Readings within start <= time <= stop (s) no longer count; the inputs stay."""
+        """The recording with readings in start <= time <= stop (s) masked; inputs are unchanged."""
         keep = torch.ones_like(self.time, dtype=torch.bool)
         for start, stop in intervals:
             if not start < stop:
@@ -209,9 +211,9 @@ class Recording(Shown):
         return replace(self, mask=self.mask & keep[:, None])
 
     def every(self, step: int) -> Recording:
-        """Every step-th sample. A held input becomes its mean until the next kept sample, so that no volume is lost.
+        """Every step-th sample. A held input becomes its mean until the next kept sample, which preserves the volume.
 
-        An input of which any part is unknown becomes unknown (NaN).
+        A mean over any unknown input (NaN) is unknown.
         """
         if step < 1:
             raise ValueError(f"{self.source}: expected every to be a whole number from 1, got {step}")
@@ -225,7 +227,7 @@ class Recording(Shown):
         )
 
     def _held_means(self, step: int) -> Tensor:
-        """Mean input (T/step, M) over each block of step samples, weighted by how long each is held."""
+        """Mean inputs (T/step, M) over blocks of `step` samples, weighted by the time for which each is held."""
         steps = torch.diff(self.time)
         held = torch.cat((steps, steps[-1:]))[:, None]
         block = torch.arange(len(self.time), device=self.time.device) // step
@@ -233,13 +235,13 @@ class Recording(Shown):
         volume = torch.zeros_like(first).index_add_(0, block, (self.inputs - first[block]) * held)
         return first + volume / torch.zeros_like(first[:, :1]).index_add_(0, block, held)
 
-    def known_stretches(self) -> list[Recording]:
-        """The longest stretches whose inputs are all known."""
+    def known_segments(self) -> list[Recording]:
+        """The longest segments in which all inputs are known."""
         known = torch.isfinite(self.inputs).all(dim=1).to(torch.int8)
         edges = torch.diff(known, prepend=known.new_zeros(1), append=known.new_zeros(1)).nonzero().flatten().tolist()
         return [self.stretch(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _range(values: Tensor) -> tuple[float, float]:
-    known = values[torch.isfinite(values)]
-    return (float(known.min()), float(known.max())) if len(known) else (math.nan, math.nan)
+    finite = values[torch.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if len(finite) else (math.nan, math.nan)

@@ -1,4 +1,4 @@
-"""What a result shows of itself in a session: a headline and a table, as text, as HTML, and for pandas."""
+"""Display of results in a session: a headline and a table, as text, as HTML, and for pandas."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import Any
 
 MOST_ROWS = 60
-"""Rows that are shown; a data frame has all of them."""
+"""Number of displayed rows; a data frame has all of them."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Table:
 
     @classmethod
     def of_rows(cls, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
-        """The table with these rows, each as long as there are names."""
+        """The table with these rows, each with one value per name."""
         return cls({name: [row[k] for row in rows] for k, name in enumerate(names)})
 
     def __len__(self) -> int:
@@ -40,11 +40,11 @@ class Table:
     def html(self) -> str:
         head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
         body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in self.rows())
-        rest = "".join(f"<p>{line}</p>" for line in self._rest())
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{rest}" if len(self) else ""
+        remark = "".join(f"<p>{line}</p>" for line in self._rest())
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{remark}" if len(self) else ""
 
     def to_pandas(self) -> Any:
-        """A pandas.DataFrame. Raises ImportError, saying what to install, where there is no pandas."""
+        """A pandas.DataFrame. Raises ImportError, with the command to install pandas, if it is missing."""
         return needed("pandas").DataFrame({name: list(column) for name, column in self.columns.items()})
 
     def _rest(self) -> list[str]:
@@ -52,26 +52,26 @@ class Table:
 
 
 class Shown:
-    """Base of results that are shown in a session: they have a headline and a table."""
+    """Base of results with a display: a headline and a table."""
 
     @property
     def headline(self) -> str:
-        """The answer, in one sentence."""
+        """The result in one sentence."""
         raise NotImplementedError
 
     def table(self) -> Table:
-        """What the headline rests on. Numbers are SI, unless a column names another unit."""
+        """The numbers behind the headline, in SI unless a column names another unit."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}: {self.headline}\n{self.table().text()}".rstrip()
 
     def _repr_html_(self) -> str:
-        """Headline, table and picture, in a notebook."""
+        """Headline, table and picture for notebooks."""
         return f"<div><p><b>{escape(self.headline)}</b></p>{self.table().html()}{self.picture()}</div>"
 
     def picture(self) -> str:
-        """What is drawn below the table, as HTML; empty where there is nothing to draw."""
+        """The picture below the table as HTML; empty if there is none."""
         return ""
 
     def to_pandas(self) -> Any:
@@ -80,16 +80,16 @@ class Shown:
 
 
 def needed(library: str, extra: str = "") -> Any:
-    """A library of an extra. Raises ImportError, saying what to install, where it is not there."""
+    """Import a library of an extra. Raises ImportError, with the command to install it, if it is missing."""
     try:
         return import_module(library)
     except ModuleNotFoundError as error:
         if error.name != library.partition(".")[0]:
             raise
-        told = (
+        sentence = (
             f"expected the library {library.partition('.')[0]}, got none; pip install 'fdi_torch[{extra or library}]'"
         )
-        raise ImportError(told) from error
+        raise ImportError(sentence) from error
 
 
 def _cell(value: Any) -> str:

@@ -1,11 +1,11 @@
-"""Unit texts: 'cm^2', 'l/min/mA', 'cm3_s', 'm³·h⁻¹'. The only parser of units, and the only door of the unit library.
+"""Units in text: 'cm^2', 'l/min/mA', 'cm3_s', 'm³·h⁻¹'. The only parser of units, and the only file that imports pint.
 
     unit     = factor { ('*' | '·' | '/' | ' ') factor }
     factor   = '1' | name [power] | '(' unit ')' [power]
     power    = ('^' | '**') integer | superscript digits,     |integer| <= 9
     quantity = number unit
 
-A text from outside is never evaluated: whatever is not of this grammar, or longer than `MOST_CHARACTERS`, is no unit.
+Untrusted text is never evaluated: text outside this grammar, or longer than `MOST_CHARACTERS`, is not a unit.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ _NAME = r"[A-Za-zµμΩΩ°][A-Za-zµμ0-9_]*|[%‰]"
 _POWER = r"(?:\^|\*\*)\s*(?P<power>[+-]?\d)(?!\d)|(?P<super>⁻?[¹²³⁴⁵⁶⁷⁸⁹])"
 _TOKEN = re.compile(rf"\s*(?:(?P<name>{_NAME})|(?P<one>1)(?![\d.])|{_POWER}|(?P<sign>[*·/()]))", re.UNICODE)
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)(?![\d.])\s*(.*)", re.DOTALL | re.ASCII)
-_VOLUME_A_TIME = re.compile(r"^((?:[cdm]?m|ft|in)3|m?[lL]|gal)_(s|min|h)$")  # no / in the headers of some loggers
+_VOLUME_A_TIME = re.compile(r"^((?:[cdm]?m|ft|in)3|m?[lL]|gal)_(s|min|h)$")  # headers of loggers without '/'
 _CUBE = re.compile(r"(?<=[a-z])([23])(?![0-9])")
 
 
 class UnitError(ValueError):
-    """A text that is no unit or no quantity."""
+    """A text that is not a unit or not a quantity."""
 
 
 def number_and_unit(text: str) -> tuple[float, str]:
     """'160 cm^2' -> (160.0, 'cm^2'); '5/s' -> (5.0, '1/s'); '0.3' -> (0.3, '1'). Raises UnitError."""
-    found = _NUMBER.fullmatch(text) if len(text) <= MOST_CHARACTERS else None
-    if found is None:
+    match = _NUMBER.fullmatch(text) if len(text) <= MOST_CHARACTERS else None
+    if match is None:
         raise UnitError(f"no quantity: {text[:MOST_CHARACTERS]}")
-    number, rest = found[1], found[2].strip().removeprefix("*")
+    number, unit = match[1], match[2].strip().removeprefix("*")
     if not math.isfinite(float(number)):
         raise UnitError(f"beyond all numbers: {number}")
-    return float(number), f"1{rest}" if rest.startswith("/") else rest or "1"
+    return float(number), f"1{unit}" if unit.startswith("/") else unit or "1"
 
 
 def is_unit(text: str) -> bool:
@@ -61,12 +61,12 @@ def is_unit(text: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def factor(unit: str, target: str) -> float:
-    """How many `target` one `unit` is. Raises UnitError where one is no unit, or they are of different kinds."""
+    """The value of one `unit` in `target`. Raises UnitError for an unknown unit or different dimensions."""
     return in_unit(1.0, unit, target)
 
 
 def in_unit(number: float, unit: str, target: str) -> float:
-    """A number of `unit` as a number of `target`. Raises UnitError."""
+    """A number in `unit` converted to `target`. Raises UnitError."""
     try:
         converted = float(_registry.Quantity(number, _parsed(unit)).to(_parsed(target)).magnitude)
     except (pint.PintError, OverflowError, ZeroDivisionError) as error:
@@ -78,25 +78,25 @@ def in_unit(number: float, unit: str, target: str) -> float:
 
 @lru_cache(maxsize=4096)
 def _parsed(text: str) -> Any:
-    """The library's unit. Raises UnitError."""
+    """The unit as an object of pint. Raises UnitError."""
     if len(text) > MOST_CHARACTERS:
         raise UnitError(f"too long for a unit: {text[:MOST_CHARACTERS]}...")
     return _Parser(_CUBE.sub(r"^\1", _VOLUME_A_TIME.sub(r"\1/\2", text.strip()))).whole()
 
 
 class _Parser:
-    """One walk over the tokens of a unit text; its depth is bounded by the length of the text."""
+    """Recursive-descent parser of a unit text; the text's length bounds its depth."""
 
     def __init__(self, text: str) -> None:
         self._text = text
         self._tokens: list[tuple[str, str]] = []
         place = 0
         while place < len(text):
-            found = _TOKEN.match(text, place)
-            if found is None or found.end() == place:
+            token = _TOKEN.match(text, place)
+            if token is None or token.end() == place:
                 raise self._wrong()
-            self._tokens.append((str(found.lastgroup), found[str(found.lastgroup)]))
-            place = found.end()
+            self._tokens.append((str(token.lastgroup), token[str(token.lastgroup)]))
+            place = token.end()
 
     def whole(self) -> Any:
         unit = self._product()
@@ -134,7 +134,7 @@ class _Parser:
 
 
 def _known(name: str) -> Any:
-    """The unit of one name, with its prefix. Raises UnitError for what is none."""
+    """The unit with that name, including a prefix. Raises UnitError for an unknown name."""
     name = _SIGNS.get(name, name)
     try:
         return _registry.Unit(_registry.UnitsContainer({_registry.get_name(name): 1}))

@@ -6,7 +6,7 @@ import pytest
 
 from fdi_torch.config import load_run
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.study import load_study
+from fdi_torch.config.study_file import load_study
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.jobs.train import train
 from tests.test_gap import believed, recorded

@@ -1,4 +1,6 @@
-"""How accurate what is reported is: levels over the whole fault box, and the paper's noise-free faults."""
+"""Accuracy of the results: simulated levels over the whole range of faults, and noise-free estimates of the paper's
+faults.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ import pytest
 import torch
 from rigs import constant_inputs, paper_network, three_tank
 
-from fdi_torch.config.run import load_run
+from fdi_torch.config.run_file import load_run
 from fdi_torch.jobs.train import train
 from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out

@@ -1,4 +1,4 @@
-"""The layout of the package: imports point one way, one door per outside library, printing only in cli."""
+"""Architecture of the package: import directions, one file per outside library, and printing in cli only."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1] / "fdi_torch"
 
 # Lowest first. A room imports from rooms further down, and sideways only where that closes no circle.
 LAYERS = (
-    {"capacity", "disk", "interruption", "names", "outside", "parameters", "recording", "tables", "units"},
+    {"capacity", "disk", "interruption", "names", "untrusted_input", "parameters", "recording", "tables", "units"},
     {"plant"},
     {"effects", "simulate"},
     {"estimate", "logbook", "recordings"},

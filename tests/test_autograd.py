@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 import fdi_torch
 from fdi_torch import Plant, Recording
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork

@@ -1,4 +1,6 @@
-"""What is wrong between a sound rig and its recording is told or refused, and is never taken for a physical cause."""
+"""Swapped channels, wrong units, stuck sensors and clock errors are reported or refused, and never diagnosed as a
+fault.
+"""
 
 from __future__ import annotations
 

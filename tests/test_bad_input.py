@@ -1,4 +1,4 @@
-"""What a user may do wrong with the main job: one clear sentence that names file and field, and exit code 2."""
+"""User errors in the main command: exit code 2 and one sentence that names file and field."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fdi_torch import cli
-from fdi_torch.config.files import SHIPPED
+from fdi_torch.config.yaml_files import SHIPPED
 
 HEADER = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm"
 ROWS = [f"{t},{50 + 10 * (t // 20)},50,{40 + t % 11},{30 + t % 5},{35 + t % 3}" for t in range(60)]
@@ -56,7 +56,7 @@ WRONG_RUN = {
     "nested key": ("evaluations", "evaluatons", "run.yaml: estimate.search: ", "the nearest is 'evaluations'"),
     "fault": ("T1.leak", "T1.leek", "run.yaml: estimate.parameters.0: ", "the nearest is 'T1.leak'"),
     "plant": ("plant: ", "plant: three_tanks #", "run.yaml: plant: ", "the nearest is 'three_tank'"),
-    "no YAML": ("[T1.leak]", "[T1.leak", "run.yaml: line 3: ", "expected YAML"),
+    "no YAML": ("[T1.leak]", "[T1.leak", "run.yaml: line 3: ", "not valid YAML"),
     "recording": ("rig.csv", "rigs.csv", "rigs.csv: ", "expected a file, got none there"),
     "log folder": ("folder: logs", "folder: rig.csv", "rig.csv/run.mcap: ", "is a file, not a folder"),
 }

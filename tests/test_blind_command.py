@@ -10,7 +10,7 @@ import pytest
 
 from fdi_torch.cli import DONE, MISUSE, main
 from fdi_torch.cli.challenge import REGRESSIONS
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 
 
 @pytest.mark.slow

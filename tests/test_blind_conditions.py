@@ -8,14 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdi_torch.blind import cases
-from fdi_torch.blind.cases import make, plans
+from fdi_torch.blind import case_drafts, cases
+from fdi_torch.blind.case_drafts import plans
+from fdi_torch.blind.case_kinds import ON_NETWORKS
+from fdi_torch.blind.cases import make
 from fdi_torch.blind.conditions import commands_of_pumps
 from fdi_torch.blind.control import BAND, LevelControl, draw_control
-from fdi_torch.blind.disturbances import HOLDS, KINDS, Disturbance, draw_disturbance
-from fdi_torch.blind.kinds import ON_NETWORKS
 from fdi_torch.blind.networks import HIGHEST, LOWEST, Networks, equilibrium, with_unmeasured
 from fdi_torch.blind.plants import three_tank
+from fdi_torch.blind.random_flows import HOLDS, KINDS, Disturbance, draw_disturbance
 from fdi_torch.blind.simulator import Drive, HiddenRigs, conductance, simulate
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 
@@ -61,7 +62,9 @@ def test_what_disturbances_bring_is_in_the_tank() -> None:
 
 def test_disturbances_move_levels_as_far_as_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cases, "STEP", 0.5)
-    monkeypatch.setattr(cases, "draw_disturbance", lambda rng, tanks: Disturbance("held", 15.0, np.ones(tanks), 1.7))
+    monkeypatch.setattr(
+        case_drafts, "draw_disturbance", lambda rng, tanks: Disturbance("held", 15.0, np.ones(tanks), 1.7)
+    )
     (case,) = make(plans(1, 1, ("dnull",)), three_tank(), 1)
     assert case.truth["causes"] == [] and case.truth["gap_rms_m"]["recording"] == 0
     assert case.truth["disturbance"] == {

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 
-from fdi_torch.blind import cases
-from fdi_torch.blind.cases import make, plans
+from fdi_torch.blind import case_drafts, cases
+from fdi_torch.blind.case_drafts import plans
+from fdi_torch.blind.case_kinds import KINDS, STANDARD, choose
+from fdi_torch.blind.cases import make
 from fdi_torch.blind.conditions import WIDEST, as_built, asked_of_pumps, exercised
 from fdi_torch.blind.deviation import Array, Deviation
-from fdi_torch.blind.files import as_csv
 from fdi_torch.blind.inputs import SIGNALS, commanded, with_standstills
-from fdi_torch.blind.kinds import KINDS, STANDARD, choose
 from fdi_torch.blind.laws_pipe import HEAD_LAWS, PIPE_LAWS
 from fdi_torch.blind.laws_pump import PUMP_LAWS
 from fdi_torch.blind.laws_sensor import READOUT_LAWS, SENSOR_LAWS
@@ -27,6 +27,7 @@ from fdi_torch.blind.nominal_run import NominalRun
 from fdi_torch.blind.places import EFFECTS, canonical, effect_places
 from fdi_torch.blind.plants import Rig, cascaded_tanks, quadruple_tank, three_tank
 from fdi_torch.blind.scaling import Scales, on_bench
+from fdi_torch.blind.sealed_files import as_csv
 from fdi_torch.blind.sensor_noise import NoiseCorrelation, autoregressive, rippling, smoothed
 from fdi_torch.blind.simulator import Drive, HiddenRigs, simulate
 from fdi_torch.blind.unseen_laws import UNKNOWN, unknown_to
@@ -401,7 +402,7 @@ def test_a_cause_that_another_hides_is_not_asked_for(monkeypatch: pytest.MonkeyP
     rig, plan = three_tank(), plans(1, 1, ("pair",))
     shows = Deviation("leak", "T1", "floor_hole", {"conductance": 3e-5})
     never = Deviation("overflow", "T3", "brim", {"crest": 0.99, "depth": 0.01, "flow": 7e-5})
-    monkeypatch.setattr(cases, "_drawn", lambda draft, *_: replace(draft, deviations=(shows, never)))
+    monkeypatch.setattr(case_drafts, "_with_sizes", lambda draft, *_: replace(draft, deviations=(shows, never)))
     monkeypatch.setattr(cases, "STEP", 0.5)
     truth = make(plan, rig, 1)[0].truth
     assert truth["causes"] == [{"effect": "leak", "location": "T1"}]

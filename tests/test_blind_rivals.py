@@ -15,7 +15,7 @@ from fdi_torch.blind.equation_errors import BLOCK, equation_errors
 from fdi_torch.blind.inputs import commanded
 from fdi_torch.blind.networks import with_unmeasured
 from fdi_torch.blind.plants import three_tank
-from fdi_torch.blind.regression_rivals import gaussian_process, noise_of, sparse_regression, split_f_test
+from fdi_torch.blind.regression_baselines import gaussian_process, noise_of, sparse_regression, split_f_test
 from fdi_torch.blind.simulator import Drive, HiddenRigs, simulate
 from fdi_torch.blind.statistics import f_test
 from fdi_torch.recording import Recording

@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 from fdi_torch.blind import blind_benchmark, joined, tables
-from fdi_torch.blind.cases import Case, plans
-from fdi_torch.blind.files import manifest, open_key, read_plant, read_recording, write_cases
+from fdi_torch.blind.baselines import always_null
+from fdi_torch.blind.case_drafts import plans
+from fdi_torch.blind.cases import Case
 from fdi_torch.blind.plants import three_tank
-from fdi_torch.blind.rivals import always_null
-from fdi_torch.blind.rows import reliability, write_rows
 from fdi_torch.blind.score import by_effect, judge, summary, utility
+from fdi_torch.blind.scored_rows import reliability, write_rows
+from fdi_torch.blind.sealed_files import manifest, open_key, read_plant, read_recording, write_cases
 from fdi_torch.blind.sizes import size_errors, sizes
 from fdi_torch.blind.statistics import clopper_pearson, mean_interval, median_interval, root_mean_square_interval
 from fdi_torch.jobs.blind_results import LOG, write_results

@@ -1,4 +1,4 @@
-"""Which compiler is taken."""
+"""Choice of the C++ compiler."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Work that no machine can do is refused before anything is allocated, and says what it would take."""
+"""Work beyond the machine's memory is refused before anything is allocated, with the amount that it would need."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import torch
 
 from fdi_torch import capacity
 from fdi_torch.capacity import expect_room, memory
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.rehearsal import load_rehearsal
-from fdi_torch.config.run import load_run
-from fdi_torch.config.study import load_study
+from fdi_torch.config.rehearsal_file import load_rehearsal
+from fdi_torch.config.run_file import load_run
+from fdi_torch.config.study_file import load_study
 from fdi_torch.estimate.evolution import EvolutionSettings, evolve
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.windows import cut_up

@@ -1,4 +1,4 @@
-"""Whole-trajectory simulation against a sequential recurrence, the reference engine and finite differences."""
+"""Collocation against a sequential recurrence, the reference engine and finite differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plant files: the shipped ones say what they should, and each impossible one is refused in one sentence."""
+"""Plant files: the shipped plants have the documented values, and every invalid file is refused in one sentence."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import yaml
 
-from fdi_torch.config.files import SHIPPED
-from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.yaml_files import SHIPPED
 
 PLANTS = sorted(path.stem for path in (SHIPPED / "plants").glob("*.yaml"))
 
@@ -173,7 +173,7 @@ def test_a_plant_file_is_found_by_shipped_name_by_folder_and_by_path(tmp_path: P
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("tanks: [", "line 1: expected YAML"),
+        ("tanks: [", "line 1: not valid YAML"),
         ("tanks: {}\nsensors: {h1: {tank: T1}, h1: {tank: T2}}", "line 2: expected each key once, got h1 twice"),
         ("- 1", "expected keys and values .* got list"),
         ("", "got nothing"),

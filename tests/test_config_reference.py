@@ -1,18 +1,18 @@
-"""The reference of keys: complete, and every key in it is one that a file may have."""
+"""The key reference is complete, and each of its keys is accepted in a file."""
 
 from __future__ import annotations
 
 import pytest
 
 from fdi_torch.config import ConfigError, RunConfig, load_run
-from fdi_torch.config.plant import PlantConfig
-from fdi_torch.config.reference import config_reference, keys
+from fdi_torch.config.key_reference import config_reference, keys
+from fdi_torch.config.plant_file import PlantConfig
 
 RUN = {path: (default, meaning) for path, default, meaning in keys(RunConfig)}
 
 
 def test_keys_of_all_depths_are_there_with_default_and_meaning() -> None:
-    assert RUN["seed"] == ("0", "of everything drawn at random")
+    assert RUN["seed"] == ("0", "seed of all random numbers")
     assert RUN["simulate.duration"] == ("1000.0", "length of the recording, s")
     assert RUN["recordings.N.columns.NAME.unit"][0] == "none"
     assert RUN["recordings.N.file"][0] == "required"

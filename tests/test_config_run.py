@@ -1,4 +1,4 @@
-"""Run files: what is shipped is understood, defaults are the ones stated, and what is wrong is said in sentences."""
+"""Run files: shipped files are valid, defaults are as documented, and errors are sentences."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import yaml
 
 from fdi_torch.config import ConfigError, build_run, load_recordings, load_run, read_recording
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
-from fdi_torch.config.files import SHIPPED, read_yaml
-from fdi_torch.config.monitor import load_monitor
-from fdi_torch.config.run import Run
+from fdi_torch.config.monitor_file import load_monitor
+from fdi_torch.config.run_file import Run
 from fdi_torch.config.simulation import NoiseConfig, noise_std, planned_recording
+from fdi_torch.config.yaml_files import SHIPPED, read_yaml
 from fdi_torch.effects import build_network
 from fdi_torch.jobs.run_setup import requested_space
 from fdi_torch.parameters import ParameterSpace
@@ -117,7 +117,7 @@ def test_overrides_reach_into_lists() -> None:
         ("estimate.parameters.9.low=1", "--set .* estimate.parameters: expected an index below 5, got '9'"),
         ("seed.deep=1", "seed: expected a valid integer, got {'deep': 1}"),
         ("seed", "--set seed: expected KEY=VALUE"),
-        ("seed={", "--set seed={: line 1: expected YAML, got something else"),
+        ("seed={", "--set seed={: line 1: not valid YAML"),
         ("simulate.start_levels.T1=5", "start_levels: expected free, equilibrium or a level such as '50 cm', got 5"),
     ],
 )
@@ -287,7 +287,7 @@ def test_columns_by_mapping_constants_and_missing_sensors(tmp_path: Path) -> Non
         ({"start_levels": {"T9": "free"}}, "rig.csv: start_levels.T9: expected a tank .* got 'T9'"),
         (
             {"start": "5 s", "stop": "6 s"},
-            "a stretch with all inputs known, got none: unknown are Q2 at 0.5 of",
+            "a segment with all inputs known, got none: unknown are Q2 at 0.5 of",
         ),
         ({"file": "rigg.csv"}, "rigg.csv: expected a file, got none there .* the nearest is 'rig.csv'"),
     ],

@@ -1,4 +1,4 @@
-"""CSV files as loggers, spreadsheets and historians write them: each is read, or refused in a sentence with a fix."""
+"""CSV files of loggers, spreadsheets and historians: each is read, or refused in a sentence with a remedy."""
 
 from __future__ import annotations
 

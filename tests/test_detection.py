@@ -1,4 +1,4 @@
-"""Thresholds against published run lengths, and false alarms counted on noise of several colours."""
+"""Thresholds against published run lengths, and false alarms on noise with several autocorrelations."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def test_cusum_run_length_is_the_published_one(threshold: float, run_length: flo
     assert cusum_run_length(threshold, 0.5) == pytest.approx(run_length, rel=2e-3)
 
 
-def test_a_sensor_that_is_read_rarely_is_heard_as_soon_in_its_own_readings() -> None:
-    """A missing reading is none: it neither counts for rest nor silences the channels that are read."""
+def test_a_rarely_read_sensor_needs_as_many_of_its_own_readings() -> None:
+    """A missing reading changes nothing: neither its own sums nor those of other channels."""
     rare = torch.full((400, 2), torch.nan, dtype=torch.float64)
     rare[::10, 1] = noise(40) + 1.5
     alone = cusum(rare[::10, 1:], 0.5)
@@ -59,14 +59,14 @@ def test_fixed_threshold_shares_the_false_alarms_among_channels() -> None:
 
 
 @pytest.mark.parametrize("chart", CHARTS)
-def test_false_alarms_come_as_often_as_asked_for(chart: str) -> None:
+def test_false_alarms_have_the_designed_rate(chart: str) -> None:
     detector = make_detector(chart, 2000.0, 1.0, 3, torch.Generator().manual_seed(1))  # type: ignore[arg-type]
     count = sum(int(detector.alarms(noise(100, 4000, 3, seed=s)).sum()) for s in range(3))
     expected = 3 * 100 * 4000 / 2000.0
     assert abs(count - expected) < 3.0 * math.sqrt(expected) + 0.04 * expected
 
 
-def test_how_far_one_recording_leaves_the_rate_of_false_alarms_off() -> None:
+def test_error_of_the_false_alarm_rate_learnt_from_one_recording() -> None:
     """Against thresholds learnt from many recordings: the rate of max |e| > h is known for every spread."""
     asked, h = 20000.0, fixed_threshold(20000.0, 3)
     spread = torch.stack([noise(1000, 3, seed=s).square().mean(0).sqrt() for s in range(400)])
@@ -76,7 +76,7 @@ def test_how_far_one_recording_leaves_the_rate_of_false_alarms_off() -> None:
 
 
 @pytest.mark.parametrize("chart", CHARTS)
-def test_the_first_alarm_from_a_moment_on_is_one_of_all_alarms(chart: str) -> None:
+def test_the_first_alarm_since_a_time_is_one_of_all_alarms(chart: str) -> None:
     detector = make_detector(chart, 200.0, 1.0, 3, torch.Generator().manual_seed(1))  # type: ignore[arg-type]
     white = noise(40, 1000, 3, seed=5)
     white[:, 600:] += 0.5
@@ -122,7 +122,7 @@ def test_glr_is_the_largest_normalised_sum(samples: int, k: int) -> None:
     assert float(glr(e, lengths)[k]) == pytest.approx(expected, rel=1e-12)
 
 
-def test_channels_share_what_the_glr_suffers_from_spreads_that_are_off() -> None:
+def test_glr_false_alarms_with_wrong_variances_average_over_channels() -> None:
     """Windows that exceed the threshold by chance point anywhere: rates drawn channel by channel, by Monte Carlo."""
     learnt = fit_whitening(noise(1000, 3), 0)
     direction = noise(200_000, 3, seed=2)
@@ -134,7 +134,7 @@ def test_channels_share_what_the_glr_suffers_from_spreads_that_are_off() -> None
     assert claimed - 1.0 == pytest.approx(float(rates.mean()) - 1.0, rel=0.1)
 
 
-def test_an_alarm_starts_the_detector_afresh() -> None:
+def test_an_alarm_restarts_the_detector() -> None:
     e = torch.zeros(20, 1, dtype=torch.float64)
     e[5], e[6], e[12] = 10.0, 10.0, 10.0
     raised = Detector("cusum", lambda x: cusum(x, 0.5), 5.0, lambda x, _: cusum_update(x, 0.5, None)).alarms(e)
@@ -201,7 +201,7 @@ def test_cusum_threshold_is_for_all_channels_together() -> None:
     assert cusum_run_length(cusum_threshold(1000.0, 3, 0.25), 0.25) == pytest.approx(6000.0, rel=1e-3)
 
 
-def test_slow_sums_of_whitened_residuals_are_known_as_well_as_is_said() -> None:
+def test_the_stated_error_of_low_frequency_sums_is_right() -> None:
     """60 fits of an AR(1) of 0.7: the true spread of slow sums about each, beside its stated standard error."""
     generator = torch.Generator().manual_seed(0)
     drawn = torch.randn(60, 1700, 2, generator=generator, dtype=torch.float64)
@@ -218,7 +218,7 @@ def test_slow_sums_of_whitened_residuals_are_known_as_well_as_is_said() -> None:
     assert float(torch.stack(off).std()) == pytest.approx(float(torch.stack(said).mean()), rel=0.2)
 
 
-def test_thresholds_allow_for_what_their_recording_does_not_tell() -> None:
+def test_thresholds_allow_for_noise_estimated_from_a_short_recording() -> None:
     generator = torch.Generator().manual_seed(1)
     long, short = (fit_whitening(torch.randn(n, 2, generator=generator, dtype=torch.float64)) for n in (20000, 400))
     for chart in CHARTS:
@@ -228,7 +228,7 @@ def test_thresholds_allow_for_what_their_recording_does_not_tell() -> None:
     assert doubted.threshold > known.threshold
 
 
-def test_the_rarest_alarm_that_can_be_asked_for_has_a_threshold() -> None:
+def test_the_longest_allowed_run_length_has_a_threshold() -> None:
     """ln of the run length grows as 2 drift h: some 6 more than at a thousandth of it."""
     low, high = (cusum_threshold(n, 3, 0.5) for n in (1e9, 1e12))
     assert high - low == pytest.approx(math.log(1e3), abs=0.5)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import placements_for
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.monitor.diagnosability import diagnosability

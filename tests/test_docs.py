@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
+import inspect
+import os
 import re
 import shlex
+import subprocess
+import sys
 import unicodedata
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
@@ -105,21 +109,27 @@ def test_every_command_has_a_path_of_functions_that_exist() -> None:
     for command, path in rows:
         functions = re.findall(r"`([\w.]+)`", path)
         assert functions[0] == f"cli.{command}.run"
+        earlier = ""
         for function in functions:
-            assert exists(function), f"{command}: no function fdi_torch.{function}"
+            module, name = home(function)
+            assert name, f"{command}: no function fdi_torch.{function}"
+            assert not earlier or name.rpartition(".")[2] in earlier, f"{command}: nothing before it calls {function}"
+            earlier += inspect.getsource(module)
 
 
-def exists(name: str) -> bool:
-    parts = name.split(".")
+def home(function: str) -> tuple[ModuleType, str]:
+    """The module of a function below fdi_torch and its name there; the name is empty if it does not exist."""
+    parts = function.split(".")
     for k in range(len(parts) - 1, 0, -1):
         try:
-            found: object = importlib.import_module(".".join(["fdi_torch", *parts[:k]]))
+            module = importlib.import_module(".".join(["fdi_torch", *parts[:k]]))
         except ImportError:
             continue
+        found: object = module
         for part in parts[k:]:
             found = getattr(found, part, None)
-        return callable(found)
-    return False
+        return module, ".".join(parts[k:]) if callable(found) else ""
+    return fdi_torch, ""
 
 
 def test_every_page_is_in_the_navigation() -> None:
@@ -145,3 +155,15 @@ def test_every_effect_and_public_name_is_in_the_reference() -> None:
 def test_the_tutorial_works_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     run_page(PAGES["docs/tutorial.md"], check)
+
+
+@pytest.mark.slow
+def test_the_site_builds_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
+    pytest.importorskip("material", reason="needs the extra docs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    settings = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=settings, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for page in tmp_path.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        assert not re.findall(r'(?:src|<link[^>]* href)="https?://[^"]*"', text), page

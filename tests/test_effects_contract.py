@@ -1,4 +1,4 @@
-"""What every effect of the library promises, at every place of two plants. An effect's author writes none of it."""
+"""Contract tests of every effect at every place of two plants; authors of effects need not write them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signatures: projection and cosines against closed forms; the library's own word on what is mistaken for what."""
+"""Signatures of effects against closed forms, and the declared confusions against the measured ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Single effects against closed forms: what each equation says, in numbers worked out by other means."""
+"""Single effects against closed forms and independent calculations."""
 
 from __future__ import annotations
 
@@ -275,7 +275,7 @@ def test_an_empty_tank_has_nothing_to_draw_from() -> None:
     assert filled((draw,), height=3.0).tolist() == pytest.approx([0.0, 30e-3 / 160e-4, 0.0])
 
 
-def test_reach_of_a_recording() -> None:
+def test_operating_range_of_a_recording() -> None:
     plant = replace(
         three_tank(), tanks=(*three_tank().tanks, Tank("T4", 0.01, 0.7)), sensors=(Sensor("d1", "T1", "V", -2.0, 9.0),)
     )

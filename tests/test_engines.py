@@ -1,4 +1,4 @@
-"""The engines agree: compiled and traced with torchdiffeq, Jacobians with differences, sums with what they sum."""
+"""Agreement of the engines with torchdiffeq, of Jacobians with differences, and of sums with their terms."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from rigs import assert_lanes_stand_alone
 from torch import Tensor
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import EFFECTS, all_placements, placements_for
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.gap.answer import adopted
+from fdi_torch.gap.channel_noise import Noise, estimate_noise, low_frequency_excess, quantization_step
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.identifiability import planned_identifiability
 from fdi_torch.gap.library import STANDARD, canonical, library_of
-from fdi_torch.gap.noise_model import Noise, estimate_noise, low_frequency_excess, quantization_step
 from fdi_torch.gap.screening import Pairs
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fdi_torch.config.plant_writer import dump_plant
-from fdi_torch.config.run import load_run
+from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.answer import adopted
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.jobs.train import train

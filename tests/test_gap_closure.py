@@ -10,10 +10,10 @@ import torch
 
 from fdi_torch.effects import placements_for
 from fdi_torch.gap.answer import Answer
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.holdout import Model, run_reference_models, transferable_values
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlacedEffect
 from fdi_torch.recording import Recording

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from fdi_torch.config.plant import load_plant
-from fdi_torch.gap.noise_model import estimate_noise
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.gap.channel_noise import estimate_noise
 from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.plant.operating_range import operating_range_of, with_simulated_levels
 from fdi_torch.recording import Recording

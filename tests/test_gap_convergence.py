@@ -10,7 +10,7 @@ import torch
 
 from fdi_torch.cli import DONE, main
 from fdi_torch.config.loaded_recordings import named_recordings
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import effect
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors

@@ -7,8 +7,8 @@ import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.discrepancy_curves import curves_at
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of

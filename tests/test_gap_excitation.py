@@ -9,10 +9,10 @@ import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.experiment_design import HIGH, discriminating_input, planned_recording
 from fdi_torch.gap.identifiability import DRAWS, identifiability, simulated_confusions
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult
 from fdi_torch.plant.effect import Placement

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import place
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.preprocess.sensor_limits import limits_from_readings, limits_of

@@ -12,7 +12,7 @@ import torch
 
 from fdi_torch import cli
 from fdi_torch.config import load_plant
-from fdi_torch.config.logged import logged_plant
+from fdi_torch.config.logged_config import logged_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
 from fdi_torch.gap.diagnose import Settings
@@ -163,7 +163,7 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["gap", "--help"])
     shown = capsys.readouterr().out
-    assert "examples:" in shown and "--holdout other.csv" in shown and "The answer is one of four" in shown
+    assert "examples:" in shown and "--holdout other.csv" in shown and "The verdict is one of four" in shown
 
 
 def test_an_adopted_leak_flows_as_before_where_its_reference_was_recalibrated() -> None:

@@ -10,8 +10,8 @@ import torch
 
 from fdi_torch.gap import trajectory_problem
 from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
-from fdi_torch.gap.noise_model import Noise
 from tests.rigs import constant_inputs, three_tank
 
 

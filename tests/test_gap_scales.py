@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from fdi_torch.config.loaded_recordings import named_recordings
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.localization.regressors import lags_and_decays, rate_limits
 from fdi_torch.plant.description import PlantDescription

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from fdi_torch.cli.gap_text import next_steps
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.diagnose import Settings, diagnose

@@ -1,10 +1,10 @@
-"""Files from outside, drawn by grammars: each is read, or refused in sentences; none ends in a traceback or hangs.
+"""Fuzzing of file readers: each generated file is read, or refused in sentences, without a traceback or a hang.
 
-The quick profile draws a few hundred files. The long one runs for two minutes, or as long as `--fuzz-minutes` says:
+The quick profile draws a few hundred files. The long one runs for two minutes, or as long as `--fuzz-minutes` states:
 
     python -m pytest tests/test_hostile_files.py -m slow -s --fuzz-minutes 60
 
-What it finds goes, made small, into tests/corpus.
+Reduced counterexamples are kept in tests/corpus.
 """
 
 from __future__ import annotations
@@ -25,23 +25,24 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
-from fdi_torch.config.files import parse_yaml
-from fdi_torch.config.loaded_recordings import known_parts, read_recording
-from fdi_torch.config.logged import logged_plant
-from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
+from fdi_torch.config.logged_config import logged_plant
+from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import dump_plant
-from fdi_torch.config.recordings import RecordingConfig
-from fdi_torch.config.run import build_run
+from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.config.run_file import build_run
 from fdi_torch.config.simulation import planned_recording
-from fdi_torch.config.study import build_study
+from fdi_torch.config.study_file import build_study
+from fdi_torch.config.yaml_files import parse_yaml
 from fdi_torch.effects import build_network
 from fdi_torch.jobs.logged_recordings import logged_recording
 from fdi_torch.jobs.replay import logged_run
 from fdi_torch.jobs.run_setup import requested_space
 from fdi_torch.logbook import inspect_log, read_run
 from fdi_torch.logbook.channel import Channel
-from fdi_torch.logbook.schemas import json_schema, topic_definition
+from fdi_torch.logbook.schemas import json_schema
 from fdi_torch.logbook.sink import EPOCH_NS, Sink
+from fdi_torch.logbook.topic_definitions import topic_definition
 from fdi_torch.recordings.check import check_recording
 from fdi_torch.report.material import gather
 
@@ -67,7 +68,7 @@ def read_run_file(data: bytes, folder: Path) -> None:
     if run.config.simulate is not None:
         planned_recording(run.config.simulate, run.plant)
     for config in run.config.recordings:
-        known_parts(read_recording(config, run.plant, folder), config, run.plant)
+        known_segments_of(read_recording(config, run.plant, folder), config, run.plant)
 
 
 def read_study(data: bytes, folder: Path) -> None:
@@ -79,7 +80,7 @@ def read_csv(data: bytes, folder: Path) -> None:
     config = RecordingConfig(file="recording.csv")
     recording = read_recording(config, PLANT, folder)
     check_recording(recording, PLANT)
-    known_parts(recording, config, PLANT)
+    known_segments_of(recording, config, PLANT)
 
 
 def read_log(data: bytes, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""A rig in code equals its file, and the commands as functions give results that show themselves."""
+"""The Python interface: a rig in code equals its file, and the functions return results with a display."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import yaml
 import fdi_torch
 from fdi_torch import Pipe, PlacedEffect, Plant, Pump, Recording, Sensor, Tank
 from fdi_torch.config import plant_in_code
-from fdi_torch.config.files import shipped_plants
-from fdi_torch.config.plant import build_plant
+from fdi_torch.config.plant_file import build_plant
+from fdi_torch.config.yaml_files import shipped_plants
 
 IN_YAML = """
 name: rig

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: work ends soon, no write is cut in two, and what is printed of the log is true."""
+"""Ctrl-C and SIGTERM: work ends soon, writes are not interrupted, and the printed state of the log is correct."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 import pytest
 import torch
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network
 from fdi_torch.interruption import UNDISTURBED, SteadyLock, Terminated, catch_signals
 from fdi_torch.recording import Recording

@@ -28,7 +28,7 @@ def found(
     )
 
 
-def test_a_set_of_several_pays_for_each_fault_and_twice_for_one_place() -> None:
+def test_the_prior_penalises_each_fault_and_twice_at_one_location() -> None:
     prior = Prior(("T1.leak.size", "T3.leak.size", "T1.plugging.size"), 6)
     one, two = prior(Hypothesis((0,))), prior(Hypothesis((0, 1)))
     assert one == pytest.approx(math.log(ODDS.effect / 6))
@@ -46,8 +46,8 @@ def test_the_volume_is_that_of_a_normal_posterior_in_a_uniform_prior() -> None:
     assert log_volume(1e-9 * curvature, width) == 0.0, "what the data do not show costs nothing"
 
 
-def test_where_nothing_fits_all_standard_errors_and_differences_count_by_what_is_left() -> None:
-    """Four times the squares that noise has: errors are twice as large, evidence is a quarter."""
+def test_an_excess_misfit_widens_standard_errors_and_reduces_evidence() -> None:
+    """Four times the sum of squares of noise: standard errors double, evidence is a quarter."""
     base = 4000.0
     near, far = found((0,), base - 1200.0, 1200.0), found((1,), base - 1300.0, 1300.0)
     first, second = with_posterior([far, near])
@@ -58,7 +58,7 @@ def test_where_nothing_fits_all_standard_errors_and_differences_count_by_what_is
     assert with_posterior([far, fitting])[0].std.tolist() == [0.02] * 3, "where one fits, nothing is doubted"
 
 
-def test_masses_sum_to_one_and_ways_of_one_change_are_one_explanation() -> None:
+def test_probabilities_sum_to_one_and_manners_of_one_change_are_merged() -> None:
     all_of_them = with_posterior([found((0,), 10.0), found((0,), 10.0, late=True), found((1,), 10.5), found((2,), 5.0)])
     assert sum(f.probability for f in all_of_them) == pytest.approx(1.0)
     told = merged(all_of_them)
@@ -66,7 +66,7 @@ def test_masses_sum_to_one_and_ways_of_one_change_are_one_explanation() -> None:
     assert sum(f.probability for f in told) == pytest.approx(1.0)
 
 
-def test_what_is_told_holds_95_percent_and_every_exact_twin() -> None:
+def test_the_credible_set_has_95_percent_and_every_indistinguishable_fit() -> None:
     rival, small = found((1,), 0.0, 301.0, mass=0.3), found((2,), 0.0, 305.0, mass=0.04)
     told = credible_set([found((0,), 0.0, mass=0.66), rival, small])
     assert [f.hypothesis.columns for f in told] == [(0,), (1,)]
@@ -74,5 +74,5 @@ def test_what_is_told_holds_95_percent_and_every_exact_twin() -> None:
     assert len(credible_set([found((0,), 0.0, mass=0.96), rival, twin])) == 2, "no reading tells the twin apart"
 
 
-def test_a_value_at_the_end_of_its_range_never_fits() -> None:
+def test_an_estimate_at_its_bound_never_fits() -> None:
     assert found((0,), 0.0).fits and not replace(found((0,), 0.0), at_bound=(0,)).fits

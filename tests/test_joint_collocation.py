@@ -1,4 +1,4 @@
-"""Several recordings as one: each part is what it is alone, and what they have in common is fitted to all of them."""
+"""Joint collocation: each recording's part equals its separate simulation, and common parameters are fitted to all."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.effects import place
 from fdi_torch.gap.answer import adopted
 from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.network import TankNetwork

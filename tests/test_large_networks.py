@@ -1,4 +1,4 @@
-"""Networks of many tanks: what is written for them alone answers as torchdiffeq and the plain equations do."""
+"""Networks of many tanks: their own code path agrees with torchdiffeq and with the unrolled equations."""
 
 from __future__ import annotations
 

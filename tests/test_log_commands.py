@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from fdi_torch import cli
-from fdi_torch.config.run import load_run
-from fdi_torch.config.study import load_study
+from fdi_torch.config.run_file import load_run
+from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.jobs.study import run_study
 from fdi_torch.jobs.train import train
@@ -118,7 +118,7 @@ def test_a_page_of_several_runs_compares_them(tmp_path: Path) -> None:
 def test_equal_logs_are_said_to_be_equal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     logs = [write_estimate(tmp_path / f"{k}.mcap", 0.3) for k in range(2)]
     assert cli.main(["compare", *map(str, logs)]) == cli.DONE
-    assert "All logs say the same, message by message." in capsys.readouterr().out
+    assert "All logs have the same content, message by message." in capsys.readouterr().out
     assert cli.main(["compare", str(logs[0])]) == cli.MISUSE
     assert "expected at least two logs to compare, got 1" in capsys.readouterr().err
 
@@ -221,7 +221,7 @@ def test_what_if_writes_a_new_log_with_its_parent(trained: Path, capsys: pytest.
     assert cli.main(["replay", str(trained), "--set", "seed=5", "--quiet"]) == cli.DONE
     child = read_run(trained.with_name(f"{trained.stem}.what_if.mcap"))
     assert child.metadata["fdi_torch.run"]["parent_run_id"] == read_run(trained).metadata["fdi_torch.run"]["run_id"]
-    assert "What differs: " in capsys.readouterr().out
+    assert "Differences in: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

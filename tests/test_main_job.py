@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from fdi_torch.cli import DONE, MISUSE, main
+from fdi_torch.cli import DONE, MISUSE, NOT_EXPLAINED, main
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.run import Run, load_run
+from fdi_torch.config.run_file import Run, load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.logbook import content_hash, read_run
 
@@ -82,9 +82,15 @@ def test_it_repeats_bit_for_bit(tmp_path: Path) -> None:
     assert content_hash(read_run(one.log).messages()) == content_hash(read_run(two.log).messages())
 
 
-def test_a_model_without_the_fault_does_not_explain_it(tmp_path: Path) -> None:
-    done = train(quick_run(tmp_path, "estimate.parameters=[P32.openness]"))
-    assert not done.result.diagnosis.explained
+def test_a_model_without_the_fault_is_called_unreliable_before_anything_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes = [word for change in (*QUICK, "estimate.parameters=[P32.openness]") for word in ("--set", change)]
+    assert main(["train", "--quiet", "--out", str(tmp_path), *changes]) == NOT_EXPLAINED
+    warning = "Unreliable: the model does not explain the recording"
+    assert capsys.readouterr().out.startswith(warning)
+    assert main(["report", "--quiet", str(tmp_path / "default.mcap")]) == DONE
+    assert f"default.mcap: {warning}. " in capsys.readouterr().out
 
 
 def test_interrupted_it_keeps_what_it_has(tmp_path: Path) -> None:
@@ -215,7 +221,7 @@ KILLED = """
 import os, signal, sys, time
 import yaml
 from pathlib import Path
-from fdi_torch.config.run import build_run
+from fdi_torch.config.run_file import build_run
 from fdi_torch.jobs.train import TrainResult, train
 def tell(share, text):
     if f"generation {sys.argv[2]}," in text:

@@ -1,4 +1,4 @@
-"""The monitor on simulated changes of known size and moment, on troubled clocks, and on a real leak."""
+"""The monitor on simulated changes of known size and onset, with irregular clocks, and on a real leak."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torch import Tensor
 
 from fdi_torch.cli import main
 from fdi_torch.config.loaded_recordings import read_recording
-from fdi_torch.config.monitor import load_monitor
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.monitor_file import load_monitor
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
@@ -109,7 +109,7 @@ def followed(run_monitor: Monitor, samples: Samples, chunk: int = 20) -> tuple[M
         ("h3.sensor_bias.bias", 4e-3),
     ],
 )
-def test_a_fault_is_alarmed_named_and_sized_with_its_onset(name: str, size: float) -> None:
+def test_a_fault_is_detected_isolated_and_sized_with_its_onset(name: str, size: float) -> None:
     _, events = followed(monitor(), recorded(step_to(name, size, 200.0), 320))
     assert [event.kind for event in events][:2] == ["alarm", "isolated"]
     assert 200.0 <= events[0].time < 240.0
@@ -121,7 +121,7 @@ def test_a_fault_is_alarmed_named_and_sized_with_its_onset(name: str, size: floa
 
 
 @pytest.mark.parametrize("period", [(1, 2, 1), (1, 1, 10)])
-def test_sensors_may_be_read_at_rates_of_their_own_and_never_together(period: tuple[int, ...]) -> None:
+def test_sensors_may_have_different_rates_and_never_be_read_together(period: tuple[int, ...]) -> None:
     """Half the readings: standard errors are larger by their square root, no more and no less."""
 
     def thinned(samples: Samples) -> Samples:
@@ -149,7 +149,7 @@ def replace_noise(run_monitor: Monitor, learnt: NoiseModel) -> Monitor:
     return Monitor(run_monitor.network, run_monitor.space, learnt, run_monitor.detector, run_monitor.settings)
 
 
-def test_random_moments_are_no_gaps() -> None:
+def test_random_sample_times_are_not_gaps() -> None:
     run = recorded(lambda t: SPACE.nominal(), 3000)
     gaps = torch.empty(3000, dtype=torch.float64).exponential_(generator=torch.Generator().manual_seed(1))
     samples = replace(run, time=torch.cumsum(gaps, 0))
@@ -160,7 +160,7 @@ def test_random_moments_are_no_gaps() -> None:
     assert [notice for _, notice in stretches] == [""] and arrived.last == float(samples.time[-1])
 
 
-def test_a_fault_that_goes_away_is_recovered() -> None:
+def test_a_fault_that_ends_is_reported_as_recovered() -> None:
     _, events = followed(monitor(), recorded(step_to("T1.leak.size", 0.1, 150.0, 330.0), 460))
     kinds = [event.kind for event in events]
     assert kinds[:2] == ["alarm", "isolated"] and kinds.count("alarm") == 2
@@ -168,8 +168,8 @@ def test_a_fault_that_goes_away_is_recovered() -> None:
     assert last.faults == ("T1.leak.size",) and last.onset is not None and abs(last.onset - 329.5) < 3.0
 
 
-def test_a_fault_whose_law_is_not_quite_the_known_one_is_one_event_until_it_goes() -> None:
-    """A hole 25 cm above the floor, where the monitor knows of holes in the floor only: its size seems to fall."""
+def test_a_fault_with_an_inexact_law_is_one_event_until_it_ends() -> None:
+    """A hole 25 cm above the floor, modelled as a hole in the floor: its estimated size decreases."""
     space = ParameterSpace([NETWORK.constants["T1.leak.size"], NETWORK.constants["T1.leak.height"]])
 
     def truth(time: float) -> Tensor:
@@ -184,7 +184,7 @@ def test_a_fault_whose_law_is_not_quite_the_known_one_is_one_event_until_it_goes
     assert abs(last.onset - 699.5) < 3.0
 
 
-def test_a_slowly_growing_fault_is_told_from_a_sudden_one() -> None:
+def test_an_incipient_fault_is_distinguished_from_a_sudden_one() -> None:
     def truth(time: float) -> Tensor:
         return SPACE.vector({"h3.sensor_bias.bias": 1e-4 * max(time - 100.0, 0.0)})
 
@@ -196,7 +196,7 @@ def test_a_slowly_growing_fault_is_told_from_a_sudden_one() -> None:
     assert abs(best.onset - 100.0) < 10.0
 
 
-def test_two_faults_at_once_are_found_together() -> None:
+def test_two_simultaneous_faults_are_isolated_together() -> None:
     def truth(time: float) -> Tensor:
         return SPACE.vector({"T1.leak.size": 0.05, "h3.sensor_bias.bias": 0.01} if time > 100.0 else {})
 
@@ -217,12 +217,12 @@ def test_standard_errors_are_those_of_repeated_runs() -> None:
     assert 0.5 < float(torch.tensor(pulls).square().mean().sqrt()) < 1.7  # 8 runs: 95 % within 0.5 to 1.5
 
 
-def test_a_run_without_fault_says_nothing() -> None:
+def test_a_fault_free_run_has_no_events() -> None:
     _, events = followed(monitor(), recorded(lambda t: SPACE.nominal(), 500, seed=5))
     assert events == []
 
 
-def test_gaps_jumps_bursts_and_unknown_inputs_are_told_and_survived() -> None:
+def test_gaps_jumps_bursts_and_unknown_inputs_are_reported() -> None:
     samples = recorded(lambda t: SPACE.nominal(), 300, seed=6)
     time, inputs = samples.time.clone(), samples.inputs.clone()
     time[100:] += 50.0
@@ -236,8 +236,8 @@ def test_gaps_jumps_bursts_and_unknown_inputs_are_told_and_survived() -> None:
     assert float(state.samples.time[-1]) == float(time[-1])
 
 
-def test_an_offset_of_the_observer_is_told_where_it_is_sure_and_matters() -> None:
-    """Noise of 1 mm in 3600 samples: 0.05 mm off is sure but means nothing, 0.5 mm off is told."""
+def test_an_observer_offset_is_reported_if_significant_and_relevant() -> None:
+    """Noise of 1 mm in 3600 samples: an offset of 0.05 mm is significant but irrelevant, 0.5 mm is reported."""
     noise = torch.randn(3600, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     residual = 1e-3 * noise + torch.tensor([0.0, 5e-5, 5e-4], dtype=torch.float64)
     whitening = fit_whitening(residual)
@@ -252,14 +252,14 @@ def test_an_offset_of_the_observer_is_told_where_it_is_sure_and_matters() -> Non
     assert "h3 lies 0.04" in doubt and "cm off the observer throughout" in doubt
 
 
-def test_a_sample_that_comes_twice_is_taken_once() -> None:
+def test_a_repeated_sample_is_used_once() -> None:
     samples = recorded(lambda t: SPACE.nominal(), 6)
     twice = Samples(samples.time[[1, 1, 2]], samples.inputs[:3], samples.readings[[1, 1, 2]])
     [(kept, notice)], _ = split_at_gaps(ClockState(0.0), twice, 1.0)
     assert kept.time.tolist() == [1.0, 2.0] and notice == ""
 
 
-def test_what_is_seen_does_not_depend_on_how_samples_come() -> None:
+def test_residuals_do_not_depend_on_how_samples_are_batched() -> None:
     samples = recorded(step_to("T3.leak.size", 0.05, 100.0), 180)
     _, few = followed(monitor(), samples, 10)
     _, single = followed(monitor(), samples, 5)
@@ -392,7 +392,7 @@ def test_figures_6_and_7() -> None:
             assert abs(size - float(expected[space.index(name)])) < 3 * std_error, (name, size, std_error)
 
 
-def test_a_level_that_is_known_at_the_start_is_not_taken_for_that_of_a_later_fault_free_part(tmp_path: Path) -> None:
+def test_the_initial_level_is_not_used_for_a_later_fault_free_part(tmp_path: Path) -> None:
     """A tank filled from empty by 50 cm^3/s, a flow read 10 % too low; the noise is learnt from 20 s on, at 10 cm."""
     noise = torch.randn(100, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).tolist()
     rows = [f"{t},{10 * (0.5 * t + 0.05 * e):.4f},45" for t, e in enumerate(noise)]
@@ -413,8 +413,8 @@ def test_a_level_that_is_known_at_the_start_is_not_taken_for_that_of_a_later_fau
     assert told == [pytest.approx(50.0 / 45.0, rel=0.01)]
 
 
-def test_the_time_to_overflow_is_told_with_an_interval_that_holds_it() -> None:
-    """A pipe that plugs: the tank before it fills. Until then the interval becomes narrower."""
+def test_the_forecast_interval_contains_the_time_to_overflow() -> None:
+    """A pipe that plugs: the tank upstream fills, and the interval becomes narrower until then."""
     samples = recorded(step_to("P13.plugging.size", 0.6, 200.0), 1100, std=0.0)
     height = PLANT.tanks[0].height
     truth = float((samples.readings[:, 0] >= height).nonzero()[0])

@@ -15,7 +15,7 @@ import torch
 import yaml
 
 from fdi_torch.cli import INTERRUPTED, main
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.jobs.replay import repeat_run

@@ -1,4 +1,4 @@
-"""The states of alarms, and that what a monitor says rests on the readings until then alone."""
+"""States of alarms; events depend only on the readings up to their time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fdi_torch.monitor.samples import Samples
 from tests.test_monitor import SPACE, followed, monitor, recorded
 
 
-def test_an_alarm_takes_only_states_that_follow() -> None:
+def test_an_alarm_allows_only_valid_transitions() -> None:
     alarm = Alarm(1, 10.0, 10.0)
     assert (
         alarm.with_state(State.ISOLATED).with_state(State.EXPLAINED).with_state(State.RECOVERED).state
@@ -59,13 +59,13 @@ def whole() -> tuple[Monitor, Samples, list[Event]]:
     return watch, samples, followed(watch, samples, len(samples))[1]
 
 
-def test_every_state_but_learning_is_met(whole: tuple[Monitor, Samples, list[Event]]) -> None:
+def test_every_state_except_learning_occurs(whole: tuple[Monitor, Samples, list[Event]]) -> None:
     kinds = {event.kind for event in whole[2]}
     assert {"alarm", "isolated", "revised", "recovered", "notice"} <= kinds
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_events_are_the_same_to_the_last_bit_however_samples_come(
+def test_events_are_identical_for_any_batching_of_samples(
     seed: int, whole: tuple[Monitor, Samples, list[Event]]
 ) -> None:
     watch, samples, expected = whole
@@ -76,10 +76,8 @@ def test_events_are_the_same_to_the_last_bit_however_samples_come(
 
 
 @pytest.mark.parametrize("cut", [120, 158, 200, 341, 400, 452, 458, 600])
-def test_nothing_said_at_a_moment_rests_on_a_later_reading(
-    cut: int, whole: tuple[Monitor, Samples, list[Event]]
-) -> None:
-    """The events of a recording that ends earlier are the first of those of the whole one, byte for byte."""
+def test_no_event_depends_on_a_later_reading(cut: int, whole: tuple[Monitor, Samples, list[Event]]) -> None:
+    """The events of a truncated recording are the first events of the complete one, byte for byte."""
     watch, samples, expected = whole
     events = in_pieces(watch, samples.segment(0, cut), [])
     assert events == expected[: len(events)]
@@ -87,7 +85,7 @@ def test_nothing_said_at_a_moment_rests_on_a_later_reading(
 
 
 @pytest.mark.parametrize("chart", CHARTS)
-def test_a_statistic_followed_in_pieces_is_that_of_the_whole(chart: str) -> None:
+def test_a_statistic_updated_in_parts_equals_that_of_the_whole(chart: str) -> None:
     detector = make_detector(chart, 1000.0, 1.0, 3, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
     white = torch.randn(700, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     white[50:53, 1] = torch.nan

@@ -1,4 +1,4 @@
-"""Files to begin with, and the catalogue of effects."""
+"""File templates, and the catalogue of effects."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import yaml
 
 from fdi_torch import cli
 from fdi_torch.config.estimation import parameter_values, placements_of
-from fdi_torch.config.files import read_yaml, shipped_plants
-from fdi_torch.config.monitor import load_monitor
-from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.monitor_file import load_monitor
+from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.config.run import load_run
-from fdi_torch.config.study import load_study
+from fdi_torch.config.run_file import load_run
+from fdi_torch.config.study_file import load_study
 from fdi_torch.config.templates import TEMPLATES, template
+from fdi_torch.config.yaml_files import read_yaml, shipped_plants
 from fdi_torch.effects import EFFECTS, build_network
 from fdi_torch.effects.catalogue import effects
 from fdi_torch.recordings.csv_files import read_header

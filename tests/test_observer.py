@@ -1,4 +1,4 @@
-"""The observer against linear theory, SciPy's Riccati solution and a plant whose middle level nobody measures."""
+"""The observer against linear theory, SciPy's Riccati solution, and a plant with an unmeasured level."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.linalg import solve_discrete_are
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
 from fdi_torch.monitor.noise_model import learn_noise, operating_point
 from fdi_torch.monitor.observer import Observer, bind_parameters, initial_levels

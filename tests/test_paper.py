@@ -9,15 +9,15 @@ from operator import attrgetter
 import pytest
 import torch
 
-from fdi_torch.config.files import SHIPPED
-from fdi_torch.config.run import load_run
-from fdi_torch.paper import tables
-from fdi_torch.paper.cases import Case, shipped_run, solve
+from fdi_torch.config.run_file import load_run
+from fdi_torch.config.yaml_files import SHIPPED
+from fdi_torch.paper import paper_tables
 from fdi_torch.paper.equations import EQUATIONS, ERRATA, STATEMENTS
 from fdi_torch.paper.modes import Modes, all_modes, called_present, confusion, diagnose_modes, mode_name
 from fdi_torch.paper.online import follow, varies
-from fdi_torch.paper.page import PAGE, WINDOWS
+from fdi_torch.paper.paper_page import PAGE, WINDOWS
 from fdi_torch.paper.published import PARAMETERS, TABLE_2, TABLE_3
+from fdi_torch.paper.table_cases import Case, shipped_run, solve
 from fdi_torch.recording import Recording
 
 TRUTH = torch.tensor([0.1, 0.6, 0.5, 1.0, 1.0], dtype=torch.float64)
@@ -67,7 +67,7 @@ def test_the_paper_prints_five_estimates_near_the_simulated_faults(name: str) ->
 
 
 def test_a_row_of_table_2_holds_errors_of_paper_search_and_refinement() -> None:
-    header, _, *rows = cells(tables.table_2([case()], TABLE_2))
+    header, _, *rows = cells(paper_tables.table_2([case()], TABLE_2))
     first = dict(zip(header, rows[0], strict=True))
     assert (first["fault"], first["true"], first["paper"], first["DE alone"]) == (
         "3-dim",
@@ -76,16 +76,16 @@ def test_a_row_of_table_2_holds_errors_of_paper_search_and_refinement() -> None:
         "0.110000",
     )
     assert (first["paper's error"], first["DE's error"], first["refined error"]) == ("-1.9e-03", "+1.0e-02", "+1.0e-03")
-    assert rows[2][3] == tables.MISPRINT and rows[2][6] == "–"
+    assert rows[2][3] == paper_tables.MISPRINT and rows[2][6] == "–"
     assert len(rows) == 5 and {len(row) for row in rows} == {len(header)}
 
 
 def test_errors_below_rounding_are_said_to_be_so() -> None:
-    assert [tables.error(e, "+") for e in (0.0, -9e-8, 2e-7)] == ["< 1e-07", "< 1e-07", "+2.0e-07"]
+    assert [paper_tables.error(e, "+") for e in (0.0, -9e-8, 2e-7)] == ["< 1e-07", "< 1e-07", "+2.0e-07"]
 
 
 def test_a_row_of_table_3_scores_the_free_estimate_by_the_bound() -> None:
-    header, _, *rows = cells(tables.table_3([case("table3_snr40", 40.0)], TABLE_3))
+    header, _, *rows = cells(paper_tables.table_3([case("table3_snr40", 40.0)], TABLE_3))
     assert rows[0][0] == "40 dB"
     assert rows[0][header.index("its error / bound")] == "+2.00"
 
@@ -118,7 +118,7 @@ def test_confusion_counts_modes_simulated_against_modes_said() -> None:
 
 
 def test_the_table_of_modes_counts_missed_and_invented_faults() -> None:
-    header, _, *rows = cells(tables.by_dimension(modes_result()))
+    header, _, *rows = cells(paper_tables.by_dimension(modes_result()))
     last = dict(zip(header, rows[-1], strict=True))
     assert (last["draws"], last["named exactly"]) == ("6", "66.7 %")
     assert (last["faults missed"], last["faults invented"]) == ("1", "1")
@@ -127,7 +127,7 @@ def test_the_table_of_modes_counts_missed_and_invented_faults() -> None:
 
 
 def test_wrongly_named_modes_are_told() -> None:
-    assert tables.wrongly_named(modes_result()) == "Named otherwise: 1 as 1 2; 1 2 as 1."
+    assert paper_tables.wrongly_named(modes_result()) == "Named otherwise: 1 as 1 2; 1 2 as 1."
 
 
 def readings(values: torch.Tensor) -> Recording:
@@ -178,7 +178,7 @@ def test_row_1_of_table_2_is_found_to_five_digits() -> None:
 def test_modes_are_named_in_one_batch() -> None:
     run = shipped_run("modes")
     found = diagnose_modes(run, 1)
-    assert found.said.shape == (31, 1, 5)
+    assert found.stated.shape == (31, 1, 5)
     assert float((found.refined - found.truth.unsqueeze(1)).abs().max()) < 0.2
 
 

@@ -1,4 +1,4 @@
-"""What is adopted changes the lines of the plant file that it has to, and nothing else."""
+"""Adoption of an estimate changes only the necessary lines of a plant file."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 
 from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.files import parse_yaml, shipped_plants
-from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_patch import patched_plant
+from fdi_torch.config.yaml_files import parse_yaml, shipped_plants
 from fdi_torch.gap.answer import with_constants
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 
@@ -116,7 +116,7 @@ def test_a_file_without_effects_gets_them_at_its_end() -> None:
 
 @pytest.mark.parametrize("name", shipped_plants())
 def test_every_shipped_plant_can_be_changed_everywhere(name: str) -> None:
-    from fdi_torch.config.files import find_plant
+    from fdi_torch.config.yaml_files import find_plant
 
     text = find_plant(name, Path.cwd()).read_text()
     before = load_plant(name)

@@ -1,4 +1,4 @@
-"""The plant against closed forms, SciPy, conservation and the paper's own form."""
+"""The plant against closed forms, SciPy, conservation of volume and the paper's equations."""
 
 from __future__ import annotations
 
@@ -296,4 +296,4 @@ def test_unknown_inputs_must_be_masked() -> None:
     recording.inputs[4, 1] = float("nan")
     with pytest.raises(ValueError, match="missing one at 4 s; mask that segment"):
         lay_out(recording, plant.channels(), 1.0)
-    assert [len(r) for r in recording.known_stretches()] == [4, 6]
+    assert [len(r) for r in recording.known_segments()] == [4, 6]

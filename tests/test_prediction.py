@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from fdi_torch.config.plant import build_plant, load_plant
+from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import leave_one_file_out, predict
@@ -89,7 +89,7 @@ def test_a_refit_that_finds_no_course_of_the_levels_says_so(monkeypatch: pytest.
     monkeypatch.setattr(Fitter, "fit", lost)
     with pytest.raises(
         ValueError,
-        match=r"no trajectory of the levels along a\.csv was found from the plant file's values; start from other values",
+        match=r"no trajectory of the levels along a\.csv was found from the plant file's values",
     ):
         refit(plant, run)
 

@@ -1,4 +1,4 @@
-"""Every public name is there, and the package loads without torch."""
+"""Every public name exists, and the package loads without torch."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fdi_torch.config.run import load_run
+from fdi_torch import load_run
 from tests.sessions import check, run_page
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")

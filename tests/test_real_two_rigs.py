@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from fdi_torch.config.loaded_recordings import named_recordings, read_recording
-from fdi_torch.config.plant import load_plant
-from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.gap.answer import adopted
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.free_runs.prediction import predict

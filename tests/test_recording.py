@@ -1,4 +1,4 @@
-"""Recording: selection of stretches on one clock, and what it refuses."""
+"""Recording: selection of segments on one clock, and rejected arguments."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_every_is_a_whole_number_from_one() -> None:
 
 def test_known_stretches_are_cut_where_an_input_is_unknown() -> None:
     nan = float("nan")
-    parts = recording([0, 1, 2, 3, 4, 5], [1, 1, nan, nan, 1, 1], [0.0] * 6).known_stretches()
+    parts = recording([0, 1, 2, 3, 4, 5], [1, 1, nan, nan, 1, 1], [0.0] * 6).known_segments()
     assert [part.time.tolist() for part in parts] == [[0, 1], [4, 5]]
 
 

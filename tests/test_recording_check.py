@@ -1,4 +1,4 @@
-"""Every finding of the check is made by a recording that has just that oddity, and by none without it."""
+"""Every finding of the check is reported for a recording with that defect, and not for one without it."""
 
 from __future__ import annotations
 

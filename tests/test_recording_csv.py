@@ -1,4 +1,4 @@
-"""CSV recordings: units, mapping, missing cells, and one clear sentence for each thing that can be wrong."""
+"""CSV recordings: units, mapping, missing cells, and one sentence for each kind of error."""
 
 from __future__ import annotations
 

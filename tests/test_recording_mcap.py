@@ -1,4 +1,4 @@
-"""Recordings from MCAP: our own logs come back as they were written, foreign ones by topic and field."""
+"""Recordings from MCAP: logs of this program are read back exactly, others by topic and field."""
 
 from __future__ import annotations
 

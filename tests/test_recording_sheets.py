@@ -1,4 +1,4 @@
-"""Recordings as plants keep them: channels at rates of their own, in one file or several, with odd clocks."""
+"""Plant recordings: channels with different sampling, in one or several files, with clock errors."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from fdi_torch.config.loaded_recordings import load_recordings, read_recording
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import check_recording
@@ -221,5 +221,5 @@ def test_stretches_may_be_named_by_stamps(plant: PlantDescription, tmp_path: Pat
     cut = read(plant, tmp_path, text, columns=zone, start="2026-03-29 03:00:02", mask=[["2026-03-29T01:00:03Z", "4 s"]])
     assert cut.time.tolist() == [2.0, 3.0, 4.0, 5.0]
     assert cut.mask[:, 0].tolist() == [True, False, False, True]
-    with pytest.raises(ConfigError, match=r"expected a moment in s as in '300 s', .* its clock tells no date"):
+    with pytest.raises(ConfigError, match=r"expected a time in s as in '300 s', .* its clock has no date"):
         read(plant, tmp_path, PLAIN, start="2026-03-29 03:00:02")

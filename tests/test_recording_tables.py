@@ -1,4 +1,4 @@
-"""Recordings in Parquet, Excel, MATLAB and HDF5 files read as the CSV file of the same table does, and so do errors."""
+"""Recordings in Parquet, Excel, MATLAB and HDF5 files give the same result, or error, as the equivalent CSV file."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ import torch
 
 from fdi_torch import cli
 from fdi_torch.config.loaded_recordings import read_recording
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.recordings.source import ChannelSource
 

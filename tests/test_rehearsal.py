@@ -1,4 +1,4 @@
-"""Rehearsals on simulated runs: rivals against the bound, false alarms and delays, faults named that are isolable."""
+"""Monte Carlo validation: estimators against the bound, false alarms and delays, isolation of isolable faults."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.proportion import wilson
@@ -41,7 +41,7 @@ def fitting(samples: int = 301):  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.slow
-def test_estimators_of_the_likelihood_reach_the_bound_and_the_others_say_how_far_they_are() -> None:
+def test_likelihood_estimators_reach_the_bound() -> None:
     runs = draw_runs(fitting(), 12, 30.0, torch.Generator().manual_seed(0))
     rows = {row.rival: row for row in compare(runs, 30.0, [100, 300])}
     assert set(rows) == set(ESTIMATOR_NAMES)
@@ -70,7 +70,7 @@ def rig(faults: list[str], **kind: float) -> tuple[SimulatedRig, Monitor, Parame
 
 
 @pytest.mark.slow
-def test_false_alarms_are_as_often_as_asked_and_large_faults_are_found_sooner() -> None:
+def test_false_alarms_have_the_designed_rate_and_large_faults_are_detected_sooner() -> None:
     made, monitor, _ = rig(["T1.leak.size"])
     charts = detectors(2000.0, 1.0, 3)
     counted = count_false_alarms(made, monitor.noise, charts, 2000.0, 40, 600, torch.Generator().manual_seed(1))
@@ -97,7 +97,7 @@ def test_false_alarms_are_as_often_as_asked_and_large_faults_are_found_sooner() 
         ("Q1.pump_gain.factor", 0.8, {}),
     ],
 )
-def test_sensor_and_actuator_faults_are_told_from_leaks_under_control(
+def test_sensor_and_actuator_faults_are_distinguished_from_leaks_under_control(
     fault: str, size: float, shape: dict[str, float]
 ) -> None:
     faults = ["T1.leak.size", "T2.leak.size", "P13.plugging.size", *([fault] if "stuck" in fault else [])]
@@ -129,7 +129,7 @@ def test_sensor_and_actuator_faults_are_told_from_leaks_under_control(
     assert found.last == (fault,) and found.early == 0, found
 
 
-def test_the_smallest_isolable_size_is_infinite_for_twins_and_grows_with_a_rival() -> None:
+def test_the_smallest_isolable_size_is_infinite_for_equal_signatures() -> None:
     made, monitor, space = rig(["T1.leak.size", "T2.leak.size", "OUT2.plugging.size"])
     seen = made.run(fault_free_schedule(space, 1), 300, torch.Generator().manual_seed(5))
     one = Samples(seen.time, seen.inputs, seen.readings[0])
@@ -144,7 +144,7 @@ def test_the_smallest_isolable_size_is_infinite_for_twins_and_grows_with_a_rival
     )  # a leak of tank 2 and its outlet: one thing but for slopes at a finite size
 
 
-def test_shares_come_with_their_interval_and_wrong_answers_with_their_number() -> None:
+def test_shares_have_intervals_and_wrong_answers_counts() -> None:
     low, high = wilson(190, 200)
     assert low == pytest.approx(0.910, abs=2e-3) and high == pytest.approx(0.973, abs=2e-3)
     assert wilson(0, 0) == (0.0, 1.0)

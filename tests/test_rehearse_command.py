@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fdi_torch.cli import MISUSE, main
-from fdi_torch.config.rehearsal import load_rehearsal
+from fdi_torch.config.rehearsal_file import load_rehearsal
 from fdi_torch.jobs.rehearsal import rehearse
 from fdi_torch.logbook import read_run
 from fdi_torch.monitor.monte_carlo.false_alarm_plan import as_asked, mean_time

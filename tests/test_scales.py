@@ -1,4 +1,4 @@
-"""A rig scaled in metres and seconds gives the scaled answers: nothing assumes the size of a laboratory bench."""
+"""Invariance to scales: a rig scaled in length and time gives scaled results."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import torch
 from rigs import blank_recording, three_tank
 
 from fdi_torch.config import load_plant, load_run
-from fdi_torch.config.monitor import MonitorConfig
+from fdi_torch.config.monitor_file import MonitorConfig
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.config.understood import understood
+from fdi_torch.config.resolved_config import resolve
 from fdi_torch.effects import EFFECTS, all_placements, build_network, placements_for
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.hybrid import estimate_parameters
@@ -130,8 +130,8 @@ def test_faults_and_their_errors_do_not_depend_on_the_rig_s_size(metres: float, 
 def test_times_of_a_monitor_that_nobody_chose_follow_the_plant() -> None:
     slow = plant_mapping(scaled(three_tank(), 1.0, 60.0))
     given = {"recording": {"file": "any.csv"}, "fault_free": ["0 s", "1 h"], "window": {"confirm": "90 s"}}
-    config, _, _ = understood(MonitorConfig, given | {"plant": slow}, Path(), "slow.yaml")
-    usual, _, _ = understood(MonitorConfig, given, Path(), "usual.yaml")
+    config, _, _ = resolve(MonitorConfig, given | {"plant": slow}, Path(), "slow.yaml")
+    usual, _, _ = resolve(MonitorConfig, given, Path(), "usual.yaml")
     assert (usual.window.lookback, usual.window.confirm, usual.false_alarms_every, usual.step) == (300, 90, 20000, 1)
     assert (config.window.lookback, config.window.confirm, config.false_alarms_every) == (30000, 90, 2e6)
     assert config.step == usual_step(scaled(three_tank(), 1.0, 60.0)) == 100

@@ -1,4 +1,4 @@
-"""Steps of each lane's own: as exact as asked for, the same in both engines, and nobody's neighbour's business."""
+"""Adaptive steps of each lane: accuracy, agreement of both engines, and independence of other lanes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rigs import assert_lanes_stand_alone, constant_inputs, three_tank
 from rigs import paper_network as rig
 from torch import Tensor
 
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import EFFECTS, all_placements
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.hybrid import HybridSettings, information_std, refine_to_convergence

@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.study import Study, load_study
+from fdi_torch.config.study_file import Study, load_study
 from fdi_torch.jobs.study import TRIAL, progress, run_study
 from fdi_torch.logbook import read_run
-from fdi_torch.study.isolation import isolate
+from fdi_torch.study.mode_isolation import count_modes
 from fdi_torch.study.monte_carlo import Trial, distant, run_block, run_blocks
-from fdi_torch.study.plan import Block, Plan, Setting, fault_modes, fixed_faults, mode_faults, uniform_faults
+from fdi_torch.study.study_plan import Block, Plan, Setting, fault_modes, fixed_faults, mode_faults, uniform_faults
 from fdi_torch.study.summary import column, covered, rms_ratio, rms_with_error, share, summarise
-from fdi_torch.study.trials import limits, make_trials
+from fdi_torch.study.trial_readings import limits, make_trials
 
 NOISE = "configs/studies/table3_noise.yaml"
 QUICK = ["study.steps=[1 s]", "study.data_step=0.2 s", "study.evaluations=600", "study.population=24"]
@@ -193,7 +193,7 @@ def test_isolation_counts_what_is_missed_and_what_is_false(plan: Plan) -> None:
         vectors = [[changed.get(i, nominal[i]) for i in range(5)] for changed in (truth, free)]
         return Trial(0, "", "", {"truth": vectors[0], "free": vectors[1], "free_std": [0.01] * 5})
 
-    found = isolate(space, [trial({0: 0.3}, {0: 0.31}), trial({0: 0.3}, {2: 0.5}), trial({}, {3: 0.99})])
+    found = count_modes(space, [trial({0: 0.3}, {0: 0.31}), trial({0: 0.3}, {2: 0.5}), trial({}, {3: 0.99})])
     assert found.labels == ("none", "T1.leak", "T3.leak")
     assert found.confusion == ((1, 0, 0), (0, 1, 1), (0, 0, 0))
     assert (found.right, found.missed, found.false) == (2, 1, 1)

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from fdi_torch.config.study import load_study
+from fdi_torch.config.study_file import load_study
 from fdi_torch.study.cluster import connected, each_on, run_on_cluster, run_with
 from fdi_torch.study.monte_carlo import Trial, run_blocks
-from fdi_torch.study.plan import Plan
+from fdi_torch.study.study_plan import Plan
 
 pytest.importorskip("distributed")
 

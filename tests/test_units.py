@@ -1,4 +1,4 @@
-"""Units out of files: products, quotients and small powers of known units, read and never evaluated."""
+"""Units in files: products, quotients and small powers of known units are parsed, and text is never evaluated."""
 
 from __future__ import annotations
 

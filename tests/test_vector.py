@@ -1,4 +1,4 @@
-"""The compiled engine's elementary functions against torch's, as each kind of processor computes them."""
+"""The compiled engine's elementary functions against torch's, on each kind of processor."""
 
 from __future__ import annotations
 

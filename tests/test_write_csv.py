@@ -1,4 +1,4 @@
-"""Recordings survive the way through a file."""
+"""A recording written to a file reads back the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""YAML from outside: plain values, as many as a file may have with its aliases spelled out, in bounded time."""
+"""Untrusted YAML: plain values only, a limited number with aliases expanded, in bounded time."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from fdi_torch.config.files import parse_yaml, with_overrides, write_yaml
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.outside import MOST_YAML_BYTES
+from fdi_torch.config.yaml_files import parse_yaml, with_overrides, write_yaml
+from fdi_torch.untrusted_input import MOST_YAML_BYTES
 
 LEVELS = range(1, 10)
 MERGES = "a0: &a0 {x: 1}\n" + "".join(f"a{i}: &a{i}\n  <<: [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in LEVELS)
@@ -30,11 +30,11 @@ REFUSED = {
     "number of many digits": ("a: " + "9" * 400, "line 1: expected a whole number below 2^63"),
     "number of more digits": ("a: " + "9" * 9000, "line 1: expected a number of at most 400 digits"),
     "sixtieths": ("a: 1" + ":59" * 100_000, "line 1: expected a number of at most 400 digits"),
-    "no date": ("a: 2026-13-45", "expected YAML, got something else: month must be in 1..12"),
+    "no date": ("a: 2026-13-45", "not valid YAML: month must be in 1..12"),
     "tag": ("a: !!python/object/apply:os.system [ls]", "line 1: expected plain values, got the tag"),
     "bytes": ("a: !!binary aGVsbG8=", "line 1: expected plain values, got the tag"),
     "truth that is none": ("a: !!bool x", "line 1: expected plain values, got the tag"),
-    "key that is a list": ("a: {[1]: 2}", "line 1: expected YAML, got something else: found unhashable key"),
+    "key that is a list": ("a: {[1]: 2}", "line 1: not valid YAML: found unhashable key"),
     "list": ("[1]", "expected keys and values such as plant: three_tank, got list"),
 }
 

@@ -1,15 +1,16 @@
-"""The blind benchmark of gap diagnosis: hidden rigs with other equations and another integrator than the library's.
+"""Blind benchmark of the gap diagnosis on simulated rigs with other equations and another integrator than the
+library's.
 
-`blind_benchmark(cases, seed, out, diagnose)` makes recordings, seals their causes, has them diagnosed, opens and
-judges; `tables` sums up, of one benchmark or of several `joined`. Nothing here imports the library's effects, network
-or engines.
+`blind_benchmark(cases, seed, out, diagnose)` simulates recordings, seals their causes, runs the diagnosis, opens the
+key and scores the answers; `tables` summarises one benchmark or several `joined` ones. Nothing here imports the
+library's effects, network or engines.
 """
 
-from fdi_torch.blind.kinds import KINDS, ON_NETWORKS, STANDARD
+from fdi_torch.blind.benchmark import blind_benchmark
+from fdi_torch.blind.case_kinds import KINDS, ON_NETWORKS, STANDARD
 from fdi_torch.blind.networks import Networks
 from fdi_torch.blind.plants import RIGS, Rig
-from fdi_torch.blind.rows import Row, Tables, joined, tables
-from fdi_torch.blind.run import blind_benchmark
+from fdi_torch.blind.scored_rows import Row, Tables, joined, tables
 
 __all__ = [
     "KINDS",

@@ -1,4 +1,4 @@
-"""Under which conditions a case is recorded: inputs, start levels, calibration constants, noise, disturbances."""
+"""Conditions of a case: inputs, initial levels, calibration constants, noise, disturbances."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 
 from fdi_torch.blind.control import LevelControl, draw_control
 from fdi_torch.blind.deviation import Array
-from fdi_torch.blind.disturbances import Disturbance
 from fdi_torch.blind.inputs import (
     DECIMALS,
     FACTORS,
@@ -21,30 +20,32 @@ from fdi_torch.blind.inputs import (
     with_standstills,
 )
 from fdi_torch.blind.plants import Rig
+from fdi_torch.blind.random_flows import Disturbance
 from fdi_torch.blind.scaling import SAME, Scales, on_bench
 from fdi_torch.blind.sensor_noise import WHITE, NoiseCorrelation, draw_correlation
-from fdi_torch.blind.simulator import Drive, HiddenRigs, Ran, simulate
+from fdi_torch.blind.simulator import Drive, HiddenRigs, SimulatedRun, simulate
 from fdi_torch.plant.description import PlantDescription
 
 RECORDED, HELD_OUT = 3601, 2401
 COARSE = 0.25
 WIDEST = 2.5
-"""Standard deviations that a constant is off at most."""
+"""Largest deviation of a constant, in standard deviations."""
 _LEAST = 0.2
 _MOST_TRIALS = 12
 LOW, HIGH = 0.13, 0.8
 FULL, LEAST = 0.5, 0.02
 NOISE = 1 / 35
-"""Of the mean level at rest, as in the three tanks: readings are then noisy by 0.14, 0.29 or 0.57 % of it."""
+"""Measurement noise over the mean level at equilibrium, times 0.05, 0.1 or 0.2: 0.14, 0.29 or 0.57 % of that level."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """commands: recording and hold-out, (T, C) in the header's unit. signal: of the recording, by name.
+    """Conditions of recording and hold-out.
 
-    starts (2, N) m. built: the rig's true constants. noise (S,): standard deviation of each sensor's readings, m;
-    errors: those of both parts, (T, S) m. control, disturbances (T, N) m^3/s: of both parts, where there are any;
-    disturbance: how the latter were drawn.
+    commands: (T, C) each, in the header's unit. signal: name of the recording's signal. starts (2, N) m: initial
+    levels. built: the rig with its true constants. noise (S,): standard deviation of each sensor's readings, m; errors:
+    (T, S) m each. control: of both parts, if a level is controlled. disturbances (T, N) m^3/s: of both parts, if any;
+    disturbance: how they were drawn.
     """
 
     rig: Rig
@@ -60,7 +61,7 @@ class Conditions:
     disturbances: tuple[Array, ...] = ()
 
     def drive(self, part: int, disturbed: bool) -> Drive:
-        """What the recording (0) or the hold-out (1) is driven with."""
+        """Inputs of the simulation of the recording (part 0) or the hold-out (part 1)."""
         asked, control = asked_of_pumps(self.built, self.commands[part]), self.control[part] if self.control else None
         error = None
         if control is not None:
@@ -72,15 +73,15 @@ class Conditions:
 
 
 def as_built(plant: PlantDescription, rng: np.random.Generator) -> PlantDescription:
-    """The rig as it was built, constants drawn within their tolerances: x (1 + s z), an offset x + s z, z standard
-    normal and clipped.
+    """The rig as built, with constants drawn within their tolerances: x (1 + s z), or x + s z for an offset, with z
+    standard normal and clipped.
     """
     off: dict[str, dict[str, float]] = {}
     for constant, tolerance in plant.tolerances.items():
         name, _, field = constant.rpartition(".")
         z = float(np.clip(rng.normal(), -WIDEST, WIDEST))
-        believed = float(getattr(plant.component(name), field))
-        drawn = believed + tolerance * z if field == "offset" else believed * max(1 + tolerance * z, _LEAST)
+        nominal = float(getattr(plant.component(name), field))
+        drawn = nominal + tolerance * z if field == "offset" else nominal * max(1 + tolerance * z, _LEAST)
         off.setdefault(name, {})[field] = drawn
     return replace(
         plant,
@@ -94,9 +95,10 @@ def as_built(plant: PlantDescription, rng: np.random.Generator) -> PlantDescript
 def draw_conditions(
     rig: Rig, rng: np.random.Generator, inputs: str, coloured: float, rest: Array, resting: str | None = None
 ) -> Conditions:
-    """inputs: 'rich', 'poor' (in the recording) or 'steps'. coloured: chance of correlated noise.
+    """Draw the conditions of a case.
 
-    rest (N,): the rig's levels without any effect at middling inputs, m. resting: a channel that often stands still.
+    inputs: 'rich', 'poor' (in the recording) or 'steps'. coloured: probability of correlated noise. rest (N,):
+    equilibrium levels without any effect at medium inputs, m. resting: a channel that is often at rest.
     """
     plant = rig.plant
     if resting:
@@ -120,7 +122,7 @@ def asked_of_pumps(plant: PlantDescription, commands: Array) -> Array:
 
 
 def commands_of_pumps(plant: PlantDescription, asked: Array) -> Array:
-    """(T, M) m^3/s -> (T, C) in the header's unit: each channel by its first pump."""
+    """(T, M) m^3/s -> (T, C) in the header's unit, each channel from its first pump."""
     first = {p.channel: i for i, p in reversed(list(enumerate(plant.pumps)))}
     pumps = [plant.pumps[first[channel]] for channel in plant.channels()]
     units = [(first[p.channel], p.gain * FACTORS[command_unit(p)], DECIMALS[command_unit(p)]) for p in pumps]
@@ -128,7 +130,7 @@ def commands_of_pumps(plant: PlantDescription, asked: Array) -> Array:
 
 
 def levels_at_rest(rig: Rig) -> Array:
-    """(N,) m: where the rig without any effect comes to rest at middling inputs."""
+    """Equilibrium levels (N,) m of the rig without any effect at medium inputs."""
     if rig.rest is not None:
         return np.array(rig.rest)
     middle = in_print(rig, np.tile(channel_limits(rig).mean(axis=1), (4001, 1)))
@@ -137,8 +139,8 @@ def levels_at_rest(rig: Rig) -> Array:
     return ran.levels[-1]
 
 
-def nominal_runs(conditions: Sequence[Conditions], part: int, disturbed: bool = False) -> list[Ran]:
-    """Each recording (0) or hold-out (1) as the rig without any effect would run, coarsely."""
+def nominal_runs(conditions: Sequence[Conditions], part: int, disturbed: bool = False) -> list[SimulatedRun]:
+    """Coarse simulations of each recording (part 0) or hold-out (part 1) without any effect."""
     if not conditions:
         return []
     rigs = HiddenRigs([c.built for c in conditions], [()] * len(conditions))
@@ -146,10 +148,10 @@ def nominal_runs(conditions: Sequence[Conditions], part: int, disturbed: bool = 
 
 
 def kept_within(conditions: Sequence[Conditions]) -> list[Conditions]:
-    """Changes the inputs of those whose rig without any effect comes near its rim, or its floor where that counts.
+    """Adjust the inputs so that the rig without any effect stays away from its rims, and from its floors if required.
 
-    Inputs are turned down (up) where levels are too high (low) alone, else drawn together about their mean.
-    Raises ValueError where that does not help.
+    Inputs are lowered (raised) if levels are only too high (low), otherwise contracted about their mean. Raises
+    ValueError if that does not help.
     """
     kept, todo = list(conditions), list(range(len(conditions)))
     for _ in range(_MOST_TRIALS):
@@ -177,8 +179,8 @@ def _moved(rig: Rig, commands: Array, low: bool, high: bool) -> Array:
     return in_print(rig, middle + 0.85 * (commands - middle) if high else 0.9 * commands + 0.1 * commands.max(axis=0))
 
 
-def controlled(c: Conditions, rng: np.random.Generator, runs: Sequence[Ran]) -> Conditions:
-    """With a level control on one pump. runs: the rig without any effect in open loop, recording and hold-out."""
+def controlled(c: Conditions, rng: np.random.Generator, runs: Sequence[SimulatedRun]) -> Conditions:
+    """The conditions with a level control on one pump. runs: open-loop runs without any effect, both parts."""
     limits, channels = channel_limits(c.rig), c.rig.plant.channels()
     flows = np.array([p.gain * FACTORS[command_unit(p)] for p in c.rig.plant.pumps])
     quanta = np.array([10.0 ** -DECIMALS[command_unit(p)] for p in c.rig.plant.pumps])
@@ -190,9 +192,9 @@ def controlled(c: Conditions, rng: np.random.Generator, runs: Sequence[Ran]) -> 
 def disturbed(
     conditions: Sequence[Conditions], disturbances: Sequence[Disturbance], generators: Sequence[np.random.Generator]
 ) -> list[Conditions]:
-    """With random flows into each tank, scaled such that the levels that are read move by `ratio` times the noise.
+    """The conditions with random flows into each tank, scaled so that measured levels move by `ratio` times the noise.
 
-    The scale comes from two coarse runs: levels move nearly in proportion.
+    The scale follows from two coarse runs, because levels respond almost linearly.
     """
     drawn = [
         tuple(d.values(rng, len(u)) for u in c.commands)
@@ -202,8 +204,8 @@ def disturbed(
     scales = [0.02 * float(asked_of_pumps(c.built, c.commands[0]).mean()) for c in conditions]
     for trial in range(3):
         out = [
-            replace(c, disturbance=d, disturbances=tuple(scale * values for values in own))
-            for c, d, own, scale in zip(conditions, disturbances, drawn, scales, strict=True)
+            replace(c, disturbance=d, disturbances=tuple(scale * values for values in unscaled))
+            for c, d, unscaled, scale in zip(conditions, disturbances, drawn, scales, strict=True)
         ]
         if trial < 2:
             moved = nominal_runs(out, 0, disturbed=True)
@@ -213,20 +215,19 @@ def disturbed(
 
 
 def moved_by(c: Conditions, levels: Array, others: Array) -> float:
-    """Root mean square of what the levels that are read differ by, each in units of its sensor's noise."""
+    """Root mean square difference of the measured levels, in units of each sensor's noise."""
     tanks = [t.name for t in c.rig.plant.tanks]
     read = [tanks.index(s.tank) for s in c.rig.plant.sensors]
     return float(np.sqrt(np.mean(((levels - others)[:, read] / c.noise) ** 2)))
 
 
 def exercised(plant: PlantDescription, scales: Scales = SAME) -> Rig:
-    """A rig that only its plant file describes, with the widest inputs, in steps of a tenth, at whose middle no tank
-    rests above half its height.
+    """A rig that is described only by its plant file, with the widest inputs at whose middle no tank is above half its
+    height in equilibrium.
 
-    scales: how much larger and slower it is than a rig on a bench. Cases are made there and recorded at the
-    plant's own size and pace: a water tower's recording lasts for days.
-
-    Raises ValueError for valves, for a rig without pumps or sensors, and where every input overfills it.
+    scales: its size and time scale relative to a bench-scale rig. Cases are simulated at bench scale and recorded at
+    the plant's own scale: a water tower's recording lasts for days. Raises ValueError for valves, for a rig without
+    pumps or sensors, and if every input overfills it.
     """
     rig = Rig(on_bench(plant, scales), LOW, HIGH, full_size=plant, scales=scales)
     while ((rest := levels_at_rest(rig)) > [FULL * t.height for t in rig.plant.tanks]).any():

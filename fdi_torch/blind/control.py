@@ -1,4 +1,4 @@
-"""Level control of a hidden rig: one pump keeps one level near a set point that steps at random."""
+"""Level control of a hidden rig: one pump keeps one level near a set point that changes in random steps."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ RESET = 120.0
 
 @dataclass(frozen=True)
 class LevelControl:
-    """pump, tank: which ones, counted in their rig. set_points (T,) m. low, high: m^3/s between which the pump runs.
+    """Level control by one pump.
 
-    two_point: all or little, switched `band` m off the set point, at every second.
-    proportional_integral: q = middle + gain (e + integral of e / reset), each `INTERVAL` s; the integral stands still
-    while the pump is at a limit. gain m^2/s. quantum: m^3/s to which commands are rounded.
+    law 'two_point': high or low flow, switched `band` m from the set point, every second. law 'proportional_integral':
+    q = middle + gain (e + integral of e / reset) every `INTERVAL` s, with the integral frozen while the pump is at a
+    limit. pump, tank: indices in the rig. set_points (T,) m. low, high: limits of the flow, m^3/s. gain: m^2/s.
+    quantum: resolution of commands, m^3/s.
     """
 
     law: str
@@ -41,14 +42,14 @@ class LevelControl:
 
 
 class Controller:
-    """A level control at work: what it asks for depends on what it asked for before."""
+    """State of a level control: its output depends on its previous output."""
 
     def __init__(self, control: LevelControl) -> None:
         self.control, self.pump, self.tank = control, control.pump, control.tank
         self.asked, self.integral = 0.5 * (control.low + control.high), 0.0
 
     def flow(self, second: int, reading: float) -> float:
-        """The flow asked for in the second that follows, m^3/s. reading: m."""
+        """Requested flow in the next second, m^3/s. reading: m."""
         c = self.control
         error = float(c.set_points[min(second, len(c.set_points) - 1)]) - reading
         if c.law == "two_point":
@@ -64,7 +65,7 @@ class Controller:
 def draw_control(
     rng: np.random.Generator, plant: PlantDescription, levels: Sequence[Array], limits: Array, quantum: Array
 ) -> tuple[LevelControl, ...]:
-    """The control of one level, for recordings of the lengths of each of `levels` ((T, N) m, undisturbed open loop).
+    """The control of one level, for recordings with the lengths of `levels` ((T, N) m, undisturbed, open loop).
 
     limits (M, 2): lowest and highest flow of each pump, quantum (M,): its least change, m^3/s. Set points lie between
     the fifth and the four fifths of the levels that the open loop reaches, so that the pump can hold them.

@@ -1,4 +1,4 @@
-"""What a law of the hidden rigs sees of the instant it acts in."""
+"""Input of a law of the hidden rigs at one instant, and a rig's deviation from its plant file."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ Numbers = Mapping[str, Array]
 
 @dataclass
 class Moment:
-    """time s on the recording's clock; dt s; level (n,) m of the pump's tank.
+    """Input of a pump's law at one instant.
 
-    asked(delay): the flow asked for so many seconds ago, (n,) s -> (n,) m^3/s.
+    time: s on the recording's clock; dt: s; level (n,): of the pump's tank, m. asked(delay): flow that was requested
+    `delay` seconds ago, (n,) s -> (n,) m^3/s.
     """
 
     time: float
@@ -29,10 +30,10 @@ class Moment:
 
 @dataclass(frozen=True)
 class Deviation:
-    """One thing that is off at a hidden rig.
+    """One deviation of a hidden rig from its plant file.
 
-    effect: its name in the diagnosis' vocabulary ('unknown' where it has none). location: the component.
-    law: the equation, by name. numbers: SI. other: the second tank, where water goes from one into another.
+    effect: name in the library, 'unknown' for a law outside it. location: the component. law: name of the equation.
+    numbers: its parameters, SI. other: the second tank of a flow between tanks.
     """
 
     effect: str

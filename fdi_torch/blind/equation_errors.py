@@ -1,4 +1,4 @@
-"""Equation errors of a recording in integral form, and the columns that effects add to them; the rivals regress these.
+"""Equation errors of a recording in integral form, and the columns that effects add, for the regression baselines.
 
 Over each block of `BLOCK` samples, and for each tank whose level and neighbours are measured:
     y = A (h_end - h_begin) - sum over samples of F(h, u) dt      (m^3)
@@ -27,9 +27,9 @@ _SMALLEST_HEAD = 1e-4  # m
 
 @dataclass(frozen=True)
 class EquationErrors:
-    """y (K, N): a row a block, NaN at tanks that cannot be balanced. nuisance: columns of what may be off anyway, one a
-    discharge coefficient. columns: of each effect at each place. local: what a place sees, (K,), and how a flow there
-    enters the balances, (N,).
+    """y (K, N): integrated balance error of each block and tank, NaN for tanks that cannot be balanced. nuisance:
+    columns of the discharge coefficients. columns: of each effect at each location. local: by location, its variable
+    (K,) and how a flow there enters the balances (N,).
     """
 
     y: Array
@@ -39,7 +39,7 @@ class EquationErrors:
 
 
 def equation_errors(plant: PlantDescription, recording: Recording) -> EquationErrors:
-    """Of an evenly sampled recording whose sensors read levels."""
+    """Equation errors of an evenly sampled recording whose sensors read levels."""
     names = [t.name for t in plant.tanks]
     area, dt = np.array([t.area for t in plant.tanks]), recording.interval
     level = np.full((len(recording), len(names)), np.nan)
@@ -105,7 +105,7 @@ def equation_errors(plant: PlantDescription, recording: Recording) -> EquationEr
 
 
 def _enters(count: int, source: int, target: int | None, sign: float = 1.0) -> Array:
-    """(N,): -1 at the tank that a flow leaves, 1 at that it enters."""
+    """(N,): -1 at the tank that a flow leaves, 1 at the tank that it enters."""
     out = np.zeros(count)
     out[source] = -sign
     if target is not None:
@@ -114,18 +114,18 @@ def _enters(count: int, source: int, target: int | None, sign: float = 1.0) -> A
 
 
 def _smooth(x: Array) -> Array:
-    """(T,): the mean of `SMOOTHED` samples about each."""
+    """(T,): moving average over `SMOOTHED` samples."""
     padded = np.pad(x, SMOOTHED // 2, mode="edge")
     return np.convolve(padded, np.ones(SMOOTHED) / SMOOTHED, "valid")
 
 
 def _over_the_sample(x: Array) -> Array:
-    """(T,): the mean of each value and the next, as a command is held from one sample to the next."""
+    """(T,): mean of each value and the next one, for inputs held between samples."""
     return np.append(0.5 * (x[1:] + x[:-1]), x[-1])
 
 
 def _shared(q: Array, balance: Array) -> Array:
-    """(T, N): a flow as it enters each tank's balance; where it does not, it counts as 0 even if it is not known."""
+    """(T, N): a flow in each tank's balance; 0 in tanks that it does not enter, even if it is unknown."""
     return np.where(balance != 0, q[:, None] * balance, 0.0)
 
 

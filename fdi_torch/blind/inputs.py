@@ -1,4 +1,4 @@
-"""What the hidden rigs are driven with: each channel a signal that is held for whole seconds, as it will be printed."""
+"""Inputs of the hidden rigs: a signal for each channel, held for whole seconds, rounded as in the recording."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FACTORS = {"cm3_s": 1e-6, "V": 1.0, "1": 1.0}
 
 
 def command_unit(pump: Pump) -> str:
-    """The unit that stands in the header of a pump's command."""
+    """Unit of a pump's command in the recording's header."""
     return "cm3_s" if pump.gain_unit == "1" else "V" if pump.gain_unit.endswith("/V") else "1"
 
 
@@ -32,7 +32,7 @@ def channel_limits(rig: Rig) -> Array:
 
 
 def in_print(rig: Rig, commands: Array) -> Array:
-    """Rounded as the recording will print it, so that the rig gets what the recording says."""
+    """Commands rounded as the recording prints them, so that the rig gets the recorded values."""
     units = [command_unit(next(p for p in rig.plant.pumps if p.channel == c)) for c in rig.plant.channels()]
     return np.stack([np.round(commands[:, i], DECIMALS[u]) for i, u in enumerate(units)], axis=1)
 
@@ -41,19 +41,19 @@ def in_print(rig: Rig, commands: Array) -> Array:
 
 
 def steps(rng: np.random.Generator, samples: int) -> Array:
-    """A random value for a random while."""
+    """Random steps of random duration."""
     return _held(rng, samples, (float(rng.random()) for _ in repeat(None)))
 
 
 def ramps(rng: np.random.Generator, samples: int) -> Array:
-    """Straight from one random value to the next."""
+    """Straight lines between random values."""
     whiles = rng.integers(SHORTEST_HOLD, LONGEST_HOLD, size=samples // SHORTEST_HOLD + 1)
     at = np.concatenate(([0], np.cumsum(whiles)))
     return np.interp(np.arange(samples), at, rng.random(len(at)))
 
 
 def waves(rng: np.random.Generator, samples: int) -> Array:
-    """Four sines, whose periods lie between twice the shortest and four times the longest while."""
+    """Sum of four sines with periods from twice the shortest to four times the longest step duration."""
     periods = np.geomspace(2 * SHORTEST_HOLD, 4 * LONGEST_HOLD, 4) * rng.uniform(0.8, 1.25, size=4)
     sines = np.sin(2 * np.pi * (np.arange(samples)[:, None] / periods + rng.random(4))).sum(axis=1)
     return (sines - sines.min()) / np.ptp(sines)
@@ -63,24 +63,24 @@ def waves(rng: np.random.Generator, samples: int) -> Array:
 
 
 def two_steps(rng: np.random.Generator, samples: int) -> Array:
-    """Up (or down) after a third, and back after two."""
+    """One step up (or down) after a third, and back after two thirds."""
     middle, up = rng.uniform(0.25, 0.55), rng.uniform(0.25, 0.75)
     return np.where(np.arange(samples) // (samples // 3) == 1, up, middle)
 
 
 def two_levels(rng: np.random.Generator, samples: int) -> Array:
-    """Low and high in turn, for random whiles."""
+    """Alternating low and high values of random duration."""
     return _held(rng, samples, cycle((rng.uniform(0.0, 0.35), rng.uniform(0.65, 1.0))))
 
 
 def one_step(rng: np.random.Generator, samples: int) -> Array:
-    """Up or down once, somewhere in the middle third."""
+    """One step up or down in the middle third."""
     first, second = rng.permutation([rng.uniform(0.15, 0.4), rng.uniform(0.6, 0.85)])
     return np.where(np.arange(samples) < rng.uniform(0.33, 0.67) * samples, first, second)
 
 
 def one_hill(rng: np.random.Generator, samples: int) -> Array:
-    """Slowly up, and slowly down again."""
+    """A slow ramp up and down."""
     top, foot = rng.uniform(0.3, 0.7) * samples, rng.uniform(0.1, 0.3)
     return np.interp(np.arange(samples), [0, top, samples], [foot, rng.uniform(0.7, 0.95), foot])
 
@@ -100,7 +100,7 @@ SIGNALS: dict[str, dict[Signal, float]] = {
     "steps": {steps: 1.0},
     "poor": {two_steps: 0.6, one_step: 0.12, one_hill: 0.12, two_levels: 0.16},
 }
-"""Signals and how often each is taken."""
+"""Signals and their frequencies."""
 
 
 def drawn(rng: np.random.Generator, inputs: str) -> Signal:
@@ -109,14 +109,14 @@ def drawn(rng: np.random.Generator, inputs: str) -> Signal:
 
 
 def commanded(rig: Rig, rng: np.random.Generator, samples: int, signal: Signal = steps) -> Array:
-    """(T, C) in the header's unit: every channel gets a signal of this kind."""
+    """(T, C) in the header's unit, with a signal of this kind for every channel."""
     limits = channel_limits(rig)
     shares = np.stack([signal(rng, samples) for _ in limits], axis=1)
     return in_print(rig, limits[:, 0] + (limits[:, 1] - limits[:, 0]) * shares)
 
 
 def with_standstills(rig: Rig, rng: np.random.Generator, samples: int, resting: str) -> Array:
-    """Random steps; one channel often stands still for long, so that the others' steps turn flows round."""
+    """Random steps; one channel is often at rest for long, so that steps of the others reverse flows."""
     commands, column, at = commanded(rig, rng, samples), rig.plant.channels().index(resting), 0
     while at < samples:
         at += int(rng.integers(2 * SHORTEST_HOLD, 2 * LONGEST_HOLD))
@@ -127,7 +127,7 @@ def with_standstills(rig: Rig, rng: np.random.Generator, samples: int, resting: 
 
 
 def channel_to_rest(plant: PlantDescription, pipe: str) -> str:
-    """The channel whose rest turns the flow of a pipe round: it feeds its source, or at least not its target."""
+    """The channel whose rest reverses the flow of a pipe: it feeds the pipe's source, or at least not its target."""
     p = next(p for p in plant.pipes if p.name == pipe)
     feeding = [q.channel for q in plant.pumps if q.target == p.source]
     others = [q.channel for q in plant.pumps if q.target != p.target]

@@ -1,4 +1,4 @@
-"""What goes wrong at the hidden rigs' pipes and outlets.
+"""Laws of deviations at the hidden rigs' pipes and outlets.
 
 A head law maps the driving head (n,) m. A pipe law is f(head, q, now, p, state) -> (factor, state):
 what the square-root flow q = k sign(head) sqrt|head| (m^3/s) is multiplied by.
@@ -17,7 +17,7 @@ _MILLIMETRE = 1e-3
 
 
 def down_pipe(head: Array, p: Numbers) -> Array:
-    """The mouth lies `drop` below the floor (negative: above): head + drop, fading as the last millimetre runs dry."""
+    """Outlet `drop` below the floor (negative: above): head + drop, fading out over the last millimetre of level."""
     raised = np.maximum(head + p["drop"], 0.0)
     wet = np.minimum(np.maximum(head, 0.0) / _MILLIMETRE, 1.0)
     return raised * wet
@@ -35,7 +35,7 @@ def reynolds_blend(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -
 
 
 def sharp_transition(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Linear in the head below one head, by the square root above it."""
+    """Linear in the head below a threshold, square root above it."""
     return np.minimum(np.sqrt(np.abs(head) / p["head"]), 1.0), None
 
 
@@ -50,7 +50,7 @@ def drifting_evenly(head: Array, q: Array, now: Moment, p: Numbers, state: Any) 
 
 
 def drifting_to_rest(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Fast at first, then coming to rest: (1 - exp(-1.5 t/T)) / (1 - exp(-1.5))."""
+    """Exponential approach: (1 - exp(-1.5 t/T)) / (1 - exp(-1.5))."""
     return 1 + p["change"] * (1 - np.exp(-1.5 * now.time / p["span"])) / (1 - np.exp(-1.5)), None
 
 
@@ -60,60 +60,60 @@ def drifting_as_sine(head: Array, q: Array, now: Moment, p: Numbers, state: Any)
 
 
 def drifting_unevenly(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Slower and faster in turn, but never back."""
+    """Monotonic growth with varying speed."""
     t = now.time / p["span"]
     return 1 + p["change"] * (t + 0.12 * np.sin(4 * np.pi * t) / (2 * np.pi)), None
 
 
 def narrowed(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Narrower (wider) from `onset` on, within `ramp` seconds."""
+    """A smaller (larger) opening from `onset` on, reached within `ramp` seconds."""
     grown = np.minimum(np.maximum((now.time - p["onset"]) / p["ramp"], 0.0), 1.0)
     return 1 - p["loss"] * grown, None
 
 
 def check_valve(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Lets water through forwards only."""
+    """A check valve: flow in the forward direction only."""
     return (head > 0).astype(np.float64), None
 
 
 def silting(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Silt settles while the flow is slow and is washed out while it is fast."""
+    """Silt that settles at low flow and is washed out at high flow."""
     silt = np.zeros_like(q) if state is None else state
     gain = np.where(np.abs(q) < p["slow"], now.dt / p["settle"], -now.dt / p["wash"])
     return 1 - p["loss"] * silt, np.minimum(np.maximum(silt + gain, 0.0), 1.0)
 
 
 def two_regimes(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """A jet that attaches above one head and lets go only below a lower one."""
+    """A jet that attaches above one head and detaches below a lower one."""
     attached = (head > p["low"]) if state is None else state
     attached = np.where(attached, head > p["low"], head > p["high"])
     return np.where(attached, 1.0, 1 - p["loss"]), attached
 
 
 def fluttering(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """A flap that opens and closes by itself."""
+    """A flap that opens and closes periodically."""
     return 1 - p["loss"] * np.sin(np.pi * now.time / p["period"]) ** 2, None
 
 
 def choked(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """A flow limiter: never more than a certain flow, q_max tanh(q/q_max) with a sharper knee."""
+    """A flow limiter: q_max tanh(q/q_max) with a sharper knee."""
     x = (q / p["most"]) ** 2
     return 1 / np.sqrt(np.sqrt(1 + x * x)), None
 
 
 def blocked_at_times(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Something that floats in front of the mouth for irregular whiles."""
+    """A floating object that blocks the inlet at irregular times."""
     t = 2 * np.pi * now.time / p["period"]
     return 1 - p["loss"] * (np.sin(t) + np.sin(t / 0.618 + 1.0) > 0.7), None
 
 
 def lopsided(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Another coefficient backwards than forwards."""
+    """A different discharge coefficient for reverse flow."""
     return np.where(head > 0, 1 + p["change"], 1 - p["change"]), None
 
 
 def gulping(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """A vortex that brings air along as soon as the head is low."""
+    """A vortex that entrains air at low head."""
     return np.where(np.abs(head) < p["head"], 1 - p["loss"], 1.0), None
 
 

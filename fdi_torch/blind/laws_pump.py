@@ -1,4 +1,4 @@
-"""What goes wrong at the hidden rigs' pumps: maps of the flow asked for into the flow delivered.
+"""Laws of deviations at the hidden rigs' pumps: maps of the requested flow to the delivered flow.
 
 A law is f(q, now, p, state) -> (q, state): q (n,) m^3/s, p its numbers (n,) each, state None at the first step.
 A flow that changes within a step is given as its mean over the step.
@@ -17,17 +17,17 @@ Delivered = tuple[Array, Any]
 
 
 def late(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Plug flow in a hose: the command of `delay` seconds ago."""
+    """Pure delay: plug flow in a hose."""
     return now.asked(p["delay"]), None
 
 
 def late_and_smeared(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """A hose with some mixing: half arrives a little before, half a little after."""
+    """Delay with some mixing: half arrives a little earlier, half a little later."""
     return 0.5 * (now.asked(0.92 * p["delay"]) + now.asked(1.08 * p["delay"])), None
 
 
 def late_and_slow(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """A hose, and a valve behind it that takes a fifth of the delay as its time constant."""
+    """Delay, and a first-order valve with a fifth of the delay as time constant."""
     return slow(now.asked(0.8 * p["delay"]), now, {"tau": 0.2 * p["delay"]}, state)
 
 
@@ -50,7 +50,7 @@ def hard_limit(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
 
 
 def rounded_limit(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """q / (1 + (q/q_max)^16)^(1/16), by squaring and square roots alone."""
+    """q / (1 + (q/q_max)^16)^(1/16), computed by squaring and square roots."""
     x = q / p["limit"]
     for _ in range(4):
         x = x * x
@@ -67,14 +67,14 @@ def _pole(x: Array, old: Array, tau: Array, dt: float) -> Array:
 
 
 def slow(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """A single pole."""
+    """First-order lag."""
     old = q if state is None else state
     new = _pole(q, old, p["tau"], now.dt)
     return 0.5 * (old + new), new
 
 
 def slow_in_two_poles(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """A rotor behind a fast driver: poles at 94 % and 6 % of the time constant."""
+    """Second-order lag: poles at 94 % and 6 % of the time constant."""
     fast, rotor = (q, q) if state is None else state
     fast_new = _pole(q, fast, 0.06 * p["tau"], now.dt)
     rotor_new = _pole(0.5 * (fast + fast_new), rotor, 0.94 * p["tau"], now.dt)
@@ -87,12 +87,12 @@ def shut_off_head(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
 
 
 def falling(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Falls off evenly with the level: q (1 - h/H)."""
+    """Linear in the level: q (1 - h/H)."""
     return q * np.maximum(1 - now.level / p["head"], 0.0), None
 
 
 def drooping(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Falls off with the square of the level: q (1 - (h/H)^2)."""
+    """Quadratic in the level: q (1 - (h/H)^2)."""
     return q * np.maximum(1 - (now.level / p["head"]) ** 2, 0.0), None
 
 
@@ -101,45 +101,45 @@ def pulsating(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
 
 
 def backlash(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """The play operator: the spindle follows the command with some slack either way."""
+    """The play operator: backlash between command and spindle."""
     old = q - p["slack"] if state is None else state
     new = np.minimum(np.maximum(old, q - p["slack"]), q + p["slack"])
     return np.maximum(new, 0.0), new
 
 
 def sticking(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """A drive that does not move for small changes of its command."""
+    """A drive that does not respond to small changes of its command."""
     old = q if state is None else state
     new = np.where(np.abs(q - old) > p["stiction"], q, old)
     return new, new
 
 
 def tiring(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """A motor that gives less the hotter its recent work has made it."""
+    """A motor that delivers less when recent work has heated it."""
     heat = q / p["rated"] if state is None else state
     delivered = q * (1 - p["loss"] * heat)
     return delivered, heat + now.dt / p["tau"] * ((q / p["rated"]) ** 2 - heat)
 
 
 def stalling(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Airlocks: three stretches in every `period` in which only a part is delivered."""
+    """Airlocks: three intervals in every `period` with partial delivery."""
     phase = np.mod(now.time / p["period"], 1.0)
     stalled = ((phase > 0.11) & (phase < 0.19)) | ((phase > 0.40) & (phase < 0.44)) | ((phase > 0.71) & (phase < 0.83))
     return np.where(stalled, p["rest"] * q, q), None
 
 
 def sputtering(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Sucks air now and then, for irregular whiles."""
+    """Air intake at irregular times."""
     return np.where(_irregular(now.time, p["period"]), p["rest"] * q, q), None
 
 
 def bent(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Right at rest and at its highest flow, off between: q (1 + 4 b (1 - q/q_max))."""
+    """Nonlinearity that vanishes at zero and full flow: q (1 + 4 b (1 - q/q_max))."""
     return q * (1 + 4 * p["bow"] * (1 - q / p["rated"])), None
 
 
 def slewing(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """A drive whose flow changes no faster than so many m^3/s each second."""
+    """Rate limit of the flow, m^3/s per second."""
     old = q if state is None else state
     most = p["rate"] * now.dt
     new = old + np.minimum(np.maximum(q - old, -most), most)
@@ -147,7 +147,7 @@ def slewing(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
 
 
 def _irregular(time: float, period: Array) -> npt.NDArray[np.bool_]:
-    """True for about a fourth of the time, in whiles that never repeat: two sines of incommensurate periods."""
+    """True for about a quarter of the time at aperiodic intervals: two sines of incommensurate periods."""
     return np.sin(2 * np.pi * time / period) + np.sin(2 * np.pi * time / (0.618 * period) + 1.0) > 0.9
 
 

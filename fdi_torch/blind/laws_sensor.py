@@ -1,4 +1,4 @@
-"""What goes wrong at the hidden rigs' sensors: maps of a signal sampled at `time` (T,) s, one column a lane.
+"""Laws of deviations at the hidden rigs' sensors: maps of a signal sampled at `time` (T,) s, one column per lane.
 
 A sensor law acts on the true level (T, n) m, before noise; a readout law on the noisy reading.
 Between samples a level is taken to run straight: inputs switch at samples only.
@@ -22,23 +22,23 @@ def stretched(x: Array, time: Array, p: Numbers) -> Array:
 
 
 def creeping(x: Array, time: Array, p: Numbers) -> Array:
-    """Drift at a steady rate."""
+    """Drift at a constant rate."""
     return x + p["rate"] * time[:, None]
 
 
 def late_reading(x: Array, time: Array, p: Numbers) -> Array:
-    """The level of `delay` seconds ago; before the start, the first level."""
+    """Pure delay; before the start, the first level."""
     columns = [np.interp(time - d, time, column) for d, column in zip(p["delay"], x.T, strict=True)]
     return np.stack(columns, axis=1)
 
 
 def damped(x: Array, time: Array, p: Numbers) -> Array:
-    """A stilling pipe: one pole by backward Euler with twenty steps a sample."""
+    """First-order lag (stilling pipe), by backward Euler with twenty steps per sample."""
     return _chain(x, time, (p["tau"],))
 
 
 def damped_twice(x: Array, time: Array, p: Numbers) -> Array:
-    """A stilling pipe and a filter behind it: poles at 94 % and 6 % of the time constant."""
+    """Second-order lag (stilling pipe and filter): poles at 94 % and 6 % of the time constant."""
     return _chain(x, time, (0.94 * p["tau"], 0.06 * p["tau"]))
 
 
@@ -61,13 +61,13 @@ def clipped(x: Array, time: Array, p: Numbers) -> Array:
 
 
 def bowed(x: Array, time: Array, p: Numbers) -> Array:
-    """Bends by `bow` halfway between two levels at which it is right."""
+    """Curvature: error `bow` halfway between two levels without error."""
     s = (x - p["low"]) / (p["high"] - p["low"])
     return x + p["bow"] * 4 * s * (1 - s)
 
 
 def sticking_float(x: Array, time: Array, p: Numbers) -> Array:
-    """A float with friction: the play operator."""
+    """Hysteresis of a float with friction: the play operator."""
     out = np.empty_like(x)
     held = x[0] - p["slack"]
     for i, level in enumerate(x):
@@ -77,12 +77,12 @@ def sticking_float(x: Array, time: Array, p: Numbers) -> Array:
 
 
 def humming(x: Array, time: Array, p: Numbers) -> Array:
-    """A slow beat of a disturbance with the sampling."""
+    """Slow beat between a disturbance and the sampling."""
     return x + p["height"] * np.sin(2 * np.pi * time[:, None] / p["period"])
 
 
 def freezing(x: Array, time: Array, p: Numbers) -> Array:
-    """A transmitter that repeats its last value for a while, now and then."""
+    """A transmitter that sometimes repeats its last value for a while."""
     phase = np.mod(time[:, None] / p["period"], 1.0)
     frozen = ((phase > 0.13) & (phase < 0.38)) | ((phase > 0.60) & (phase < 0.93))
     out = x.copy()
@@ -92,22 +92,22 @@ def freezing(x: Array, time: Array, p: Numbers) -> Array:
 
 
 def jumped(x: Array, time: Array, p: Numbers) -> Array:
-    """Somebody knocked against it: another zero from some time on."""
+    """A zero shift at some time."""
     return x + p["offset"] * (time[:, None] > p["onset"])
 
 
 def kinked(x: Array, time: Array, p: Numbers) -> Array:
-    """Another gain above some level."""
+    """A different gain above some level."""
     return x + p["extra"] * np.maximum(x - p["knee"], 0.0)
 
 
 def leading(x: Array, time: Array, p: Numbers) -> Array:
-    """Foam: reads too high while the level rises, too low while it falls."""
+    """Foam: positive error while the level rises, negative while it falls."""
     return x + p["ahead"] * np.gradient(x, time, axis=0)
 
 
 def wandering(x: Array, time: Array, p: Numbers) -> Array:
-    """Zero that wanders with the temperature: two slow sines of incommensurate periods."""
+    """Zero that varies with the temperature: two slow sines of incommensurate periods."""
     t = 2 * np.pi * time[:, None] / p["period"]
     return x + 0.5 * p["height"] * (np.sin(t) + np.sin(t / 0.618 + 1.0))
 
@@ -117,7 +117,7 @@ def rounded(x: Array, time: Array, p: Numbers) -> Array:
 
 
 def bursting(x: Array, time: Array, p: Numbers) -> Array:
-    """Short bursts of outliers: each begins with this chance, lasts up to four samples, and has one height."""
+    """Short bursts of outliers: each starts with this probability, lasts up to four samples, and has one height."""
     out = x.copy()
     for column, (seed, chance, height) in enumerate(zip(p["seed"], p["chance"], p["height"], strict=True)):
         rng = np.random.default_rng(int(seed))

@@ -1,4 +1,4 @@
-"""How each effect of the diagnosis' vocabulary is drawn at a hidden rig: law, numbers and usual strength.
+"""Draw of each named effect at a hidden rig: law, numbers and usual strength.
 
 Sizes are shares of what the sound rig does under this recording's inputs; a draw is f(s, place) -> Deviation.
 """
@@ -48,7 +48,7 @@ def pump_back_pressure(s: NominalRun, at: str) -> Deviation:
 
 
 def laminar_flow(s: NominalRun, at: str) -> Deviation:
-    """The size is the share of flow lost at the middling head, f = 1 - size, solved for the law's own head."""
+    """The size is the share of flow lost at the median head, f = 1 - size, solved for the law's head."""
     law = s.one_of("viscous_and_inertial", "reynolds_blend", "sharp_transition")
     kept = 1 - s.size(0.07, 0.22)
     if law == "sharp_transition":
@@ -74,7 +74,7 @@ def coefficient_drift(s: NominalRun, at: str) -> Deviation:
 
 
 def plugging(s: NominalRun, at: str) -> Deviation:
-    """From the start on where strong, else from some time on: a small one from the start is within tolerance."""
+    """From the start if strong, otherwise from some time on, because a small one from the start is within tolerance."""
     sudden = s.strength < 0.5 or s.rng.random() < 0.5
     onset = s.uniform(0.12, 0.5) * s.seconds if sudden else -1e9
     return Deviation(
@@ -109,7 +109,7 @@ def unmetered_flow(s: NominalRun, at: str) -> Deviation:
 
 
 def area_taper(s: NominalRun, at: str) -> Deviation:
-    """The cross-section believed in was measured at the floor, or is that at half height."""
+    """The nominal cross-section is that at the floor, or that at half height."""
     slope = ((1 + s.either(0.15, 0.4)) ** 0.5 - 1) / s.tank(at, 0.98)
     tank = s.plant.component(at)
     half = 0.5 * tank.height if isinstance(tank, Tank) and s.rng.random() < 0.5 else 0.0

@@ -1,4 +1,4 @@
-"""Random networks of tanks: tree-like with some cross pipes, pumped at some tanks, drained at some.
+"""Random networks of tanks: tree-like with some cross pipes, with pumps and outlets at some tanks.
 
 Bores, cross-sections, heights and places of pumps and outlets are drawn; the pumps are then scaled together such that
 the highest tank rests at a given share of its rim. All pipes lie on the floor, so that q = k sign(x) sqrt|x| makes
@@ -27,7 +27,7 @@ _MOST_DRAWS = 1000
 
 @dataclass(frozen=True)
 class Networks:
-    """Rigs that are another network in each case, of `fewest` to `most` tanks."""
+    """Rigs that are a new random network of `fewest` to `most` tanks in each case."""
 
     fewest: int = FEWEST
     most: int = MOST
@@ -41,7 +41,9 @@ class Networks:
             )
 
     def rig(self, rng: np.random.Generator) -> Rig:
-        """A network whose tanks all rest between two shares of their rims at middling inputs; others are redrawn."""
+        """A network whose equilibrium levels at medium inputs lie between two shares of the rims; others
+        are rejected.
+        """
         tanks = int(rng.integers(self.fewest, self.most + 1))
         for _ in range(_MOST_DRAWS):
             plant = _drawn(rng, tanks)
@@ -127,7 +129,7 @@ def equilibrium(plant: PlantDescription, pumped: Array) -> Array:
 
 
 def with_unmeasured(rig: Rig, share: float, rng: np.random.Generator) -> Rig:
-    """The rig without sensors at this share of its tanks, rounded; at least one sensor stays."""
+    """The rig without the sensors of this share of its tanks, rounded; at least one sensor remains."""
     sensors = rig.believed.sensors
     gone = min(round(share * len(rig.plant.tanks)), len(sensors) - 1)
     dropped = {sensors[int(k)].name for k in rng.choice(len(sensors), size=gone, replace=False)}

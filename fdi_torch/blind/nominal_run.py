@@ -1,4 +1,4 @@
-"""What a cause is drawn against: how the sound rig moves under these inputs, so that thresholds are crossed."""
+"""The nominal run of a case, against which causes are drawn, so that their thresholds are crossed."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Ta
 
 @dataclass(frozen=True)
 class NominalRun:
-    """One case's sound rig.
+    """Run of a case's rig without deviations.
 
-    plant: as built. levels (T, N) m and asked (T, M) m^3/s of the recording; seconds: its length.
-    strength: 1 usual, 0.2 weak. rng: this case's own.
+    plant: as built. levels (T, N) m and asked (T, M) m^3/s: levels and requested flows of the recording. strength: of
+    the effects, 1 usual, 0.2 weak. rng: random generator of the case.
     """
 
     plant: PlantDescription
@@ -33,32 +33,32 @@ class NominalRun:
         return float(self.rng.uniform(low, high))
 
     def size(self, low: float, high: float) -> float:
-        """A size in its usual range, times the strength asked for."""
+        """A size in its usual range, times the strength."""
         return self.strength * self.uniform(low, high)
 
     def either(self, low: float, high: float) -> float:
-        """A size of either sign."""
+        """A size with random sign."""
         return self.size(low, high) * (1.0 if self.rng.random() < 0.5 else -1.0)
 
     def one_of(self, *laws: str) -> str:
         return laws[int(self.rng.integers(len(laws)))]
 
     def pump(self, name: str) -> tuple[float, float]:
-        """Lowest and highest flow asked of the pump, m^3/s."""
+        """Lowest and highest flow requested from the pump, m^3/s."""
         column = self.asked[:, [p.name for p in self.plant.pumps].index(name)]
         return float(column.min()), float(column.max())
 
     def tank(self, name: str, share: float) -> float:
-        """The level that the tank stays below for this share of the time, m."""
+        """The level below which the tank is for this share of the time, m."""
         column = self.levels[:, [t.name for t in self.plant.tanks].index(name)]
         return float(np.quantile(column, share))
 
     def span(self, tank: str) -> float:
-        """Levels between which the tank moves, m."""
+        """Lowest and highest level of the tank, m."""
         return self.tank(tank, 0.98) - self.tank(tank, 0.02)
 
     def tank_of(self, location: str) -> str:
-        """The tank a pump feeds, a sensor reads or a pipe drains."""
+        """The tank that a pump feeds, a sensor measures or a pipe drains."""
         component = self.plant.component(location)
         if isinstance(component, Pump):
             return component.target
@@ -67,7 +67,7 @@ class NominalRun:
         return component.tank if isinstance(component, Sensor) else component.name
 
     def head(self, pipe: str, share: float) -> float:
-        """The driving head that the pipe stays below for this share of the time, m."""
+        """The driving head below which the pipe is for this share of the time, m."""
         tanks = [t.name for t in self.plant.tanks]
         p = next(p for p in self.plant.pipes if p.name == pipe)
         head = self.levels[:, tanks.index(p.source)] - p.elevation

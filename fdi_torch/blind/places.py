@@ -1,4 +1,4 @@
-"""Where each effect can sit in a plant; what counts as one and the same thing."""
+"""Locations at which each effect can occur in a plant, and causes that count as equivalent."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Cause = tuple[str, str]
 
 
 def places(plant: PlantDescription, kinds: tuple[str, ...]) -> tuple[str, ...]:
-    """The locations of these kinds. A tank pair counts only where nothing known joins the two."""
+    """The locations of these kinds. A tank pair counts only if no known pipe connects the two tanks."""
     outlets = [p.name for p in plant.pipes if p.is_outlet]
     joined = [{p.source, p.target} for p in plant.pipes]
     by_kind = {
@@ -53,12 +53,14 @@ def places(plant: PlantDescription, kinds: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def effect_places(plant: PlantDescription) -> tuple[Cause, ...]:
-    """Every effect at every place it can have: 62 in the three tanks."""
+    """Every effect at every possible location: 62 in the three-tank plant."""
     return tuple((effect, place) for effect, kinds in EFFECTS.items() for place in places(plant, kinds))
 
 
 def canonical(cause: Cause, plant: PlantDescription) -> Cause:
-    """A leak at a drained tank's floor and a wider outlet to the outside are one thing; it is called the leak."""
+    """The canonical name of a cause: a leak at the floor of a drained tank and a wider outlet are both
+    called the leak.
+    """
     effect, location = cause
     if effect == "plugging":
         for pipe in plant.pipes:
@@ -78,7 +80,7 @@ TWINS: tuple[tuple[tuple[str, ...], str], ...] = (
 
 
 def are_twins(a: Cause, b: Cause, plant: PlantDescription) -> bool:
-    """Whether two causes are one thing, or nearly collinear at one place."""
+    """Whether two causes are equivalent, or nearly collinear at one location."""
     if canonical(a, plant) == canonical(b, plant):
         return True
     return a[1] == b[1] and any(a[0] in family and b[0] in family for family, _ in TWINS)

@@ -1,4 +1,4 @@
-"""The rigs of the blind benchmark, with numbers of their own: nothing is read from the library's plant files."""
+"""The rigs of the blind benchmark, with their own numbers: nothing is read from the library's plant files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Rig:
 
     @property
     def believed(self) -> PlantDescription:
-        """The plant file that the diagnosis is given."""
+        """The plant file for the diagnosis."""
         return self.full_size or self.plant
 
     def __post_init__(self) -> None:
@@ -102,7 +102,7 @@ def quadruple_tank() -> Rig:
 
 
 def cascaded_tanks() -> Rig:
-    """One pump, an upper tank pouring into a lower one, both read."""
+    """One pump, an upper tank flowing into a lower one, both measured."""
     tanks = (Tank("T1", 50 * CM2, 0.5, leak_reference="O1"), Tank("T2", 50 * CM2, 0.5, leak_reference="O2"))
     pipes = (
         Pipe("O1", "T1", "T2", 0.30 * CM2, 0.7, free_fall=True),

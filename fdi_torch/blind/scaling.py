@@ -15,7 +15,7 @@ from fdi_torch.plant.description import PlantDescription, Pump, Sensor
 
 @dataclass(frozen=True)
 class Scales:
-    """What one second, metre and square metre of the bench are at the rig, s, m and m^2."""
+    """Scale factors from bench to rig: s, m and m^2 at the rig for one second, metre and square metre on the bench."""
 
     time: float = 1.0
     length: float = 1.0
@@ -30,7 +30,7 @@ class Scales:
         return self.area * math.sqrt(self.length) / self.time
 
     def command(self, pump: Pump) -> float:
-        """What a pump's command of 1 on the bench is at the rig: more where commands are flows, else the same."""
+        """Scale factor of a pump's command: that of a flow if commands are flows, otherwise 1."""
         return self.flow if pump.gain_unit == "1" else 1.0
 
     def as_dict(self) -> dict[str, float]:
@@ -41,12 +41,12 @@ SAME = Scales()
 
 
 def decimals(on_bench: int, scale: float) -> int:
-    """Decimals in print that tell as much as `on_bench` decimals do on the bench."""
+    """Number of printed decimals at the rig that is equivalent to `on_bench` decimals on the bench."""
     return max(on_bench - round(math.log10(scale)), 0)
 
 
 def on_bench(plant: PlantDescription, scales: Scales) -> PlantDescription:
-    """The dynamically similar plant on the bench; readings in volts and the like stay the same."""
+    """The dynamically similar plant at bench scale; readings in volts and similar units are unchanged."""
     return replace(
         plant,
         tanks=tuple(
@@ -76,7 +76,7 @@ def _sensor(sensor: Sensor, scales: Scales) -> Sensor:
 
 
 def _unit_of(plant: PlantDescription, constant: str, scales: Scales) -> float:
-    """An offset's tolerance is in the reading's unit, all others are shares."""
+    """Tolerances of offsets are in the reading's unit, all others are relative."""
     name, _, field = constant.rpartition(".")
     sensor = next((s for s in plant.sensors if s.name == name), None)
     return scales.length if field == "offset" and sensor is not None and sensor.unit == "m" else 1.0

@@ -1,4 +1,4 @@
-"""Scores diagnoses against the opened key: detection, name, place, answer set, confident errors, closure, utility."""
+"""Scores of diagnoses against the key: detection, name, location, answer set, confident errors, closure, utility."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+from fdi_torch.blind.case_kinds import KINDS
 from fdi_torch.blind.conditions import HELD_OUT
-from fdi_torch.blind.kinds import KINDS
 from fdi_torch.blind.places import Cause, canonical, effect_places
 from fdi_torch.blind.sizes import size_errors
 from fdi_torch.blind.statistics import clopper_pearson, mean_interval, median_interval
@@ -33,7 +33,7 @@ MEDIANS = ("closed_error", "sec")
 
 
 def utility(answer: Collection[Cause], truth: Collection[Cause], pairs: int) -> float:
-    """DXC'09 utility of a set of causes w for the truth v of f pairs (Feldman et al., 2010).
+    """DXC'09 utility of an answered set of causes w for the true set v among f possible ones (Feldman et al., 2010).
 
     1 - n (N + 1) / (f (n + 1)) - m (M + 1) / (f (m + 1)), n = |w - v|, N = |w|, m = |v - w|, M = f - N.
     """
@@ -43,7 +43,7 @@ def utility(answer: Collection[Cause], truth: Collection[Cause], pairs: int) -> 
 
 
 def expected_utility(answer: Answer, sets: Sequence[list[Cause]], truth: list[Cause], plant: PlantDescription) -> float:
-    """Utility weighted by the posterior; where there is none, each member of the answer set counts the same."""
+    """Utility averaged over the posterior; without one, over the members of the answer set with equal weights."""
     post = [(_causes(x["causes"], plant), float(x["probability"])) for x in answer.get("posterior") or []]
     post = post or [(s, 1.0) for s in sets or [[]]]
     weight, pairs = sum(w for _, w in post) or 1.0, len(effect_places(plant))
@@ -51,12 +51,12 @@ def expected_utility(answer: Answer, sets: Sequence[list[Cause]], truth: list[Ca
 
 
 def _with_names(causes: Sequence[Cause]) -> list[Cause]:
-    """Less what has none: an unknown is no effect-place pair."""
+    """The causes without unknown ones, which are not effects of the library."""
     return [cause for cause in causes if cause[0] != "unknown"]
 
 
 def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> Row:
-    """One row of scores. truth: a line of the key, with its kind and causes."""
+    """One row of scores. truth: a line of the key, with kind and causes."""
     kind, true = truth["kind"], _causes(truth["causes"], plant)
     causes = _causes(answer.get("causes"), plant)
     sets = [_causes(s, plant) for s in answer.get("ambiguity_set") or []] or ([causes] if causes else [])
@@ -76,10 +76,11 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
         alarm = verdict != "no_gap"
         return row | {"right": not alarm, "false_alarm": alarm, "named_wrong": verdict == "named"}
     row |= {"detected": verdict not in ("no_gap", "crash")} | judge_closure(truth, answer, plant)
-    unseen = [("unknown", true[0][1])] if denied else [cause for cause in true if cause[0] == "unknown"]
-    if unseen:
+    outside_library = [("unknown", true[0][1])] if denied else [cause for cause in true if cause[0] == "unknown"]
+    if outside_library:
         where = [w["location"] for w in answer.get("where") or []]
-        return row | _judge_unseen(unseen[0], [] if denied else _with_names(true), causes, sets, verdict, where)
+        named = [] if denied else _with_names(true)
+        return row | _judge_unknown(outside_library[0], named, causes, sets, verdict, where)
     row |= {"z": size_errors(truth, answer.get("causes") or (), plant)} if verdict in ("named", "ambiguous") else {}
     if kind == "messy":
         return row | _judge_messy(true[0], causes, verdict)
@@ -90,12 +91,12 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
 
 
 def _stated(kind: str, true: list[Cause], answer: Answer, plant: PlantDescription) -> Row:
-    """The probability that the best explanation was given, and whether it is the true one."""
+    """The stated probability of the best explanation, and whether it is the true one."""
     best = max(answer.get("posterior") or [], key=lambda x: float(x["probability"]), default=None)
     if best is None:
         return {}
     causes = _causes(best["causes"], plant)
-    if best.get("unknown_at"):  # as the first format says it
+    if best.get("unknown_at"):  # answers of format 1
         causes.append(("unknown", best["unknown_at"]))
     expected = [("unknown", true[0][1])] if kind == "left_out" else true
     if kind == "messy":
@@ -105,17 +106,17 @@ def _stated(kind: str, true: list[Cause], answer: Answer, plant: PlantDescriptio
     return {"stated": float(best["probability"]), "stated_right": right}
 
 
-def _judge_unseen(
-    unseen: Cause, named: list[Cause], causes: list[Cause], sets: list[list[Cause]], verdict: Any, where: list[str]
+def _judge_unknown(
+    unknown: Cause, named: list[Cause], causes: list[Cause], sets: list[list[Cause]], verdict: Any, where: list[str]
 ) -> Row:
-    """A law that no library holds, at its place; named: causes beside it, all of which have to be there for
-    `cause_beside`.
+    """Scores for a law outside the library. named: true causes of the library at other locations, all of which
+    `cause_beside` requires.
     """
-    at_place = where[:1] == [unseen[1]] or unseen in causes
+    at_place = where[:1] == [unknown[1]] or unknown in causes
     row = {"right": verdict == "unknown" and at_place, "place": at_place, "named_wrong": verdict == "named"}
     if not named:
         return row
-    whole = sorted([*named, unseen])
+    whole = sorted([*named, unknown])
     return row | {
         "cause_beside": row["right"] and _with_names(causes) == named,
         "in_set": any(sorted(s) == whole for s in sets),
@@ -123,7 +124,7 @@ def _judge_unseen(
 
 
 def _judge_messy(full: Cause, causes: list[Cause], verdict: Any) -> Row:
-    """The full effect is to be named; the faint ones may be."""
+    """Scores for one full effect among faint ones: only the full one has to be named."""
     return {
         "right": full in causes,
         "place": any(place == full[1] for _, place in causes),
@@ -132,7 +133,7 @@ def _judge_messy(full: Cause, causes: list[Cause], verdict: Any) -> Row:
 
 
 def _judge_named(true: list[Cause], causes: list[Cause], sets: list[list[Cause]], verdict: Any, tolerated: bool) -> Row:
-    """tolerated: the cause is a change of an outlet that may lie within its tolerance, and no gap was reported."""
+    """tolerated: no gap was reported, and the cause is an outlet's deviation that may lie within its tolerance."""
     named = sorted(causes) == sorted(true)
     return {
         "right": (named and verdict in ("named", "ambiguous")) or tolerated,
@@ -144,13 +145,13 @@ def _judge_named(true: list[Cause], causes: list[Cause], sets: list[list[Cause]]
 
 
 def judge_closure(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> Row:
-    """How far `closed` is from 1 - (a^2 - f^2)/(r^2 - f^2) with the true noise f of the hold-out.
+    """Error of `closed` relative to 1 - (a^2 - f^2)/(r^2 - f^2) with the true noise f of the hold-out.
 
-    Defined where the gap r^2 - f^2 left by recalibration is over five of its standard errors. The answer is in the
-    unit of the first sensor, the key in metres of level.
+    Defined if the gap r^2 - f^2 after recalibration is larger than five standard errors. The answer is in the unit of
+    the first sensor, the key in metres of level.
     """
     closure = answer.get("closure") or {}
-    if truth.get("disturbance"):  # the floor is then no longer the sensors' noise
+    if truth.get("disturbance"):  # the error floor is then larger than the sensors' noise
         return {}
     if not truth.get("noise_rms_m") or any(closure.get(k) is None for k in ("recalibrated", "augmented")):
         return {}
@@ -158,13 +159,13 @@ def judge_closure(truth: Mapping[str, Any], answer: Answer, plant: PlantDescript
     metres = unit_factor(closure.get("unit", "cm"), sensor.unit) / sensor.gain
     floor = truth["noise_rms_m"]["holdout"]
     square = math.fsum(f * f for f in floor) / len(floor)
-    left, gap = ((closure[k] * metres) ** 2 - square for k in ("augmented", "recalibrated"))
+    residual, gap = ((closure[k] * metres) ** 2 - square for k in ("augmented", "recalibrated"))
     error = square * math.sqrt(2 / (HELD_OUT * len(floor)) * truth.get("repeats", 1.0))
     if gap < 5 * error:
         return {}
     if closure.get("closed") is None:
         return {"closed_within": False}
-    off = abs(closure["closed"] - (1 - left / gap))
+    off = abs(closure["closed"] - (1 - residual / gap))
     return {"closed_error": off, "closed_within": off <= 0.03}
 
 
@@ -179,7 +180,7 @@ def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
 
 
 def by_effect(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """The same for each effect that is the only cause of its case; those without a name go by their law."""
+    """Scores of each effect over the cases with this single cause; laws outside the library under their own name."""
     lone = [r for r in rows if len(r["truth"]) == 1]
     return {e: _stratum([r for r in lone if r["effect"] == e]) for e in sorted({r["effect"] for r in lone})}
 

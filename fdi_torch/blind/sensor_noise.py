@@ -14,23 +14,23 @@ _AT = np.arange(LONGEST, dtype=np.float64)
 
 @dataclass(frozen=True)
 class NoiseCorrelation:
-    """e_i = sum_j k_j w_(i-j) with sum k_j^2 = 1. kernel: k."""
+    """Moving-average noise e_i = sum_j k_j w_(i-j) with sum k_j^2 = 1. kernel: k."""
 
     name: str
     kernel: Array = field(default_factory=lambda: np.ones(1))
 
     @property
     def correlations(self) -> Array:
-        """(2 L - 1,): from the most negative lag to the most positive one; 1 in the middle."""
+        """Autocorrelation (2 L - 1,) from the most negative lag to the most positive one; 1 in the middle."""
         return np.correlate(self.kernel, self.kernel, "full")
 
     @property
     def repeats(self) -> float:
-        """Readings that count as one where mean squares are taken: the sum of all squared correlations."""
+        """Number of readings equivalent to one independent reading in mean squares: the sum of squared correlations."""
         return float(np.sum(self.correlations**2))
 
     def noise(self, rng: np.random.Generator, samples: int, std: Array) -> Array:
-        """(T, S) of these standard deviations (S,)."""
+        """Noise (T, S) with these standard deviations (S,)."""
         white = rng.normal(size=(samples + len(self.kernel) - 1, len(std)))
         return std * np.stack([np.convolve(column, self.kernel, "valid") for column in white.T], axis=1)
 
@@ -39,22 +39,22 @@ WHITE = NoiseCorrelation("white")
 
 
 def autoregressive(coefficient: float) -> NoiseCorrelation:
-    """e_i = a e_(i-1) + w_i."""
+    """First-order autoregression e_i = a e_(i-1) + w_i."""
     return _of_unit_energy("autoregressive", np.power(coefficient, _AT))
 
 
 def smoothed(samples: int) -> NoiseCorrelation:
-    """A transmitter that shows the mean of its last few samples."""
+    """Moving average of a transmitter over its last few samples."""
     return _of_unit_energy("smoothed", np.ones(samples))
 
 
 def rippling(period: float, lasting: float) -> NoiseCorrelation:
-    """Ripples of a period that die away within so many samples (AR(2))."""
+    """Damped oscillation with a period and a decay time in samples (AR(2))."""
     return _of_unit_energy("rippling", np.exp(-_AT / lasting) * np.cos(2 * np.pi * _AT / period))
 
 
 def draw_correlation(rng: np.random.Generator) -> NoiseCorrelation:
-    """A correlation at random, mostly AR(1)."""
+    """A random correlation, mostly AR(1)."""
     name = rng.choice(["autoregressive", "smoothed", "rippling"], p=[0.7, 0.15, 0.15])
     if name == "smoothed":
         return smoothed(int(rng.integers(3, 9)))

@@ -1,11 +1,11 @@
-"""The hidden rigs, many at once: a second, independent simulation in plain NumPy at a step of 0.02 s.
+"""Simulator of the hidden rigs, independent of the library: plain NumPy with a step of 0.02 s, many rigs at once.
 
 It integrates volumes, not levels: V' = inflow - outflow, with h = h(V) by inverting V(h) = integral of A(h).
-Inflow is a mean over the step; the flows that depend on levels are extrapolated by Adams-Bashforth 2:
+Inflow is averaged over the step; level-dependent flows are extrapolated by Adams-Bashforth 2:
     V_{n+1} = V_n + dt (pumped_n + disturbance_n + 3/2 f_n - 1/2 f_{n-1}).
-What stands above a rim at the end of a step runs over it at once, into the tank that catches it or outside.
-All tanks of all rigs stand in one vector, and so do pipes and pumps, so that rigs of any layouts run together.
-Each tank's flows are summed in the order of its rig's pipes, so a rig does not depend on its company.
+Water above a rim at the end of a step overflows at once, into the receiving tank or outside. All tanks of all rigs are
+in one vector, and so are pipes and pumps, so that rigs of different layouts run together. Each tank's flows are summed
+in the order of its rig's pipes, so that a rig's result does not depend on the others.
 """
 
 from __future__ import annotations
@@ -60,20 +60,22 @@ def grouped(
     first_tank = np.cumsum([0, *(len(own) for own in tanks)])
     groups = []
     for name, law in laws.items():
-        found = [(rig, d) for rig, ds in enumerate(deviations) for d in ds if d.law == name]
-        if not found:
+        matching = [(rig, d) for rig, ds in enumerate(deviations) for d in ds if d.law == name]
+        if not matching:
             continue
-        if len({rig for rig, _ in found}) < len(found):
+        if len({rig for rig, _ in matching}) < len(matching):
             raise ValueError(f"expected each law once in a rig, got {name} twice; draw another place")
-        spot = [first[rig] + list(names[rig]).index(d.location.split("-")[0]) for rig, d in found]
-        other = [first_tank[rig] + list(tanks[rig]).index(d.other) if d.other else first_tank[-1] for rig, d in found]
-        numbers = {key: np.array([d.numbers[key] for _, d in found]) for key in found[0][1].numbers}
+        spot = [first[rig] + list(names[rig]).index(d.location.split("-")[0]) for rig, d in matching]
+        other = [
+            first_tank[rig] + list(tanks[rig]).index(d.other) if d.other else first_tank[-1] for rig, d in matching
+        ]
+        numbers = {key: np.array([d.numbers[key] for _, d in matching]) for key in matching[0][1].numbers}
         groups.append(Group(law, np.array(spot, dtype=np.intp), np.array(other, dtype=np.intp), numbers))
     return groups
 
 
 class HiddenRigs:
-    """A batch of rigs: each a plant as built, and what is off there."""
+    """A batch of rigs, each with its plant as built and its deviations."""
 
     def __init__(self, built: Sequence[PlantDescription], deviations: Sequence[Sequence[Deviation]]) -> None:
         tanks = [[t.name for t in plant.tanks] for plant in built]
@@ -120,14 +122,14 @@ class HiddenRigs:
             self.table_base = np.arange(len(self.tables)) * _GRID
 
     def volumes(self, levels: Array) -> Array:
-        """(N,) m -> m^3."""
+        """Volumes (N,) m^3 from levels (N,) m."""
         volume = self.area * levels
         for table in self.tables:
             volume[table.spot] = table.volume(levels[table.spot])
         return volume
 
     def levels(self, volume: Array) -> Array:
-        """(N,) m^3 -> m."""
+        """Levels (N,) m from volumes (N,) m^3."""
         level = volume / self.area
         if self.tables:
             x = volume[self.table_spot] / self.table_last
@@ -138,14 +140,14 @@ class HiddenRigs:
         return level
 
     def spilled(self, volume: Array) -> Array:
-        """(N,) m^3, less what stands above the rims, plus what runs over into other tanks."""
+        """Volumes (N,) m^3 after overflow: without the water above the rims, plus overflow from other tanks."""
         over = np.maximum(volume - self.rim, 0.0)
         return volume - over + self._into(self.caught, over) if over.any() else volume
 
     def pumped(
         self, level: Array, asked: Array, time: float, dt: float, past: Callable[[Group, Array], Array]
     ) -> Array:
-        """What each tank is given by its pumps (N,), m^3/s. asked (M,)."""
+        """Inflow of each tank from its pumps (N,), m^3/s. asked (M,): requested flows."""
         q = asked.copy()
         for group in self.pump_groups:
             now = Moment(time, dt, level[self.fed[group.spot]], lambda delay, g=group: past(g, delay))  # type: ignore[misc]
@@ -153,7 +155,7 @@ class HiddenRigs:
         return self._into(self.fed, q)
 
     def drained(self, level: Array, time: float, dt: float) -> Array:
-        """Net inflow (N,) of each tank by all that depends on levels, m^3/s."""
+        """Net inflow (N,) of each tank from all level-dependent flows, m^3/s."""
         wet = np.append(np.maximum(level, 0.0), 0.0)
         now = Moment(time, dt, level, _no_command)
         q = self.piped(wet, now)
@@ -165,7 +167,7 @@ class HiddenRigs:
         return net
 
     def piped(self, wet: Array, now: Moment) -> Array:
-        """Flow (P,) of each pipe from its source on, m^3/s. wet (N + 1,): levels and the outside, m."""
+        """Flow (P,) of each pipe from its source, m^3/s. wet (N + 1,): levels and the outside, m."""
         above = np.maximum(wet[self.source] - self.elevation, 0.0)
         head = above - np.maximum(wet[self.target] - self.elevation, 0.0) * self.submerged
         for group in self.head_groups:
@@ -178,13 +180,13 @@ class HiddenRigs:
         return q
 
     def _into(self, tanks: Index, q: Array) -> Array:
-        """(N,): the sum of the flows (or volumes) that go into each tank; what goes outside is dropped."""
+        """(N,): sum of the flows (or volumes) into each tank; those to the outside are dropped."""
         sums: Array = np.bincount(tanks, weights=q, minlength=self.count + 1).astype(np.float64, copy=False)
         return sums[:-1]
 
 
 class VolumeTable:
-    """V(h) of one tank whose cross-section varies, inverted onto an even grid of volumes up to the rim."""
+    """V(h) of one tank with varying cross-section, inverted onto an even grid of volumes up to the rim."""
 
     def __init__(self, tank: Any, law: Callable[..., Array], numbers: dict[str, Array], spot: int) -> None:
         self.spot = spot
@@ -218,14 +220,14 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class Ran:
-    """levels (T, N) m at 0, 1, 2, ... s, and asked (T, M) m^3/s: as driven, with what a level control asked for."""
+class SimulatedRun:
+    """levels (T, N) m at 0, 1, 2, ... s, and requested flows asked (T, M) m^3/s, including those of a level control."""
 
     levels: Array
     asked: Array
 
 
-def simulate(rigs: HiddenRigs, drives: Sequence[Drive], step: float = STEP) -> list[Ran]:
+def simulate(rigs: HiddenRigs, drives: Sequence[Drive], step: float = STEP) -> list[SimulatedRun]:
     """Runs all rigs together, a drive each.
 
     Raises ValueError where a second is not a whole number of steps.
@@ -264,13 +266,13 @@ def simulate(rigs: HiddenRigs, drives: Sequence[Drive], step: float = STEP) -> l
         volume = rigs.spilled(volume)
         before = drained
     return [
-        Ran(levels[:own, t : rigs.first_tank[i + 1]], asked[:own, p : rigs.first_pump[i + 1]])
+        SimulatedRun(levels[:own, t : rigs.first_tank[i + 1]], asked[:own, p : rigs.first_pump[i + 1]])
         for i, (own, t, p) in enumerate(zip(lengths, rigs.first_tank, rigs.first_pump, strict=False))
     ]
 
 
 def _disturbances(rigs: HiddenRigs, drives: Sequence[Drive], rows: Sequence[Index]) -> Array | None:
-    """(T, N) of all rigs, m^3/s; none where no rig is disturbed."""
+    """Disturbance flows (T, N) of all rigs, m^3/s; None if no rig is disturbed."""
     if all(drive.disturbance is None for drive in drives):
         return None
     widths = np.diff(rigs.first_tank)

@@ -17,11 +17,11 @@ from fdi_torch.plant.description import PlantDescription, Pump, Sensor
 NORMAL_95 = 1.96
 
 Quantity = tuple[str, str, Callable[[Mapping[str, float], PlantDescription, str, Scales], float]]
-"""Name of a parameter, its SI unit, and its true value by a law's numbers, plant, place and scales of the rig."""
+"""Name of a parameter, its SI unit, and its true value from a law's numbers, plant, location and scales of the rig."""
 
 
 def _number(parameter: str, unit: str, value: Callable[[Mapping[str, float]], float]) -> Quantity:
-    """A number that only has to be brought from the bench to the rig's own size and pace."""
+    """A number that only has to be scaled from bench to rig."""
 
     def at_the_rig(numbers: Mapping[str, float], plant: PlantDescription, at: str, scales: Scales) -> float:
         factors = {"s": scales.time, "1/s": 1 / scales.time, "m": scales.length, "m/s": scales.length / scales.time}
@@ -31,7 +31,7 @@ def _number(parameter: str, unit: str, value: Callable[[Mapping[str, float]], fl
 
 
 def _reading(parameter: str, unit: str, number: str) -> Quantity:
-    """A number in the unit of a level; NaN at a sensor that reads in another unit, or with an offset of its own."""
+    """A number in the unit of a level; NaN for a sensor with another unit or with an offset deviation."""
     name, _, level = _number(parameter, unit, lambda n: n[number])
 
     def at_the_rig(numbers: Mapping[str, float], plant: PlantDescription, at: str, scales: Scales) -> float:
@@ -50,7 +50,7 @@ def _dead_zone(numbers: Mapping[str, float], plant: PlantDescription, at: str, s
 
 
 def _leak(numbers: Mapping[str, float], plant: PlantDescription, at: str, scales: Scales) -> float:
-    """As a share of the nominal capacity of the tank's reference pipe."""
+    """Leak conductance as a share of the nominal capacity of the tank's reference pipe."""
     pipes = [p.name for p in plant.pipes]
     reference = next((t.leak_reference for t in plant.tanks if t.name == at), None)
     first = next((p.name for p in plant.pipes if at in (p.source, p.target)), pipes[0])
@@ -81,11 +81,11 @@ SAME: dict[tuple[str, str], Quantity] = {
 
 
 def size_errors(truth: Mapping[str, Any], causes: Iterable[Mapping[str, Any]], plant: PlantDescription) -> list[str]:
-    """'effect z' for each cause that is true, told with a standard error, and has a number of the same quantity."""
+    """'effect z' for each correctly named cause that has a standard error and a true value of the same quantity."""
     units = truth.get("scales") or {}
     scales = Scales(units.get("time_s", 1.0), units.get("length_m", 1.0), units.get("area_m2", 1.0))
     true = {(c["effect"], c["location"]) for c in truth["causes"]}
-    found = []
+    scores = []
     for cause in causes:
         for d in truth.get("deviations", ()):
             here = (d["effect"], d["location"])
@@ -96,12 +96,12 @@ def size_errors(truth: Mapping[str, Any], causes: Iterable[Mapping[str, Any]], p
             expected = value(d["numbers"], plant, d["location"], scales)
             if amount.get("std") and math.isfinite(expected):
                 factor = unit_factor(amount.get("unit") or "1", unit)
-                found.append(f"{d['effect']} {(factor * amount['value'] - expected) / (factor * amount['std']):.4g}")
-    return found
+                scores.append(f"{d['effect']} {(factor * amount['value'] - expected) / (factor * amount['std']):.4g}")
+    return scores
 
 
 def sizes(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """By effect and over all: root mean square of z with its interval, and the share within 1.96 standard errors."""
+    """By effect and for all: root mean square of z with its interval, and the share within 1.96 standard errors."""
     by: dict[str, list[float]] = {}
     for row in rows:
         for effect, z in (text.split() for text in row.get("z") or ()):

@@ -1,4 +1,4 @@
-"""Intervals for shares, means and medians, and the F test."""
+"""Confidence intervals for shares, means and medians, and the F test."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
 
 
 def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Median and the order statistics that hold it in 95 % of samples of any distribution; NaN where there are few."""
+    """Median and the order statistics of its distribution-free 95 % interval; NaN for few values."""
     ranked, n = sorted(values), len(values)
     if not ranked:
         return math.nan, math.nan, math.nan
@@ -29,7 +29,7 @@ def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def mean_interval(values: Sequence[float], z: float = 1.96) -> tuple[float, float, float]:
-    """Mean and its normal 95 % interval; NaN where there are no values, no width where there is one."""
+    """Mean and its normal 95 % interval; NaN without values, zero width for one value."""
     if not values:
         return math.nan, math.nan, math.nan
     mean = math.fsum(values) / len(values)
@@ -51,7 +51,7 @@ def root_mean_square_interval(values: Sequence[float]) -> tuple[float, float, fl
 
 
 def f_test(explained: float, residual: float, parameters: int, samples: float) -> float:
-    """p-value of `parameters` columns that lower the sum of squares by `explained` to `residual`."""
+    """p-value of `parameters` columns that reduce the sum of squares by `explained` to `residual`."""
     freedom = samples - parameters
     if freedom <= 0 or residual <= 0:
         return 1.0

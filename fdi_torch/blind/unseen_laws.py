@@ -1,4 +1,4 @@
-"""Effects no diagnosis has a name for: how each is drawn, where it sits, what a library might have called it."""
+"""Laws outside the library: how each is drawn, where it can be, and names under which a library might know it."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ UNKNOWN = (
 
 
 def unknown_to(library: Collection[str]) -> tuple[Unknown, ...]:
-    """Those that a library of these effects cannot name."""
+    """The laws that a library of these effects does not contain."""
     left = tuple(u for u in UNKNOWN if not set(u.aliases) & set(library))
     if not left:
         raise ValueError(

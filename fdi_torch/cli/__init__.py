@@ -1,7 +1,7 @@
 """`fdi COMMAND`: parse the command line, run the command, and turn errors into a message and an exit code.
 
-Exit codes: 0 done, 2 wrong use (explained on standard error), 3 ran but did not converge, 130 interrupted,
-143 terminated.
+Exit codes: 0 done, 2 wrong use (explained on standard error), 3 ran but did not converge, 4 converged, but the
+model does not explain the recording, 130 interrupted, 143 terminated.
 A command is one line of `COMMANDS`, a module `options/NAME.py` with its description, EXAMPLES and
 `add_arguments(parser)`, and a module `NAME.py` with `run(arguments, screen) -> exit code`. The latter is imported after
 the arguments are parsed, so that help does not wait for torch.
@@ -22,7 +22,7 @@ from fdi_torch.disk import sentence
 from fdi_torch.interruption import Terminated, catch_signals
 from fdi_torch.names import unknown
 
-DONE, MISUSE, NOT_CONVERGED, INTERRUPTED, TERMINATED = 0, 2, 3, 130, 143
+DONE, MISUSE, NOT_CONVERGED, NOT_EXPLAINED, INTERRUPTED, TERMINATED = 0, 2, 3, 4, 130, 143
 
 COMMANDS = {
     "train": "estimate the sizes of faults in a recording",

@@ -6,8 +6,8 @@ from difflib import unified_diff
 from pathlib import Path
 
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.files import find_plant
 from fdi_torch.config.plant_patch import patched_plant
+from fdi_torch.config.yaml_files import find_plant
 from fdi_torch.disk import write_text
 from fdi_torch.plant.description import PlantDescription
 

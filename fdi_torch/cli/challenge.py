@@ -12,16 +12,16 @@ from typing import Any
 import torch
 
 from fdi_torch.blind import Networks, Row, Tables, blind_benchmark, joined
+from fdi_torch.blind.baselines import Diagnosis
+from fdi_torch.blind.benchmark import Each
 from fdi_torch.blind.conditions import exercised
 from fdi_torch.blind.plants import RIGS, Rig
-from fdi_torch.blind.regression_rivals import gaussian_process, sparse_regression, split_f_test
-from fdi_torch.blind.rivals import Diagnosis
-from fdi_torch.blind.run import Each
+from fdi_torch.blind.regression_baselines import gaussian_process, sparse_regression, split_f_test
 from fdi_torch.blind.scaling import Scales
-from fdi_torch.blind.table import misses, sheets
+from fdi_torch.blind.score_tables import misses, sheets
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.library import STANDARD as LIBRARY
 from fdi_torch.gap.one_at_a_time import one_at_a_time

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.loaded_recordings import known_parts, read_recording
-from fdi_torch.config.plant import load_plant
-from fdi_torch.config.recordings import RecordingConfig
-from fdi_torch.config.run import load_run
+from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.preprocess.acquisition import examined
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         recording = read_recording(config, plant, base)
         checks.append(_checked(recording, plant))
         _show(checks[-1], screen)
-        stretches = known_parts(recording, config, plant)
+        stretches = known_segments_of(recording, config, plant)
         if len(stretches) > 1 or len(stretches[0].recording) < len(recording):
             spans = ", ".join(f"{p.recording.time[0]:g} to {p.recording.time[-1]:g} s" for p in stretches)
             screen.say(f"usable with all inputs known: {spans}")
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
     """The check of a recording, with refused or masked channels first."""
     check = check_recording(whole, plant)
-    examinations = [examined(plant, part) for part in whole.known_stretches()]
+    examinations = [examined(plant, part) for part in whole.known_segments()]
     problems = [ChannelFinding("slip", ", ".join(e.fault.channels), e.fault.text) for e in examinations if e.fault]
     problems += [
         ChannelFinding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})

@@ -10,9 +10,9 @@ import torch
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.estimation import full_name
 from fdi_torch.config.loaded_recordings import read_recording
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.reading_noise import reading_noise
-from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
 from fdi_torch.monitor.monitor_setup import usual_faults
 from fdi_torch.parameters import parse_quantity
@@ -61,22 +61,22 @@ def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Rec
     return Recording(time, inputs, readings, plant.channels(), columns, tuple(units.values()), sensor_units), True
 
 
-def _show(found: Diagnosability, screen: Screen) -> None:
-    screen.say(f"{found.rank} of {len(found.faults)} faults (or combinations) are determined together")
+def _show(report: Diagnosability, screen: Screen) -> None:
+    screen.say(f"{report.rank} of {len(report.faults)} faults (or combinations) are determined together")
     header = ("fault", "unit", "std, all together", "by correlation", "smallest detectable", "smallest isolable")
-    columns = (found.std, found.std_by_correlation, found.smallest_detectable, found.smallest_isolable)
+    columns = (report.std, report.std_by_correlation, report.smallest_detectable, report.smallest_isolable)
     rows = [
         [name, unit or "1", *(f"{value:.3g}" for value in numbers)]
-        for name, unit, *numbers in zip(found.faults, found.units, *columns, strict=True)
+        for name, unit, *numbers in zip(report.faults, report.units, *columns, strict=True)
     ]
     screen.table("", header, rows, left=2)
     screen.say()
-    shows = [[name, *(f"{v:.3g}" for v in row)] for name, row in zip(found.faults, found.shows, strict=True)]
-    screen.table("effect of a unit of each fault, in noise standard deviations", ("fault", *found.sensors), shows)
+    shows = [[name, *(f"{v:.3g}" for v in row)] for name, row in zip(report.faults, report.shows, strict=True)]
+    screen.table("effect of a unit of each fault, in noise standard deviations", ("fault", *report.sensors), shows)
     screen.say()
     apart = [[str(i + 1), name, *(f"{v:.2g}" for v in row)] for i, (name, row) in
-             enumerate(zip(found.faults, found.apart, strict=True))]  # fmt: skip
-    numbers = tuple(str(i + 1) for i in range(len(found.faults)))
+             enumerate(zip(report.faults, report.apart, strict=True))]  # fmt: skip
+    numbers = tuple(str(i + 1) for i in range(len(report.faults)))
     screen.table("sine of the angle between signatures (0: not distinguishable)", ("", "fault", *numbers), apart, 2)
-    for sentence in (*found.groups, *found.remarks):
+    for sentence in (*report.groups, *report.remarks):
         screen.say(f"- {sentence}")

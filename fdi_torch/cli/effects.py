@@ -8,7 +8,7 @@ from typing import Any
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects.catalogue import Entry, effects
 from fdi_torch.parameters import Parameter, display_unit
 

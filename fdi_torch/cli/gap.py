@@ -14,7 +14,7 @@ from fdi_torch.cli.gap_refit import run_refit
 from fdi_torch.cli.gap_text import next_steps, show, show_plan
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import named_recordings
-from fdi_torch.config.plant import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.disk import write_text
 from fdi_torch.gap.answer import UNKNOWN, Answer, adopted
 from fdi_torch.gap.diagnose import Settings

@@ -63,28 +63,28 @@ def run_refit(
     return DONE
 
 
-def _show(found: Refit, screen: Screen) -> None:
+def _show(result: Refit, screen: Screen) -> None:
     rows = []
-    for sensor in found.plant.sensors:
+    for sensor in result.plant.sensors:
         unit, scale = display_unit(sensor.unit)
-        rows.append([sensor.name, *(f"{scale * of[sensor.name]:.4g}" for of in (found.before, found.rmse)), unit])
+        rows.append([sensor.name, *(f"{scale * of[sensor.name]:.4g}" for of in (result.before, result.rmse)), unit])
     screen.table("error", ("sensor", "constants fitted", "effects too", "unit"), rows)
-    constants = build_network(found.plant).constants
+    constants = build_network(result.plant).constants
     rows = []
-    for name, (value, error) in found.fitted.items():
+    for name, (value, error) in result.fitted.items():
         unit, scale = display_unit(constants[name].unit)
         rows.append([name, f"{scale * value:.4g}", f"{scale * error:.2g}", "" if unit == "1" else unit])
     screen.table("fitted to all recordings", ("parameter", "value", "std error", "unit"), rows)
-    screen.say(f"{found.parameters} values fitted, including initial levels")
+    screen.say(f"{result.parameters} values fitted, including initial levels")
 
 
-def _show_run_specific(found: Refit, screen: Screen) -> None:
+def _show_run_specific(result: Refit, screen: Screen) -> None:
     """Values that differ by recording, and their between-run variation."""
-    constants = build_network(found.plant).constants
+    constants = build_network(result.plant).constants
     rows = []
-    for name in dict.fromkeys(own.name for own in found.own):
+    for name in dict.fromkeys(own.name for own in result.own):
         unit, scale = display_unit(constants[name].unit)
-        each = [own for own in found.own if own.name == name]
+        each = [own for own in result.own if own.name == name]
         for own in each:
             numbers = [f"{scale * own.value:.4g}", f"{scale * own.std:.2g}", unit]
             rows.append([name, Path(own.source).name, f"{own.start:g}", *numbers])

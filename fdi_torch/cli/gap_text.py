@@ -80,17 +80,17 @@ def next_steps(
     return steps
 
 
-def show_plan(found: Identifiability, screen: Screen) -> int:
+def show_plan(limits: Identifiability, screen: Screen) -> int:
     """Print which effects the planned inputs do not show and which they cannot distinguish."""
-    for name, place in found.hidden:
+    for name, place in limits.hidden:
         screen.say(f"does not show at its typical size: {name} at {place}")
-    for (a, at), (b, there), distance in found.inseparable:
+    for (a, at), (b, there), distance in limits.inseparable:
         screen.say(f"cannot be distinguished: {a} at {at} and {b} at {there} (chi-square distance {distance:.1f})")
-    if not found.hidden and not found.inseparable:
+    if not limits.hidden and not limits.inseparable:
         screen.say("every effect of the library shows at its typical size and is distinguishable from every other")
-    shown = {f"{place}.{name}": residual for (name, place), residual in found.shown.items()}
+    shown = {f"{place}.{name}": residual for (name, place), residual in limits.shown.items()}
     screen.result(
-        {"format": "fdi_torch.gap_plan/1", "hidden": found.hidden, "twins": found.inseparable, "shown": shown}
+        {"format": "fdi_torch.gap_plan/1", "hidden": limits.hidden, "twins": limits.inseparable, "shown": shown}
     )
     return DONE
 

@@ -21,9 +21,9 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     elif arguments.topic is not None:
         write_topic(arguments, screen)
     else:
-        found = inspect_log(arguments.log)
-        show(found, screen)
-        screen.result(as_json(found))
+        inspection = inspect_log(arguments.log)
+        show(inspection, screen)
+        screen.result(as_json(inspection))
     return DONE
 
 
@@ -46,45 +46,46 @@ def write_topic(arguments: argparse.Namespace, screen: Screen) -> None:
     screen.note(f"{count} messages of {arguments.topic}: {arguments.out or 'standard output'}")
 
 
-def show(found: Inspection, screen: Screen) -> None:
+def show(inspection: Inspection, screen: Screen) -> None:
     """Print run, data, result, topics and integrity of the log."""
-    kind = found.about.get("run", {}).get("kind", "")
-    screen.say(f"{found.path}: {'a log of fdi ' + kind if kind else 'a foreign MCAP file'}, written by {found.library}")
+    kind = inspection.about.get("run", {}).get("kind", "")
+    log = f"a log of fdi {kind}" if kind else "a foreign MCAP file"
+    screen.say(f"{inspection.path}: {log}, written by {inspection.library}")
     for record in RECORDS:
-        values = found.about.get(record, {})
+        values = inspection.about.get(record, {})
         if values:
             screen.say(f"{record:<8}{', '.join(f'{name} {value}' for name, value in values.items() if value)}")
-    results = list(found.about.get("result", {}).items())
+    results = list(inspection.about.get("result", {}).items())
     for name, value in results[:MOST_RESULTS]:
         screen.say(f"result  {name} {value[:100]}")
     if len(results) > MOST_RESULTS:
         screen.say(f"result  and {len(results) - MOST_RESULTS} more")
     rows = [
         [info.topic, info.schema, str(info.messages), f"{info.first:.6g}", f"{info.last:.6g}", str(info.size)]
-        for info in found.topics.values()
+        for info in inspection.topics.values()
     ]
     screen.say()
     screen.table("", ("topic", "schema", "messages", "from, s", "to, s", "bytes"), rows, left=2)
-    for item in found.attachments.values():
+    for item in inspection.attachments.values():
         screen.say(f"attachment {item.name}, {item.size} bytes")
     screen.say()
-    state = "intact: all CRCs, indices and counts agree" if found.health.sound else "damaged"
-    screen.say(f"{found.size} bytes, {found.messages} messages in {found.health.chunks} chunks; {state}")
-    for sentence in (*found.health.problems, found.advice):
+    state = "intact: all CRCs, indices and counts agree" if inspection.health.sound else "damaged"
+    screen.say(f"{inspection.size} bytes, {inspection.messages} messages in {inspection.health.chunks} chunks; {state}")
+    for sentence in (*inspection.health.problems, inspection.advice):
         if sentence:
             screen.say(f"- {sentence}")
 
 
-def as_json(found: Inspection) -> dict[str, object]:
+def as_json(inspection: Inspection) -> dict[str, object]:
     return {
         "format": "fdi_torch.inspect/1",
-        "path": str(found.path),
-        "size": found.size,
-        "ours": found.ours,
-        "about": found.about,
-        "other_metadata": found.other_metadata,
-        "topics": list(found.topics.values()),
-        "attachments": {name: item.size for name, item in found.attachments.items()},
-        "sound": found.health.sound,
-        "problems": list(found.health.problems),
+        "path": str(inspection.path),
+        "size": inspection.size,
+        "ours": inspection.ours,
+        "about": inspection.about,
+        "other_metadata": inspection.other_metadata,
+        "topics": list(inspection.topics.values()),
+        "attachments": {name: item.size for name, item in inspection.attachments.items()},
+        "sound": inspection.health.sound,
+        "problems": list(inspection.health.problems),
     }

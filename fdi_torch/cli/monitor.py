@@ -8,7 +8,7 @@ import orjson
 
 from fdi_torch.cli.options import live
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.monitor import load_monitor
+from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.events import FORMAT, Event

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.paper.page import make_page
+from fdi_torch.paper.paper_page import make_page
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

@@ -12,10 +12,10 @@ import torch
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.channels import missing_inputs
-from fdi_torch.config.files import find_data
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
-from fdi_torch.config.plant import load_plant
-from fdi_torch.config.recordings import RecordingConfig
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.config.yaml_files import find_data
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
@@ -126,27 +126,27 @@ def _expect_inputs(name: str, plant: PlantDescription, columns: Collection[str])
         )
 
 
-def _row(plant: PlantDescription, recording: Recording, found: Prediction) -> list[str]:
-    errors = [f"{display_unit(s.unit)[1] * found.rmse[s.name]:.4g}" for s in plant.sensors]
-    levels = ", ".join(f"{tank} {100 * level:.1f} cm" for tank, level in found.start_levels.items())
+def _row(plant: PlantDescription, recording: Recording, prediction: Prediction) -> list[str]:
+    errors = [f"{display_unit(s.unit)[1] * prediction.rmse[s.name]:.4g}" for s in plant.sensors]
+    levels = ", ".join(f"{tank} {100 * level:.1f} cm" for tank, level in prediction.start_levels.items())
     times = (f"{float(recording.time[i]):g}" for i in (0, -1))
     return [Path(recording.source).name, *times, *errors, levels]
 
 
 def _result(
-    plant: PlantDescription, recording: Recording, found: Prediction, arguments: argparse.Namespace
+    plant: PlantDescription, recording: Recording, prediction: Prediction, arguments: argparse.Namespace
 ) -> dict[str, Any]:
     return {
         "format": "fdi_torch.prediction/1",
         "plant": plant.name,
         "recording": recording.source,
-        "rmse": dict(found.rmse),
-        "start_levels": dict(found.start_levels),
-        "own": dict(found.own),
+        "rmse": dict(prediction.rmse),
+        "start_levels": dict(prediction.start_levels),
+        "own": dict(prediction.own),
         "start_samples": arguments.start_samples,
         "settle": arguments.settle,
         "time": recording.time.tolist(),
-        "readings": {s.name: found.readings[:, i].tolist() for i, s in enumerate(plant.sensors)},
+        "readings": {s.name: prediction.readings[:, i].tolist() for i, s in enumerate(plant.sensors)},
     }
 
 

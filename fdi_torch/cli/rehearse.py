@@ -6,7 +6,7 @@ import argparse
 
 from fdi_torch.cli.options import live
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.rehearsal import load_rehearsal
+from fdi_torch.config.rehearsal_file import load_rehearsal
 from fdi_torch.jobs.rehearsal import RehearsalResult, rehearse
 
 

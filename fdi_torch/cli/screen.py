@@ -21,7 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fdi_torch.disk import named_errors
-from fdi_torch.outside import printable, printable_json
+from fdi_torch.untrusted_input import printable, printable_json
 
 SECONDS_BETWEEN_LINES = 2.0
 ENDLESS = 1 << 16  # characters per line of a pipe or a file

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fdi_torch.cli.options import overrides
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.run import load_run
+from fdi_torch.config.run_file import load_run
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.recordings.csv_files import write_csv

@@ -6,9 +6,9 @@ import argparse
 
 from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.study import load_study
+from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.study import StudyResult, run_study
-from fdi_torch.study.isolation import Isolation
+from fdi_torch.study.mode_isolation import Isolation
 from fdi_torch.study.summary import Ratio, Score, Summary
 
 

@@ -6,11 +6,11 @@ import argparse
 import math
 from collections.abc import Sequence
 
-from fdi_torch.cli import DONE, NOT_CONVERGED
+from fdi_torch.cli import DONE, NOT_CONVERGED, NOT_EXPLAINED
 from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.windows import show_windows
-from fdi_torch.config.run import load_run
+from fdi_torch.config.run_file import load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.parameters import display_unit
@@ -22,19 +22,28 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     job = load_run(arguments.config, overrides(arguments))
     if job.config.estimate.windows is not None:
         with screen.progress(job.name) as advance:
-            found = fit_windows(job, advance)
-        show_windows(found, screen)
+            windowed_fit = fit_windows(job, advance)
+        show_windows(windowed_fit, screen)
         return DONE
     with live(arguments, job.name, screen) as listener, screen.progress(job.name) as advance:
         done = train(job, advance, arguments.resume, listener)
     show(done, screen)
     screen.result(as_json(done))
-    return DONE if done.result.estimate.status == "converged" else NOT_CONVERGED
+    if done.result.estimate.status != "converged":
+        return NOT_CONVERGED
+    return DONE if done.result.diagnosis.explained else NOT_EXPLAINED
 
 
 def show(done: TrainResult, screen: Screen) -> None:
-    """Print the estimate as a table with units, the diagnosis, and the paths of log and pictures."""
+    """Print the estimate as a table with units, the diagnosis, and the paths of log and pictures.
+
+    A model that does not explain the recording is said before anything else.
+    """
     final, diagnosis = done.result.estimate, done.result.diagnosis
+    if diagnosis.warning:
+        screen.say(f"{diagnosis.warning}.")
+        screen.say("- next: fdi gap finds where and by which effect the plant file deviates from the recording")
+        screen.say()
     rows = []
     for i, p in enumerate(done.fitting.space):
         unit, scale = display_unit(p.unit)
@@ -80,10 +89,6 @@ def in_words(done: TrainResult) -> list[str]:
         lines.append(f"- {fault.name}: " + ", ".join(parts))
     lines += [f"- {name} lies at the {end} end of its range" for name, end in final.at_bounds.items()]
     lines += [f"- {sentence}" for sentence in final.undetermined]
-    if not diagnosis.explained:
-        ratio = diagnosis.unexplained_ratio
-        lines.append(f"this model does not explain the recording: residuals are {ratio:.2g} times the sensors' noise")
-        lines.append("- next: fdi gap finds where and by which effect the plant file deviates from it")
     return lines
 
 

@@ -12,43 +12,43 @@ LARGEST_RELATIVE_ERROR = 10.0  # a size with a larger standard error is not show
 MARKS = {"absent": "-", "cannot tell": "?"}
 
 
-def show_windows(found: WindowedFit, screen: Screen) -> None:
+def show_windows(fit: WindowedFit, screen: Screen) -> None:
     """Print one line per window and per period. Sizes without a unit are relative, flows hold at the mean levels."""
-    names = [_name(fault) for fault in found.windows[0].faults] if found.windows else []
-    rows = [[f"{w.start:g}", f"{w.stop:g}", *(_cell(fault) for fault in w.faults)] for w in found.windows]
+    names = [_name(fault) for fault in fit.windows[0].faults] if fit.windows else []
+    rows = [[f"{w.start:g}", f"{w.stop:g}", *(_cell(fault) for fault in w.faults)] for w in fit.windows]
     screen.table(
         "windows (?: not determined, for example in an empty tank)", ["from, s", "to, s", *names], rows, left=0
     )
     screen.say()
     rows = []
-    for s in found.stretches:
+    for s in fit.stretches:
         flow = "" if s.flow is None else f"{1e6 * s.flow:.3g}"
         rows.append([_name(s), f"{s.start:g}", f"{s.stop:g}", *_size(s, "> "), flow])
     screen.table("present", ("fault", "from, s", "to, s", "size", "std error", "flow, cm^3/s"), rows)
-    screen.say(f"step of the simulation: {found.step:g} s")
-    screen.say(f"log: {found.log}")
+    screen.say(f"step of the simulation: {fit.step:g} s")
+    screen.say(f"log: {fit.log}")
     screen.result(
         {
             "format": "fdi_torch.windows/1",
-            "windows": found.windows,
-            "stretches": found.stretches,
-            "step": found.step,
-            "log": str(found.log),
+            "windows": fit.windows,
+            "stretches": fit.stretches,
+            "step": fit.step,
+            "log": str(fit.log),
         }
     )
 
 
-def _size(found: WindowFault | Stretch, beyond: str) -> tuple[str, str]:
+def _size(fault: WindowFault | Stretch, beyond: str) -> tuple[str, str]:
     """Size and standard error in a practical unit; `beyond` and the size without an error if that is too large."""
-    _, scale = display_unit(found.unit)
-    size, std = scale * found.size, scale * found.std
-    shown = f"{size:.3f}" if found.unit == "1" else f"{size:.4g}"
+    _, scale = display_unit(fault.unit)
+    size, std = scale * fault.size, scale * fault.std
+    shown = f"{size:.3f}" if fault.unit == "1" else f"{size:.4g}"
     return (shown, f"{std:.2g}") if std < LARGEST_RELATIVE_ERROR * max(abs(size), 1.0) else (f"{beyond}{shown}", "")
 
 
-def _name(found: WindowFault | Stretch) -> str:
-    unit, _ = display_unit(found.unit)
-    return f"{found.name}, {unit}" if unit else found.name
+def _name(fault: WindowFault | Stretch) -> str:
+    unit, _ = display_unit(fault.unit)
+    return f"{fault.name}, {unit}" if unit else fault.name
 
 
 def _cell(fault: WindowFault) -> str:

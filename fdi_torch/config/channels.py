@@ -1,11 +1,11 @@
-"""Which column of a file, or which constant, each of the plant's channels is."""
+"""The mapping of the plant's channels to columns of a file or to constants."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from fdi_torch.config.recordings import ColumnConfig, FileConfig
+from fdi_torch.config.recording_config import ColumnConfig, FileConfig
 from fdi_torch.config.strict import Amount, quantity
 from fdi_torch.names import unknown
 from fdi_torch.parameters import header_unit
@@ -15,6 +15,9 @@ from fdi_torch.recordings.source import ChannelSource, ClockSource
 
 
 def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, ChannelSource]:
+    """The source of each channel that the configuration mentions; time is `t`. Raises ValueError for unknown channels
+    and keys.
+    """
     units = _units(plant)
     mapping: dict[str, ChannelSource] = {}
     for name, column in config.columns.items():
@@ -27,16 +30,16 @@ def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, Ch
 
 
 def _expect_keys_that_fit(place: str, name: str, column: ColumnConfig, plant: PlantDescription) -> None:
-    """Raises ValueError for a key that says nothing of that channel."""
+    """Raises ValueError for a key that does not apply to that channel."""
     only_clock, only_input = ("stamps", "zone", "shift", "sort"), ("held",)
     only_channel = ("constant", "recorded", "held", "words", "quality", "good", "plus")
-    unfit = only_channel if name == "t" else only_clock
+    not_allowed = only_channel if name == "t" else only_clock
     if name != "t" and name not in plant.channels():
-        unfit = (*unfit, *only_input)
-    for key in unfit:
+        not_allowed = (*not_allowed, *only_input)
+    for key in not_allowed:
         if key in column.model_fields_set:
-            of = "a channel" if name == "t" else "an input" if key in only_input else "t"
-            raise ValueError(f"{place}.{key}: expected this key of {of} only; leave it out")
+            kind = "a channel" if name == "t" else "an input" if key in only_input else "t"
+            raise ValueError(f"{place}.{key}: expected this key of {kind} only; leave it out")
 
 
 def _clock_source(column: ColumnConfig) -> ClockSource:
@@ -60,7 +63,7 @@ def _channel_source(place: str, column: ColumnConfig, unit: str) -> ChannelSourc
 
 
 def _meaning(place: str, value: Amount | None, unit: str | None) -> float:
-    """The number that a word stands for, in the unit of its column; NaN where nothing was read."""
+    """The number for a word, in the unit of its column; NaN for a bad reading."""
     if isinstance(value, str):
         raise ValueError(f"{place}: expected a number in the unit of the column ({unit or 'see its header'}) or null")
     return float("nan") if value is None else float(value)
@@ -71,7 +74,7 @@ def _units(plant: PlantDescription) -> dict[str, str]:
 
 
 def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant: PlantDescription) -> None:
-    """Raises ValueError where a channel's unit (SI) is of another kind than the plant's."""
+    """Raises ValueError if a channel's SI unit differs from the plant's."""
     expected = _units(plant)
     for name, unit in zip(names, units, strict=True):
         if unit != expected[name]:
@@ -84,24 +87,24 @@ def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant:
 def unrecorded_valves(
     path: Path, plant: PlantDescription, config: FileConfig | None = None
 ) -> dict[str, ChannelSource]:
-    """The valves that a table lacks and the plant file says how they then stand."""
-    known = {p.valve: p.unrecorded for p in plant.pipes if p.valve and p.unrecorded is not None}
-    return {name: ChannelSource(None, "1", known[name]) for name in _lacking(path, known, config)}
+    """The valves without a column, with their opening from the plant file."""
+    openings = {p.valve: p.unrecorded for p in plant.pipes if p.valve and p.unrecorded is not None}
+    return {name: ChannelSource(None, "1", openings[name]) for name in _without_column(path, openings, config)}
 
 
 def missing_inputs(path: Path, plant: PlantDescription) -> list[str]:
-    """The plant's inputs that a CSV file has no column for, but valves of which the plant file says how they stand."""
-    known = unrecorded_valves(path, plant)
-    return [name for name in _lacking(path, plant.channels()) if name not in known]
+    """The plant's inputs without a column in a CSV file, apart from valves whose opening the plant file states."""
+    with_opening = unrecorded_valves(path, plant)
+    return [name for name in _without_column(path, plant.channels()) if name not in with_opening]
 
 
-def _lacking(path: Path, names: Collection[str], config: FileConfig | None = None) -> list[str]:
-    """Those of the names that no header of a CSV file is about; of other files none."""
+def _without_column(path: Path, names: Collection[str], config: FileConfig | None = None) -> list[str]:
+    """The names that no header of a CSV file contains; none for an MCAP log."""
     if not names or is_log(path):
         return []
     header = read_header(path) if config is None else read_header(path, config.header, config.sheet)
-    there = {*header, *(split[0] for column in header if (split := header_unit(column)))}
-    return [name for name in names if name not in there]
+    present = {*header, *(split[0] for column in header if (split := header_unit(column)))}
+    return [name for name in names if name not in present]
 
 
 def is_log(path: Path) -> bool:

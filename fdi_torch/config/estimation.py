@@ -1,4 +1,4 @@
-"""What is to be estimated, and how: parameters by name, constants to calibrate, objectives, search and refinement."""
+"""The estimation block: parameters by name, constants to calibrate, objectives, search and refinement."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ Objective = Literal["correlation", "likelihood"]
 
 class ParameterConfig(Strict):
     name: str = Field(description="COMPONENT.CONSTANT, COMPONENT.EFFECT (its size) or COMPONENT.EFFECT.PARAMETER")
-    nominal: Amount | None = Field(None, description="what is believed")
-    low: Amount | None = Field(None, description="lower end of the box")
-    high: Amount | None = Field(None, description="upper end of the box")
-    std: Amount | None = Field(None, description="one standard deviation of the belief")
+    nominal: Amount | None = Field(None, description="nominal value, the mean of the prior")
+    low: Amount | None = Field(None, description="lower bound")
+    high: Amount | None = Field(None, description="upper bound")
+    std: Amount | None = Field(None, description="standard deviation of the prior")
 
 
 def _parameter(value: Any) -> Any:
@@ -65,15 +65,15 @@ class ObjectiveConfig(Strict):
 def _existing_method(value: Any) -> Any:
     if value in ("lbfgs", "adam"):
         raise ValueError(
-            f"expected lm or none, got {value}, a method that no longer exists; lm gives what it gave "
-            "(estimate.refine.method=lm), for it changed nothing"
+            f"expected lm or none, got {value}, a method that no longer exists; use lm (estimate.refine.method=lm), "
+            "which gives the same result"
         )
     return value
 
 
 class RefineConfig(Strict):
     method: Annotated[Literal["lm", "none"], BeforeValidator(_existing_method)] = Field(
-        "lm", description="Levenberg-Marquardt, or none: the search's best member as it is"
+        "lm", description="Levenberg-Marquardt, or none: the best member of the search is the result"
     )
     iterations: int = Field(50, ge=1, description="at most")
 
@@ -88,7 +88,7 @@ class EstimationConfig(Strict):
         default_factory=list, description="names, or mappings with name, low, high, nominal, std"
     )
     calibrate: Annotated[Any, BeforeValidator(_auto_or_names)] = Field(
-        "auto", description="constants estimated beside them, their tolerance as prior; auto: all, where data are real"
+        "auto", description="constants estimated too, with their tolerance as prior; auto: all for real data"
     )
     objective: ObjectiveConfig = Field(default_factory=ObjectiveConfig)
     search: Annotated[EvolutionSettings, BeforeValidator(_known_settings)] = Field(
@@ -96,51 +96,52 @@ class EstimationConfig(Strict):
     )
     refine: RefineConfig = Field(default_factory=RefineConfig)
     step: StepConfig = Field(default_factory=StepConfig)
-    confidence: Share = Field(0.95, gt=0, lt=1, description="of intervals and of the diagnosis")
+    confidence: Share = Field(0.95, gt=0, lt=1, description="confidence level of intervals and of the diagnosis")
     windows: Seconds | None = Field(
-        None, gt=0, description="length of windows, s: each is fitted on its own, for faults that come and go"
+        None, gt=0, description="length of windows that are fitted separately, s, for faults that come and go"
     )
 
 
 def full_name(name: str, plant: PlantDescription) -> str:
-    """'T1.leak' -> 'T1.leak.size': an effect's name stands for its size. Raises ValueError where it cannot be there."""
-    location, _, rest = name.partition(".")
-    if rest in {e.name for e in EFFECTS}:
-        return f"{name}.{effect_at(rest, location, plant).parameters(location, plant)[0].name}"
+    """'T1.leak' -> 'T1.leak.size': an effect's name means its size. Raises ValueError for an impossible place."""
+    location, _, effect_name = name.partition(".")
+    if effect_name in {e.name for e in EFFECTS}:
+        return f"{name}.{effect_at(effect_name, location, plant).parameters(location, plant)[0].name}"
     return name
 
 
 def names_in_full(names: Iterable[str], plant: PlantDescription, field: str) -> list[str]:
-    """The same names, effects with their size. Raises ConfigError, naming the field, for one that the plant lacks."""
-    given = list(names)
+    """The full names. Raises ConfigError, naming the field, for a name that the plant does not have."""
+    short = list(names)
     try:
-        full = [full_name(name, plant) for name in given]
+        full = [full_name(name, plant) for name in short]
         constants = build_network(plant, placements_for(full)).constants
     except ValueError as error:
         raise ConfigError([f"{field}: {error}"]) from error
-    for name, known in zip(given, full, strict=True):
-        if known not in constants:
+    for name, name_in_full in zip(short, full, strict=True):
+        if name_in_full not in constants:
             raise ConfigError([f"{field}: {_unknown_parameter(name, constants, plant)}"])
     return full
 
 
 def placements_of(names: Iterable[str], plant: PlantDescription) -> tuple[Placement, ...]:
-    """The effects that these names speak of, each once."""
+    """The distinct effects to which the names belong."""
     return placements_for(full_name(name, plant) for name in names)
 
 
 def estimated_space(
     config: EstimationConfig, constants: ParameterSpace, plant: PlantDescription, real_data: bool
 ) -> ParameterSpace:
-    """The parameters and the constants to calibrate, as `constants` (of the network) has them, changed as asked.
+    """The parameters to estimate and the constants to calibrate, with the configured changes of the network's
+    constants.
 
-    Raises ConfigError for names that are unknown or doubled, wrong units, and boxes that do not hold the nominal value.
+    Raises ConfigError for unknown or repeated names, wrong units, and bounds that exclude the nominal value.
     """
-    chosen = [_chosen(p, i, constants, plant) for i, p in enumerate(config.parameters)]
-    taken = {p.name for p in chosen}
-    calibrated = [constants[name] for name in _calibrated(config, constants, plant, real_data) if name not in taken]
+    estimated = [_chosen(p, i, constants, plant) for i, p in enumerate(config.parameters)]
+    names = {p.name for p in estimated}
+    calibrated = [constants[name] for name in _calibrated(config, constants, plant, real_data) if name not in names]
     try:
-        return ParameterSpace([*chosen, *calibrated])
+        return ParameterSpace([*estimated, *calibrated])
     except ValueError as error:
         raise ConfigError([f"estimate.parameters: {error}"]) from error
 

@@ -1,4 +1,4 @@
-"""Reading the recordings that are meant, as the plant's inputs and outputs."""
+"""Loading of recordings as the plant's inputs and outputs."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import torch
 from pydantic import ValidationError
 
 from fdi_torch.config.channels import channel_mapping, expect_units, is_log, unrecorded_valves
-from fdi_torch.config.files import find_data, find_file, read_extended
 from fdi_torch.config.problems import ConfigError, explain
-from fdi_torch.config.recordings import FileConfig, RecordingConfig, StartLevel, in_seconds
+from fdi_torch.config.recording_config import FileConfig, RecordingConfig, StartLevel, in_seconds
+from fdi_torch.config.yaml_files import find_data, find_file, read_extended
 from fdi_torch.logbook import LogError
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
@@ -29,7 +29,7 @@ GIVE_A_CONSTANT = "give the unknown one a constant, as in columns: {Q1: {constan
 
 @dataclass(frozen=True)
 class LoadedRecording:
-    """A stretch of a recording whose inputs are all known, and what is known of each tank's level at its start."""
+    """A segment of a recording with all inputs known, and what is known of each tank's initial level."""
 
     recording: Recording
     start_levels: dict[str, StartLevel]
@@ -41,37 +41,38 @@ def load_recordings(
     base: Path | None = None,
     given: Mapping[str, Recording] | None = None,
 ) -> list[LoadedRecording]:
-    """Every recording, cut where an input is unknown. given: as for `read_recording`."""
-    parts = []
+    """All recordings, cut into segments with known inputs. given: as for `read_recording`."""
+    segments = []
     for config in configs:
         whole = read_recording(config, plant, base, given)
-        parts += known_parts(whole, config, plant)
-    return parts
+        segments += known_segments_of(whole, config, plant)
+    return segments
 
 
-def known_parts(whole: Recording, config: RecordingConfig, plant: PlantDescription) -> list[LoadedRecording]:
-    """A recording cut where an input is unknown; the levels at the start of a later stretch are free."""
-    stretches = [part for part in whole.known_stretches() if len(part) > 1]
-    if not stretches:
-        raise ConfigError([f"{whole.source}: expected a stretch with all inputs known, got none: {_unknown(whole)}"])
+def known_segments_of(whole: Recording, config: RecordingConfig, plant: PlantDescription) -> list[LoadedRecording]:
+    """The segments of a recording in which all inputs are known; initial levels of later segments are free."""
+    segments = [part for part in whole.known_segments() if len(part) > 1]
+    if not segments:
+        raise ConfigError([f"{whole.source}: expected a segment with all inputs known, got none: {_unknown(whole)}"])
     first = float(whole.time[0])
-    starts = [config.start_levels if float(part.time[0]) == first else "free" for part in stretches]
-    return [LoadedRecording(part, _levels(start, plant, config)) for part, start in zip(stretches, starts, strict=True)]
+    levels = [config.start_levels if float(part.time[0]) == first else "free" for part in segments]
+    return [LoadedRecording(part, _levels(level, plant, config)) for part, level in zip(segments, levels, strict=True)]
 
 
 def _unknown(whole: Recording) -> str:
-    """Which inputs are unknown and how often, and what to do about it."""
+    """The shares of unknown values of the inputs, and advice."""
     shares = torch.isnan(whole.inputs).double().mean(dim=0).tolist()
-    each = {name: share for name, share in zip(whole.input_names, shares, strict=True) if share > 0.0}
-    told = ", ".join(f"{name} at {share:.3g} of the samples" for name, share in each.items())
-    some = next((name for name, share in each.items() if share < 1.0), "")
-    fix = f"where its last value stands for empty cells say for how long, as in columns: {{{some}: {{held: 10 s}}}}"
-    return f"unknown are {told}; " + (f"{fix}, or {GIVE_A_CONSTANT}" if some else GIVE_A_CONSTANT)
+    unknown_shares = {name: share for name, share in zip(whole.input_names, shares, strict=True) if share > 0.0}
+    listing = ", ".join(f"{name} at {share:.3g} of the samples" for name, share in unknown_shares.items())
+    partly_known = next((name for name, share in unknown_shares.items() if share < 1.0), "")
+    fix = f"if an input keeps its value over empty cells, give the time: columns: {{{partly_known}: {{held: 10 s}}}}"
+    return f"unknown are {listing}; " + (f"{fix}, or {GIVE_A_CONSTANT}" if partly_known else GIVE_A_CONSTANT)
 
 
 def named_recordings(name: str, plant: PlantDescription, base: Path) -> list[Recording]:
-    """What stands for recordings on a command line: a CSV or MCAP file, or a YAML file with a list under `recordings`,
-    as in a run file; each in stretches whose inputs are known.
+    """The recordings of a command line's argument, in segments with known inputs.
+
+    name: a CSV or MCAP file, or a YAML file with a list under `recordings`, as in a run file.
     """
     if Path(name).suffix not in (".yaml", ".yml"):
         return [part.recording for part in load_recordings([RecordingConfig(file=name)], plant, base)]
@@ -86,16 +87,16 @@ def named_recordings(name: str, plant: PlantDescription, base: Path) -> list[Rec
     return [loaded.recording for loaded in load_recordings(configs, plant, path.parent)]
 
 
-def named_apart(recordings: Sequence[Any]) -> tuple[list[Any], dict[str, Recording]]:
-    """Recordings as a run file lists them, of which some may be `Recording`s themselves: these by a name each."""
+def separate_recordings(recordings: Sequence[Any]) -> tuple[list[Any], dict[str, Recording]]:
+    """The recordings of a run file with each `Recording` object replaced by a name, and these objects by name."""
     given: dict[str, Recording] = {}
     listed = []
-    for each in recordings:
-        if isinstance(each, Recording):
-            name = each.source if each.source not in given else f"{each.source} ({len(given) + 1})"
-            given[name] = each
-            each = {"file": name}
-        listed.append(each)
+    for entry in recordings:
+        if isinstance(entry, Recording):
+            name = entry.source if entry.source not in given else f"{entry.source} ({len(given) + 1})"
+            given[name] = entry
+            entry = {"file": name}
+        listed.append(entry)
     return listed, given
 
 
@@ -105,21 +106,21 @@ def read_recording(
     base: Path | None = None,
     given: Mapping[str, Recording] | None = None,
 ) -> Recording:
-    """The plant's inputs and outputs: selected, masked and thinned, unknown inputs still in it (NaN).
+    """The plant's inputs and outputs in a recording, cropped, masked and decimated; unknown inputs are NaN.
 
-    config: what a run file says of a recording, or the file's name alone. base: where paths start. given: recordings
-    that are at hand and are not read, by what `file` calls them. Raises ConfigError naming file, row and column.
+    config: the recording's entry in a run file, or the name of the file. base: folder of relative paths. given:
+    recordings in memory, by the name that `file` gives them. Raises ConfigError naming file, row and column.
     """
     if not isinstance(config, RecordingConfig):
         config = RecordingConfig(file=str(config))
     channels, columns = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
-    at_hand = (given or {}).get(config.file)
-    path = Path(config.file) if at_hand else find_data(config.file, base or Path.cwd())
+    in_memory = (given or {}).get(config.file)
+    path = Path(config.file) if in_memory else find_data(config.file, base or Path.cwd())
     try:
-        if at_hand is None:
+        if in_memory is None:
             recording = _read(config, path, base or Path.cwd(), plant, channels, columns)
         else:
-            recording = at_hand.selected(channels, columns)
+            recording = in_memory.selected(channels, columns)
         names = (*recording.input_names, *recording.output_names)
         expect_units(recording.source, names, (*recording.input_units, *recording.output_units), plant)
         start = -math.inf if config.start is None else in_seconds(config.start, recording, config)
@@ -134,9 +135,9 @@ def read_recording(
 def read_frame(frame: Any, plant: PlantDescription, **keys: Any) -> Recording:
     """The plant's inputs and outputs in a pandas.DataFrame, by the rules of CSV files.
 
-    Columns are named as a CSV file's (`h1_cm`, `h1 [cm]`), or as the plant's channels with their units in
-    `frame.attrs["units"]`, as `Recording.to_pandas` gives it. Time is the index where that has a name, or a column.
-    keys: what a run file says under `recordings:` beside the file, such as columns={"h1": {"column": "LT1", "unit":
+    Columns have headers as in a CSV file (`h1_cm`, `h1 [cm]`), or the names of the plant's channels with their units in
+    `frame.attrs["units"]`, as `Recording.to_pandas` returns them. Time is the index if it has a name, else a column.
+    keys: further keys of the entry under `recordings:` in a run file, such as columns={"h1": {"column": "LT1", "unit":
     "mm"}}. Raises ConfigError naming row and column.
     """
     units = frame.attrs.get("units", {})
@@ -167,7 +168,7 @@ def _read(
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> Recording:
-    """By the file's ending: an MCAP log (also one that was cut off while written), or else CSV."""
+    """Read by the file's ending: an MCAP log (also an incomplete one), else CSV or another table."""
     mapping = channel_mapping(config, plant)
     if is_log(path):
         if config.also or config.tags or config.sheet or not config.header:
@@ -193,11 +194,12 @@ def _source(config: FileConfig, path: Path, mapping: Mapping[str, ChannelSource]
     return FileSource(path, mapping, rows, config.header, config.sheet)
 
 
-def _levels(wanted: Any, plant: PlantDescription, config: RecordingConfig) -> dict[str, StartLevel]:
+def _levels(start_levels: Any, plant: PlantDescription, config: RecordingConfig) -> dict[str, StartLevel]:
+    """The start level of each tank; tanks that are not mentioned are free."""
     tanks = [tank.name for tank in plant.tanks]
-    if not isinstance(wanted, dict):
-        return dict.fromkeys(tanks, wanted)
-    for name in wanted:
+    if not isinstance(start_levels, dict):
+        return dict.fromkeys(tanks, start_levels)
+    for name in start_levels:
         if name not in tanks:
             raise ConfigError([f"{config.file}: start_levels.{name}: {unknown('a tank', name, tanks)}"])
-    return {tank: wanted.get(tank, "free") for tank in tanks}
+    return {tank: start_levels.get(tank, "free") for tank in tanks}

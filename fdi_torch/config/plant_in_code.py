@@ -1,4 +1,4 @@
-"""`Plant`: a rig as Python code or a plant file describes it."""
+"""`Plant`: a rig as described in Python code or in a plant file."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from fdi_torch.plant.effect import Effect, fits, place_kind
 from fdi_torch.simulate.ode import Inputs, PlantOde
 
 Read = Callable[[Any, str], float]
-"""From a value as written and its SI unit to its SI value."""
+"""A function from a value as written and its SI unit to its SI value."""
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
 class Plant(PlantDescription):
-    """A rig: its components, what is known of their constants, and the effects that it is known to have.
+    """A rig: its components, prior knowledge of their constants, and its known effects.
 
-    Quantities are text with a unit, as in a plant file ('200 cm^2', '3 %'), or numbers in SI. tolerances: one standard
-    deviation of a constant as a share of it, by patterns such as '*.discharge_coefficient' (* is any name); of an
-    offset, a start level or a parameter of an effect in its unit. varying: patterns of the constants that are others in
-    each recording. effects: what the plant is known to have. matters: which faults a monitor says aloud, in SI.
+    Quantities are text with a unit, as in a plant file ('200 cm^2', '3 %'), or numbers in SI. tolerances: relative
+    standard deviations of constants, by patterns such as '*.discharge_coefficient' (* is any name); of an offset, a
+    start level or a parameter of an effect in its unit. varying: patterns of the constants that differ between
+    recordings. effects: the plant's known effects. matters: least reported size and urgency of faults for a monitor,
+    SI.
 
-    `dump_plant` writes it as a plant file, from which `load_plant` makes an equal one. Raises ValueError naming
-    component and field, what is expected there and what is given.
+    `dump_plant` writes it as a plant file, which `load_plant` reads as an equal plant. Raises ValueError naming
+    component and field, with the expected and the given value.
 
     >>> Plant(
     ...     tanks=[Tank("A", area="200 cm^2", height="60 cm")],
@@ -59,16 +60,24 @@ class Plant(PlantDescription):
         name: str = "plant",
     ) -> None:
         parts = (tuple(tanks), tuple(pipes), tuple(pumps), tuple(sensors))
-        bare = PlantDescription(name, *parts, gravity=settled("gravity", gravity, "m/s^2"))
-        if not bare.sensors:
+        without_effects = PlantDescription(name, *parts, gravity=si_value("gravity", gravity, "m/s^2"))
+        if not without_effects.sensors:
             raise ValueError("sensors: expected at least one, got none; add one such as h1: {tank: T1}")
-        placed = tuple(settled_effect(i, each, bare) for i, each in enumerate(effects))
-        own = PlantDescription(name, *parts, placed, gravity=bare.gravity)
-        given = settled_tolerances(tolerances or {}, own)
-        super().__init__(name, *parts, placed, given, _varying(varying, given), tuple(matters), bare.gravity)
+        placed = tuple(effect_in_si(i, each, without_effects) for i, each in enumerate(effects))
+        with_effects = PlantDescription(name, *parts, placed, gravity=without_effects.gravity)
+        absolute_tolerances = tolerances_in_si(tolerances or {}, with_effects)
+        super().__init__(
+            name,
+            *parts,
+            placed,
+            absolute_tolerances,
+            _varying(varying, absolute_tolerances),
+            tuple(matters),
+            without_effects.gravity,
+        )
 
     def __eq__(self, other: object) -> bool:
-        """A plant equals any description of the same."""
+        """Equality of all fields with any `PlantDescription`."""
         if not isinstance(other, PlantDescription):
             return NotImplemented
         return all(getattr(self, f.name) == getattr(other, f.name) for f in fields(PlantDescription))
@@ -82,12 +91,12 @@ class Plant(PlantDescription):
         *,
         resolution: float | None = None,
     ) -> PlantOde:
-        """dh/dt = f(t, h) of this plant, as `torchdiffeq.odeint` takes it; `.start` are the start levels.
+        """dh/dt = f(t, h) of this plant, for `torchdiffeq.odeint`; `.start` holds the start levels.
 
         inputs: a `Recording`, constant inputs (channels,) in SI, or a function of t in s to these. theta: parameters
         that differ from their nominal values, by full name in SI, each a number or a tensor (*batch), through which
-        gradients flow: {"A.leak.size": size}. resolution: s, how sharply roots and rims are drawn.
-        Raises ValueError for a name that is no parameter, and for actuators with memory or delay.
+        gradients flow: {"A.leak.size": size}. resolution: time scale of the smoothing of square roots and rims, s.
+        Raises ValueError for an unknown parameter, and for actuators with memory or dead time.
         """
         named = theta or {}
         network = build_network(self, placements_for(named))
@@ -96,15 +105,17 @@ class Plant(PlantDescription):
         return PlantOde(network, inputs, space, torch.stack(columns, -1) if columns else None, resolution=resolution)
 
     def _repr_html_(self) -> str:
-        """The drawing of the rig, in a notebook."""
+        """The drawing of the rig for notebooks."""
         from fdi_torch.report.schematic import schematic
         from fdi_torch.report.style import inline_svg
 
         return str(inline_svg(schematic(self), f"plant-{self.name}", f"plant {self.name}"))
 
 
-def settled(place: str, value: float | str, unit: str, read: Read | None = None) -> float:
-    """A quantity in SI: text by its unit, a number as it is; or by `read`. Raises ValueError naming `place`."""
+def si_value(place: str, value: float | str, unit: str, read: Read | None = None) -> float:
+    """The SI value of a quantity: text by its unit, a number unchanged; or by `read`. Raises ValueError naming
+    `place`.
+    """
     try:
         if read is None:
             return quantity(value, unit) if isinstance(value, str) else quantity(value, "1")
@@ -113,8 +124,8 @@ def settled(place: str, value: float | str, unit: str, read: Read | None = None)
         raise ValueError(f"{place}: {error}") from error
 
 
-def settled_effect(index: int, placed: PlacedEffect, plant: PlantDescription, read: Read | None = None) -> PlacedEffect:
-    """The effect with its parameters in SI. Raises ValueError where it cannot be there, or has no such parameter."""
+def effect_in_si(index: int, placed: PlacedEffect, plant: PlantDescription, read: Read | None = None) -> PlacedEffect:
+    """The effect with its parameters in SI. Raises ValueError for an impossible place or an unknown parameter."""
     place = f"effects.{index}"
     try:
         known = effect_parameters(placed.effect, placed.location, plant)
@@ -123,7 +134,7 @@ def settled_effect(index: int, placed: PlacedEffect, plant: PlantDescription, re
     for name in placed.parameters:
         if name not in known:
             raise ValueError(f"{place}.parameters: {unknown(f'a parameter of {placed.effect}', name, known)}")
-    values = {n: settled(f"{place}.parameters.{n}", v, known[n].unit, read) for n, v in placed.parameters.items()}
+    values = {n: si_value(f"{place}.parameters.{n}", v, known[n].unit, read) for n, v in placed.parameters.items()}
     for name, value in values.items():
         if value < 0.0 <= known[name].low:
             raise ValueError(f"{place}.parameters.{name}: expected at least 0 {known[name].unit}, got {value:g}")
@@ -131,26 +142,27 @@ def settled_effect(index: int, placed: PlacedEffect, plant: PlantDescription, re
 
 
 def effect_parameters(name: str, location: str, plant: PlantDescription) -> dict[str, Parameter]:
-    """The parameters of an effect at a place, by their short names. Raises ValueError where it cannot be there."""
+    """The parameters of an effect at a place, by short name. Raises ValueError for an impossible place."""
     return {p.name: p for p in effect_at(name, location, plant).parameters(location, plant)}
 
 
 def effect_at(name: str, location: str, plant: PlantDescription) -> Effect:
-    """The effect of that name. Raises ValueError where it cannot be at that place of the plant."""
-    found = effect(name)
-    if not fits(found, plant, location):
-        there = ", ".join(place for place in plant.locations() if fits(found, plant, place)) or "none there is"
+    """The effect of that name. Raises ValueError if it cannot be placed there."""
+    requested = effect(name)
+    if not fits(requested, plant, location):
+        possible = ", ".join(place for place in plant.locations() if fits(requested, plant, place)) or "none there is"
         raise ValueError(
-            f"{location}.{name}: expected a place of kind {' or '.join(found.places)} ({there}), "
+            f"{location}.{name}: expected a place of kind {' or '.join(requested.places)} ({possible}), "
             f"got {place_kind(plant, location)} {location}"
         )
-    return found
+    return requested
 
 
-def settled_tolerances(
+def tolerances_in_si(
     patterns: Mapping[str, float | str], plant: PlantDescription, read: Read | None = None
 ) -> dict[str, float]:
-    """Patterns such as *.discharge_coefficient spelled out for every constant that they match, in SI; later ones win.
+    """Expand patterns such as *.discharge_coefficient to every matching constant, in SI; later patterns override
+    earlier ones.
 
     A pattern for parameters of effects has two dots.
     """
@@ -163,14 +175,14 @@ def settled_tolerances(
         if not matched:
             raise ValueError(f"{place}: {unknown('a constant', pattern, known)}")
         for name in matched:
-            tolerances[name] = settled(place, value, units.get(name, "1"), read)
+            tolerances[name] = si_value(place, value, units.get(name, "1"), read)
             if not tolerances[name] > 0:
                 raise ValueError(f"{place}: expected a positive tolerance such as 3 %, got {value}")
     return tolerances
 
 
 def _varying(patterns: Iterable[str], tolerances: dict[str, float]) -> tuple[str, ...]:
-    """Raises ValueError for what matches no constant with a tolerance: how much would it vary?"""
+    """The matching constants. Raises ValueError for a pattern without any constant that has a tolerance."""
     try:
         return tuple(matching("a constant with a tolerance", patterns, tolerances))
     except ValueError as error:
@@ -178,13 +190,13 @@ def _varying(patterns: Iterable[str], tolerances: dict[str, float]) -> tuple[str
 
 
 def absolute_units(plant: PlantDescription) -> dict[str, str]:
-    """Tolerances that are no shares: of offsets, start levels and the parameters of effects, with their units."""
+    """Units of the tolerances that are not relative: of offsets, start levels and parameters of effects."""
     offsets = {f"{sensor.name}.offset": sensor.unit for sensor in plant.sensors}
     return offsets | {f"{tank.name}.start_level": "m" for tank in plant.tanks} | effect_units(plant)
 
 
 def effect_units(plant: PlantDescription) -> dict[str, str]:
-    """Units of all parameters of the plant's effects, by their full names."""
+    """Units of all parameters of the plant's effects, by full name."""
     return {
         f"{e.location}.{e.effect}.{name}": parameter.unit
         for e in plant.effects

@@ -1,4 +1,4 @@
-"""A plant file changed where the plant has changed: comments, order, wildcards and units stay as they are written."""
+"""Edits of a plant file that change only the differing values; comments, order, wildcards and units are kept."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from typing import Any
 
 import yaml
 
-from fdi_torch.config.files import compose_yaml, parse_yaml
-from fdi_torch.config.plant import build_plant
+from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.plant_writer import dump_plant, plant_mapping
 from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.yaml_files import compose_yaml, parse_yaml
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.units import UnitError, in_unit, number_and_unit
 
 DIGITS = 7
-"""Of a number that is written: a ten-millionth of it, far below any standard error."""
-_SAME = 1e-6  # relative, of numbers written with so many digits
+"""Significant digits of written numbers; the rounding error is far below any standard error."""
+_SAME = 1e-6  # relative tolerance of numbers written with `DIGITS` digits
 _PARTS = ("tanks", "pipes", "pumps", "sensors")
 Path = tuple[str | int, ...]
 
 
 def patched_plant(text: str, before: PlantDescription, after: PlantDescription) -> tuple[str, bool]:
-    """The text of a plant file with what is different in `after`, and whether the rest of it could be kept.
+    """The text of a plant file changed to describe `after`, and whether its format could be kept.
 
-    text: the file that `before` was read from. Numbers are written in the unit that stands there, to `DIGITS` digits.
-    Where the changes cannot be told apart in the text (anchors that several components share), it is written anew.
+    text: the file from which `before` was read. Numbers are written with `DIGITS` digits in the unit of the text. If
+    the changes cannot be located in the text (anchors shared by several components), the file is written anew.
     """
     edits = _Edits(text)
     for path, value in _changes(before, after):
@@ -43,7 +43,7 @@ def patched_plant(text: str, before: PlantDescription, after: PlantDescription) 
 
 
 def _changes(before: PlantDescription, after: PlantDescription) -> Iterator[tuple[Path, str | float]]:
-    """Path and new value of every constant, effect's parameter and tolerance that is not what it was."""
+    """Path and new value of every changed constant, effect parameter and tolerance."""
     old, new = plant_mapping(before), plant_mapping(after)
     for part in _PARTS:
         for name, fields in new.get(part, {}).items():
@@ -68,13 +68,13 @@ def _new_effects(before: PlantDescription, after: PlantDescription) -> list[Plac
 
 
 def _rounded(placed: PlacedEffect, plant: PlantDescription) -> dict[str, Any]:
-    """As a plant file has it."""
+    """The mapping of the effect in a plant file."""
     mapping: dict[str, Any] = plant_mapping(plant)["effects"][plant.effects.index(placed)]
     return mapping | {"parameters": {n: _in_unit_of(v, None) for n, v in mapping["parameters"].items()}}
 
 
 class _Edits:
-    """Changes of a YAML text, found by the places that its parser tells of each value."""
+    """Edits of a YAML text, at the positions that the parser reports for its values."""
 
     def __init__(self, text: str) -> None:
         self._text = text if text.endswith("\n") or not text else f"{text}\n"
@@ -83,7 +83,7 @@ class _Edits:
         self._added: dict[Path, list[str]] = {}
 
     def set(self, path: Path, value: str | float) -> None:
-        """Writes a value in the unit of the one there, or adds the key to the mapping that it belongs in."""
+        """Write a value in the unit of the present one, or add the key to its mapping."""
         node = self._at(path)
         if isinstance(node, yaml.ScalarNode):
             quote = node.style if node.style in ("'", '"') else ""
@@ -93,11 +93,11 @@ class _Edits:
             self._added.setdefault(path[:-1], []).append(_flow({path[-1]: _in_unit_of(value, None)})[1:-1])
 
     def append(self, path: Path, item: Mapping[str, Any]) -> None:
-        """Adds an item to a list."""
+        """Add an item to a list."""
         self._added.setdefault(path, []).append(_flow(dict(item)))
 
     def applied(self) -> str:
-        """The text with all of them, from its end to its beginning, so that places stay true."""
+        """The edited text; edits are applied from the end, so that positions remain valid."""
         edits = [*self._replaced, *(self._inserted(path, items) for path, items in self._added.items())]
         text = self._text
         for start, end, new in sorted(edits, reverse=True):
@@ -105,7 +105,7 @@ class _Edits:
         return text
 
     def _at(self, path: Path) -> Any:
-        """The node there; None where there is none."""
+        """The node at that path, or None."""
         node: Any = self._root
         for step in path:
             if isinstance(node, yaml.SequenceNode) and isinstance(step, int):
@@ -117,10 +117,10 @@ class _Edits:
         return node
 
     def _inserted(self, path: Path, items: list[str]) -> tuple[int, int, str]:
-        """Where and how the items are added to the collection at that path."""
+        """The edit (start, end, text) that adds items to the collection at that path."""
         node = self._at(path)
         is_list = path == ("effects",)
-        if node is None or isinstance(node, yaml.ScalarNode):  # it is not in the file yet
+        if node is None or isinstance(node, yaml.ScalarNode):  # the collection is not in the file yet
             whole = f"[{', '.join(items)}]" if is_list else f"{{{', '.join(items)}}}"
             if len(path) == 1 and not self._root.flow_style:
                 lines = "".join(f"  - {item}\n" if is_list else f"  {item}\n" for item in items)
@@ -136,7 +136,7 @@ class _Edits:
 
 
 def _end(node: Any) -> int:
-    """Where what a block holds ends; its own mark lies behind the comments and empty lines that follow."""
+    """End of a block's content; the mark of the block itself is after following comments and empty lines."""
     while isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         node = last[1] if isinstance(node, yaml.MappingNode) else last
@@ -144,26 +144,26 @@ def _end(node: Any) -> int:
 
 
 def _flow(value: Any) -> str:
-    """On one line."""
+    """YAML on one line."""
     return str(yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6)).strip()
 
 
 def _in_unit_of(value: str | float, written: str | None) -> Any:
-    """A quantity to `DIGITS` digits, in the unit of what is written there; a bare number remains one."""
+    """A quantity with `DIGITS` digits, in the unit of `written`; a bare number stays one."""
     number, unit = number_and_unit(str(value))
     if written is not None:
         try:
-            _, wanted = number_and_unit(written)
-            number, unit = in_unit(number, unit, wanted), wanted
+            _, written_unit = number_and_unit(written)
+            number, unit = in_unit(number, unit, written_unit), written_unit
         except UnitError:
-            pass  # a word such as equilibrium stands there
+            pass  # `written` is a word such as equilibrium
     short = f"{number:.{DIGITS}g}"
     return float(short) if unit == "1" else f"{short} {unit}"
 
 
 def _equal(one: PlantDescription, other: PlantDescription) -> bool:
-    """The same plant, numbers as good as equal, its effects in any order."""
-    return _alike(_plain(one), _plain(other))
+    """Whether two plants are equal up to rounding, with effects in any order."""
+    return _nearly_equal(_plain(one), _plain(other))
 
 
 def _plain(plant: PlantDescription) -> dict[str, Any]:
@@ -171,11 +171,11 @@ def _plain(plant: PlantDescription) -> dict[str, Any]:
     return plain | {"effects": sorted(plain["effects"], key=lambda e: (e["effect"], e["location"]))}
 
 
-def _alike(one: Any, other: Any) -> bool:
+def _nearly_equal(one: Any, other: Any) -> bool:
     if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(_alike(one[key], other[key]) for key in one)
+        return one.keys() == other.keys() and all(_nearly_equal(one[key], other[key]) for key in one)
     if isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        return len(one) == len(other) and all(map(_alike, one, other))
+        return len(one) == len(other) and all(map(_nearly_equal, one, other))
     if isinstance(one, float | int) and isinstance(other, float | int):
         return math.isclose(one, other, rel_tol=_SAME, abs_tol=1e-15)
     return bool(one == other)

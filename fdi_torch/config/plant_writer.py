@@ -1,11 +1,11 @@
-"""Plant files written: PlantDescription in SI -> YAML with units, so that it reads back as the same description."""
+"""Writing of plant files: PlantDescription in SI -> YAML with units that reads back as the same description."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from fdi_torch.config.files import write_yaml
 from fdi_torch.config.plant_in_code import absolute_units, effect_at, effect_parameters
+from fdi_torch.config.yaml_files import write_yaml
 from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import (
     OUTSIDE,
@@ -32,7 +32,7 @@ _UNITS = {
     "A/m": ("mA/m", "mA/cm"),
     "1/m": ("1/m", "%/m", "%/cm"),
 }
-"""SI unit -> units in which numbers are often round, the usual one first."""
+"""SI unit -> customary units, the usual one first."""
 
 
 def dump_plant(plant: PlantDescription) -> str:
@@ -124,7 +124,9 @@ def _given(**fields: Any) -> dict[str, Any]:
 
 
 def _text(value: float, unit: str) -> str | float:
-    """'160 cm^2' in the first unit in which that is short and reads back the same, else SI to the last bit."""
+    """'160 cm^2': the first customary unit in which the number is short and reads back exactly, else SI with all
+    digits.
+    """
     if unit == "1":
         return value
     for shown in (*_UNITS.get(unit, ()), unit):

@@ -1,4 +1,4 @@
-"""What is wrong with a configuration, in sentences: file, field, what was expected, what was found."""
+"""Configuration errors as sentences: file, field, expected and given value."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be used. problems: one sentence each; the message is these sentences, one a line."""
+    """A configuration that cannot be used. problems: one sentence each; the message has one sentence per line."""
 
     def __init__(self, problems: Sequence[str]) -> None:
         super().__init__("\n".join(problems))
@@ -18,7 +18,7 @@ class ConfigError(ValueError):
 
 
 class UnknownKeyError(ValueError):
-    """A key that is not known where it stands."""
+    """An unknown key."""
 
     def __init__(self, sentence: str, key: str) -> None:
         super().__init__(sentence)
@@ -26,15 +26,15 @@ class UnknownKeyError(ValueError):
 
 
 def explain(error: ValidationError, source: str, known: Iterable[str] = ()) -> ConfigError:
-    """Pydantic's findings as sentences. known: the paths of all keys, for one that stands in the wrong place."""
+    """Pydantic's findings as sentences. known: the paths of all keys, to locate a misplaced key."""
     known = list(known)
     sentences = [f"{source}: {_path(e['loc'])}{_sentence(e, known)}" for e in error.errors(include_url=False)]
     return ConfigError(list(dict.fromkeys(sentences)))
 
 
 @contextmanager
-def told_in(source: str) -> Iterator[None]:
-    """What is wrong with a field is said with the file that has it."""
+def naming_source(source: str) -> Iterator[None]:
+    """A context in which ConfigErrors are prefixed with the file."""
     try:
         yield
     except ConfigError as error:
@@ -45,17 +45,17 @@ def _path(location: tuple[int | str, ...]) -> str:
     return ".".join(str(part) for part in location) + ": " if location else ""
 
 
-def _sentence(found: Any, known: Sequence[str]) -> str:
-    if found["type"] == "missing":
+def _sentence(finding: Any, known: Sequence[str]) -> str:
+    if finding["type"] == "missing":
         return "expected a value, got nothing; add it"
-    if "error" in found.get("ctx", {}):
-        return f"{found['ctx']['error']}{_elsewhere(found['ctx']['error'], known)}"
-    if found["type"] in ("list_type", "tuple_type"):
-        return f"expected a list, as in [{found['input']}], got {_shown(found['input'])}"
-    if found["type"] in ("dict_type", "model_type"):
-        return f"expected keys with values, got {_shown(found['input'])}"
-    expected = found["msg"].replace("Input should be", "expected").replace("Input should have", "expected")
-    return f"{expected}, got {_shown(found['input'])}"
+    if "error" in finding.get("ctx", {}):
+        return f"{finding['ctx']['error']}{_elsewhere(finding['ctx']['error'], known)}"
+    if finding["type"] in ("list_type", "tuple_type"):
+        return f"expected a list, as in [{finding['input']}], got {_shown(finding['input'])}"
+    if finding["type"] in ("dict_type", "model_type"):
+        return f"expected keys with values, got {_shown(finding['input'])}"
+    expected = finding["msg"].replace("Input should be", "expected").replace("Input should have", "expected")
+    return f"{expected}, got {_shown(finding['input'])}"
 
 
 def _elsewhere(error: Exception, known: Sequence[str]) -> str:

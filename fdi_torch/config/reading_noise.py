@@ -1,4 +1,4 @@
-"""How noisy readings are said to be, in one short text for all sensors or for each."""
+"""Noise of readings, as one short text for all sensors or for each of them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from fdi_torch.plant.description import PlantDescription, Sensor
 def reading_noise(text: str, plant: PlantDescription) -> list[float]:
     """Standard deviation of each sensor's readings in its SI unit.
 
-    '1 mm' is of the level, whatever the sensor reads; '0.01 mA' is for plants whose sensors all read milliamperes;
-    'p1 = 2 mV, h2 = 1 mm' names each sensor. Raises ValueError.
+    '1 mm' refers to the level, for sensors of any unit; '0.01 mA' is for plants with current sensors only; 'p1 = 2 mV,
+    h2 = 1 mm' names each sensor. Raises ValueError.
     """
     if "=" not in text:
         return [_std(text, sensor) for sensor in plant.sensors]

@@ -1,4 +1,4 @@
-"""Recordings to be made: inputs, faults and noise of a simulated run."""
+"""The simulation block: inputs, faults and noise of a simulated run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fdi_torch.capacity import expect_room
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import StartLevels
+from fdi_torch.config.recording_config import StartLevels
 from fdi_torch.config.strict import Amount, Decibel, Seconds, Strict, quantity
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
@@ -20,7 +20,7 @@ from fdi_torch.simulate.simulated_recording import noise_level
 
 
 class InputConfig(Strict):
-    value: Amount | None = Field(None, description="held throughout, in the unit of the plant's channel")
+    value: Amount | None = Field(None, description="constant value, in the unit of the plant's channel")
     steps: list[tuple[Seconds, Amount]] = Field(
         default_factory=list, description="[[0 s, 50 cm^3/s], [200 s, 60 cm^3/s], ...]: from each time on"
     )
@@ -31,7 +31,7 @@ def _input(value: Any) -> Any:
 
 
 def flat_names(value: Any, prefix: str = "") -> Any:
-    """{T1: {leak: 0.3}} -> {T1.leak: 0.3}, as --set simulate.faults.T1.leak=0.3 makes it."""
+    """{T1: {leak: 0.3}} -> {T1.leak: 0.3}, the form in which --set simulate.faults.T1.leak=0.3 arrives."""
     if not isinstance(value, dict):
         return value
     flat: dict[str, Any] = {}
@@ -44,16 +44,16 @@ def flat_names(value: Any, prefix: str = "") -> Any:
 class NoiseConfig(Strict):
     snr_db: Decibel | None = Field(None, description="signal-to-noise ratio of each output, dB")
     definition: Literal["variance", "power"] = Field(
-        "variance", description="noise against the signal's variance, or against its mean square"
+        "variance", description="signal power of the ratio: the output's variance or its mean square"
     )
-    std: dict[str, Amount] = Field(default_factory=dict, description="instead, of named outputs: {h1: 1 mm}")
+    std: dict[str, Amount] = Field(default_factory=dict, description="standard deviation by output: {h1: 1 mm}")
 
 
 class SimulationConfig(Strict):
     inputs: dict[str, Annotated[InputConfig, BeforeValidator(_input)]] = Field(
         default_factory=dict, description="channel: value or steps"
     )
-    hold: Literal["zero_order", "linear"] = Field("zero_order", description="how inputs run between samples")
+    hold: Literal["zero_order", "linear"] = Field("zero_order", description="course of inputs between samples")
     duration: Seconds = Field(1000.0, gt=0, description="length of the recording, s")
     sample_time: Seconds = Field(1.0, gt=0, description="sampling interval, s")
     start_levels: StartLevels = Field(
@@ -63,13 +63,13 @@ class SimulationConfig(Strict):
         default_factory=dict, description="values of any parameters, such as T1.leak: 0.3"
     )
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="added to every output")
-    seed: int | None = Field(None, description="of the noise, where it is not the run's seed")
+    seed: int | None = Field(None, description="seed of the noise; by default the run's seed")
 
 
 def planned_recording(config: SimulationConfig, plant: PlantDescription) -> Recording:
-    """The clock and the inputs of the run to be simulated; its readings are still unknown (NaN, not counted).
+    """Time and inputs of the run to be simulated; its readings are NaN and masked.
 
-    Raises ConfigError for inputs that the plant lacks or misses, and for steps that are not at samples.
+    Raises ConfigError for unknown or missing inputs, and for steps between samples.
     """
     time = _clock(config, plant)
     units = plant.channel_units()
@@ -95,17 +95,19 @@ def planned_recording(config: SimulationConfig, plant: PlantDescription) -> Reco
 
 
 def noise_std(config: NoiseConfig, plant: PlantDescription, clean: Tensor) -> Tensor:
-    """Standard deviation (N,) of the noise for noise-free outputs (T, N), in their SI units.
+    """Standard deviation (N,) of the noise of noise-free outputs (T, N), in their SI units.
 
-    From the signal-to-noise ratio, or as given.
+    From the signal-to-noise ratio, or as configured.
     """
     names = [sensor.column for sensor in plant.sensors]
     std = clean.new_zeros(len(names))
     if config.snr_db is not None:
         std = noise_level(clean, config.snr_db, config.definition)
         if bool((std <= 0).any()):
-            still = names[int((std <= 0).nonzero()[0])]
-            raise ConfigError([f"simulate.noise.snr_db: expected outputs that vary, got a constant {still}; give std"])
+            constant_output = names[int((std <= 0).nonzero()[0])]
+            raise ConfigError(
+                [f"simulate.noise.snr_db: expected outputs that vary, got a constant {constant_output}; give std"]
+            )
     for name, value in config.std.items():
         if name not in names:
             raise ConfigError([f"simulate.noise.std.{name}: {unknown('an output of the plant', name, names)}"])
@@ -127,8 +129,8 @@ def _clock(config: SimulationConfig, plant: PlantDescription) -> Tensor:
     _expect_room_for_samples(config, plant)
     intervals = round(config.duration / config.sample_time)
     if intervals < 1 or abs(intervals * config.sample_time - config.duration) > 1e-9 * config.duration:
-        wanted = f"a multiple of sample_time ({config.sample_time:g} s)"
-        raise ConfigError([f"simulate.duration: expected {wanted}, got {config.duration:g} s"])
+        expected = f"a multiple of sample_time ({config.sample_time:g} s)"
+        raise ConfigError([f"simulate.duration: expected {expected}, got {config.duration:g} s"])
     return torch.arange(intervals + 1, dtype=torch.float64) * config.sample_time
 
 
@@ -150,7 +152,7 @@ def _series(name: str, config: InputConfig, unit: str, time: Tensor, run: Simula
 
 
 def _interpolated(time: Tensor, times: Tensor, values: Tensor) -> Tensor:
-    """Straight lines between the given points, level after the last."""
+    """Linear interpolation of the given points, constant after the last."""
     if len(times) == 1:
         return values.expand_as(time).clone()
     right = torch.searchsorted(times, time, right=True).clamp(1, len(times) - 1)

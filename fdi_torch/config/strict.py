@@ -1,4 +1,4 @@
-"""The base of all configuration models: unknown keys are refused, quantities carry their units."""
+"""The base of all configuration models: unknown keys are errors, and quantities have units."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fdi_torch.recording import LARGEST
 
 
 class Strict(BaseModel):
-    """A mapping with known keys only. Field descriptions say what each is, with its unit."""
+    """A mapping with known keys only. Field descriptions state the meaning of each key, with its unit."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -29,9 +29,9 @@ class Strict(BaseModel):
 
 
 def quantity(value: Any, unit: str) -> float:
-    """'160 cm^2' -> 0.016 for unit 'm^2'. A number without unit is taken only where the unit is '1'.
+    """'160 cm^2' -> 0.016 for unit 'm^2'. A number without unit is accepted only for the unit '1'.
 
-    Raises ValueError where it is no finite quantity of that kind.
+    Raises ValueError for anything that is not a finite quantity in that unit.
     """
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ValueError(f"expected a quantity in {unit}, got {value!r}")
@@ -62,30 +62,30 @@ Area = Annotated[float, *_of("m^2")]
 Flow = Annotated[float, *_of("m^3/s")]
 Seconds = Annotated[float, *_of("s")]
 Decibel = Annotated[float, Field(ge=-300, le=300)]
-_ON_A_BENCH = "the default is for tanks on a bench"
+_ON_A_BENCH = "the default is for a bench-top rig"
 BenchSeconds = Annotated[Seconds, _ON_A_BENCH]
 BenchSteps = Annotated[list[float], BeforeValidator(_each_in_seconds), _ON_A_BENCH]
 Acceleration = Annotated[float, *_of("m/s^2")]
 
 Amount = float | str
-"""A quantity whose unit depends on what it belongs to; turned into SI where that is known."""
+"""A quantity whose unit depends on its owner; converted to SI once that is known."""
 
 
 Config = TypeVar("Config", bound=Strict)
 
 
-def is_for_a_bench(field: FieldInfo) -> bool:
-    """Whether a key's default is multiplied by the plant's time scale."""
+def has_bench_default(field: FieldInfo) -> bool:
+    """Whether the default is multiplied by the plant's time scale."""
     return _ON_A_BENCH in field.metadata
 
 
-def at_pace(config: Config, scale: float) -> Config:
-    """The same, with times that nobody chose and that are meant for a bench multiplied by a plant's time scale."""
+def scaled_to_plant(config: Config, scale: float) -> Config:
+    """The configuration with all default times for a bench-top rig multiplied by the plant's time scale."""
     changes: dict[str, Any] = {}
     for name, field in type(config).model_fields.items():
         value = getattr(config, name)
         if isinstance(value, Strict):
-            changes[name] = at_pace(value, scale)
-        elif is_for_a_bench(field) and name not in config.model_fields_set:
+            changes[name] = scaled_to_plant(value, scale)
+        elif has_bench_default(field) and name not in config.model_fields_set:
             changes[name] = [scale * v for v in value] if isinstance(value, list) else scale * value
     return config.model_copy(update=changes) if scale != 1.0 else config

@@ -1,4 +1,4 @@
-"""Commented minimal files to begin with: a plant, and runs, monitors and studies of any plant."""
+"""Commented minimal files: a plant, and runs, monitors and studies of any plant."""
 
 from __future__ import annotations
 
@@ -103,9 +103,10 @@ TEMPLATES = {"plant": PLANT, "run": RUN, "monitor": MONITOR, "study": STUDY}
 
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str) -> str:
-    """The text of a new file of that kind. plant, plant_file: what it is about, as its key `plant` has it.
+    """The text of a new file of that kind.
 
-    name: of the run, and of the recording that it reads. Raises ValueError for a kind that there is not.
+    plant: the plant of the file; plant_file: its entry under the key `plant`; name: of the run and of the recording
+    that it reads. Raises ValueError for an unknown kind.
     """
     if kind not in TEMPLATES:
         raise ValueError(unknown("a kind of file", kind, TEMPLATES))
@@ -129,14 +130,14 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str) -> 
 
 
 def _inputs(plant: PlantDescription) -> str:
-    """A step up and a step down of each pump about half of its range, valves open."""
-    most = {pump.channel: (pump.max_flow / pump.gain, pump.command_unit) for pump in plant.pumps}
+    """For each pump a step up and a step down about half of its range; valves are open."""
+    full_commands = {pump.channel: (pump.max_flow / pump.gain, pump.command_unit) for pump in plant.pumps}
     lines = []
     for channel in plant.channels():
-        if channel not in most:
+        if channel not in full_commands:
             lines.append(f"    {channel}: 1")
             continue
-        high, unit = most[channel]
+        high, unit = full_commands[channel]
         levels = [f"{share * high:.3g}{'' if unit == '1' else ' ' + unit}" for share in (0.4, 0.5, 0.3)]
         steps = ", ".join(f"[{t} s, {level}]" for t, level in zip((0, 200, 400), levels, strict=True))
         lines.append(f"    {channel}: {{steps: [{steps}]}}")

@@ -38,6 +38,9 @@ class Fault:
     hole: float | None
 
 
+UNRELIABLE = "Unreliable: the model does not explain the recording"
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """faults: every suspected one, present or not. kind: 'no fault', 'single fault' or 'multiple faults'.
@@ -59,6 +62,13 @@ class Diagnosis:
     @property
     def kind(self) -> str:
         return ("no fault", "single fault", "multiple faults")[min(len(self.present), 2)]
+
+    @property
+    def warning(self) -> str:
+        """One sentence if the model does not explain the recording, so that no size can be trusted."""
+        if self.explained:
+            return ""
+        return f"{UNRELIABLE} (residuals {self.unexplained_ratio:.2g} times the sensors' noise)"
 
 
 def diagnose(

@@ -18,8 +18,8 @@ from torch import Tensor
 from fdi_torch.effects import EFFECTS
 from fdi_torch.estimate.kalman import KalmanWhitening
 from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, levenberg_marquardt
+from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
 from fdi_torch.gap.dataset import DataSet, RecordingPart, interpolate
-from fdi_torch.gap.noise_model import Noise, low_frequency_excess
 from fdi_torch.gap.trajectory_problem import FAR, TrajectoryProblem
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement

@@ -10,18 +10,18 @@ import torch
 from fdi_torch.gap.answer import Answer, Verdict
 from fdi_torch.gap.answer_assembly import build_answer
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise, estimate_noise, quantization_step
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.diagnosis_result import DiagnosisResult
 from fdi_torch.gap.free_form import fitted_free_form
 from fdi_torch.gap.library import possible_places
 from fdi_torch.gap.marginal_likelihood import with_disturbances
-from fdi_torch.gap.noise_model import Noise, estimate_noise, quantization_step
 from fdi_torch.gap.posterior import CauseHypothesis, Posterior, posterior_of
 from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_noise_limits
 from fdi_torch.gap.problem import PLAIN, DiagnosisProblem, Settings, problem_of
 from fdi_torch.gap.screening import options_of
-from fdi_torch.gap.search import ExplanationPool, search
+from fdi_torch.gap.structure_search import ExplanationPool, search
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of_all, with_simulated_levels
 from fdi_torch.recording import Recording

@@ -10,7 +10,7 @@ from fdi_torch.gap.answer import CauseName, Verdict
 from fdi_torch.gap.candidate_fit import Fit, Fitter, unexplained_chi_square
 from fdi_torch.gap.posterior import CauseHypothesis, Posterior
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
-from fdi_torch.gap.search import SearchResult
+from fdi_torch.gap.structure_search import SearchResult
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import OperatingRange
 

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise, estimate_noise, with_rounding
 from fdi_torch.gap.dataset import DataSet
-from fdi_torch.gap.noise_model import Noise, estimate_noise, with_rounding
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement
 from fdi_torch.simulate.collocation import Collocation

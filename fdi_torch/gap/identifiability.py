@@ -24,9 +24,9 @@ from torch import Tensor
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.library import canonical, library_of
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, options_of, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement

@@ -16,9 +16,9 @@ import torch
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.library import library_of
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.gap.screening import Option, ScreeningResult, options_of, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement

@@ -20,7 +20,7 @@ from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.library import canonical
 from fdi_torch.gap.localization.localize import LocalizedDiscrepancy, localize
-from fdi_torch.gap.search import ExplanationPool, RankedExplanation, SearchResult
+from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, SearchResult
 from fdi_torch.plant.description import PlantDescription
 
 

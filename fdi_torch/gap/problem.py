@@ -12,7 +12,7 @@ from fdi_torch.gap.library import library_of
 from fdi_torch.gap.preprocess.acquisition import StuckSegment, usable, without_sensors
 from fdi_torch.gap.preprocess.outliers import Outlier, SensorOutliers, outliers_of, without
 from fdi_torch.gap.preprocess.sensor_limits import limits_from_readings
-from fdi_torch.gap.search import DEEPEST
+from fdi_torch.gap.structure_search import DEEPEST
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.scales import time_scale

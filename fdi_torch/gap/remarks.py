@@ -11,11 +11,11 @@ import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
+from fdi_torch.gap.channel_noise import low_frequency_excess
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_square
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
 from fdi_torch.gap.model_comparison import causal_places
-from fdi_torch.gap.noise_model import low_frequency_excess
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
@@ -73,9 +73,9 @@ def _free_form_fails(result: DiagnosisResult, held: HeldOut) -> str:
     """The remark on a free form that fails on a hold-out."""
     source = Path(held.data.recording.source).name or "the hold-out"
     return (
-        f"the free function for the unknown discrepancy at {' and '.join(causal_places(result))} predicts {source} "
-        "worse than the recalibrated plant: the discrepancy has memory, depends on time, or lies outside the recorded range; "
-        "use the place from this answer, but not the function"
+        f"the free function for the unknown discrepancy at {' and '.join(causal_places(result))} "
+        f"predicts {source} worse than the recalibrated plant: the discrepancy has memory, depends on time, or lies "
+        "outside the recorded range; use the place from this answer, but not the function"
     )
 
 

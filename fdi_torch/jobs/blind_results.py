@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.blind import Row, Tables, tables
-from fdi_torch.blind.files import manifest, read_plant
-from fdi_torch.blind.rows import write_rows
-from fdi_torch.blind.run import without_nan
-from fdi_torch.blind.table import OWN, markdown
+from fdi_torch.blind.benchmark import without_nan
+from fdi_torch.blind.score_tables import OWN, markdown
+from fdi_torch.blind.scored_rows import write_rows
+from fdi_torch.blind.sealed_files import manifest, read_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.disk import write_text
 from fdi_torch.logbook import RunLog

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.logged import logged_plant
+from fdi_torch.config.logged_config import logged_plant
 from fdi_torch.gap.diagnose import ProgressCallback, Settings
-from fdi_torch.gap.search import DEEPEST
+from fdi_torch.gap.structure_search import DEEPEST
 from fdi_torch.jobs.gap import groups, run_gap
 from fdi_torch.jobs.logged_recordings import logged_recording
 from fdi_torch.logbook import LogError

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from fdi_torch.config.run import Run
+from fdi_torch.config.run_file import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.logbook import LogError, Message, last_state, read_run, set_aside, unfinished
 from fdi_torch.logbook.reader import Run as Log

@@ -12,7 +12,7 @@ import orjson
 import torch
 from torch import Tensor
 
-from fdi_torch.config.monitor import MonitorRun
+from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.monitor.diagnosability import diagnosability

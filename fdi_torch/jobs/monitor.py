@@ -14,9 +14,9 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.growing import Row, growing_rows
+from fdi_torch.config.growing_recordings import Row, growing_rows
 from fdi_torch.config.loaded_recordings import read_recording
-from fdi_torch.config.monitor import MonitorRun
+from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
 from fdi_torch.jobs.logged_monitor import ALARM, LoggedMonitor, MonitorCallbacks, event_key
 from fdi_torch.jobs.row_buffer import logged_rows, recording_of_rows, resumed_rows, rows_until, samples_of_rows

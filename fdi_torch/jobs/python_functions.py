@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.loaded_recordings import named_recordings, read_recording
-from fdi_torch.config.monitor import MonitorRun, build_monitor, load_monitor
-from fdi_torch.config.plant import load_plant
-from fdi_torch.config.run import Run, build_run, load_run
-from fdi_torch.config.study import Study, build_study, load_study
+from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.run_file import Run, build_run, load_run
+from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.free_runs.prediction import START_SAMPLES, Prediction
@@ -233,7 +233,7 @@ def predict(
     if len(parts) != 1:
         raise ValueError(
             f"{parts[0].source}: expected a recording whose inputs are known throughout, got {len(parts)} stretches; "
-            "cut one with Recording.known_stretches()"
+            "cut one with Recording.known_segments()"
         )
     with one_thread():
         prediction = run_freely(plant, parts[0], start_samples, step, settle, vary)
@@ -270,7 +270,7 @@ def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDes
     for each in [wanted] if isinstance(wanted, Recording | str | Path) else wanted:
         if isinstance(each, Recording):
             whole = read_recording(each.source, plant, given={each.source: each})
-            segments += [part for part in whole.known_stretches() if len(part) > 1]
+            segments += [part for part in whole.known_segments() if len(part) > 1]
         else:
             segments += named_recordings(str(each), plant, Path.cwd())
     return segments

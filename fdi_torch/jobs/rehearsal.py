@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.rehearsal import Rehearsal
+from fdi_torch.config.rehearsal_file import Rehearsal
 from fdi_torch.jobs.log_paths import RESUMES
 from fdi_torch.jobs.study import copied_trials, new_and_unfinished_log
 from fdi_torch.logbook import Listener, RunLog

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.files import with_overrides
 from fdi_torch.config.loaded_recordings import LoadedRecording
-from fdi_torch.config.logged import logged_mapping
-from fdi_torch.config.monitor import build_monitor
-from fdi_torch.config.run import Run, build_run
-from fdi_torch.config.study import build_study
+from fdi_torch.config.logged_config import logged_mapping
+from fdi_torch.config.monitor_file import build_monitor
+from fdi_torch.config.run_file import Run, build_run
+from fdi_torch.config.study_file import build_study
+from fdi_torch.config.yaml_files import with_overrides
 from fdi_torch.jobs import monitor as monitor_job
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs.gap_replay import replay_gap

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fdi_torch.config.logged import logged_plant
+from fdi_torch.config.logged_config import logged_plant
 from fdi_torch.disk import write_text
 from fdi_torch.logbook import Run, compare, read_run
 from fdi_torch.plant.description import PlantDescription

@@ -7,8 +7,8 @@ from itertools import chain, pairwise
 
 import torch
 
-from fdi_torch.config.growing import Row
-from fdi_torch.config.monitor import MonitorRun
+from fdi_torch.config.growing_recordings import Row
+from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.logbook import Run as Log
 from fdi_torch.logbook import series
 from fdi_torch.monitor.samples import GAP, Samples

@@ -10,8 +10,8 @@ import torch
 
 from fdi_torch.config.estimation import EstimationConfig, estimated_space, parameter_values, placements_of
 from fdi_torch.config.loaded_recordings import LoadedRecording, load_recordings
-from fdi_torch.config.problems import ConfigError, told_in
-from fdi_torch.config.run import Run
+from fdi_torch.config.problems import ConfigError, naming_source
+from fdi_torch.config.run_file import Run
 from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
@@ -60,14 +60,14 @@ def simulate_recording(run: Run) -> Recording:
     config = run.config.simulate
     if config is None:
         raise ValueError(f"{run.source}: expected simulate, got none; describe the simulation under that key")
-    with told_in(run.source):
+    with naming_source(run.source):
         planned = planned_recording(config, run.plant)
         placements = placements_of(config.faults, run.plant)
     network = build_network(run.plant, placements)
     levels, _ = start_levels(run.plant, network, planned, config.start_levels)
     tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(run.plant.tanks, levels, strict=True))
     network = build_network(replace(run.plant, tanks=tanks), placements)
-    with told_in(run.source):
+    with naming_source(run.source):
         values = parameter_values(config.faults, network.constants, run.plant)
     clean = clean_readings(network, planned, values)
     seed = run.config.seed if config.seed is None else config.seed
@@ -94,7 +94,7 @@ def requested_space(run: Run) -> ParameterSpace:
         network = build_network(run.plant, placements_of([p.name for p in config.parameters], run.plant))
     except ValueError as error:
         raise ConfigError([f"{run.source}: estimate.parameters: {error}"]) from error
-    with told_in(run.source):
+    with naming_source(run.source):
         return estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
 
 

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.study import Study
+from fdi_torch.config.study_file import Study
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.logbook.reader import Run as LoggedRun
 from fdi_torch.report.fit_figure import save
 from fdi_torch.report.study_figures import correlation_figure, error_figure
 from fdi_torch.study.cluster import run_on_cluster
-from fdi_torch.study.isolation import Isolation, isolate
+from fdi_torch.study.mode_isolation import Isolation, count_modes
 from fdi_torch.study.monte_carlo import Trial, run_blocks
-from fdi_torch.study.plan import Plan
+from fdi_torch.study.study_plan import Plan
 from fdi_torch.study.summary import Ratio, Summary, summarise
 from fdi_torch.tables import Shown, Table
 
@@ -146,8 +146,8 @@ def trials_by_setting(plan: Plan, trials: Mapping[int, Trial]) -> Iterator[list[
 
 
 def summaries_of(study: Study, trials: Mapping[int, Trial]) -> Iterator[Summary]:
-    for setting, own in zip(study.plan.settings, trials_by_setting(study.plan, trials), strict=True):
-        yield summarise(study.plan, setting, own, study.config.tolerance)
+    for setting, group in zip(study.plan.settings, trials_by_setting(study.plan, trials), strict=True):
+        yield summarise(study.plan, setting, group, study.config.tolerance)
 
 
 def isolation_of(study: Study, trials: Mapping[int, Trial]) -> Isolation | None:
@@ -155,7 +155,7 @@ def isolation_of(study: Study, trials: Mapping[int, Trial]) -> Isolation | None:
     if study.config.faults != "modes" or "free" not in study.config.estimators:
         return None
     ordered = [trials[number] for number in sorted(trials)]
-    return isolate(study.plan.fitting.space, ordered, study.run.config.estimate.confidence)
+    return count_modes(study.plan.fitting.space, ordered, study.run.config.estimate.confidence)
 
 
 def log_summary(study: Study, trials: Mapping[int, Trial], log: RunLog) -> tuple[tuple[Summary, ...], Isolation | None]:
@@ -175,11 +175,11 @@ def draw(study: Study, trials: Mapping[int, Trial], log: Path) -> tuple[Path, ..
         return ()
     groups = list(trials_by_setting(study.plan, trials))
     levels = [float(setting.snr_db or 0.0) for setting in study.plan.settings]
-    figures = {"correlation": correlation_figure(levels, [[t.numbers["rho"] for t in own] for own in groups])}
+    figures = {"correlation": correlation_figure(levels, [[t.numbers["rho"] for t in group] for group in groups])}
     estimator = next((name for name in ("free", "boxed") if name in study.config.estimators), None)
     if estimator:
-        errors = [[t.numbers[estimator] for t in own] for own in groups]
+        errors = [[t.numbers[estimator] for t in group] for group in groups]
         truth = study.plan.settings[0].faults[0]
-        bounds = [own[0].numbers["bound"] for own in groups]
+        bounds = [group[0].numbers["bound"] for group in groups]
         figures["estimates"] = error_figure(study.plan.fitting.space, levels, errors, truth, bounds)
     return tuple(save(figure, log.with_name(f"{log.stem}_{name}.png")) for name, figure in figures.items())

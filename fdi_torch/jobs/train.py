@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.config.loaded_recordings import LoadedRecording
-from fdi_torch.config.run import Run
+from fdi_torch.config.run_file import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
@@ -27,7 +27,7 @@ from fdi_torch.jobs.run_setup import (
     tensors_on,
     usable_device,
 )
-from fdi_torch.logbook import Listener, RunLog, Trickle, as_array
+from fdi_torch.logbook import DeferredTopic, Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.report.fit_figure import fit_figure, save
 from fdi_torch.report.style import inline_svg
@@ -54,10 +54,7 @@ class TrainResult(Shown):
         diagnosis = self.result.diagnosis
         names = ", ".join(fault.name for fault in diagnosis.present)
         text = f"{diagnosis.kind}: {names}" if names else diagnosis.kind
-        if diagnosis.explained:
-            return text
-        ratio = diagnosis.unexplained_ratio
-        return f"the model does not explain the recording (residuals {ratio:.2g} times the noise); {text}"
+        return "; ".join(filter(None, (diagnosis.warning, text)))
 
     def table(self) -> Table:
         """One row per parameter, SI."""
@@ -134,8 +131,8 @@ class SearchLogger:
         self._fields = ("problem", "generation", "best_cost", "mean_cost", "evaluations", *space.names)
         self.iterations = 0
         units = {p.name: p.unit for p in space}
-        self._generation = Trickle(GENERATION, self._generations, units)
-        self._iteration = Trickle(ITERATION, self._iterations, units)
+        self._generation = DeferredTopic(GENERATION, self._generations, units)
+        self._iteration = DeferredTopic(ITERATION, self._iterations, units)
         self._keep, self._next_state = log.keep, 0
 
     def generation(self, search: Search) -> None:

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.recordings import StartLevel
-from fdi_torch.config.run import Run
+from fdi_torch.config.recording_config import StartLevel
+from fdi_torch.config.run_file import Run
 from fdi_torch.effects import without_startup_effects
 from fdi_torch.estimate.stretches import Stretch, stretches_of
 from fdi_torch.estimate.windows import Window, cut_up, noise_of, window_of, window_step

@@ -1,4 +1,6 @@
-"""Logs of runs in MCAP: written, read, repaired, inspected, compared and replayed. The only importer of mcap."""
+"""Logs of runs in MCAP: writing, reading, recovering, inspecting, comparing and replaying. Only this package imports
+mcap.
+"""
 
 from fdi_torch.logbook.compare import Comparison, align, compare
 from fdi_torch.logbook.errors import LogError
@@ -11,13 +13,14 @@ from fdi_torch.logbook.payload import as_array, unpack
 from fdi_torch.logbook.reader import Message, Run, read_run
 from fdi_torch.logbook.recover import Recovery, recover
 from fdi_torch.logbook.replay import Replay, replay
-from fdi_torch.logbook.resume import last_state, set_aside, unfinished
 from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, number_at, own_signals, series
-from fdi_torch.logbook.trickle import Trickle
+from fdi_torch.logbook.unfinished_log import last_state, set_aside, unfinished
+from fdi_torch.logbook.write_buffer import DeferredTopic
 from fdi_torch.logbook.writer import Listener, RunLog
 
 __all__ = [
     "Comparison",
+    "DeferredTopic",
     "Inspection",
     "Listener",
     "Live",
@@ -28,7 +31,6 @@ __all__ = [
     "Run",
     "RunLog",
     "Signals",
-    "Trickle",
     "align",
     "arrays",
     "as_array",

@@ -1,4 +1,4 @@
-"""What a file says about a topic."""
+"""Description of a topic in an MCAP file."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Channel:
-    """Encoding, schema and metadata of a topic (pairs, so that channels can be compared and counted)."""
+    """Encoding, schema and metadata of a topic; metadata are pairs, so that channels can be compared and hashed."""
 
     topic: str
     encoding: str = "json"
     schema_name: str = ""
     schema_encoding: str = ""
-    schema_data: bytes = field(default=b"", hash=False)  # long, and looked up for each message
+    schema_data: bytes = field(default=b"", hash=False)  # too long to be hashed for each message
     metadata: tuple[tuple[str, str], ...] = field(default=(), hash=False)

@@ -1,4 +1,4 @@
-"""Runs side by side: only what differs in them, whether their results agree, their curves over a common axis."""
+"""Comparison of runs: the differences of their records, the agreement of their results, curves on a common axis."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fdi_torch.logbook.signals import series
 
 SECTIONS = ("run", "config", "seeds", "data", "env", "git", "status", "result")
 _WALL = {"run": ("started", "run_id", "parent_run_id"), "status": ("ended", "wall_seconds")}
-# The number that says which event a message is; topics not named here align by plant time.
+# The field that identifies an event of a topic; all other topics are aligned by plant time.
 AXES = {
     "/estimator/de/generation": "generation",
     "/estimator/refine/iteration": "iteration",
@@ -25,10 +25,10 @@ AXES = {
 
 @dataclass(frozen=True)
 class Result:
-    """One estimated parameter in all runs; NaN where a run lacks it.
+    """One estimated parameter in all runs; NaN if a run lacks it.
 
-    p_value: of values this far apart if all runs estimate one truth with independent errors,
-    Cochran's Q = sum w (x - mean)^2, w = 1 / std^2, against chi^2; for two runs Q = z^2. NaN where no two have errors.
+    p_value: of the hypothesis that all runs estimate one true value with independent errors, by Cochran's Q = sum w (x
+    - mean)^2, w = 1 / std^2, against chi^2; for two runs Q = z^2. NaN if fewer than two runs have standard errors.
     """
 
     name: str
@@ -39,16 +39,16 @@ class Result:
 
     @property
     def agree(self) -> bool | None:
-        """At 95 %; None where it cannot be said."""
+        """Whether the runs agree at 95 %; None if there is no p-value."""
         return None if math.isnan(self.p_value) else self.p_value >= 0.05
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """labels: one a run. differences: section -> key -> one text a run, "" where a run lacks it.
+    """labels: one per run. differences: section -> key -> one text per run, "" if a run lacks it.
 
-    same_content: do all logs say the same, message by message? same_data: did all read the same data? Then their
-    errors are not independent, and `agree` says only whether methods differ by less than the noise lets them.
+    same_content: whether all logs have the same messages. same_data: whether all runs used the same data; their errors
+    are then not independent, and `agree` only states that the methods differ by less than the noise explains.
     """
 
     labels: tuple[str, ...]
@@ -70,13 +70,13 @@ class Comparison:
 
 
 def compare(paths: Sequence[str | Path]) -> Comparison:
-    """Compare any number of logs. Raises LogError where one cannot be read, ValueError for fewer than two."""
+    """Compare two or more logs. Raises LogError for an unreadable log, ValueError for fewer than two."""
     if len(paths) < 2:
         raise ValueError(f"expected at least two logs to compare, got {len(paths)}; name more")
     runs = [read_run(path) for path in paths]
     return Comparison(
         labels_of([run.path for run in runs]),
-        {section: found for section in SECTIONS if (found := _differing(runs, section))},
+        {section: entries for section in SECTIONS if (entries := _differing(runs, section))},
         _results(runs),
         len({content_hash(run.messages()) for run in runs}) == 1,
         len({tuple(sorted(_hashes(run).items())) for run in runs}) == 1 and bool(_hashes(runs[0])),
@@ -86,10 +86,10 @@ def compare(paths: Sequence[str | Path]) -> Comparison:
 def align(
     paths: Sequence[str | Path], topic: str, field: str, where: Mapping[str, float] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One field of all runs over a common axis: axis (K,), values (runs, K), NaN where a run has no such event.
+    """One field of all runs on a common axis: axis (K,), values (runs, K), NaN for missing events.
 
-    The axis is the generation, the iteration, the trial, or plant time in s; never wall time. where: keep messages
-    whose numbers equal these, such as {"problem": 0}. Of several messages at one place the last counts.
+    The axis is the generation, the iteration, the trial, or plant time in s; never wall time. where: only messages with
+    these numbers, such as {"problem": 0}. Of several messages at one point the last one counts.
     """
     axis_field, where = AXES.get(topic, "t"), where or {}
     columns = []
@@ -102,7 +102,7 @@ def align(
 
 
 def labels_of(paths: Sequence[Path]) -> tuple[str, ...]:
-    """The shortest ends of the paths that tell the runs apart."""
+    """The shortest ends of the paths that distinguish the runs."""
     for depth in range(1, max(len(path.resolve().parts) for path in paths)):
         ends = ["/".join(path.resolve().parts[-depth:]).removesuffix(".mcap") for path in paths]
         if len(set(ends)) == len(ends):
@@ -111,7 +111,7 @@ def labels_of(paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def chi2_p_value(values: Sequence[float], std: Sequence[float]) -> float:
-    """Cochran's Q test of one common value; NaN for fewer than two values with positive errors."""
+    """Cochran's Q test of one common value; NaN for fewer than two values with positive standard errors."""
     x, s = np.asarray(values, dtype=np.float64), np.asarray(std, dtype=np.float64)
     usable = np.isfinite(x) & np.isfinite(s) & (s > 0)
     x, s = x[usable], s[usable]
@@ -142,12 +142,12 @@ def _hashes(run: Run) -> dict[str, str]:
 
 def _results(runs: Sequence[Run]) -> tuple[Result, ...]:
     estimates = [_estimates(run) for run in runs]
-    names = dict.fromkeys(name for found in estimates for name in found)
-    return tuple(_result(name, [found.get(name, _NOTHING) for found in estimates]) for name in names)
+    names = dict.fromkeys(name for e in estimates for name in e)
+    return tuple(_result(name, [e.get(name, _NOTHING) for e in estimates]) for name in names)
 
 
-def _result(name: str, found: Sequence[tuple[float, float, str]]) -> Result:
-    values, std, units = zip(*found, strict=True)
+def _result(name: str, estimates: Sequence[tuple[float, float, str]]) -> Result:
+    values, std, units = zip(*estimates, strict=True)
     return Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, std))
 
 
@@ -155,13 +155,13 @@ _NOTHING = (float("nan"), float("nan"), "")
 
 
 def _estimates(run: Run) -> dict[str, tuple[float, float, str]]:
-    """Parameter -> (value, standard error, unit), of the last estimate of each problem."""
-    found: dict[str, tuple[float, float, str]] = {}
+    """Parameter -> (value, standard error, unit), from the last estimate of each problem."""
+    estimates: dict[str, tuple[float, float, str]] = {}
     for message in run.messages(["/estimate/final"]):
         payload = message.payload
         prefix = f"{payload['problem']}:" if payload.get("problem") else ""
         names, values, std = payload["names"], payload["values"], payload["std"]
         units = payload.get("units") or [""] * len(names)
         for name, value, error, unit in zip(names, values, std, units, strict=True):
-            found[prefix + name] = (float(value), float(error), unit)
-    return found
+            estimates[prefix + name] = (float(value), float(error), unit)
+    return estimates

@@ -1,4 +1,4 @@
-"""What an MCAP file holds, gathered while it is written: the summary at its end."""
+"""The contents of an MCAP file, collected during writing for the summary at its end."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FOOTER = struct.Struct("<BQQQ")
 
 
 class Contents:
-    """Channels in the order of their first messages; chunks, attachments and metadata in that of the file."""
+    """Channels in order of their first messages; chunks, attachments and metadata in order of the file."""
 
     def __init__(self) -> None:
         self.chunks: list[records.ChunkIndex] = []
@@ -30,17 +30,17 @@ class Contents:
         self._counts: dict[int, int] = {}
 
     def described(self, channel: Channel) -> Described:
-        """The channel as it stands in this file, with its number."""
+        """The channel's records in this file, with its number."""
         return self._channels.get(channel) or self._register(channel)
 
     def chunk(self, index: records.ChunkIndex, messages: Mapping[int, int]) -> None:
-        """A chunk, and how many messages each channel has in it."""
+        """Add a chunk with its number of messages by channel."""
         self.chunks.append(index)
         for number, count in messages.items():
             self._counts[number] = self._counts.get(number, 0) + count
 
     def ending(self, size: int, crc: int) -> bytes:
-        """All that follows data of that size and CRC: their end, the summary, places of its parts, the footer."""
+        """Everything after data of that size and CRC: end of data, summary, summary offsets, footer."""
         end_of_data = record_bytes(records.DataEnd(crc))
         start = size + len(end_of_data)
         summary, offsets = b"", b""
@@ -62,7 +62,7 @@ class Contents:
             schema = self._schemas.setdefault(
                 key, records.Schema(number, channel.schema_data, channel.schema_encoding, channel.schema_name)
             )
-        told = records.Channel(
+        record = records.Channel(
             id=len(self._channels) + 1,
             topic=channel.topic,
             message_encoding=channel.encoding,
@@ -70,7 +70,7 @@ class Contents:
             schema_id=schema.id if schema else 0,
         )
         is_signal = channel.topic.startswith("/plant/") and channel.topic.endswith(("/input", "/output"))
-        self._channels[channel] = Described(schema, told, is_signal)
+        self._channels[channel] = Described(schema, record, is_signal)
         return self._channels[channel]
 
     def _summary(self) -> list[tuple[Opcode, Sequence[Any]]]:
@@ -88,7 +88,7 @@ class Contents:
         )
         return [
             (Opcode.SCHEMA, list(self._schemas.values())),
-            (Opcode.CHANNEL, [told.channel for told in self._channels.values()]),
+            (Opcode.CHANNEL, [described.channel for described in self._channels.values()]),
             (Opcode.STATISTICS, [statistics]),
             (Opcode.CHUNK_INDEX, chunks),
             (Opcode.ATTACHMENT_INDEX, self.attachments),
@@ -97,7 +97,7 @@ class Contents:
 
 
 def metadata_bytes(name: str, values: Mapping[str, str]) -> bytes:
-    """A metadata record, in a tenth of the library's time: a run begins with a few hundred values."""
+    """A metadata record, built ten times faster than by the library; a run starts with a few hundred values."""
     pairs = b"".join([_text(text) for pair in values.items() for text in pair])
     body = _text(name) + struct.pack("<I", len(pairs)) + pairs
     return struct.pack("<BQ", Opcode.METADATA, len(body)) + body
@@ -109,7 +109,7 @@ def _text(text: str) -> bytes:
 
 
 def record_bytes(record: Any) -> bytes:
-    """A record of the format as it stands in the file."""
+    """The bytes of an MCAP record."""
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()

@@ -1,4 +1,4 @@
-"""What goes wrong with a log file, as one sentence a user can act on."""
+"""Errors of log files as one sentence with advice."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from fdi_torch.disk import sentence
 
 
 class LogError(OSError):
-    """A log cannot be written or read. Its text is one sentence that names the file and what to do."""
+    """A log cannot be written or read. The text is one sentence that names the file and a remedy."""
 
 
 def log_error(path: Path, error: OSError) -> LogError:
-    """The sentence for an operating system's error on `path`."""
+    """The LogError for an operating system's error on `path`."""
     return LogError(sentence(path, error))

@@ -1,4 +1,4 @@
-"""A topic or an attachment taken out of a log, for other tools."""
+"""Export of a topic or an attachment from a log."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 def export(run: Run, topic: str, form: str, stream: BinaryIO) -> int:
     """Write a topic's messages as "csv", "ndjson" or "npz" to an open binary file; returns their number.
 
-    csv: one row a message, units in the header (`h1_m`, `Q1_m3_s`), lists as JSON. ndjson: messages as they are.
-    npz: one array a field of numbers or text. Raises LogError where the topic has no messages.
+    csv: one row per message, units in the header (`h1_m`, `Q1_m3_s`), lists as JSON. ndjson: the messages unchanged.
+    npz: one array per field of numbers or text. Raises LogError if the topic has no messages.
     """
     if form not in _FORMS:
         raise ValueError(f"expected one of the formats {', '.join(_FORMS)}, got {form}")
@@ -35,7 +35,7 @@ def export(run: Run, topic: str, form: str, stream: BinaryIO) -> int:
 
 
 def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
-    """Write an attachment into `folder`, never outside it and never over a file. Returns where it is."""
+    """Write an attachment into `folder`, never outside it and never over a file. Returns its path."""
     content = run.attachment(name)
     target = Path(folder) / safe_name(name)
     try:
@@ -52,7 +52,7 @@ def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
 
 
 def safe_name(name: str) -> str:
-    """A file name made of the last part of `name` and of harmless characters only."""
+    """A file name from the last part of `name`, with harmless characters only."""
     last = re.split(r"[/\\]", name)[-1]
     return _UNSAFE.sub("_", last).lstrip(".")[:100] or "attachment"
 
@@ -81,10 +81,10 @@ def _ndjson(run: Run, topic: str, stream: BinaryIO) -> int:
 def _npz(run: Run, topic: str, stream: BinaryIO) -> int:
     columns, _ = _columns(run, topic)
     payloads = list(_payloads(run, topic))
-    found = {name: _array([payload.get(name) for payload in payloads]) for name in columns}
-    kept = {name: array for name, array in found.items() if array is not None}
+    arrays = {name: _array([payload.get(name) for payload in payloads]) for name in columns}
+    usable = {name: array for name, array in arrays.items() if array is not None}
     if payloads:
-        np.savez_compressed(stream, **kept)  # type: ignore[arg-type]
+        np.savez_compressed(stream, **usable)  # type: ignore[arg-type]
     return len(payloads)
 
 
@@ -106,7 +106,7 @@ def _payloads(run: Run, topic: str) -> Iterator[dict[str, Any]]:
 
 
 def _loaded(run: Run, message: Message) -> Any:
-    """The JSON as it stands, with its list of non-finite numbers."""
+    """The raw JSON, with its list of non-finite numbers."""
     if message.channel.encoding != "json":
         raise LogError(f"{run.path}: {message.topic} is in {message.channel.encoding}, only json can be exported")
     try:
@@ -129,7 +129,7 @@ def _cell(value: Any) -> str:
 
 
 def _array(values: list[Any]) -> np.ndarray | None:
-    """Numbers with NaN where one is missing, or texts; None where they are neither."""
+    """Numbers, NaN where missing, or texts; None for other values."""
     if all(isinstance(value, int | float | None) for value in values):
         return np.array([np.nan if value is None else float(value) for value in values])
     if all(isinstance(value, str | None) for value in values):

@@ -1,4 +1,4 @@
-"""A hash of what a log says, whatever its chunks: topic, time and payload of every message, without wall time."""
+"""A hash of a log's content independent of chunks and wall time: topic, time and payload of every message."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def content_hash(messages: Iterable[Message]) -> str:
 
 
 def canonical(message: Message) -> bytes:
-    """The payload in one spelling: JSON with sorted keys and without wall time; other encodings as they are."""
+    """The payload in canonical form: JSON with sorted keys and without wall time; other encodings unchanged."""
     if message.channel.encoding != "json":
         return message.data
     try:

@@ -1,4 +1,4 @@
-"""A log read while it is being written: messages as its chunks reach the disk."""
+"""Reading of a log while it is written: messages as its chunks reach the disk."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def follow(
     poll_seconds: float = 0.1,
     on_damage: Callable[[scan.Damage], None] = lambda damage: None,
 ) -> Iterator[Message]:
-    """Messages of a growing log, from its start, as they come; ends when the log is finished.
+    """Messages of a growing log from its start, as they arrive; ends when the log is finished.
 
-    path: NAME.mcap, there or not yet (`NAME.mcap.partial` grows meanwhile), or any file that grows. Damaged parts are
-    handed to `on_damage` and passed over. Raises LogError where nothing came for `idle_seconds`.
+    path: NAME.mcap, which may not exist yet (`NAME.mcap.partial` grows meanwhile), or any growing file. Damaged parts
+    are passed to `on_damage` and skipped. Raises LogError if nothing arrives for `idle_seconds`.
     """
     tail = _Tail(Path(path), on_damage)
     quiet_since = time.monotonic()
@@ -46,19 +46,19 @@ def follow(
 
 
 class _Tail:
-    """How far a growing file has been read."""
+    """The position up to which a growing file has been read."""
 
     def __init__(self, path: Path, on_damage: Callable[[scan.Damage], None]) -> None:
         self.final = path.with_suffix("") if path.suffix == ".partial" else path
         self.partial = self.final.with_name(self.final.name + ".partial")
         self.place: int | None = None
         self.seen = 0
-        self.begun = False  # places in the unfinished file mean nothing in the finished one, which is joined anew
+        self.begun = False  # positions in the unfinished file are not valid in the finished one, which is rewritten
         self.on_damage = on_damage
         self.directory = Directory()
 
     def finished(self) -> bool:
-        """Is the file there under its final name, with its end?"""
+        """Whether the file exists under its final name and is complete."""
         if self.partial.exists() or not self.final.exists() or not self.final.stat().st_size:
             return False
         return scan.ends_whole(map_file(self.final))
@@ -77,12 +77,12 @@ class _Tail:
         except (FileNotFoundError, LogError):
             if source.exists():
                 raise
-            return  # not there yet, or finished between two looks: the next one sees it under its final name
+            return  # not there yet, or just finished: the next call finds it under its final name
         if data:
             yield from self._grown(data)
 
     def _grown(self, data: scan.Buffer) -> Iterator[Message]:
-        """Messages of the records that have become whole since the last look."""
+        """Messages of the records completed since the last call."""
         for part in scan.frames(data, self.place):
             if isinstance(part, scan.Damage):
                 if part.end == len(data):
@@ -94,10 +94,10 @@ class _Tail:
 
     def _opened(self, data: scan.Buffer, part: scan.Frame) -> Iterator[Message]:
         try:
-            found = open_part(data, part, self.directory)
+            messages = open_part(data, part, self.directory)
         except scan.ChunkError as error:
             self.on_damage(scan.Damage(part.start, part.end, str(error)))
             return
-        for message in found:
+        for message in messages:
             self.seen += 1
             yield message

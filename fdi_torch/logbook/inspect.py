@@ -1,4 +1,4 @@
-"""What a log is about and whether it is sound, as data."""
+"""Inspection of a log: its contents and its health, as data."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PREFIX = "fdi_torch."
 
 @dataclass
 class TopicInfo:
-    """A topic's messages. first, last: plant time in s. size: bytes before compression."""
+    """A topic's messages. first, last: plant time, s. size: bytes before compression."""
 
     topic: str
     schema: str
@@ -40,7 +40,7 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class Health:
-    """ended: was the file finished? problems: one sentence each; empty where every check passed."""
+    """ended: whether the file was finished. problems: one sentence each; empty if every check passed."""
 
     ended: bool
     chunks: int
@@ -54,7 +54,9 @@ class Health:
 
 @dataclass(frozen=True)
 class Inspection:
-    """about: metadata records by their short names ("run", "config", "status", "result"...); {} if not ours."""
+    """about: metadata records of this program by short name ("run", "config", "status", "result" ...); {} for other
+    logs.
+    """
 
     path: Path
     size: int
@@ -73,7 +75,7 @@ class Inspection:
 
 
 def inspect_log(path: str | Path) -> Inspection:
-    """Read a whole log, ours or foreign, and check it. Raises LogError where it is no MCAP file."""
+    """Read and check a whole log of this or another program. Raises LogError if it is not an MCAP file."""
     run = read_run(path, salvage=True)
     topics = _topics(run)
     about = {name.removeprefix(PREFIX): values for name, values in run.metadata.items() if name.startswith(PREFIX)}
@@ -88,7 +90,7 @@ def inspect_log(path: str | Path) -> Inspection:
 
 
 def check_health(run: Run, topics: dict[str, TopicInfo]) -> Health:
-    """CRCs, indices and completeness. `topics` counts what `run`, opened for salvage, really holds."""
+    """Check CRCs, indices and completeness; `topics` counts what is actually in `run`, which was opened for salvage."""
     problems = [*_ending(run), *(f"bytes {gap.start} to {gap.end}: {gap.reason}" for gap in run.damages)]
     if run.ended:
         problems += [*_data_crc(run), *_summary(run, sum(info.messages for info in topics.values()))]
@@ -118,7 +120,7 @@ def _ending(run: Run) -> Iterator[str]:
 
 
 def _data_crc(run: Run) -> Iterator[str]:
-    """The CRC over all records before the one that ends them."""
+    """Check the CRC of all records before the end of data."""
     for part in _frames(run, Opcode.DATA_END):
         (crc,) = struct.unpack("<I", body_of(run.data, part))
         if crc and zlib.crc32(run.data[: part.start]) != crc:
@@ -126,11 +128,11 @@ def _data_crc(run: Run) -> Iterator[str]:
 
 
 def _summary(run: Run, messages: int) -> Iterator[str]:
-    """Do the counts and the places in the summary agree with the file?"""
+    """Check the counts and positions in the summary against the file."""
     for part in _frames(run, Opcode.STATISTICS):
-        told = Statistics.read(stream_of(body_of(run.data, part))).message_count
-        if told != messages:
-            yield f"the summary counts {told} messages, the file holds {messages}"
+        counted = Statistics.read(stream_of(body_of(run.data, part))).message_count
+        if counted != messages:
+            yield f"the summary counts {counted} messages, the file holds {messages}"
     indexed = [ChunkIndex.read(stream_of(body_of(run.data, part))) for part in _frames(run, Opcode.CHUNK_INDEX)]
     places = {(index.chunk_start_offset, index.chunk_start_offset + index.chunk_length) for index in indexed}
     chunks = {(part.start, part.end) for part in _frames(run, Opcode.CHUNK)}

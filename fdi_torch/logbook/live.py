@@ -1,7 +1,7 @@
-"""A running job served over the Foxglove WebSocket protocol. The only importer of foxglove (extra `live`).
+"""Live view of a running job by the Foxglove WebSocket protocol. Only this file imports foxglove (extra `live`).
 
-What goes into the log is sent as it is written: the same topics, schemas, metadata and payloads, with plant time as
-the time. A viewer that comes late is first sent the latest messages of each topic it asks for.
+Messages are sent as they are logged: the same topics, schemas, metadata and payloads, with plant time as the time. A
+viewer that connects late first receives the latest messages of each topic to which it subscribes.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import Any
 from fdi_torch.logbook.channel import Channel
 
 PORT = 8765
-KEPT = 20_000  # messages of a channel that a late viewer is sent
-BACKLOG = 200_000  # messages on their way to one viewer, beyond which the oldest are dropped
+KEPT = 20_000  # latest messages of a channel, for viewers that connect late
+BACKLOG = 200_000  # unsent messages of one viewer, beyond which the oldest are dropped
 
 
 class Live:
-    """Hears what is logged and sends it on. Made by `serve`."""
+    """Listener that forwards logged messages. Created by `serve`."""
 
     def __init__(self, foxglove: Any) -> None:
         self._foxglove = foxglove
@@ -31,24 +31,24 @@ class Live:
         self.address = ""
 
     def __call__(self, channel: Channel, log_time: int, data: bytes) -> None:
-        """One message of the log."""
+        """Forward one message of the log."""
         number = self._numbers.get(channel) or self._advertise(channel)
-        known, sent = self._by_number[number]
+        channel_on_server, sent = self._by_number[number]
         with self._lock:
             sent.append((log_time, data))
-        known.log(data, log_time=log_time)
+        channel_on_server.log(data, log_time=log_time)
 
     def catch_up(self, viewer: int, number: int) -> None:
-        """A viewer asks for the channel of that number: it is sent what it has missed."""
+        """Send a viewer the stored messages of the channel to which it subscribes."""
         with self._lock:
-            known, sent = self._by_number[number]
+            channel_on_server, sent = self._by_number[number]
             missed = list(sent)
         for log_time, data in missed:
-            known.log(data, log_time=log_time, sink_id=viewer)
+            channel_on_server.log(data, log_time=log_time, sink_id=viewer)
 
     def _advertise(self, channel: Channel) -> int:
-        """Offer a channel to viewers. Returns the number by which they ask for it."""
-        with self._lock:  # a viewer that asks at once waits here until its channel is known
+        """Advertise a channel to viewers. Returns its number."""
+        with self._lock:  # a viewer that subscribes at once waits until its channel is registered
             made = self._foxglove.Channel(
                 channel.topic,
                 schema=self._foxglove.Schema(
@@ -66,9 +66,9 @@ class Live:
 
 @contextmanager
 def serve(name: str, host: str = "127.0.0.1", port: int = PORT) -> Iterator[Live]:
-    """A server for the time of the block; its `address` is what a viewer is told to open. port 0: any free one.
+    """A server during the block; `address` is the URL for viewers. port 0: any free port.
 
-    Raises ValueError where the extra is not installed, or the address cannot be had.
+    Raises ValueError if the extra is not installed, or the address is not available.
     """
     try:
         import foxglove

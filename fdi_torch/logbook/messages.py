@@ -11,32 +11,32 @@ import numpy as np
 import orjson
 
 from fdi_torch.interruption import SteadyLock
-from fdi_torch.logbook.block import Block, Timed, block_of
 from fdi_torch.logbook.channel import Channel
+from fdi_torch.logbook.channel_register import Register
 from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, as_it_is, plain
-from fdi_torch.logbook.register import Register
+from fdi_torch.logbook.sample_block import Block, Timed, block_of
 from fdi_torch.logbook.sink import EPOCH_NS, log_time_of
-from fdi_torch.logbook.trickle import PutOff, Trickle
+from fdi_torch.logbook.write_buffer import DeferredTopic, WriteBuffer
 
 Named = Mapping[str, Any]
 _RESERVED = ("t", NON_FINITE, WALL, "masked")
 _BLOCK = 4096
 _FEW = 32
-"""So few samples are written faster one by one."""
+"""Up to this many samples are written faster one by one."""
 
 
 class Messages:
-    """Encodes messages and hands them to `put`, with their log time in ns.
+    """Encodes messages and passes them to `put`, with their log time in ns.
 
-    What comes in a slow trickle can be put off (`later`), and is then encoded many at a time. keep((trickle, item)):
-    the same with nothing else done, for what comes so often that even `later` counts; for when not `due`, after a
-    first `later`.
+    Messages that arrive one at a time can be deferred (`later`), and are then encoded many at a time. `keep((topic,
+    item))` does the same with the least overhead; it may be used while `due` is false, after a first `later`. due:
+    whether buffered messages must be written now.
     """
 
     def __init__(self) -> None:
         self._lock = SteadyLock()
-        self._put_off = PutOff()
-        self.keep = self._put_off.keep
+        self._buffer = WriteBuffer()
+        self.keep = self._buffer.keep
         self.due = False
         self._latest = 0.0
         self.register = Register()
@@ -63,9 +63,10 @@ class Messages:
         about: Mapping[str, str] | None = None,
         wall: bool = False,
     ) -> None:
-        """One message. units: of named numbers; about: further metadata of the channel, heard at its first message.
+        """Write one message. units: of named numbers; about: further metadata of the channel, used with its first
+        message.
 
-        A field of value None is left out. Raises ValueError for a time that is not finite and for names taken already.
+        A field with the value None is omitted. Raises ValueError for a non-finite time and for reserved names.
         """
         with self._lock:
             self.settle()
@@ -95,26 +96,27 @@ class Messages:
         log_time = log_time_of(t)
         return channel, log_time, log_time, self.register.next_number(topic), data
 
-    def later(self, trickle: Trickle, item: Any, size: int = 0) -> None:
-        """One message, soon: before the next one that is written at once. size: about how many bytes the item keeps.
+    def later(self, deferred: DeferredTopic, item: Any, size: int = 0) -> None:
+        """Write one message with delay, but before the next one that is written at once. size: memory of the item,
+        bytes.
 
-        The first of a topic is written at once, so that errors show.
+        The first message of a topic is written at once, so that errors surface.
         """
-        if trickle.topic not in self.register:
-            ((t, fields),) = trickle.told((item,))
-            self.write(trickle.topic, fields, t, units=trickle.units)
+        if deferred.topic not in self.register:
+            ((t, fields),) = deferred.encode((item,))
+            self.write(deferred.topic, fields, t, units=deferred.units)
             return
-        self._put_off.add(trickle, item, size)
+        self._buffer.add(deferred, item, size)
         if self.due:
             self.flush()
-        elif self._put_off.is_enough:
+        elif self._buffer.is_enough:
             self.settle()
 
     def settle(self) -> None:
-        """Writes what was put off, in its order."""
+        """Write the deferred messages in their order."""
         with self._lock:
-            if self._put_off:
-                self.put(self._timed(of.topic, fields, t, of.units) for of, t, fields in self._put_off.taken())
+            if self._buffer:
+                self.put(self._timed(of.topic, fields, t, of.units) for of, t, fields in self._buffer.taken())
 
     def samples(
         self,
@@ -125,7 +127,7 @@ class Messages:
         units: Sequence[str],
         about: Mapping[str, str] | None = None,
     ) -> None:
-        """A whole signal, values (T, N) over time (T,), one message a sample."""
+        """Write a whole signal, values (T, N) over time (T,), one message per sample."""
         self.recording_blocks([(topic, as_array(values), names, units, None, about)], as_array(time))
 
     def recording(
@@ -142,9 +144,9 @@ class Messages:
         hold: str = "zero_order",
         group: str = "",
     ) -> None:
-        """A recording: `/plant/input` and `/plant/output` (`/plant/GROUP/...` where several are in one log).
+        """Write a recording to `/plant/input` and `/plant/output`, or `/plant/GROUP/...` if a log has several.
 
-        time (T,) in s, inputs (T, M), outputs (T, N), mask (T, N) True where a reading counts. NaN is kept.
+        time (T,) s, inputs (T, M), outputs (T, N), mask (T, N): True for valid readings. NaN is preserved.
         """
         root = f"/plant/{group}" if group else "/plant"
         mask = None if mask is None else as_array(mask).astype(bool)
@@ -157,7 +159,7 @@ class Messages:
         )
 
     def recording_blocks(self, signals: Sequence[tuple[Any, ...]], time: np.ndarray) -> None:
-        """Several signals over one clock, sample by sample, in blocks that keep memory small."""
+        """Write several signals with one clock, sample by sample, in blocks that limit memory."""
         for topic, values, names, *_ in signals:
             _check_signal(topic, values, names, len(time))
         if not np.isfinite(time).all():
@@ -187,12 +189,12 @@ class Messages:
         self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
 
     def follow_on(self, channel: Channel, sequence: int, t: float) -> None:
-        """Number and describe what comes as if the message (channel, sequence, t) had just been written."""
+        """Continue numbering and description as if the message (channel, sequence, t) had just been written."""
         self.register.follow_on(channel, sequence)
         self._latest = max(self._latest, t)
 
     def sample(self, topic: str, t: float, values: Named, units: Mapping[str, str] | None = None) -> None:
-        """One sample of a signal that arrives bit by bit, such as "/plant/output" or "/plant/truth"."""
+        """Write one sample of a signal that arrives incrementally, such as "/plant/output" or "/plant/truth"."""
         self.write(topic, values, t, units=units)
 
 
@@ -202,7 +204,7 @@ def _in_turn(
     log_times: Sequence[int],
     encoded: Sequence[Sequence[bytes]],
 ) -> Iterator[Timed]:
-    """One message of each channel a sample."""
+    """One message of each channel per sample."""
     streams = [
         zip(repeat(channel), log_times, log_times, count(first), payloads, strict=False)
         for channel, first, payloads in zip(channels, sequences, encoded, strict=True)
@@ -211,14 +213,14 @@ def _in_turn(
 
 
 def _rows(names: Sequence[str], block: np.ndarray, hidden: np.ndarray, clock: list[float]) -> list[bytes]:
-    """Payloads of samples (B, N) among which some are not finite, or hidden (B, N) by the mask."""
+    """Payloads of samples (B, N) with non-finite numbers, or with readings masked by hidden (B, N)."""
     keys = ("t", *names)
     rows = zip(clock, *block.T.tolist(), strict=True)
     return [orjson.dumps(_row(keys, row, hidden[i : i + 1])) for i, row in enumerate(rows)]
 
 
-def _row(keys: Sequence[str], row: Sequence[float], uncounted: np.ndarray) -> dict[str, Any]:
-    hidden = zip(keys[1:], uncounted.ravel(), strict=True) if uncounted.size else ()
+def _row(keys: Sequence[str], row: Sequence[float], hidden_row: np.ndarray) -> dict[str, Any]:
+    hidden = zip(keys[1:], hidden_row.ravel(), strict=True) if hidden_row.size else ()
     masked = [name for name, is_hidden in hidden if is_hidden]
     return plain({**dict(zip(keys, row, strict=True)), "masked": masked or None})
 

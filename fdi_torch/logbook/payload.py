@@ -1,9 +1,9 @@
-"""One message as JSON and back, without losing a bit.
+"""Lossless conversion between a message and JSON.
 
-JSON has no NaN and no infinity. A non-finite scalar is left out of its message, a non-finite element of an array
-stands there as 0; both are listed in the string array `non_finite` as `name=nan`, `name=inf`, `name[3]=-inf`, from
-which `decode` restores them. Finite float64 survive exactly; float32 is widened first. An integer beyond 2^53, which
-many readers round, is refused. Arrays with a shape travel as base64 of little-endian bytes (`pack`, `unpack`).
+JSON has no NaN and no infinity. A non-finite scalar is omitted from its message, a non-finite element of an array is
+replaced by 0; both are listed in the string array `non_finite` as `name=nan`, `name=inf`, `name[3]=-inf`, from which
+`decode` restores them. Finite float64 are preserved exactly; float32 is widened first. Integers beyond 2^53, which many
+readers round, are rejected. Arrays with a shape are base64 of little-endian bytes (`pack`, `unpack`).
 """
 
 from __future__ import annotations
@@ -29,48 +29,48 @@ _DTYPES = ("<f8", "<i8", "|u1", "|b1")
 
 
 def encode(fields: Mapping[str, Any]) -> bytes:
-    """JSON of plain numbers, strings, arrays and tensors; None is left out."""
+    """JSON of plain numbers, strings, arrays and tensors; None is omitted."""
     return orjson.dumps(plain(fields))
 
 
 def as_it_is(message: Mapping[str, Any]) -> bytes | None:
-    """JSON of a message that holds plain numbers, texts and flat lists of one kind of them; None of others.
+    """Fast path of `encode` for plain numbers, texts and homogeneous flat lists; None for other messages.
 
-    It gives what `encode` gives, sooner: that a number was not finite, or was none, shows in the text as null.
+    The result is the same: a non-finite number would appear in the text as null.
     """
     kinds = set(map(type, message.values()))
     if list in kinds:
         for value in message.values():
             if type(value) is list:
                 inside = set(map(type, value))
-                kinds |= inside if len(inside) < 2 else {object}  # integers among other numbers become such numbers
+                kinds |= inside if len(inside) < 2 else {object}  # mixed integers and floats need conversion
         kinds.discard(list)
     if not kinds <= _AS_IT_IS:
         return None
     try:
         data = orjson.dumps(message, option=orjson.OPT_STRICT_INTEGER)
-    except TypeError:  # an integer that is too large; `encode` says so
+    except TypeError:  # an integer that is too large; `encode` reports it
         return None
     return None if b"null" in data else data
 
 
 def plain(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """The same fields as JSON values, non-finite numbers moved into the field `non_finite`."""
+    """The fields as JSON values, with non-finite numbers moved to the field `non_finite`."""
     message: dict[str, Any] = {}
-    lost: list[str] = []
+    non_finite: list[str] = []
     for name, value in fields.items():
         value = _plain_value(name, value)
         if type(value) is float and not math.isfinite(value):
-            lost.append(f"{name}={value}")
+            non_finite.append(f"{name}={value}")
         elif value is not None:
-            message[name] = _finite_list(name, value, lost) if type(value) is list else value
-    if lost:
-        message[NON_FINITE] = lost
+            message[name] = _finite_list(name, value, non_finite) if type(value) is list else value
+    if non_finite:
+        message[NON_FINITE] = non_finite
     return message
 
 
 def decode(data: bytes) -> dict[str, Any]:
-    """Fields of a JSON message, non-finite numbers put back. Raises ValueError where it is no JSON object."""
+    """The fields of a JSON message with non-finite numbers restored. Raises ValueError if it is not a JSON object."""
     message = orjson.loads(data)
     if not isinstance(message, dict):
         raise ValueError(f"expected a JSON object as message, got {type(message).__name__}")
@@ -97,11 +97,11 @@ def unpack(message: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def as_array(value: Any) -> np.ndarray:
-    """A numpy array of a number, list, array or tensor on any device."""
+    """A numpy array from a number, list, array or tensor on any device."""
     if not hasattr(value, "detach"):
         return np.asarray(value)
     try:
-        return np.asarray(value.numpy())  # in a quarter of the time of what always works
+        return np.asarray(value.numpy())  # four times faster than the general case below
     except (RuntimeError, TypeError):
         return np.asarray(value.numpy(force=True))
 
@@ -141,10 +141,10 @@ def _exact_integer(name: str, value: int) -> int:
     return value
 
 
-def _finite_list(name: str, values: list[Any], lost: list[str]) -> list[Any]:
-    broken = [i for i, value in enumerate(values) if isinstance(value, float) and not math.isfinite(value)]
-    for i in broken:
-        lost.append(f"{name}[{i}]={values[i]}")
+def _finite_list(name: str, values: list[Any], non_finite: list[str]) -> list[Any]:
+    positions = [i for i, value in enumerate(values) if isinstance(value, float) and not math.isfinite(value)]
+    for i in positions:
+        non_finite.append(f"{name}[{i}]={values[i]}")
         values[i] = 0.0
     return values
 

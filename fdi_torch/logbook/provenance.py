@@ -1,4 +1,4 @@
-"""Where a run comes from: versions, code, and the data's fingerprints."""
+"""Provenance of a run: versions, state of the code, hashes of the data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PACKAGES = ("fdi_torch", "torch", "torchdiffeq", "numpy", "scipy", "mcap", "orjs
 
 
 def environment(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
-    """Versions of Python, the system and the packages that shape a result; the number of threads."""
+    """Versions of Python, the system and the packages that affect results; the number of threads."""
     versions = {"python": platform.python_version(), "system": platform.system(), "machine": platform.machine()}
     versions |= {package: version_of(package) for package in packages}
     torch = sys.modules.get("torch")
@@ -25,22 +25,22 @@ def environment(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
 
 @cache
 def version_of(package: str) -> str:
-    """What is imported says it at once; of the others the installation knows it."""
-    told = getattr(sys.modules.get(package), "__version__", None)
+    """The version of a package: its `__version__` if imported, else from the installation."""
+    imported = getattr(sys.modules.get(package), "__version__", None)
     try:
-        return told if isinstance(told, str) else metadata.version(package)
+        return imported if isinstance(imported, str) else metadata.version(package)
     except metadata.PackageNotFoundError:
         return "absent"
 
 
 def git_state(folder: Path | None = None) -> dict[str, str]:
-    """Commit of the code and whether it was changed since; empty texts outside a repository."""
+    """The commit of the code and whether it was changed since; empty texts outside a repository."""
     folder = folder or Path(__file__).parent
-    # One process, and no more of git's work than the question needs.
+    # One process with the least work for git.
     options = ("--porcelain=v2", "--branch", "--untracked-files=no", "--no-ahead-behind", "--no-renames")
-    told = _git(folder, "status", *options).splitlines()
-    commit = next((line.split()[-1] for line in told if line.startswith("# branch.oid ")), "")
-    changed = any(not line.startswith("#") for line in told)
+    lines = _git(folder, "status", *options).splitlines()
+    commit = next((line.split()[-1] for line in lines if line.startswith("# branch.oid ")), "")
+    changed = any(not line.startswith("#") for line in lines)
     return {"commit": commit, "changed": "yes" if changed else "no" if commit else ""}
 
 

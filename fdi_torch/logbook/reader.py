@@ -1,7 +1,7 @@
-"""Reading a log: what is said about the run, its messages, its arrays. The file is untrusted input.
+"""Reading of a log: its records, messages and arrays. The file is untrusted input.
 
-A file without end (`.partial`, torn by a crash) opens too; `advice` then says what to do. Damage in the middle raises
-LogError when the reading gets there, unless `salvage` is asked for.
+An incomplete file (`.partial`, torn by a crash) can be opened too; `advice` then states what to do. Damage in the
+middle raises LogError when it is reached, unless `salvage` is set.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.payload import decode
 from fdi_torch.logbook.schemas import conforming
 from fdi_torch.logbook.sink import EPOCH_NS
-from fdi_torch.outside import MOST_EXPANSION, MOST_UNPACKED
+from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_UNPACKED
 
-# Outside chunks nothing guards these by a CRC. Our logs hold none there, so that one is another record, damaged.
+# Outside chunks these records have no CRC. Logs of this program have none there; one found there is a damaged record.
 _LOOSE = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
 
 
@@ -47,7 +47,7 @@ class Message:
 
     @property
     def payload(self) -> dict[str, Any]:
-        """Its fields, each of the kind that its topic says. Raises LogError where it is not a JSON object."""
+        """Its fields, restricted to the types of its topic. Raises LogError if it is not a JSON object."""
         if self.channel.encoding != "json":
             raise LogError(f"{self.topic}: messages in {self.channel.encoding}, only json can be read")
         try:
@@ -57,13 +57,13 @@ class Message:
 
     @property
     def t(self) -> float:
-        """Plant time in s; of a foreign message, its log time since 2000."""
+        """Plant time, s; for logs of other programs, the log time since 2000."""
         return (self.log_time - EPOCH_NS) * 1e-9
 
 
 @dataclass(frozen=True)
 class Attachment:
-    """A file inside the log; size in bytes, frame: where it lies."""
+    """A file inside the log. size in bytes; frame: its position."""
 
     name: str
     media_type: str
@@ -72,7 +72,7 @@ class Attachment:
 
 
 class Run:
-    """An opened log. metadata: record name -> texts. attachments by name. damages: what cannot be read."""
+    """An opened log. metadata: record name -> texts. attachments by name. damages: unreadable parts."""
 
     def __init__(self, path: str | Path, salvage: bool = False, max_chunk_bytes: int = scan.MAX_CHUNK_BYTES) -> None:
         self.path = Path(path)
@@ -82,7 +82,7 @@ class Run:
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, Attachment] = {}
         self.damages: list[scan.Damage] = []
-        self._allowed = 0  # bytes that chunks may still unpack to
+        self._allowed = 0  # bytes that further chunks may still expand to
         self.data = map_file(self.path)
         self.parts = list(scan.frames(self.data))
         self.ended = scan.ends_whole(self.data)
@@ -93,19 +93,19 @@ class Run:
 
     @property
     def ours(self) -> bool:
-        """Was it written by this project?"""
+        """Whether this program wrote the log."""
         return self.profile == "fdi_torch" or "fdi_torch.run" in self.metadata
 
     @property
     def advice(self) -> str:
-        """What to tell the user about the file's state; empty where it is whole."""
+        """Advice on an incomplete or damaged file; empty for a complete one."""
         if self.complete:
             return ""
         return f"{self.path}: the file is not whole; `fdi recover {self.path}` saves what can be read"
 
     @property
     def config_text(self) -> str:
-        """The configuration exactly as it was given; empty where none was."""
+        """The configuration exactly as given; empty if there is none."""
         return self.attachment("config.yaml").decode() if "config.yaml" in self.attachments else ""
 
     def attachment(self, name: str) -> bytes:
@@ -116,13 +116,13 @@ class Run:
         return self.attachment_at(self.attachments[name].frame)[2]
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
-        """Messages in the order they were written, of some topics or of all."""
+        """Messages in order of writing, of the given topics or of all."""
         for item in self.walk():
             if isinstance(item, Message) and (topics is None or item.topic in topics):
                 yield item
 
     def walk(self) -> Iterator[Message | scan.Frame]:
-        """Messages, and the frames of metadata and attachments, in the order of the file."""
+        """Messages, and the frames of metadata and attachments, in order of the file."""
         self.damages = [part for part in self.parts if isinstance(part, scan.Damage)]
         directory = Directory(self._summary_records())
         self._allowed = max(MOST_UNPACKED, MOST_EXPANSION * len(self.data))
@@ -145,7 +145,7 @@ class Run:
         return record.name, record.media_type, bytes(record.data)
 
     def _part_messages(self, part: scan.Frame, directory: Directory) -> list[Message]:
-        """Of a chunk. Compressed chunks become together so much larger than the file and no more."""
+        """Messages of a chunk. The total expansion of compressed chunks is limited relative to the file's size."""
         try:
             cap = min(self.max_chunk_bytes, self._allowed)
             messages = open_part(self.data, part, directory, cap, require_crc=self.ours)
@@ -159,7 +159,7 @@ class Run:
             return []
 
     def _summary_records(self) -> Iterator[Schema | ChannelRecord]:
-        """Schemas and channels repeated in the summary, where its CRC agrees: the first chunk may be lost."""
+        """Schemas and channels of the summary, if its CRC is valid; they replace those of a lost first chunk."""
         start = _summary_start(self.data)
         for part in self.parts if start else ():
             if isinstance(part, scan.Frame) and part.start >= start and part.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -167,7 +167,7 @@ class Run:
                 yield kind.read(scan.stream_of(scan.body_of(self.data, part)))
 
     def _read_head(self) -> None:
-        """Header, metadata and the list of attachments."""
+        """Read header, metadata and the list of attachments."""
         for part in self.parts:
             if isinstance(part, scan.Damage):
                 self.damages.append(part)
@@ -189,12 +189,12 @@ class Run:
 
 
 def read_run(path: str | Path, salvage: bool = False, max_chunk_bytes: int = scan.MAX_CHUNK_BYTES) -> Run:
-    """Open a log of ours or of others. Raises LogError where it is no MCAP file."""
+    """Open a log of this or another program. Raises LogError if it is not an MCAP file."""
     return Run(path, salvage, max_chunk_bytes)
 
 
 class Directory:
-    """Channels by their number, learnt from the records that announce them."""
+    """Channels by number, collected from the records that define them."""
 
     def __init__(self, summary: Iterable[Schema | ChannelRecord] = ()) -> None:
         self._schemas: dict[int, Schema] = {}
@@ -210,7 +210,7 @@ class Directory:
         named = (schema.name, schema.encoding, bytes(schema.data))
         pairs = tuple(record.metadata.items())
         learnt = Channel(record.topic, record.message_encoding, *named, pairs)
-        if self._channels.get(record.id) != learnt:  # the same object each time is found faster
+        if self._channels.get(record.id) != learnt:  # keeping one object per channel speeds up lookups
             self._channels[record.id] = learnt
 
     def message(self, raw: scan.RawMessage) -> Message:
@@ -227,22 +227,24 @@ def open_part(
     max_chunk_bytes: int = scan.MAX_CHUNK_BYTES,
     require_crc: bool = False,
 ) -> list[Message]:
-    """All messages of a chunk (or of a record outside chunks), or ChunkError: a chunk is believed as a whole."""
+    """All messages of a chunk, or of a record outside chunks. Raises ChunkError; a chunk is read completely or not at
+    all.
+    """
     if part.opcode == Opcode.CHUNK:
         body = scan.chunk_body(data, part, max_chunk_bytes, require_crc)
     else:
         body = bytes(data[part.start : part.end])
-    found = []
+    messages = []
     for record in scan.chunk_records(body):
         if isinstance(record, scan.RawMessage):
-            found.append(directory.message(record))
+            messages.append(directory.message(record))
         else:
             directory.learn(record)
-    return found
+    return messages
 
 
 def map_file(path: Path) -> Any:
-    """The whole file as memory. Raises LogError where it is empty or cannot be opened."""
+    """The file mapped into memory. Raises LogError if it is empty or cannot be opened."""
     try:
         with open(path, "rb") as file:
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
@@ -254,7 +256,7 @@ def map_file(path: Path) -> Any:
 
 
 def _summary_start(data: Any) -> int:
-    """Where the summary begins, if the file has one and its CRC agrees; else 0."""
+    """The start of the summary if there is one with a valid CRC, else 0."""
     if not scan.ends_whole(data):
         return 0
     start, _, crc = struct.unpack_from("<QQI", data, len(data) - 28)

@@ -1,7 +1,7 @@
-"""What is left of a broken log, as a whole one: everything before, between and after the damage.
+"""Recovery of a damaged log: a complete new log with everything before, between and after the damage.
 
-A chunk is taken where its CRC agrees, as a whole or not at all, so no damaged message is ever passed on. Metadata has
-no CRC in this format: in a damaged file it is copied where its inner lengths agree, and may hold a flipped letter.
+A chunk is taken only if its CRC is valid, and then completely, so that no damaged message is passed on. Metadata has no
+CRC in MCAP: in a damaged file it is copied if its inner lengths agree, and may contain a wrong letter.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from fdi_torch.logbook.copying import copy_log
 from fdi_torch.logbook.errors import LogError
+from fdi_torch.logbook.log_copy import copy_log
 from fdi_torch.logbook.reader import Run
 from fdi_torch.logbook.scan import Damage
 
@@ -19,7 +19,7 @@ RECORD = "fdi_torch.recovery"
 
 @dataclass(frozen=True)
 class Recovery:
-    """target: the repaired file. messages: how many it holds. lost: the gaps. ended: had the run come to its end?"""
+    """target: the repaired file. messages: their number. lost: the gaps. ended: whether the run had come to its end."""
 
     source: Path
     target: Path
@@ -29,12 +29,12 @@ class Recovery:
 
     @property
     def whole(self) -> bool:
-        """Was nothing lost, as far as the file can tell?"""
+        """Whether nothing was lost, as far as the file shows."""
         return self.ended and not self.lost
 
     @property
     def sentence(self) -> str:
-        """What was saved and what was not, in words."""
+        """The result in words."""
         if self.whole:
             return f"{self.source}: the file is whole, all {self.messages} messages are in {self.target}"
         size = sum(damage.end - damage.start for damage in self.lost)
@@ -47,26 +47,26 @@ class Recovery:
 
 
 def recover(source: str | Path, target: str | Path | None = None) -> Recovery:
-    """Write what can be read of `source` to `target`, a new file; by default NAME.recovered.mcap beside it.
+    """Write the readable parts of `source` to the new file `target`, by default NAME.recovered.mcap beside it.
 
-    Raises LogError where the source cannot be opened or holds nothing of the format, or the target cannot be written.
+    Raises LogError if the source cannot be opened or is not MCAP, or if the target cannot be written.
     """
     source = Path(source)
     target = _beside(source) if target is None else Path(target)
-    found: list[Recovery] = []
+    recoveries: list[Recovery] = []
 
     def report(run: Run, messages: int) -> dict[str, dict[str, str]]:
         lost = tuple(sorted(run.damages, key=lambda damage: damage.start))
-        found.append(Recovery(source, target, messages, lost, run.ended))
-        return {RECORD: _record(found[-1])}
+        recoveries.append(Recovery(source, target, messages, lost, run.ended))
+        return {RECORD: _record(recoveries[-1])}
 
     try:
         copy_log(source, target, salvage=True, extra=report)
     except LogError:
-        if found:
+        if recoveries:
             target.unlink(missing_ok=True)
         raise
-    return found[0]
+    return recoveries[0]
 
 
 def _beside(source: Path) -> Path:

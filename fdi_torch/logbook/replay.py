@@ -1,4 +1,4 @@
-"""A run done again from its own log, and held against what was logged, event by event."""
+"""Replay: a run is repeated from its own log and compared with it, event by event."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ Outcome = Literal["bit-equal", "within tolerance", "differs"]
 
 @dataclass(frozen=True)
 class Difference:
-    """An event that is not the same: its number among those compared (from 1), what it is, both sides as text."""
+    """The first differing field of an event: its number among those compared (from 1), its place, both values
+    as text.
+    """
 
     event: int
     topic: str
@@ -37,10 +39,11 @@ class Difference:
 
 @dataclass(frozen=True)
 class Replay:
-    """outcome: bit-equal, within tolerance, or differs; the comparison ends with the first event that differs.
+    """outcome: bit-equal, within tolerance, or differs; the comparison ends at the first event that differs.
 
-    events: how many were compared. first: the first beyond the tolerance. first_inexact: the first not bit-equal.
-    largest: largest |a - b| / max(|a|, |b|) met. versions: what differs in the environment, name -> (then, now).
+    events: number of compared events. first: the first difference beyond the tolerance. first_inexact: the first that
+    is not bit-equal. largest: largest |a - b| / max(|a|, |b|). versions: differences of the environment, name -> (then,
+    now).
     """
 
     outcome: Outcome
@@ -61,16 +64,15 @@ def replay(
     select: Select | None = None,
     env: Mapping[str, str] | None = None,
 ) -> Replay:
-    """Do a run again and compare.
+    """Repeat a run and compare it with its log.
 
-    rerun: gets the opened log and returns the new log's path, or its messages. Numbers are within tolerance where
-    |a - b| <= absolute + relative max(|a|, |b|). skip_topics: not compared; by default what is said in words.
-    select: which messages of each side are compared, and in which order; by default all, as they were logged.
-    Raises LogError where a log cannot be read.
+    rerun: receives the opened log and returns the new log's path, or its messages. Numbers are within tolerance if |a -
+    b| <= absolute + relative max(|a|, |b|). skip_topics: not compared; by default log messages. select: chooses and
+    orders the messages to compare on each side; by default all as logged. Raises LogError for an unreadable log.
     """
     run = read_run(path)
-    again = rerun(run)
-    replayed = read_run(again).messages() if isinstance(again, str | Path) else again
+    repeated = rerun(run)
+    replayed = read_run(repeated).messages() if isinstance(repeated, str | Path) else repeated
     return compare_events(
         *((select(side) if select else side) for side in (run.messages(), replayed)),
         relative=relative,
@@ -89,22 +91,24 @@ def compare_events(
     skip_topics: Collection[str] = (),
     versions: dict[str, tuple[str, str]] | None = None,
 ) -> Replay:
-    """Two streams of events in their order, up to the first that differs beyond the tolerance."""
+    """Compare two ordered streams of events, up to the first difference beyond the tolerance."""
     events, largest, first_inexact = 0, 0.0, None
     streams = ((m for m in stream if m.topic not in skip_topics) for stream in (logged, replayed))
     for events, (then, now) in enumerate(zip_longest(*streams), 1):
-        for found in _deviations(then, now):
-            difference = Difference(events, *_event(then, now), found.field, repr(found.then), repr(found.now))
+        for deviation in _deviations(then, now):
+            difference = Difference(
+                events, *_event(then, now), deviation.field, repr(deviation.then), repr(deviation.now)
+            )
             first_inexact = first_inexact or difference
-            largest = max(largest, found.relative)
-            if not found.within(relative, absolute):
+            largest = max(largest, deviation.relative)
+            if not deviation.within(relative, absolute):
                 return Replay("differs", events, difference, first_inexact, largest, versions or {})
     outcome: Outcome = "bit-equal" if first_inexact is None else "within tolerance"
     return Replay(outcome, events, None, first_inexact, largest, versions or {})
 
 
 def version_changes(run: Run, now: Mapping[str, str]) -> dict[str, tuple[str, str]]:
-    """What of the environment is not as it was when the log was written."""
+    """Differences of the environment since the log was written."""
     then = run.metadata.get("fdi_torch.env", {})
     names = dict.fromkeys([*then, *now])
     return {name: (then.get(name, ""), now.get(name, "")) for name in names if then.get(name, "") != now.get(name, "")}
@@ -112,7 +116,7 @@ def version_changes(run: Run, now: Mapping[str, str]) -> dict[str, tuple[str, st
 
 @dataclass(frozen=True)
 class _Deviation:
-    """One field on both sides."""
+    """One differing field with both values."""
 
     field: str
     then: Any
@@ -124,7 +128,7 @@ class _Deviation:
 
     @property
     def relative(self) -> float:
-        """|a - b| / max(|a|, |b|); infinite where the sides are no finite numbers."""
+        """|a - b| / max(|a|, |b|); infinite unless both are finite numbers."""
         if not self.numeric:
             return math.inf
         scale = max(abs(self.then), abs(self.now))
@@ -137,7 +141,7 @@ class _Deviation:
 
 
 def _deviations(then: Message | None, now: Message | None) -> Iterator[_Deviation]:
-    """Fields that are not the same to the last bit."""
+    """Fields that are not bitwise equal."""
     if then is None or now is None:
         yield _Deviation("event", *("missing" if side is None else "there" for side in (then, now)))
     elif then.topic != now.topic:
@@ -151,7 +155,7 @@ def _deviations(then: Message | None, now: Message | None) -> Iterator[_Deviatio
 
 
 def _unequal(name: str, then: Any, now: Any) -> Iterator[_Deviation]:
-    """One deviation a field, or one an element of lists of equal length and of mappings, also where text tells them."""
+    """Deviations of a field: one per element of lists of equal length and of mappings, also within JSON texts."""
     if isinstance(then, str) and isinstance(now, str) and then != now:
         then, now = _untold(then), _untold(now)
     if isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
@@ -165,7 +169,7 @@ def _unequal(name: str, then: Any, now: Any) -> Iterator[_Deviation]:
 
 
 def _untold(text: str) -> Any:
-    """What a text tells as JSON where it is a mapping or a list, or else the text."""
+    """The value of a JSON text that is a mapping or a list; other texts unchanged."""
     if not text.startswith(("{", "[")):
         return text
     try:
@@ -181,14 +185,14 @@ def _same(then: Any, now: Any) -> bool:
 
 
 def _fields(message: Message) -> dict[str, Any]:
-    """Fields of a message without wall time; packed arrays as lists of their elements."""
+    """Fields of a message without wall time; packed arrays as lists."""
     payload = {name: value for name, value in message.payload.items() if name not in (WALL, NON_FINITE)}
     arrays = {name: array.ravel().tolist() for name, array in unpack(payload).items()}
     return payload | arrays
 
 
 def _event(then: Message | None, now: Message | None) -> tuple[str, str]:
-    """Topic of an event and which one it is."""
+    """The topic of an event and its position."""
     message = then or now
     if message is None:
         return "", ""

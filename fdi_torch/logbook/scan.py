@@ -1,8 +1,8 @@
-"""Records of an MCAP file, taken from bytes that may be torn, damaged or hostile.
+"""Parsing of MCAP records from bytes that may be torn, damaged or hostile.
 
 A record is opcode (1 byte), length (8 bytes, little-endian) and body (https://mcap.dev/spec). `frames` walks the top
-level: where a record is not sound, it skips to the next one that is and reports the gap. `chunk_messages` opens a
-chunk, never beyond a cap of bytes, and only where its CRC agrees. Nothing here raises on bad bytes but `ChunkError`.
+level; it skips from an invalid record to the next valid one and reports the gap. `chunk_records` parses a chunk, never
+beyond a limit of bytes, and only with a valid CRC. Invalid bytes raise no error but `ChunkError`.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ MAX_CHUNK_BYTES = 64 * 2**20
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
 _MESSAGE = struct.Struct("<HIQQ")
-# Records where reading may go on after damage, because lengths inside them must agree: chunk, chunk index, attachment,
-# statistics, metadata, data end. The three high bytes of any sensible length are zero.
+# Records at which reading may resume after damage, because inner lengths validate them: chunk, chunk index, attachment,
+# statistics, metadata, data end. The three high bytes of any plausible length are zero.
 _ANCHORS = re.compile(rb"[\x06\x08\x09\x0b\x0c\x0f](?=.{5}\x00\x00\x00)", re.DOTALL)
 
 Buffer = Any  # bytes or mmap
@@ -36,7 +36,7 @@ Buffer = Any  # bytes or mmap
 
 @dataclass(frozen=True)
 class Frame:
-    """A sound record: bytes start..end of the file, opcode and length included."""
+    """A valid record: bytes start..end of the file, including opcode and length."""
 
     opcode: int
     start: int
@@ -45,7 +45,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes start..end of the file cannot be read."""
+    """Unreadable bytes start..end of the file."""
 
     start: int
     end: int
@@ -61,11 +61,11 @@ class RawMessage(NamedTuple):
 
 
 class ChunkError(ValueError):
-    """A chunk that cannot be opened, and why."""
+    """A chunk that cannot be read, with the reason."""
 
 
 def frames(data: Buffer, start: int | None = None) -> Iterator[Frame | Damage]:
-    """Sound records in order, and the gaps between them; a gap at the end is a torn record."""
+    """Valid records in order, and the gaps between them; a gap at the end is a torn record."""
     size = len(data)
     place = (8 if data[:8] == MAGIC else 0) if start is None else start
     while place < size and data[place : place + 8] != MAGIC[: size - place]:
@@ -79,19 +79,21 @@ def frames(data: Buffer, start: int | None = None) -> Iterator[Frame | Damage]:
 
 
 def ends_whole(data: Buffer) -> bool:
-    """Does the file end as a finished one does: footer and magic?"""
+    """Whether the file ends with footer and magic, as a finished one does."""
     return len(data) > 45 and data[-8:] == MAGIC and data[-37:-28] == _HEAD.pack(Opcode.FOOTER, 20)
 
 
 def unpacked_size(data: Buffer, frame: Frame) -> int:
-    """Bytes of the records in a chunk, as it states them, or of a record outside chunks."""
+    """Stated size of the records in a chunk, or size of a record outside chunks, bytes."""
     return (
         int(_CHUNK.unpack_from(data, frame.start + 9)[2]) if frame.opcode == Opcode.CHUNK else frame.end - frame.start
     )
 
 
 def chunk_body(data: Buffer, frame: Frame, cap: int = MAX_CHUNK_BYTES, require_crc: bool = False) -> bytes:
-    """The records inside a chunk. Raises ChunkError: over the cap, not decompressible, CRC differs."""
+    """The records inside a chunk. Raises ChunkError if they exceed `cap`, cannot be decompressed, or have a
+    wrong CRC.
+    """
     size, crc = _CHUNK.unpack_from(data, frame.start + 9)[2:]
     name_end = frame.start + 41 + _u32(data, frame.start + 37)
     compression = bytes(data[frame.start + 41 : name_end])
@@ -106,7 +108,7 @@ def chunk_body(data: Buffer, frame: Frame, cap: int = MAX_CHUNK_BYTES, require_c
 
 
 def chunk_records(body: bytes) -> Iterator[Schema | Channel | RawMessage]:
-    """Schemas, channels and messages inside a chunk. Raises ChunkError where they do not parse."""
+    """Schemas, channels and messages inside a chunk. Raises ChunkError if they cannot be parsed."""
     place = 0
     try:
         while place < len(body):
@@ -136,7 +138,7 @@ def body_of(data: Buffer, frame: Frame) -> bytes:
 
 
 def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
-    """At most size + 1 bytes, whatever the data claim about themselves."""
+    """Decompress at most size + 1 bytes, whatever the data claim."""
     try:
         if compression == b"zstd":
             return zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(io.BytesIO(data)).read(size + 1)
@@ -150,7 +152,7 @@ def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
 
 
 def _after_damage(data: Buffer, place: int) -> int:
-    """Where to go on: after the damaged record where its length still leads to a sound one, else at the next anchor."""
+    """Where reading resumes: after the damaged record if its length leads to a valid one, else at the next anchor."""
     end = _framed(data, place)
     if end is not None and end < len(data) and (_sound(data, end) is not None or data[end:] == MAGIC):
         return end
@@ -159,7 +161,7 @@ def _after_damage(data: Buffer, place: int) -> int:
 
 
 def _framed(data: Buffer, place: int) -> int | None:
-    """End of a record by its length alone; None where it leaves the file or has no opcode."""
+    """End of a record by its length alone; None if it exceeds the file or has no opcode."""
     if len(data) - place < 9:
         return None
     opcode, length = _HEAD.unpack_from(data, place)
@@ -167,7 +169,7 @@ def _framed(data: Buffer, place: int) -> int | None:
 
 
 def _sound(data: Buffer, place: int) -> int | None:
-    """End of a record whose inner lengths (and, for attachments, CRC) agree; None where they do not."""
+    """End of a record whose inner lengths (for attachments also the CRC) agree, else None."""
     end = _framed(data, place)
     if end is None:
         return None
@@ -196,7 +198,7 @@ def _text_end(data: Buffer, place: int, end: int) -> int:
 
 
 def _map_ends_at(data: Buffer, place: int, end: int) -> bool:
-    """A map of texts, name and value in turn, that fills place..end."""
+    """Whether a map of texts (name and value in turn) fills place..end."""
     if place + 4 + _u32(data, place) != end:
         return False
     place += 4

@@ -1,4 +1,4 @@
-"""Messages as arrays: any topic's fields over time, and the recording inside a log, ours or foreign."""
+"""Messages as arrays: fields of any topic over time, and the recording in a log of this or another program."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ import orjson
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.reader import Message, Run
-from fdi_torch.logbook.schemas import topic_definition
 from fdi_torch.logbook.sink import EPOCH_NS
-from fdi_torch.outside import MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION, expect_unpacked
+from fdi_torch.logbook.topic_definitions import topic_definition
+from fdi_torch.untrusted_input import MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION, expect_unpacked
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 _BLOCK = 65536
@@ -29,9 +29,9 @@ Source = tuple[str, str]  # topic, field
 
 @dataclass(frozen=True)
 class Signals:
-    """A recording as plain arrays. time (T,) in s, inputs (T, M), outputs (T, N), mask (T, N) True where one counts.
+    """A recording as plain arrays: time (T,) s, inputs (T, M), outputs (T, N), mask (T, N) True for valid readings.
 
-    Units are "" where the log does not state them.
+    A unit is "" if the log does not state it.
     """
 
     time: np.ndarray
@@ -46,18 +46,18 @@ class Signals:
 
 
 def series(run: Run, topic: str, fields: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-    """Numbers of a topic over its messages, (K,) each, NaN where a message lacks one; always with `t` in s.
+    """Numbers of a topic over its messages, (K,) each, NaN where missing; always with `t`, s.
 
-    fields: names, or paths into foreign messages such as "pose.x" and "data[2]"; all top-level numbers where None.
+    fields: names, or paths into nested messages such as "pose.x" and "data[2]"; default: all top-level numbers.
     """
-    wanted = list(fields) if fields is not None else _numeric_fields(run, topic)
-    rows = ((_time(message, payload), *_numbers(payload, wanted)) for message, payload in _of(run, topic))
-    table = _table(rows, len(wanted) + 1)
-    return {"t": table[:, 0], **{name: table[:, i + 1] for i, name in enumerate(wanted) if name != "t"}}
+    names = list(fields) if fields is not None else _numeric_fields(run, topic)
+    rows = ((_time(message, payload), *_numbers(payload, names)) for message, payload in _of(run, topic))
+    table = _table(rows, len(names) + 1)
+    return {"t": table[:, 0], **{name: table[:, i + 1] for i, name in enumerate(names) if name != "t"}}
 
 
 def own_signals(run: Run, group: str = "") -> Signals:
-    """The recording in one of our logs. Raises LogError where it holds none."""
+    """The recording in a log of this program. Raises LogError if it has none."""
     root = f"/plant/{group}" if group else "/plant"
     source, channel = _first_channel(run, f"{root}/input"), _first_channel(run, f"{root}/output")
     if channel is None:
@@ -77,8 +77,8 @@ def mapped_signals(
 ) -> Signals:
     """A recording from any log: signal -> (topic, field). The first output's topic is the clock.
 
-    Time is the log time in s since the clock's first message, or the number in `time_field`. Signals on other
-    topics are held from their last message; before their first one they are NaN.
+    Time is the log time in s since the clock's first message, or the number in `time_field`. Signals on other topics
+    are held from their last message, and NaN before their first.
     """
     if not outputs:
         raise ValueError("expected at least one output, got none; map a signal to a topic and a field")
@@ -105,7 +105,7 @@ def held(clock: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
 
 
 def arrays(run: Run, name: str = "results.npz") -> dict[str, np.ndarray]:
-    """Arrays of an attached .npz, of a limited size, nothing pickled. What a header claims must be there."""
+    """The arrays of an attached .npz of limited size, without pickled objects and with consistent headers."""
     content = run.attachment(name)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -118,7 +118,7 @@ def arrays(run: Run, name: str = "results.npz") -> dict[str, np.ndarray]:
 
 
 def _array_in(content: bytes) -> np.ndarray:
-    """A .npy file. Raises ValueError where its header claims other than the bytes that follow."""
+    """The array of a .npy file. Raises ValueError if its header does not match the bytes that follow."""
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
@@ -147,7 +147,7 @@ def _time(message: Message, payload: Mapping[str, Any]) -> float:
 
 
 def number_at(payload: Any, field: str) -> float:
-    """A field by its name or, where there is none of that name, its path; NaN where it is no number."""
+    """A field by its name, or else by its path; NaN if it is not a number."""
     value = payload
     for step in [field] if field in payload else field_path(field):
         try:
@@ -162,7 +162,7 @@ def _numbers(payload: Any, fields: Iterable[str]) -> list[float]:
 
 
 def _numeric_fields(run: Run, topic: str) -> list[str]:
-    """Top-level numbers of any message of the topic, in order of appearance."""
+    """Names of all top-level numbers in the topic's messages, in order of appearance."""
     names: dict[str, None] = {}
     for _, payload in _of(run, topic):
         names.update(dict.fromkeys(k for k, v in payload.items() if isinstance(v, int | float)))
@@ -170,7 +170,7 @@ def _numeric_fields(run: Run, topic: str) -> list[str]:
 
 
 def _table(rows: Iterable[Sequence[float]], width: int) -> np.ndarray:
-    """Rows as an array, in blocks, so that the numbers do not lie about as objects."""
+    """The rows as an array, converted in blocks to save memory."""
     blocks, block = [np.zeros((0, width))], []
     for row in rows:
         block.append(row)
@@ -185,11 +185,11 @@ def _first_channel(run: Run, topic: str) -> Channel | None:
 
 
 def _names(channel: Channel) -> tuple[str, ...]:
-    """Signals of a plant channel, in the order they were logged: the numbers its schema names."""
-    known = {"t", "non_finite", "wall", *topic_definition(channel.topic).fields}
+    """Signals of a plant channel in order of logging: the numbers in its schema."""
+    reserved = {"t", "non_finite", "wall", *topic_definition(channel.topic).fields}
     try:
         properties = orjson.loads(channel.schema_data)["properties"]
-        return tuple(name for name in properties if name not in known)
+        return tuple(name for name in properties if name not in reserved)
     except (ValueError, KeyError, TypeError) as error:
         raise LogError(f"{channel.topic}: expected a schema with properties, got {error}") from error
 
@@ -202,35 +202,35 @@ def _units(channel: Channel) -> tuple[str, ...]:
 def _own_table(run: Run, channel: Channel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times (T,), values (T, N) and mask (T, N) of a plant topic."""
     names = _names(channel)
-    uncounted: list[tuple[int, int]] = []
+    masked: list[tuple[int, int]] = []
 
     def rows() -> Iterable[Sequence[float]]:
         for row, (message, payload) in enumerate(_of(run, channel.topic)):
-            uncounted.extend((row, names.index(name)) for name in payload.get("masked", ()) if name in names)
+            masked.extend((row, names.index(name)) for name in payload.get("masked", ()) if name in names)
             yield (_time(message, payload), *(number_at(payload, name) for name in names))
 
     table = _table(rows(), len(names) + 1)
     mask = np.isfinite(table[:, 1:])
-    if uncounted:
-        mask[tuple(np.array(uncounted).T)] = False
+    if masked:
+        mask[tuple(np.array(masked).T)] = False
     return table[:, 0], table[:, 1:], mask
 
 
 def _mapped_table(
     run: Run, topic: str, sources: Mapping[str, Source], time_field: str | None, origin: int
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Times in s since `origin` (ns), or as `time_field` says, and one column a signal."""
-    wanted = {name: path for name, (where, path) in sources.items() if where == topic}
+    """Times in s since `origin` (ns), or from `time_field`, and one column per signal."""
+    paths = {name: path for name, (where, path) in sources.items() if where == topic}
 
     def rows() -> Iterable[Sequence[float]]:
         for message, payload in _of(run, topic):
             t = number_at(payload, time_field) if time_field else (message.log_time - origin) * 1e-9
-            yield (t, *_numbers(payload, wanted.values()))
+            yield (t, *_numbers(payload, paths.values()))
 
-    table = _table(rows(), len(wanted) + 1)
+    table = _table(rows(), len(paths) + 1)
     if not len(table):
         raise LogError(f"{run.path}: expected messages on {topic}, got none; `fdi inspect {run.path}` lists the topics")
-    return table[:, 0], {name: table[:, i + 1] for i, name in enumerate(wanted)}
+    return table[:, 0], {name: table[:, i + 1] for i, name in enumerate(paths)}
 
 
 def _columns(columns: Sequence[np.ndarray], samples: int) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""One method for each topic of a log. They take plain numbers, arrays and tensors of any library.
+"""The methods that write each topic of a log, from plain numbers, arrays and tensors of any library.
 
-`t` is plant time in s. An event without a plant time of its own (a generation, an iteration, a trial) counts one
-second a step, so that viewers draw it over its number; other events default to the latest time logged.
+`t` is plant time in s. An event without plant time (a generation, an iteration, a trial) counts one second per step, so
+that viewers draw it over its number; other events default to the latest logged time.
 """
 
 from __future__ import annotations
@@ -14,35 +14,35 @@ import orjson
 from fdi_torch.logbook.messages import Messages, Named
 from fdi_torch.logbook.payload import as_array, pack
 from fdi_torch.logbook.sink import log_time_of
-from fdi_torch.logbook.trickle import Trickle
+from fdi_torch.logbook.write_buffer import DeferredTopic
 
 _LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
 
 
-def _packed(kept: Sequence[tuple[float, Named, Named]]) -> Iterator[tuple[float, Named]]:
-    for t, fields, arrays in kept:
-        told = dict(fields)
+def _packed(items: Sequence[tuple[float, Named, Named]]) -> Iterator[tuple[float, Named]]:
+    for t, fields, arrays in items:
+        message = dict(fields)
         for name, array in arrays.items():
-            told |= pack(name, array)
-        yield t, told
+            message |= pack(name, array)
+        yield t, message
 
 
-_POPULATION = Trickle("/estimator/de/population", _packed)
+_POPULATION = DeferredTopic("/estimator/de/population", _packed)
 
 
 class Topics(Messages):
-    """The topics by name."""
+    """One method per topic."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._trickles: dict[str, Trickle] = {}
+        self._deferred: dict[str, DeferredTopic] = {}
 
-    def _trickle(self, topic: str, units: Mapping[str, str] | None) -> Trickle:
-        """Of messages whose fields are kept as they are."""
-        found = self._trickles.get(topic)
-        if found is None or found.units != units:
-            found = self._trickles[topic] = Trickle(topic, lambda kept: kept, units)
-        return found
+    def _deferred_topic(self, topic: str, units: Mapping[str, str] | None) -> DeferredTopic:
+        """The deferred topic for messages whose fields need no conversion."""
+        deferred = self._deferred.get(topic)
+        if deferred is None or deferred.units != units:
+            deferred = self._deferred[topic] = DeferredTopic(topic, lambda items: items, units)
+        return deferred
 
     def residual(
         self,
@@ -52,7 +52,7 @@ class Topics(Messages):
         thresholds: Named | None = None,
         units: Mapping[str, str] | None = None,
     ) -> None:
-        """y - y_hat per sensor, with test statistics and thresholds where there are any."""
+        """y - y_hat of each sensor, with its test statistics and thresholds if any."""
         tested = {f"{name}_statistic": value for name, value in (statistics or {}).items()}
         limits = {f"{name}_threshold": value for name, value in (thresholds or {}).items()}
         self.write("/observer/residual", {**residuals, **tested, **limits}, t, units=units)
@@ -78,14 +78,14 @@ class Topics(Messages):
         numbers: mean_cost, spread, evaluations and others by name.
         """
         fields = {"problem": problem, "generation": generation, "best_cost": best_cost, **numbers, **best}
-        self.later(self._trickle("/estimator/de/generation", units), (generation if t is None else t, fields))
+        self.later(self._deferred_topic("/estimator/de/generation", units), (generation if t is None else t, fields))
 
     def population(
         self, generation: int, arrays: Mapping[str, Any], *, problem: int = 0, t: float | None = None
     ) -> None:
-        """The state of the search, from which it can go on: any arrays of numbers, such as population and cost.
+        """The state of the search for its continuation: any numeric arrays, such as population and cost.
 
-        They are written a little later, and must not be changed in place.
+        They are written with delay, and must not be changed in place.
         """
         fields = {"problem": problem, "generation": generation}
         size = sum(getattr(array, "nbytes", 0) for array in arrays.values())
@@ -107,7 +107,7 @@ class Topics(Messages):
         numbers: step, gradient, damping, accepted and others by name.
         """
         fields = {"problem": problem, "iteration": iteration, "cost": cost, **numbers, **parameters}
-        self.later(self._trickle("/estimator/refine/iteration", units), (iteration if t is None else t, fields))
+        self.later(self._deferred_topic("/estimator/refine/iteration", units), (iteration if t is None else t, fields))
 
     def estimate(
         self,
@@ -150,11 +150,13 @@ class Topics(Messages):
         self.write("/diagnosis/fault", fields, t)
 
     def gap_where(self, location: str, share: float, p_value: float | None = None, **numbers: Any) -> None:
-        """How likely it is that something is wrong at a component. Format 1: the share of the gap that it can close."""
+        """The probability that something is wrong at a component. In format 1: the share of the gap that it
+        explains.
+        """
         self.write("/gap/where", {"location": location, "share": share, "p_value": p_value, **numbers})
 
     def gap_verdict(self, answer: Named) -> None:
-        """The diagnosis of a gap in the format `fdi_torch.gap/2`; what is numeric in its closure plots by name."""
+        """The diagnosis of a gap in the format `fdi_torch.gap/2`; numbers of its closure are fields of their own."""
         closure = {k: v for k, v in answer.get("closure", {}).items() if isinstance(v, int | float)}
         where, posterior = answer.get("where", []), answer.get("posterior", [])
         fields = {
@@ -181,7 +183,7 @@ class Topics(Messages):
         self.write("/study/trial", fields, trial)
 
     def summary(self, group: str, trials: int, numbers: Named, **texts: str) -> None:
-        """A setting of a study, summed up."""
+        """The summary of one setting of a study."""
         self.write("/study/summary", {"group": group, "trials": trials, **texts, **numbers})
 
     def say(self, message: str, level: str = "info", name: str = "fdi", t: float | None = None) -> None:

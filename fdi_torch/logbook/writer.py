@@ -1,8 +1,8 @@
-"""RunLog: the log of one run or study, written so that a crash loses at most its last second.
+"""RunLog: the log of one run or study; a crash loses at most its last second.
 
-The run is written to `NAME.mcap.partial` and becomes `NAME.mcap` at its end. What waits in memory goes to disk after
-0.75 s at the latest, by a small thread, also while the run computes and says nothing. Chunks that came there in pieces
-are whole in the end, so that equal configuration, data and seed give byte-identical files but for the wall-clock
+The run is written to `NAME.mcap.partial`, which becomes `NAME.mcap` at its end. Waiting messages go to disk after 0.75
+s at the latest, by a small thread, also while the run computes without logging. Chunks written in pieces are replaced
+by full ones at the end, so that equal configuration, data and seed give byte-identical files apart from wall-clock
 fields: `started` and `run_id` of `fdi_torch.run`, `ended` and `wall_seconds` of `fdi_torch.status`.
 """
 
@@ -22,33 +22,32 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.interruption import UNDISTURBED, Terminated
-from fdi_torch.logbook.block import Block, Timed
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError, log_error
-from fdi_torch.logbook.flat import flatten
+from fdi_torch.logbook.flat_metadata import flatten
 from fdi_torch.logbook.payload import as_array
 from fdi_torch.logbook.provenance import environment, git_state, version_of
 from fdi_torch.logbook.reader import Message
-from fdi_torch.logbook.schemas import FORMAT_VERSION
+from fdi_torch.logbook.sample_block import Block, Timed
 from fdi_torch.logbook.sink import Sink
+from fdi_torch.logbook.topic_definitions import FORMAT_VERSION
 from fdi_torch.logbook.topics import Topics
 
 Listener = Callable[[Channel, int, bytes], None]
-"""Hears each message as it is logged: its channel, its log time in ns and its payload."""
+"""Called with each logged message: its channel, its log time in ns and its payload."""
 
-_MOMENT = 0.05
-"""Seconds that the clock leaves to the run."""
+_GRACE_SECONDS = 0.05
+"""Time in which the run may write waiting messages itself before the flushing thread does."""
 
 
 class RunLog(Topics):
     """Context manager that logs a run. Messages are written by the methods of `Topics`.
 
-    path: NAME.mcap, which must not exist. kind: the command, such as "train". config_text: the configuration exactly
-    as given; config: the same, resolved, as plain nested values. seeds: name -> seed. data: one mapping an input file,
-    with its "path" and "sha256". env, git: found out where not given. clock: wall time in ns. listener: hears every
-    message as it is logged. after_interruption: how the work goes on after Ctrl-C or SIGTERM, as a clause; the
-    exception then carries it as a note, behind where the log lies.
-    Raises LogError where the file cannot be written.
+    path: NAME.mcap, which must not exist. kind: the command, such as "train". config_text: the configuration exactly as
+    given; config: the same, resolved, as plain nested values. seeds: name -> seed. data: one mapping per input file,
+    with its "path" and "sha256". env, git: determined if not given. clock: wall time, ns. listener: called with every
+    logged message. after_interruption: how to continue after Ctrl-C or SIGTERM, as a clause; it is added to the
+    exception as a note, after the path of the log. Raises LogError if the file cannot be written.
     """
 
     def __init__(
@@ -92,7 +91,7 @@ class RunLog(Topics):
 
     @property
     def run_id(self) -> str:
-        """Names this run: a hash of its inputs and its start."""
+        """Identifier of this run: a hash of its inputs and its start."""
         return self._run["run_id"]
 
     def __enter__(self) -> RunLog:
@@ -127,7 +126,7 @@ class RunLog(Topics):
                 self._say_what_is_kept(error)
 
     def _end(self) -> None:
-        """The log as a whole file, under its name."""
+        """Complete the log under its final name."""
         self.settle()
         self._publish(self._write_end(self._open_sink()))
 
@@ -138,26 +137,26 @@ class RunLog(Topics):
             error.add_note(self._after_interruption)
 
     def set_status(self, status: str, reason: str = "") -> None:
-        """How the run ended, such as "not_converged"; "completed" where nothing is said."""
+        """Set how the run ended, such as "not_converged"; the default is "completed"."""
         self.status, self.reason = status, reason
 
     def result(self, values: Mapping[str, Any]) -> None:
-        """Named results for the record `fdi_torch.result`, written at the end."""
+        """Add named results to the record `fdi_torch.result`, written at the end."""
         self._results.update(flatten(values))
 
     def result_arrays(self, **arrays: Any) -> None:
-        """Arrays for the attachment `results.npz`, written at the end."""
+        """Add arrays to the attachment `results.npz`, written at the end."""
         self._arrays.update({name: as_array(array) for name, array in arrays.items()})
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
-        """A file inside the log."""
+        """Attach a file to the log."""
         self.settle()
         with self._lock:
             self._open_sink().attachment(name, media_type, data)
             self._note_progress()
 
     def flush(self) -> None:
-        """Everything logged so far goes to disk."""
+        """Write everything logged so far to disk."""
         with self._lock:
             self.due = False
             self.settle()
@@ -165,14 +164,14 @@ class RunLog(Topics):
             self._note_progress()
 
     def put(self, messages: Iterable[Timed]) -> None:
-        """Encoded messages; the methods of `Topics` end here."""
+        """Write encoded messages; all methods of `Topics` call it."""
         with self._lock:
             sink = self._open_sink()
             sink.messages(messages if self._listener is None else self._heard(messages, self._listener))
             self._note_progress()
 
     def put_block(self, block: Block) -> None:
-        """Many samples, to the same bytes."""
+        """Write a block of samples, with the same bytes."""
         if self._listener is not None:
             self.put(block)
             return
@@ -181,7 +180,7 @@ class RunLog(Topics):
             self._note_progress()
 
     def carry_over(self, messages: Iterable[Message]) -> int:
-        """Messages of an earlier log of the same run, as they were; what is logged next follows them. Their number."""
+        """Copy messages of an earlier log of the same run, to be continued; returns their number."""
         count = 0
         for message in messages:
             self.follow_on(message.channel, message.sequence, message.t)
@@ -206,7 +205,7 @@ class RunLog(Topics):
         return self._sink
 
     def _note_progress(self) -> None:
-        """Remember since when messages wait in memory, at the latest."""
+        """Update the time since when messages have been waiting in memory."""
         sink = self._open_sink()
         if not sink.waiting:
             self._waiting_since = None
@@ -215,10 +214,12 @@ class RunLog(Topics):
         self._size = sink.written
 
     def _flush_by_clock(self) -> None:
-        """A run that logs something in the next moment writes by itself: two threads at a time hinder each other."""
+        """Flush waiting messages periodically. A run about to log writes them itself, since two writers slow each other
+        down.
+        """
         while not self._stop.wait(self._flush_seconds / 2):
             self.due = self._has_waited()
-            if self.due and not self._stop.wait(_MOMENT):
+            if self.due and not self._stop.wait(_GRACE_SECONDS):
                 with self._lock:
                     try:
                         if self.due:
@@ -229,7 +230,7 @@ class RunLog(Topics):
     def _has_waited(self) -> bool:
         with self._lock:
             since = self._waiting_since
-            if since is None and self._put_off:
+            if since is None and self._buffer:
                 self._waiting_since = time.monotonic()
             return since is not None and time.monotonic() - since >= self._flush_seconds / 2
 
@@ -241,7 +242,7 @@ class RunLog(Topics):
             sink.attachment("config.yaml", "application/yaml", self._config_text.encode())
 
     def _write_end(self, sink: Sink) -> Path:
-        """Results and status; the file that is whole then."""
+        """Write results and status; returns the complete file."""
         if self._arrays:
             sink.attachment("results.npz", "application/x-npz", _npz(self._arrays))
         if self._results:

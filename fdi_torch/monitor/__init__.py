@@ -1,1 +1,5 @@
-"""Diagnosis on line: observers, detection, isolation, moving windows, and what can be diagnosed at all."""
+"""On-line diagnosis: observers, detection, isolation, window monitors, and diagnosability.
+
+`believed` (P,) in this room are the parameter values that the observer uses: nominal values and calibrated constants,
+changed by the faults isolated so far. `healthy` are the same values with every fault at nominal.
+"""

@@ -1,1 +1,1 @@
-"""The 2020 paper on one page: its tables and figures made again, ours and its numbers side by side."""
+"""Reproduction of the tables and figures of the 2020 paper on one page, with published and computed numbers."""

@@ -1,4 +1,4 @@
-"""Where each equation of the paper lives in the code."""
+"""Table of the paper's equations and the code that implements them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Equation:
-    """numbers: as the paper counts. says: in our words. places: 'module:name' below fdi_torch; none: not built."""
+    """numbers: of the paper's equations. says: their meaning. places: 'module:name' below fdi_torch;
+    empty: not built.
+    """
 
     numbers: tuple[int, ...]
     says: str
@@ -48,7 +50,8 @@ EQUATIONS = (
     Equation((22,), "binomial crossover with at least one component of the mutant", ("estimate.generation:ask",)),
     Equation((23,), "the better of parent and candidate survives", ("estimate.generation:tell",)),
     Equation((24,), "levels of three tanks: inflow less outflow over area", ("plant.network:TankNetwork.level_rates",)),
-    Equation((25,), "states, readings and pump flows", ("plant.network:TankNetwork.read", "config.plant:load_plant")),
+    Equation((25,), "states, readings and pump flows",
+             ("plant.network:TankNetwork.read", "config.plant_file:load_plant")),
     Equation((26,), "the fault-free plant from known start levels", ("simulate.simulated_recording:clean_readings",)),
     Equation((27,), "a leak: Torricelli's law through a hole", ("effects.leak:Leak.inflow",)),
     Equation((28,), "plugging: a share of a pipe's flow is lost", ("effects.plugging:Plugging.flow",)),
@@ -68,7 +71,7 @@ STATEMENTS = (
     ("Theorem 1", "what must hold for that, and what correlation alone never sees",
      ("monitor.diagnosability:diagnosability", "monitor.diagnosability:without_gain_and_offset")),
 )  # fmt: skip
-"""(what, in our words, places) of what the paper states without a number of its own."""
+"""(what, meaning, places) of statements that the paper makes without an equation number."""
 
 ERRATA = (
     ("(29), (31), section 5", "With the signs of (29) the net outlet's parameter is −1 without a fault and stands "
@@ -92,4 +95,4 @@ ERRATA = (
     ("Table 3, SNR 40", "The estimate of θ₂ is off by 0.04, some seventy times what noise of that level explains.",
      "Printed as it is."),
 )  # fmt: skip
-"""(where, what is wrong, what is built)."""
+"""(where, what is wrong in the paper, what is implemented)."""

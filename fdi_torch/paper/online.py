@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.config.estimation import parameter_values, placements_of
-from fdi_torch.config.run import Run
+from fdi_torch.config.run_file import Run
 from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.diagnosis import sample_noise
@@ -31,7 +31,7 @@ from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
 
 TIME_BETWEEN_FALSE_ALARMS = 20_000.0
 STILL_RATIO = 1.2
-"""A channel whose spread is less than this many times its sample-to-sample noise does not vary."""
+"""A channel is constant if its standard deviation is less than this multiple of its sample-to-sample noise."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Window:
 
     @property
     def delay(self) -> float:
-        """From the window's begin to the alarm, s; NaN without one."""
+        """Time from the beginning of the window to the alarm, s; NaN without an alarm."""
         return float("nan") if self.alarm is None else self.alarm - self.begin
 
 
@@ -67,7 +67,7 @@ class OnLine:
 
 
 def follow(runs: Sequence[Run]) -> OnLine:
-    """The windows that the runs simulate, one after the other; the last run says how to estimate, and the seed."""
+    """The windows that the runs simulate, one after the other; the last run defines the estimation and the seed."""
     recording, fault_free, network, space = laid_end_to_end(runs)
     noise, detector = learnt(network, fault_free, runs[-1].config.seed)
     # Start levels are known, at rest as after a fit: no opening gain.
@@ -127,18 +127,18 @@ def laid_end_to_end(runs: Sequence[Run]) -> tuple[Recording, Recording, TankNetw
 
 
 def faulty_network(run: Run) -> TankNetwork:
-    """The plant with every fault that the run estimates, all at nominal."""
+    """The plant with every estimated fault, all at nominal."""
     return build_network(run.plant, placements_of([p.name for p in run.config.estimate.parameters], run.plant))
 
 
 def faults_of(run: Run, network: TankNetwork) -> dict[str, float]:
-    """What the run simulates, SI by full name."""
+    """Simulated values, SI by full name."""
     assert run.config.simulate is not None
     return parameter_values(run.config.simulate.faults, network.constants, run.plant)
 
 
 def start_of(run: Run, network: TankNetwork, recording: Recording) -> Tensor:
-    """Levels (tanks,) at which the run starts, m."""
+    """Initial levels (tanks,) of the run, m."""
     assert run.config.simulate is not None
     return start_levels(run.plant, network, recording, run.config.simulate.start_levels)[0]
 
@@ -150,7 +150,7 @@ def started_at(network: TankNetwork, levels: Tensor) -> TankNetwork:
 
 
 def learnt(network: TankNetwork, fault_free: Recording, seed: int) -> tuple[NoiseModel, Detector]:
-    """Noise and observer gain from a fault-free recording, and a detector of rare false alarms."""
+    """Noise model and observer gain from a fault-free recording, and a detector with rare false alarms."""
     noise, _ = learn_noise(network, samples_of_recording(fault_free, network.description))
     sampling = float(torch.diff(fault_free.time).median())
     generator = torch.Generator().manual_seed(seed)
@@ -159,23 +159,25 @@ def learnt(network: TankNetwork, fault_free: Recording, seed: int) -> tuple[Nois
 
 
 def first_alarm(seen: Observation, noise: NoiseModel, detector: Detector) -> float | None:
-    """When the white residual first leaves its fault-free range, s."""
+    """Time of the first alarm of the white residual, s."""
     index = int(detector.first_alarm(noise.whitening(seen.steady_residual)))
     return None if index == NO_ALARM else float(seen.time[index])
 
 
 def varies(recording: Recording) -> bool:
-    """Whether every output varies by more than its own noise; correlation is undefined where one does not."""
+    """Whether every output varies by more than its noise; the correlation of a constant output is undefined."""
     noise = sample_noise(recording.outputs, recording.mask.to(recording.outputs.dtype))
     return bool((recording.outputs.std(dim=0) > STILL_RATIO * noise).all())
 
 
 def sized(recording: Recording, space: ParameterSpace, run: Run) -> HybridResult:
-    """The faults of one window; its start levels are estimated with them, for nothing but noisy readings tells them."""
+    """The faults of one window, estimated together with its initial levels, which are known from noisy
+    readings only.
+    """
     fitting = set_up(run.plant, [recording], space, "free", run.config.engine)
     return estimate_parameters(fitting, hybrid_settings(run.config.estimate), run.config.seed)
 
 
 def fed_back(result: HybridResult, faults: int) -> tuple[Tensor, Tensor]:
-    """The newest parameters (P,) for the observer (16), and the levels (tanks,) at which the window ends."""
+    """Parameters (P,) for the adaptive observer (16), and the levels (tanks,) at the end of the window."""
     return result.estimate.value[:faults], result.predicted[0][-1]

@@ -1,9 +1,9 @@
-"""What the paper prints, and the order of its five parameters."""
+"""Numbers published in the paper, and the order of its five parameters."""
 
 from __future__ import annotations
 
 PARAMETERS = ("T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size")
-"""theta_1 to theta_5 by their names here."""
+"""Names of theta_1 to theta_5 in this package."""
 
 SYMBOLS = ("θ₁", "θ₂", "θ₃", "θ₄", "θ₅")
 
@@ -14,7 +14,7 @@ TABLE_2: dict[str, tuple[float | None, ...]] = {
     "table2_4d": (0.11311, 0.598932, 0.483429, 0.742294, 0.996307),
     "table2_5d": (0.096488, 0.606524, 0.513945, 0.689603, 0.912194),
 }
-"""Estimates by run file, free of noise. None: a misprint, the entry of theta_2 twice."""
+"""Noise-free estimates by run file. None: a misprint, the entry of theta_2 is repeated."""
 
 TABLE_3: dict[str, tuple[float | None, ...]] = {
     "table3_snr50": (0.300550, 0.301163, 0.491633, 0.602957, 0.996162),

@@ -259,5 +259,5 @@ def placed_parameters(placement: Placement, plant: PlantDescription) -> list[Par
 
 def _expect_fit(plant: PlantDescription, placement: Placement) -> None:
     if not fits(placement.effect, plant, placement.location):
-        wanted = " or ".join(placement.effect.places)
-        raise ValueError(f"{placement.prefix}: expected a place of kind {wanted}, got {placement.location}")
+        kinds = " or ".join(placement.effect.places)
+        raise ValueError(f"{placement.prefix}: expected a place of kind {kinds}, got {placement.location}")

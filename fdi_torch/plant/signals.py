@@ -81,9 +81,9 @@ class CumulativeSignal:
 
     def up_to(self, instant: Tensor, channel: int) -> Tensor:
         """The integral from the first sample to `instant`, any shape."""
-        after = self._interval(instant)
-        left = torch.clamp(after - 1, min=0)
-        return self.integral[left, channel] + self.slopes[after, channel] * (instant - self.time[left])
+        interval = self._interval(instant)
+        sample = torch.clamp(interval - 1, min=0)
+        return self.integral[sample, channel] + self.slopes[interval, channel] * (instant - self.time[sample])
 
     def slope_at(self, instant: Tensor, channel: int) -> Tensor:
         """The slope of the integral up to `instant`: the signal's mean between the samples around it."""

@@ -101,9 +101,11 @@ def rule_of(source: ChannelSource, quality: int | None) -> Rule:
 
 def _find_column(path: Path, header: Sequence[str], name: str, column: str | None) -> str:
     """The column of a channel: with this whole header, or with this name in a header of the form name_unit."""
-    wanted = column or name
-    splits = [(h, header_unit(h)) for h in header]
-    matches = [h for h in header if h == wanted] or [h for h, split in splits if split and split[0] == wanted]
+    requested = column or name
+    names_and_units = [(h, header_unit(h)) for h in header]
+    matches = [h for h in header if h == requested] or [
+        h for h, pair in names_and_units if pair and pair[0] == requested
+    ]
     if len(matches) > 1:
         fix = (
             f"map one under columns: {{{name}: {{column: {matches[0]}}}}}" if matches[0] != matches[1] else "rename one"
@@ -111,12 +113,14 @@ def _find_column(path: Path, header: Sequence[str], name: str, column: str | Non
         raise ValueError(f"{path}: expected one column for {name}, got {' and '.join(matches)}; {fix}")
     if matches:
         return matches[0]
-    names = {split[0]: h for h, split in splits if split}
-    nearest = difflib.get_close_matches(wanted, [*header, *names], n=1, cutoff=0.5)
-    nearest = [h for h in header if h.lower().startswith(wanted.lower())] or nearest if len(wanted) > 1 else nearest
+    names = {pair[0]: h for h, pair in names_and_units if pair}
+    nearest = difflib.get_close_matches(requested, [*header, *names], n=1, cutoff=0.5)
+    nearest = (
+        [h for h in header if h.lower().startswith(requested.lower())] or nearest if len(requested) > 1 else nearest
+    )
     hint = f"; the nearest is {names.get(nearest[0], nearest[0])}" if nearest else ""
     raise ValueError(
-        f"{path}: expected a column for {name} ('{wanted}' or '{wanted}_UNIT'), got {', '.join(header)}{hint}; "
+        f"{path}: expected a column for {name} ('{requested}' or '{requested}_UNIT'), got {', '.join(header)}{hint}; "
         f"map it under columns: {{{name}: {{column: ..., unit: ...}}}}"
     )
 

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fdi_torch.names import unknown
-from fdi_torch.outside import MOST_SHEET, MOST_SHEET_EXPANSION, expect_unpacked
 from fdi_torch.recordings.table_files import Row
 from fdi_torch.tables import needed
+from fdi_torch.untrusted_input import MOST_SHEET, MOST_SHEET_EXPANSION, expect_unpacked
 
 _BOOK = "xl/workbook.xml"
 

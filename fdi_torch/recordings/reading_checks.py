@@ -50,7 +50,7 @@ def _on_change(name: str, values: Tensor, time: Tensor, unit: str) -> Iterator[C
     if irregular and least_step > 0.0 and usual < ALIKE * least_step and least_step > FINER * resolution(values):
         text = (
             f"seems to be logged on change, when it has moved by {_shown(least_step, unit)}: readings come early or "
-            "late by as much, which standard errors do not know; where exactness matters log at a fixed rate"
+            "late by as much, which standard errors do not include; log at a fixed rate where accuracy matters"
         )
         yield ChannelFinding("on change", name, text, {"step": least_step})
 

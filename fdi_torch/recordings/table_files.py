@@ -17,7 +17,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.outside import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, expect_unpacked
+from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, expect_unpacked
 
 Row = Sequence[object]
 DELIMITER = "\t"

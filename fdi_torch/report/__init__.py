@@ -1,5 +1,5 @@
-"""Figures, and the page that shows a run. The only importer of matplotlib.
+"""Figures, and the report page of a run. The only room that imports matplotlib.
 
-A page is made from a log alone: each section draws what the log holds and is left out where it holds nothing of it, so
-one frame serves every kind of run. `predictions` and `sections/gap` say which optional arrays are drawn.
+A page is made from a log alone: each section draws its part of the log and is left out if the log has none, so that one
+frame serves every kind of run. `predictions` and `sections/gap` list the optional arrays.
 """

@@ -1,4 +1,4 @@
-"""Pictures of a blind benchmark: shares with their intervals, what was named for what, how sure it was."""
+"""Figures of a blind benchmark: shares of right answers with intervals, confusion matrix, calibration."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def shares_panel(
     """Share of right answers of each kind with its interval, and small marks for the baselines."""
     figure, axes = panel(short(title), "right answers, %", "", height=1.1 + 0.3 * len(kinds))
     rows = np.arange(len(kinds))
-    for (name, found), colour, mark in zip(others.items(), (OTHER, SOFT, INK, MARK), "dx+^", strict=False):
-        at = [_share(s) if s else np.nan for s in found]
-        axes.plot(100 * np.array(at), rows, mark, color=colour, ms=5, label=short(name, 20).replace("_", " "))
+    for (name, shares), colour, mark in zip(others.items(), (OTHER, SOFT, INK, MARK), "dx+^", strict=False):
+        x = [_share(s) if s else np.nan for s in shares]
+        axes.plot(100 * np.array(x), rows, mark, color=colour, ms=5, label=short(name, 20).replace("_", " "))
     low, middle, high = (100 * np.array([pick(s) for s in own]) for pick in (_low, _share, _high))
     axes.hlines(rows, low, high, color=MODEL, lw=2.0, alpha=0.5)
     axes.plot(middle, rows, "o", color=MODEL, ms=6, label="fdi")
@@ -36,7 +36,7 @@ def shares_panel(
 
 
 def confusion_panel(title: str, rows: Sequence[str], columns: Sequence[str], counts: np.ndarray) -> Figure:
-    """counts (rows, columns): what was there against what was answered; blue where a row's name is its column's."""
+    """Counts (rows, columns) of the true cause against the answer; right answers are blue."""
     figure, axes = panel(short(title), "", "", height=1.35 + 0.27 * len(rows))
     for i, j in np.argwhere(counts > 0):
         right = rows[i] == columns[j] or columns[j] == "unknown, there"
@@ -51,8 +51,8 @@ def confusion_panel(title: str, rows: Sequence[str], columns: Sequence[str], cou
 
 
 def calibration_panel(title: str, bins: Sequence[Mapping[str, Any]]) -> Figure:
-    """How often the best explanation was true, beside the probability it was given, which is the orange mark."""
-    figure, axes = panel(short(title), "probability given to the best explanation", "is the true one, %")
+    """Frequency with which the best explanation was true, against its stated probability (orange mark)."""
+    figure, axes = panel(short(title), "stated probability of the best explanation", "it was true, %")
     at = np.arange(len(bins))
     low, middle, high = (100 * np.array([pick(b) for b in bins]) for pick in (_low, _share, _high))
     axes.vlines(at, low, high, color=MODEL, lw=2.0, alpha=0.5)

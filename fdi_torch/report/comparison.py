@@ -1,4 +1,4 @@
-"""Runs side by side on a page: only what differs, whether results agree, convergence and residuals over one another."""
+"""Comparison of runs on a page: differences, agreement of results, and their convergence and residuals together."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CURVES = {
 
 
 def comparison_section(compared: Comparison, runs: Sequence[Material]) -> Section:
-    """runs: in the order that they were compared in."""
+    """The section about all runs, given in the order of the comparison."""
     blocks: list[Any] = [tag("p", sentence) for sentence in in_words(compared)]
     if compared.results:
         header = ["parameter", "unit", *compared.labels, "p", "agree"]
@@ -40,11 +40,11 @@ def comparison_section(compared: Comparison, runs: Sequence[Material]) -> Sectio
 
 
 def in_words(compared: Comparison) -> list[str]:
-    """What the comparison comes to, one sentence each."""
+    """The result of the comparison, one sentence each."""
     if compared.same_content:
-        return ["All logs say the same, message by message."]
+        return ["All logs have the same content, message by message."]
     differing = ", ".join(compared.differences)
-    words = [f"What differs: {differing}." if differing else "Configuration, versions and data are the same."]
+    words = [f"Differences in: {differing}." if differing else "Configuration, versions and data are the same."]
     apart = [result.name for result in compared.results if result.agree is False]
     if any(result.agree is not None for result in compared.results):
         words.append(f"At 95 % these differ: {', '.join(apart)}." if apart else "At 95 % the results agree.")
@@ -54,7 +54,7 @@ def in_words(compared: Comparison) -> list[str]:
 
 
 def result_rows(compared: Comparison) -> list[list[str]]:
-    """Parameter, unit, value with error of each run, p-value, and whether they agree."""
+    """Rows with parameter, unit, value and error of each run, p-value, and agreement."""
     verdicts = {True: "yes", False: "no", None: ""}
     rows = []
     for result in compared.results:
@@ -65,7 +65,7 @@ def result_rows(compared: Comparison) -> list[list[str]]:
 
 
 def _convergence(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
-    """One line a run; of several problems or starts the first."""
+    """Cost of each run; with several problems or starts, that of the first."""
     pictures = []
     for k, (topic, (title, step, field)) in enumerate(CURVES.items()):
         if sum(bool(run.counts.get(topic)) for run in runs) < 2:
@@ -73,25 +73,25 @@ def _convergence(compared: Comparison, runs: Sequence[Material]) -> list[Picture
         steps, costs = align([run.run.path for run in runs], topic, field, {"problem": 0})
         lines: list[Line] = []
         for label, cost, colour in zip(compared.labels, costs, COLOURS, strict=False):
-            told = np.isfinite(cost)
-            lines.append((label, steps[told], cost[told], colour))
+            present = np.isfinite(cost)
+            lines.append((label, steps[present], cost[present], colour))
         pictures.append(Picture(f"compare_cost_{k + 1}", line_panel(title, step, "cost", lines, log=True)))
     return pictures
 
 
 def _residuals(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
-    """What is left of each sensor's readings, of the runs that tell what they predict."""
+    """Residuals of each sensor, for the runs whose log has predictions."""
     lines: dict[tuple[str, str], list[Line]] = {}
     for label, run, colour in zip(compared.labels, runs, COLOURS, strict=False):
         recording = run.recordings[0] if run.groups else None
-        said = predicted(run.arrays, 0, len(run.groups) > 1, recording.outputs.shape) if recording else None
-        if recording is None or said is None:
+        model = predicted(run.arrays, 0, len(run.groups) > 1, recording.outputs.shape) if recording else None
+        if recording is None or model is None:
             continue
-        left = np.where(recording.mask, recording.outputs - said, np.nan)
+        residual = np.where(recording.mask, recording.outputs - model, np.nan)
         for i, name in enumerate(recording.output_names):
             unit, scale = shown_unit(recording.output_units[i])
-            lines.setdefault((name, unit), []).append((label, recording.time, scale * left[:, i], colour))
+            lines.setdefault((name, unit), []).append((label, recording.time, scale * residual[:, i], colour))
     return [
-        Picture(f"compare_residual_{k + 1}", line_panel(name, "time, s", axis("read − estimate", unit), own))
-        for k, ((name, unit), own) in enumerate(lines.items())
+        Picture(f"compare_residual_{k + 1}", line_panel(name, "time, s", axis("read − estimate", unit), sensor_lines))
+        for k, ((name, unit), sensor_lines) in enumerate(lines.items())
     ]

@@ -1,4 +1,4 @@
-"""The picture of a fit: what was read, what the estimate predicts, and what is left."""
+"""Figure of a fit: readings, prediction and residual of each sensor."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from fdi_torch.recording import Recording
-from fdi_torch.report.curves import thinned
+from fdi_torch.report.downsampling import thinned
 from fdi_torch.report.html import short
 from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.style import MODEL, SOFT, label_lines, save, styled
@@ -18,7 +18,7 @@ __all__ = ["fit_figure", "save"]
 
 
 def fit_figure(recording: Recording, predicted: Tensor, title: str) -> Figure:
-    """Readings against prediction above, what is left below, one column a sensor. predicted (T, N) in SI."""
+    """Readings and prediction above, residual below, one column per sensor. predicted (T, N) in SI."""
     count = len(recording.output_names)
     with styled():
         figure = Figure(figsize=(max(4.2 * count, 6.0), 5.2), layout="constrained")
@@ -34,12 +34,12 @@ def _draw_sensor(upper: Axes, lower: Axes, recording: Recording, predicted: Tens
     unit, scale = shown_unit(recording.output_units[i])
     counted, outputs = recording.mask[:, i].cpu().numpy(), recording.outputs[:, i].cpu().numpy()
     read = scale * np.where(counted, outputs, np.nan)
-    said = scale * predicted[:, i].detach().cpu().numpy()
+    model = scale * predicted[:, i].detach().cpu().numpy()
     time = recording.time.cpu().numpy()
     upper.plot(*thinned(time, read), color=SOFT, lw=0.9, label="read")
-    upper.plot(*thinned(time, said), color=MODEL, label="estimate")
+    upper.plot(*thinned(time, model), color=MODEL, label="estimate")
     lower.axhline(0.0, color=SOFT, lw=0.7)
-    lower.plot(*thinned(time, read - said), color=MODEL, lw=0.7)
+    lower.plot(*thinned(time, read - model), color=MODEL, lw=0.7)
     upper.set_title(short(recording.output_names[i]))
     upper.set_ylabel(axis("reading", unit))
     lower.set_ylabel(axis("read − estimate", unit))

@@ -1,4 +1,4 @@
-"""The picture of free runs: what was read, what one or two plant files predict from the first samples, what is left."""
+"""Figure of free runs: readings, predictions of one or two plant files, and their errors."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from fdi_torch.recording import Recording
-from fdi_torch.report.curves import thinned
+from fdi_torch.report.downsampling import thinned
 from fdi_torch.report.html import short
 from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, styled
 
 
 def free_run_figure(recording: Recording, columns: list[str], runs: Mapping[str, Tensor], title: str) -> Figure:
-    """One column a sensor (`columns`: its output in the recording). runs: predicted readings (T, N) in SI by the name
-    of the plant, the better one last.
+    """One column per sensor (`columns`: its output in the recording).
+
+    runs: predicted readings (T, N) in SI by plant name, the better plant last.
     """
     count = len(columns)
     with styled():
@@ -27,8 +28,8 @@ def free_run_figure(recording: Recording, columns: list[str], runs: Mapping[str,
         FigureCanvasAgg(figure)
         axes = figure.subplots(2, count, sharex=True, squeeze=False, height_ratios=(2, 1))
         for i, column in enumerate(columns):
-            said = {name: predicted[:, i] for name, predicted in runs.items()}
-            _draw(axes[0, i], axes[1, i], recording, recording.output_names.index(column), said)
+            predictions = {name: predicted[:, i] for name, predicted in runs.items()}
+            _draw(axes[0, i], axes[1, i], recording, recording.output_names.index(column), predictions)
         figure.suptitle(short(title, 100))
     return figure
 
@@ -41,9 +42,9 @@ def _draw(upper: Axes, lower: Axes, recording: Recording, i: int, runs: Mapping[
     upper.plot(*thinned(time, read), color=SOFT, lw=2.0, label="read")
     lower.axhline(0.0, color=SOFT, lw=0.7)
     for (name, predicted), color in zip(runs.items(), (MARK, MODEL)[-len(runs) :], strict=True):
-        said = scale * predicted.detach().cpu().numpy()
-        upper.plot(*thinned(time, said), color=color, lw=1.0, label=name)
-        lower.plot(*thinned(time, read - said), color=color, lw=0.8)
+        model = scale * predicted.detach().cpu().numpy()
+        upper.plot(*thinned(time, model), color=color, lw=1.0, label=name)
+        lower.plot(*thinned(time, read - model), color=color, lw=0.8)
     upper.set_title(short(recording.output_names[i]), loc="left")
     upper.set_ylabel(axis("reading", unit))
     lower.set_ylabel(axis("read − run", unit))

@@ -1,4 +1,4 @@
-"""HTML in which everything is escaped unless it was built here: a tank named `<script>` is a tank named so."""
+"""HTML elements with everything escaped that was not built here, so that names from files cannot inject markup."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff\u20
 
 
 class Markup(str):
-    """HTML that may stand on a page as it is."""
+    """HTML that needs no escaping."""
 
     __slots__ = ()
 
 
 def clean(text: Any) -> str:
-    """Text without characters that control terminals, files or the direction of writing."""
+    """Text without control characters and characters that change the writing direction."""
     return _CONTROL.sub("\N{REPLACEMENT CHARACTER}", str(text))
 
 
@@ -31,12 +31,12 @@ def short(text: Any, most: int = 40) -> str:
 
 
 def escape(content: Any) -> Markup:
-    """Text as HTML; markup stays what it is."""
+    """Text as HTML; markup is unchanged."""
     return content if isinstance(content, Markup) else Markup(html.escape(clean(content)))
 
 
 def tag(name: str, *content: Any, **attributes: str) -> Markup:
-    """An element; `class_` and `for_` name attributes that Python does not allow."""
+    """An element; write `class_` and `for_` for attributes that are Python keywords."""
     written = "".join(f' {key.rstrip("_").replace("_", "-")}="{escape(value)}"' for key, value in attributes.items())
     return Markup(f"<{name}{written}>{''.join(escape(part) for part in content)}</{name}>")
 
@@ -46,9 +46,9 @@ def join(parts: Sequence[Any], between: str = "") -> Markup:
 
 
 def table(header: Sequence[Any], rows: Sequence[Sequence[Any]], left: int = 1) -> Markup:
-    """Rows under a header, the first `left` columns flush left; very long tables are cut, and say so.
+    """A table whose first `left` columns are left-aligned; very long tables are cut, with a note.
 
-    One of more than NARROW columns is `wide`: a phone shows its rows as cards, each cell beside its `data-label`.
+    A table of more than NARROW columns is `wide`: on a phone its rows become cards, each cell with its `data-label`.
     """
     labels = [_TAGS.sub("", name) if isinstance(name, Markup) else clean(name) for name in header]
     sides = ["l" if i < left else "r" for i in range(len(header))]
@@ -57,17 +57,17 @@ def table(header: Sequence[Any], rows: Sequence[Sequence[Any]], left: int = 1) -
         tag("tr", *(tag("td", c, class_=s, data_label=n) for c, s, n in zip(row, sides, labels, strict=True)))
         for row in rows[:MOST_ROWS]
     ]
-    cut = [] if len(rows) <= MOST_ROWS else [tag("p", f"and {len(rows) - MOST_ROWS} rows more", class_="note")]
+    cut = [] if len(rows) <= MOST_ROWS else [tag("p", f"and {len(rows) - MOST_ROWS} more rows", class_="note")]
     width = {"class_": "wide"} if len(header) > NARROW else {}
     return join([tag("div", tag("table", tag("thead", head), tag("tbody", *shown), **width), class_="scroll"), *cut])
 
 
 def pairs(entries: Sequence[tuple[Any, Any]]) -> Markup:
-    """Names and values, one pair a line."""
+    """A list of names and values."""
     rows = (tag("div", tag("dt", name), tag("dd", value)) for name, value in entries[:MOST_ROWS])
     return tag("dl", *rows)
 
 
 def folded(summary: str, *content: Any) -> Markup:
-    """Content that opens on request; printed pages show it open."""
+    """Content that opens on click; it is open in print."""
     return tag("details", tag("summary", summary), *content)

@@ -1,4 +1,4 @@
-"""What a log holds, read once for all sections of the page. The file is untrusted input."""
+"""Content of a log, read once for all sections of the page. The file is untrusted input."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fdi_torch.gap.verdict_words import FORMAT_1
 from fdi_torch.logbook import Inspection, LogError, Run, Signals, arrays, inspect_log, own_signals, series
 from fdi_torch.plant.description import PlantDescription
 
-# Signals and the search's populations are read as arrays, or not at all.
+# Only these topics are kept as messages; signals and search populations are read as arrays when needed.
 EVENTS = (
     "/plant/truth",
     "/observer/alarm",
@@ -34,9 +34,8 @@ Payload = dict[str, Any]
 
 @dataclass
 class Material:
-    """One run. events: topic -> messages in order. units: topic -> field -> SI unit. counts: messages of every topic.
-
-    plant: as the log's configuration describes it, None where it does not. trouble: what could not be read, in words.
+    """Content of one log. events: topic -> messages in order. units: topic -> field -> SI unit. counts: messages of
+    every topic. plant: from the log's configuration, None if it has none. trouble: what could not be read.
     """
 
     run: Run
@@ -51,12 +50,12 @@ class Material:
         return self.run.metadata.get(f"fdi_torch.{record}", {})
 
     def listed(self, name: str) -> list[Any]:
-        """A list of the run's result; empty where there is none, or none that can be read."""
+        """A list in the run's result; empty if it is missing or unreadable."""
         try:
-            found = orjson.loads(self.about("result").get(name, "[]"))
+            value = orjson.loads(self.about("result").get(name, "[]"))
         except ValueError:
             return []
-        return found if isinstance(found, list) else []
+        return value if isinstance(value, list) else []
 
     @property
     def kind(self) -> str:
@@ -74,9 +73,9 @@ class Material:
 
     @cached_property
     def groups(self) -> list[str]:
-        """Names of the recordings in the log; "" where there is one."""
-        found = [topic.split("/") for topic in self.counts if topic.startswith("/plant/") and topic.endswith("/output")]
-        return ["/".join(parts[2:-1]) for parts in found]
+        """Names of the recordings in the log; "" if there is only one."""
+        paths = [topic.split("/") for topic in self.counts if topic.startswith("/plant/") and topic.endswith("/output")]
+        return ["/".join(parts[2:-1]) for parts in paths]
 
     @cached_property
     def recordings(self) -> list[Signals]:
@@ -84,7 +83,7 @@ class Material:
 
     @cached_property
     def arrays(self) -> dict[str, np.ndarray]:
-        """The run's result arrays; none where there are none, or none that can be read."""
+        """The run's result arrays; empty if they are missing or unreadable."""
         if "results.npz" not in self.run.attachments:
             return {}
         try:
@@ -95,40 +94,40 @@ class Material:
 
     @cached_property
     def residuals(self) -> dict[str, np.ndarray]:
-        """Columns of the observer's residual over time; none where nothing observed."""
+        """Columns of the observer's residual over time; empty without an observer."""
         return series(self.run, "/observer/residual") if self.counts.get("/observer/residual") else {}
 
     @cached_property
     def truth(self) -> dict[str, float]:
-        """What was simulated, by parameter: the first message of the truth, SI."""
+        """Simulated values by parameter, SI."""
         first = next(iter(self.of("/plant/truth")), {})
         return {name: float(value) for name, value in first.items() if name != "t" and isinstance(value, int | float)}
 
     @cached_property
     def answer(self) -> Payload:
-        """The answer of a gap diagnosis; empty where there is none."""
+        """The answer of a gap diagnosis; empty if there is none."""
         text = next((message.get("answer", "") for message in reversed(self.of("/gap/verdict"))), "")
         if not text:
             return {}
         try:
-            found = orjson.loads(text)
+            answer = orjson.loads(text)
         except ValueError:
-            found = None
-        if not isinstance(found, dict):
-            self.trouble.append("/gap/verdict: the answer is no JSON object")
+            answer = None
+        if not isinstance(answer, dict):
+            self.trouble.append("/gap/verdict: the answer is not a JSON object")
             return {}
-        return found
+        return answer
 
     @property
     def meaning_of_shares(self) -> str:
-        """What the number beside each place of a gap diagnosis is; in format 1 of its answer it was another one."""
+        """Meaning of the number at each location of a gap diagnosis, which differs in format 1."""
         if self.answer.get("format") == FORMAT_1:
             return "share of the gap that a free discrepancy there alone closes"
         return "probability that something is wrong there"
 
 
 def gather(run: Run, plant: PlantDescription | None = None) -> Material:
-    """Reads a log, best opened with `salvage`, so that a damaged one shows what is whole."""
+    """Read a log, ideally opened with `salvage`, so that the intact part of a damaged log is shown."""
     material = Material(run, plant)
     for message in run.messages():
         topic = message.topic

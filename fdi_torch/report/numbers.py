@@ -1,4 +1,4 @@
-"""Numbers and units as people read them."""
+"""Numbers and units as text for people."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def shown_unit(si_unit: str) -> tuple[str, float]:
-    """'m^3/s' -> ('cm³/s', 1e6): the unit on an axis and how many of it one SI unit is; unknown units stay."""
+    """'m^3/s' -> ('cm³/s', 1e6): display unit and scale factor from SI; unknown units are unchanged."""
     try:
         unit, scale = display_unit(si_unit)
     except ValueError:
@@ -28,19 +28,19 @@ def raised(unit: str) -> str:
 
 
 def axis(name: str, unit: str) -> str:
-    """'level, cm': what stands on an axis."""
+    """'level, cm': label of an axis."""
     return f"{name}, {unit}" if unit else name
 
 
 def number(value: float, digits: int = 4) -> str:
-    """A number with some significant digits; a dash where there is none."""
+    """A number with the given significant digits; a dash for NaN."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
     return _minus(f"{value:.{digits}g}")
 
 
 def with_error(value: float, std: float) -> str:
-    """'0.3000 ± 0.0020': the error with two digits, the value as far as the error lets one read it."""
+    """'0.3000 ± 0.0020': the error with two digits, the value with as many decimals."""
     if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
         return number(value)
     digits = min(max(1 - math.floor(math.log10(std)), 0), 12)

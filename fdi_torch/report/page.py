@@ -1,4 +1,4 @@
-"""The page: every run's verdict in words first, then its sections; one file, no network, no scripts."""
+"""The report page: each run's verdict, then its sections, in one file without network access or scripts."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from fdi_torch.report.style import save
 from fdi_torch.report.stylesheet import STYLESHEET
 from fdi_torch.report.verdict import headline, how_it_ended, kind_words
 
-# Should anything slip through the escaping, the browser still loads and runs nothing.
+# Even if something passed the escaping, the browser would load and run nothing.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 
 
 @dataclass(frozen=True)
 class RunReport:
-    """A run as it stands on the page."""
+    """A run with its sections."""
 
     material: Material
     sections: tuple[Section, ...]
@@ -31,13 +31,13 @@ class RunReport:
 
 
 def report_of(material: Material, makers: Sequence[Maker] = SECTIONS) -> RunReport:
-    """All sections that the log has something for. What a log says wrongly costs its section, not the page."""
+    """All sections for which the log has content. An error in a log affects its section only."""
     made = (_made(maker, material) for maker in makers)
     return RunReport(material, tuple(section for section in made if section is not None))
 
 
 def page(reports: Sequence[RunReport], first: Sequence[Section] = ()) -> str:
-    """The whole page. first: sections about all runs together, such as their comparison."""
+    """The complete page. first: sections about all runs, such as their comparison."""
     title = " · ".join(report.material.run.path.stem for report in reports[:4])
     articles = [*(section_html(section, "all-") for section in first)]
     articles += [_article(report, f"r{k}-") for k, report in enumerate(reports)]
@@ -53,7 +53,7 @@ def page(reports: Sequence[RunReport], first: Sequence[Section] = ()) -> str:
 
 
 def write_pictures(report: RunReport, folder: Path) -> list[Path]:
-    """Every picture as PNG and as SVG."""
+    """Write every picture as PNG and SVG."""
     return [save(p.figure, folder / f"{p.name}{ending}") for p in report.pictures for ending in (".png", ".svg")]
 
 
@@ -73,5 +73,5 @@ def _made(maker: Maker, material: Material) -> Section | None:
 
 
 def _reason(error: Exception) -> str:
-    """What went wrong, in words."""
+    """The error as text."""
     return f"{type(error).__name__}: {error}" if not isinstance(error, OSError) else str(error)

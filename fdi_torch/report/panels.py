@@ -1,4 +1,4 @@
-"""The panels that several sections share: signals over time, costs over steps."""
+"""Panels that several sections share: lines, residuals, bars, confidence ellipses."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from fdi_torch.report.curves import thinned
+from fdi_torch.report.downsampling import thinned
 from fdi_torch.report.html import short
 from fdi_torch.report.style import INK, MARK, MODEL, OTHER, SOFT, label_lines, logarithmic, panel
 
@@ -15,7 +15,7 @@ Line = tuple[str, np.ndarray, np.ndarray, str]  # name, x, y, colour
 
 
 def line_panel(title: str, x_label: str, y_label: str, lines: Sequence[Line], log: bool = False) -> Figure:
-    """Lines over a common axis, named in their colours where there are several. log: if all of y is positive."""
+    """Lines over a common axis, labelled in their colours if there are several. log: use it if all y are positive."""
     figure, axes = panel(short(title), short(x_label), short(y_label, 60))
     for name, x, y, colour in lines:
         shown_x, shown_y = thinned(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
@@ -37,7 +37,7 @@ def residual_panel(
     thresholds: Sequence[np.ndarray] = (),
     events: Sequence[float] = (),
 ) -> Figure:
-    """A residual over time (T,), with its thresholds (T,) and the times of alarms where there are any."""
+    """A residual over time (T,), with thresholds (T,) and alarm times."""
     figure, axes = panel(short(title), "time, s", short(y_label, 60), height=2.1)
     axes.axhline(0.0, color=SOFT, lw=0.7)
     axes.plot(*thinned(time, residual), color=MODEL, lw=0.8, label="residual")
@@ -56,7 +56,7 @@ def bar_panel(
     texts: Sequence[str],
     strong: Sequence[bool],
 ) -> Figure:
-    """Horizontal bars from the top, each with its number at its end; strong ones in the colour of what deviates."""
+    """Horizontal bars from the top, each with its value at the end; `strong` ones are highlighted."""
     height = max(1.2, 0.75 + 0.29 * len(names))
     figure, axes = panel(short(title), short(x_label), "", height=height)
     rows = list(range(len(names)))
@@ -79,7 +79,7 @@ def ellipse_panel(
     covariance: np.ndarray,
     truth: tuple[float, float] | None = None,
 ) -> Figure:
-    """Confidence regions of two parameters at 50 % and 95 % (chi^2 with two degrees of freedom), and the truth."""
+    """50 % and 95 % confidence regions of two parameters (chi^2 with two degrees of freedom), and the true values."""
     labels = [f"{short(n, 26)}{', ' + u if u else ''}" for n, u in zip(names, units, strict=True)]
     figure, axes = panel("", labels[0], labels[1], width=3.6, height=3.0)
     values, vectors = np.linalg.eigh(covariance)

@@ -1,4 +1,4 @@
-"""The figures of the paper, drawn from arrays."""
+"""The figures of the 2020 paper, drawn from arrays."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from fdi_torch.report.curves import thinned
+from fdi_torch.report.downsampling import thinned
 from fdi_torch.report.style import FAINT, INK, MARK, MODEL, OTHER, SOFT, label_lines, panel, styled
 
 _FIVE = (MODEL, MARK, OTHER, INK, SOFT)
 
 
-def correlation_figure(snr: np.ndarray, found: np.ndarray, law_snr: np.ndarray, law: np.ndarray) -> Figure:
-    """Figure 3: the sum of correlations at the estimate against SNR (dB), and what noise alone leaves of it."""
+def correlation_figure(snr: np.ndarray, sums: np.ndarray, law_snr: np.ndarray, law: np.ndarray) -> Figure:
+    """Figure 3: the sum of correlations at the estimate over SNR (dB), and its expected value under noise."""
     figure, axes = panel("Correlation against noise", "SNR, dB", "sum of correlations", 6.0, 3.2)
     axes.plot(law_snr, law, color=SOFT, label="3 / √(1 + 10^(−SNR/10))")
-    axes.plot(snr, found, "o", color=MODEL, label="at the estimate")
+    axes.plot(snr, sums, "o", color=MODEL, label="at the estimate")
     label_lines(axes)
     return figure
 
@@ -40,13 +40,13 @@ def convergence_figure(
     return figure
 
 
-def outputs_figure(time: np.ndarray, read: np.ndarray, said: np.ndarray, changes: Sequence[float]) -> Figure:
-    """Figure 6: readings and estimated outputs (S, C) in cm, one panel an output; changes: times of faults, s."""
+def outputs_figure(time: np.ndarray, read: np.ndarray, estimate: np.ndarray, changes: Sequence[float]) -> Figure:
+    """Figure 6: readings and estimated outputs (S, C) in cm, one panel per output. changes: onset times, s."""
     figure, panels = _stack(read.shape[1], "Outputs and their estimate")
     for i, axes in enumerate(panels):
         _mark(axes, changes)
         axes.plot(*thinned(time, read[:, i]), color=SOFT, lw=2.4, label="read")
-        axes.plot(*thinned(time, said[:, i]), color=MODEL, lw=1.0, label="estimate")
+        axes.plot(*thinned(time, estimate[:, i]), color=MODEL, lw=1.0, label="estimate")
         axes.set_ylabel(f"h{i + 1}, cm")
     label_lines(panels[0])
     return figure
@@ -60,7 +60,7 @@ def residuals_figure(
     changes: Sequence[float],
     alarms: Sequence[float],
 ) -> Figure:
-    """Figure 7: residuals (S, C) in cm of the observer with nominal parameters, of the one that is fed back, and of the
+    """Figure 7: residuals (S, C) in cm of the observer with nominal parameters, of the adaptive observer, and of the
     model fitted to each window.
     """
     figure, panels = _stack(nominal.shape[1], "Residuals of the observers")
@@ -77,8 +77,8 @@ def residuals_figure(
 
 
 def confusion_figure(counts: np.ndarray, rows: Sequence[str], columns: Sequence[str]) -> Figure:
-    """Shares of each row's draws (M, M + 1) as a heat map: modes simulated against modes said."""
-    figure, axes = panel("Fault modes: simulated against said", "said", "simulated", 8.0, 7.4)
+    """Share of each row's draws (M, M + 1) as a heat map: simulated against stated modes."""
+    figure, axes = panel("Fault modes: simulated against stated", "stated", "simulated", 8.0, 7.4)
     with styled():
         share = counts / counts.sum(axis=1, keepdims=True)
         shown = axes.imshow(
@@ -93,7 +93,7 @@ def confusion_figure(counts: np.ndarray, rows: Sequence[str], columns: Sequence[
 
 
 def _stack(count: int, title: str) -> tuple[Figure, list[Axes]]:
-    """One panel above the other on one clock."""
+    """Panels above each other with a common time axis."""
     with styled():
         figure = Figure(figsize=(7.5, 1.7 * count + 0.6), layout="constrained")
         FigureCanvasAgg(figure)

@@ -1,4 +1,4 @@
-"""The rig as a drawing: tanks with their levels, pipes, pumps and sensors, and on them what a diagnosis says."""
+"""Drawing of the rig: tanks with their levels, pipes, pumps and sensors, with the diagnosis on them."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.report.html import short
-from fdi_torch.report.layout import tank_places
+from fdi_torch.report.rig_layout import tank_places
 from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
 
 INCH = 0.8  # per unit of the drawing; a tank is one unit wide
 TALL = 1.4
 COLUMN, ROW = 1.95, 3.1
-LETTER = 0.1  # at most, of a word beside a sensor
-LINE, WITHIN = 0.2, 9  # height of a line; letters of a line within a tank
+LETTER = 0.1  # largest width of a letter beside a sensor
+LINE, WITHIN = 0.2, 9  # height of a line; letters per line within a tank
 Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Overlay:
-    """What is drawn on the rig. levels: tank -> m. marks: location -> words on a guilty component. heat: location ->
-    how sure it is that something is wrong there, 0 to 1, as strength of colour."""
+    """The diagnosis to draw. levels: tank -> m. marks: location -> texts of diagnosed effects. probabilities: location
+    -> probability of a discrepancy there (0 to 1), drawn as strength of colour.
+    """
 
     levels: Mapping[str, float] = field(default_factory=dict)
     marks: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    heat: Mapping[str, float] = field(default_factory=dict)
+    probabilities: Mapping[str, float] = field(default_factory=dict)
 
 
 def schematic(plant: PlantDescription, overlay: Overlay | None = None) -> Figure:
-    """The whole rig; sizes are not to scale, levels are, between floor and rim."""
+    """The complete rig; sizes are not to scale, but levels are, between floor and rim."""
     drawing = _Drawing(plant, overlay or Overlay())
     with styled():
         drawing.draw()
@@ -51,11 +52,11 @@ class _Drawing:
         self.crossings = 0
         rows = 1 + max(row for row, _ in self.places.values())
         columns = 1 + max(column for _, column in self.places.values())
-        longest = max((len(words) for name in plant.locations() for words in self.said(name)), default=0)
+        longest = max((len(words) for name in plant.locations() for words in self.diagnosis(name)), default=0)
         margin = max(1.0, 0.058 * longest)
-        beside = max((len(w) for s in plant.sensors for w in (short(s.name, 16), *self.said(s.name))), default=0)
+        beside = max((len(w) for s in plant.sensors for w in (short(s.name, 16), *self.diagnosis(s.name))), default=0)
         left, right = -margin, (columns - 1) * COLUMN + max(margin, 0.8 + LETTER * beside)
-        words = 0.2 * max((len(self.said(name)) for name in plant.locations()), default=0)
+        words = 0.2 * max((len(self.diagnosis(name)) for name in plant.locations()), default=0)
         bottom, top = -(rows - 1) * ROW - 0.85 - words, TALL + 1.05 + words
         self.figure = Figure(figsize=((right - left) * INCH, (top - bottom) * INCH))
         FigureCanvasAgg(self.figure)
@@ -67,7 +68,7 @@ class _Drawing:
     def draw(self) -> None:
         for tank in self.plant.tanks:
             self.overflow(tank)
-        for location in (*self.overlay.marks, *self.overlay.heat):
+        for location in (*self.overlay.marks, *self.overlay.probabilities):
             self.pair(location)
         for pipe in self.plant.pipes:
             self.pipe(pipe)
@@ -86,22 +87,22 @@ class _Drawing:
     def colour(self, name: str, plain: str = INK) -> str:
         return MARK if name in self.overlay.marks else plain
 
-    def said(self, name: str) -> list[str]:
-        """What the diagnosis says of a component."""
-        share = self.overlay.heat.get(name, 0.0)
+    def diagnosis(self, name: str) -> list[str]:
+        """Texts of the diagnosis at a component."""
+        share = self.overlay.probabilities.get(name, 0.0)
         marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
         return [*marks, f"{100 * share:.0f} %"] if share >= 0.005 else marks
 
     def lines(self, name: str, width: int) -> list[tuple[str, str, str]]:
-        """Text, colour and weight of what is written at a component."""
+        """Text, colour and weight of each line at a component."""
         marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
-        shares = self.said(name)[len(marks) :]
+        shares = self.diagnosis(name)[len(marks) :]
         marks = [line for text in marks for line in wrap(text, width, break_long_words=False)]
         lines = [(short(name, 16), INK, "normal"), *((text, MARK, "bold") for text in marks)]
         return [*lines, *((text, INK, "bold") for text in shares)]
 
     def words(self, name: str, point: Point, ha: str, va: str, width: int = 26) -> None:
-        """A component's name, and below it in colour what is wrong with it, in lines of so many letters."""
+        """Write a component's name and below it the diagnosis, in lines of `width` letters."""
         x, y = point
         step = LINE if va == "top" else -LINE
         lines = self.lines(name, width)
@@ -109,20 +110,24 @@ class _Drawing:
             self.axes.text(x, y - k * step, text, ha=ha, va=va, color=colour, weight=weight, fontsize=9.0, zorder=6)
 
     def line(self, name: str, points: Sequence[Point], arrow: bool = False) -> None:
-        """A pipe along points, stressed where it is guilty."""
+        """Draw a pipe along points, highlighted if it has a discrepancy."""
         x, y = np.array(points).T
-        if self.overlay.heat.get(name, 0.0) > 0.0:
-            self.axes.plot(x, y, color=MARK, lw=11, alpha=strength(self.overlay.heat[name]), solid_capstyle="round")
+        if self.overlay.probabilities.get(name, 0.0) > 0.0:
+            self.axes.plot(
+                x, y, color=MARK, lw=11, alpha=strength(self.overlay.probabilities[name]), solid_capstyle="round"
+            )
         self.axes.plot(x, y, color=self.colour(name), lw=2.4 if name in self.overlay.marks else 1.6, zorder=2)
         if arrow:
             self.axes.add_patch(_arrow_head(points[-1], self.colour(name)))
 
     def tank(self, tank: Tank) -> None:
         x, y = self.corner(tank.name)
-        heat = self.overlay.heat.get(tank.name, 0.0)
+        probability = self.overlay.probabilities.get(tank.name, 0.0)
         self.axes.add_patch(Rectangle((x - 0.5, y), 1.0, TALL, facecolor=PAPER, edgecolor="none", zorder=3))
-        if heat > 0.0:
-            fill = Rectangle((x - 0.5, y), 1.0, TALL, facecolor=MARK, alpha=strength(heat), edgecolor="none", zorder=3)
+        if probability > 0.0:
+            fill = Rectangle(
+                (x - 0.5, y), 1.0, TALL, facecolor=MARK, alpha=strength(probability), edgecolor="none", zorder=3
+            )
             self.axes.add_patch(fill)
         level = self.overlay.levels.get(tank.name, float("nan"))
         if np.isfinite(level):
@@ -144,10 +149,10 @@ class _Drawing:
         x += (same.index(pump.name) - (len(same) - 1) / 2) * 0.7 - (0.22 if self.fed_from_above(pump.target) else 0.0)
         centre, radius = (x, y + TALL + 0.55), 0.17
         self.line(pump.name, [(x, centre[1] - radius), (x, y + TALL + 0.06)], arrow=True)
-        heat = self.overlay.heat.get(pump.name, 0.0)
+        probability = self.overlay.probabilities.get(pump.name, 0.0)
         self.axes.add_patch(Circle(centre, radius, facecolor=PAPER, edgecolor=self.colour(pump.name), lw=1.6, zorder=4))
-        if heat > 0.0:
-            self.axes.add_patch(Circle(centre, 1.6 * radius, facecolor=MARK, alpha=strength(heat), zorder=5))
+        if probability > 0.0:
+            self.axes.add_patch(Circle(centre, 1.6 * radius, facecolor=MARK, alpha=strength(probability), zorder=5))
         blade = [(x - 0.1, centre[1] + 0.07), (x + 0.1, centre[1] + 0.07), (x, centre[1] - 0.13)]
         self.axes.add_patch(Polygon(blade, facecolor=self.colour(pump.name), edgecolor="none", zorder=5))
         self.words(pump.name, (x, centre[1] + radius + 0.08), "center", "bottom")
@@ -156,9 +161,9 @@ class _Drawing:
         x, y = self.corner(sensor.tank)
         same = [s.name for s in self.plant.sensors if s.tank == sensor.tank]
         centre = (x + 0.5, y + 0.85 - 0.4 * same.index(sensor.name))
-        heat = self.overlay.heat.get(sensor.name, 0.0)
-        if heat > 0.0:
-            self.axes.add_patch(Circle(centre, 0.2, facecolor=MARK, alpha=strength(heat), zorder=6))
+        probability = self.overlay.probabilities.get(sensor.name, 0.0)
+        if probability > 0.0:
+            self.axes.add_patch(Circle(centre, 0.2, facecolor=MARK, alpha=strength(probability), zorder=6))
         colour = self.colour(sensor.name)
         self.axes.add_patch(Circle(centre, 0.085, facecolor=PAPER, edgecolor=colour, lw=1.6, zorder=7))
         self.words(sensor.name, (centre[0] + 0.15, centre[1] + 0.1), "left", "top")
@@ -200,7 +205,7 @@ class _Drawing:
         return [(x + 0.6 * side, y), (x + 0.6 * side, low), (to_x - 0.6 * side, low), (to_x - 0.6 * side, to_y)]
 
     def valve(self, middle: Point, colour: str, upright: bool) -> None:
-        """A bow tie across the pipe: its opening is measured."""
+        """Draw a bow tie across the pipe: its opening is measured."""
         a, b = np.array([[-0.12, 0.08], [-0.12, -0.08], [0.12, 0.08], [0.12, -0.08]]).T
         x, y = (b, a) if upright else (a, b)
         self.axes.add_patch(
@@ -208,7 +213,7 @@ class _Drawing:
         )
 
     def overflow(self, tank: Tank) -> None:
-        """Dotted: what runs over a rim into another tank."""
+        """Draw the overflow of a tank into another one, dotted."""
         if tank.overflow_to == OUTSIDE:
             return
         (x, y), (to_x, to_y) = self.corner(tank.name), self.corner(tank.overflow_to)
@@ -221,13 +226,13 @@ class _Drawing:
         self.axes.plot(*np.array(path).T, color=SOFT, lw=1.0, ls=":", zorder=1)
 
     def pair(self, location: str) -> None:
-        """An unknown path between two tanks, dashed."""
+        """Draw an unmodelled flow between two tanks, dashed."""
         pairs = {f"{a}-{b}": (a, b) for a, b in self.plant.tank_pairs()}
         if location not in pairs:
             return
         (x, y), (to_x, to_y) = (self.corner(name) for name in pairs[location])
         points = [(x, y + 0.42), (to_x, to_y + 0.42)]
-        alpha = 1.0 if location in self.overlay.marks else strength(self.overlay.heat.get(location, 0.0))
+        alpha = 1.0 if location in self.overlay.marks else strength(self.overlay.probabilities.get(location, 0.0))
         self.axes.plot(*np.array(points).T, color=MARK, lw=1.8, ls="--", alpha=alpha, zorder=1)
         if location in self.overlay.marks:
             self.words(location, ((x + to_x) / 2, (y + to_y) / 2 + 1.3), "center", "top")
@@ -240,7 +245,7 @@ class _Drawing:
 
 
 def strength(share: float) -> float:
-    """Opacity of a place by how sure it is (0 to 1): much stronger for what is certain than for what is likely."""
+    """Opacity of a location by its probability (0 to 1); cubic, so that certain locations stand out."""
     return 0.5 * share**3
 
 

@@ -1,4 +1,4 @@
-"""A section of the page: a title over words, tables and pictures."""
+"""A section of the page: a title with text, tables and pictures."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from fdi_torch.report.html import Markup, clean, escape, join, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.style import inline_svg
 
-REM_PER_INCH = 7.6  # of a wide picture on a wide page; its letters are then as large as the text's
+REM_PER_INCH = 7.6  # width of a wide picture; its text then has the size of the page's text
 
 
 @dataclass(frozen=True)
 class Picture:
-    """name: of its file, without ending. caption: what one sees, in words; also read aloud. wide: takes a whole row."""
+    """name: of its file, without suffix. caption: description, also for screen readers. wide: uses a whole row."""
 
     name: str
     figure: Figure
@@ -26,7 +26,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """blocks: markup, text (a paragraph), or a list of pictures set side by side."""
+    """blocks: markup, text (a paragraph), or a list of pictures in a grid."""
 
     title: str
     blocks: Sequence[Markup | str | Sequence[Picture]]
@@ -40,7 +40,7 @@ Maker = Callable[[Material], "Section | None"]
 
 
 def section_html(section: Section, prefix: str) -> Markup:
-    """prefix: makes the ids of this run's pictures unique on the page."""
+    """The section as HTML. prefix: makes picture ids unique on the page."""
     blocks = []
     for block in section.blocks:
         if isinstance(block, str):

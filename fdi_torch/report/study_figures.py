@@ -1,4 +1,4 @@
-"""Pictures of a noise study: correlation against signal-to-noise ratio, and each parameter's estimates at each."""
+"""Figures of a noise study: correlation over SNR, and the distribution of each parameter's error."""
 
 from __future__ import annotations
 

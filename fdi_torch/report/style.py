@@ -1,5 +1,5 @@
-"""The visual language of all figures: three colours that also the colour-blind tell apart, units on every axis, labels
-above the data; as SVG whose colours follow the page's light or dark theme.
+"""Style of all figures: colours that colour-blind readers can distinguish, units on every axis, labels above the data,
+and SVG whose colours follow the page's light or dark theme.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from matplotlib.ticker import NullFormatter
 
 from fdi_torch.disk import replacing
 
-# What was read is grey, what a model says is blue, what deviates is orange, a second model or the truth is green
+# Readings are grey, models blue, deviations orange, a second model or the truth green
 # (after Okabe & Ito 2008, darkened until text in them has a contrast of 4.5 on white).
 INK, SOFT, FAINT = "#1f2933", "#67727e", "#d3d9e0"
 MODEL, MARK, OTHER = "#0b6cab", "#b84a00", "#0b7558"
@@ -61,14 +61,14 @@ WIDTH, HEIGHT = 4.4, 2.7
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Figures made and saved inside have the house style; a glyph that the font lacks is no reason to speak."""
+    """Context in which figures are made and saved in this style, without warnings about missing glyphs."""
     with matplotlib.rc_context(_SETTINGS), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*missing from.*font")
         yield
 
 
 def panel(title: str, x_label: str, y_label: str, width: float = WIDTH, height: float = HEIGHT) -> tuple[Figure, Axes]:
-    """One small figure with one pair of axes, for a phone and side by side on a desk. width, height in inches."""
+    """A small figure with one pair of axes, sized for phones and grids. width, height in inches."""
     with styled():
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)
@@ -80,16 +80,16 @@ def panel(title: str, x_label: str, y_label: str, width: float = WIDTH, height: 
 
 
 def logarithmic(axes: Axes) -> None:
-    """A vertical axis by decades, in plain numbers."""
+    """Make the vertical axis logarithmic, with plain numbers."""
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(lambda value, place: f"{value:g}")
     low, high = axes.get_ylim()
-    few = high < 30.0 * low  # so few decades that the steps between have to be named too
+    few = high < 30.0 * low  # so few decades that intermediate ticks need labels too
     axes.yaxis.set_minor_formatter((lambda value, place: f"{value:g}") if few else NullFormatter())
 
 
 def label_lines(axes: Axes, columns: int = 4) -> None:
-    """Names of the lines above the plot, each in its line's colour; no box hides data."""
+    """Label the lines above the plot in their colours, so that no box hides data."""
     with styled():
         axes.legend(
             loc="lower right",
@@ -106,7 +106,7 @@ def label_lines(axes: Axes, columns: int = 4) -> None:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Writes the picture as PNG or SVG, by the path's ending; equal figures give equal files."""
+    """Write the picture as PNG or SVG, by the path's suffix; equal figures give equal files."""
     metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
     with styled(), replacing(path) as new:
         figure.savefig(new, dpi=160, metadata=metadata)
@@ -114,7 +114,7 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def inline_svg(figure: Figure, name: str, description: str) -> str:
-    """The figure as an element of a page: colours are the page's variables, ids are unique below `name`."""
+    """The figure as an HTML element: colours are the page's variables, ids are prefixed with `name`."""
     text = io.StringIO()
     with styled():
         figure.savefig(text, format="svg", metadata={"Date": None}, transparent=True)
@@ -130,7 +130,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
 
 
 def _own_ids(svg: str, name: str) -> str:
-    """Ids that something refers to begin with `name`; the others go."""
+    """Prefix the ids that are referenced with `name`, and remove the others."""
     used = set(re.findall(r'(?:url\(#|href="#)([^")]+)', svg))
 
     def renamed(match: re.Match[str]) -> str:

@@ -1,7 +1,7 @@
-"""How the page looks: one column of cards, light or dark as the reader's system is, and on paper.
+"""Stylesheet of the page: one column of cards, light or dark as the reader's system, and for print.
 
-A table that is wider than its card scrolls, with a shadow at the side where there is more of it; on a phone the rows of
-a wide one are cards.
+A table that is wider than its card scrolls, with a shadow at the side that has more; on a phone the rows of a wide one
+are cards.
 """
 
 STYLESHEET = """

@@ -1,14 +1,15 @@
-"""The answer of a run in words, before any picture."""
+"""The result of a run in one sentence, for the top of the page."""
 
 from __future__ import annotations
 
+from fdi_torch.estimate.diagnosis import UNRELIABLE
 from fdi_torch.gap.verdict_words import verdict_sentence
-from fdi_torch.report.findings import Finding, fault_at, findings
+from fdi_torch.report.diagnosed_effects import DiagnosedEffect, diagnosed_effects, fault_at
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
 from fdi_torch.report.sections.rehearsal import rehearsal_tables
 from fdi_torch.report.sections.study import ESTIMATORS
-from fdi_torch.report.windows import told_windows
+from fdi_torch.report.windowed_fit_result import logged_windows
 
 KINDS = {
     "train": "Fault diagnosis",
@@ -17,7 +18,7 @@ KINDS = {
     "study": "Study",
     "gap": "Sim-to-real gap",
     "challenge": "Blind benchmark",
-    "rehearsal": "A monitor tried out",
+    "rehearsal": "Validation of a monitor",
 }
 
 
@@ -26,46 +27,49 @@ def kind_words(material: Material) -> str:
 
 
 def headline(material: Material) -> str:
-    """The verdict; how the run ended where it has none."""
-    said = (
+    """The verdict, or the status of the run if it has none."""
+    sentences = (
         gap_words,
         monitor_words,
-        lambda m: fault_words(findings(m)),
+        lambda m: fault_words(diagnosed_effects(m)),
         alarm_words,
         benchmark_words,
         rehearsal_words,
         study_words,
     )
-    for words in (of(material) for of in (*said, windows_words)):
+    warning = f"{UNRELIABLE}. " if material.about("result").get("explained") == "false" else ""
+    for words in (of(material) for of in (*sentences, windows_words)):
         if words:
-            return words
+            return warning + words
     return material.about("status").get("status", "did not end").replace("_", " ").capitalize()
 
 
-def fault_words(found: list[Finding]) -> str:
-    if not found:
+def fault_words(effects: list[DiagnosedEffect]) -> str:
+    if not effects:
         return ""
-    present = [f.sized for f in found if f.present]
+    present = [f.sized for f in effects if f.present]
     if not present:
         return "No fault found"
     return f"{'Fault' if len(present) == 1 else f'{len(present)} faults'}: {_listed(present)}"
 
 
 def gap_words(material: Material) -> str:
-    """The terminal's sentence, with the sizes of what is named."""
-    sized = _listed([finding.sized for finding in findings(material)])
+    """The sentence of the terminal, with the sizes of the named causes."""
+    sized = _listed([finding.sized for finding in diagnosed_effects(material)])
     return verdict_sentence(material.answer, sized).removesuffix(".")
 
 
 def monitor_words(material: Material) -> str:
-    """What is open of each alarm, with every explanation above 5 %, as the last event about it says."""
+    """The explanations above 5 % of each open alarm, from the last event about it, and the recovered faults."""
     if material.kind != "monitor":
         return ""
     last = {m["alarm"]: m for m in material.of("/observer/alarm") if m.get("alarm") and m.get("headline")}
     states = {m["alarm"]: str(m.get("state", "")) for m in material.of("/observer/alarm") if m.get("alarm")}
-    told = [f"{m['headline']} ({states[n]})" for n, m in last.items() if states[n] not in ("recovered", "retired")]
+    still_open = [
+        f"{m['headline']} ({states[n]})" for n, m in last.items() if states[n] not in ("recovered", "retired")
+    ]
     ended = [f"{m['headline']}" for n, m in last.items() if states[n] == "recovered"]
-    parts = [_listed(told)] if told else []
+    parts = [_listed(still_open)] if still_open else []
     parts += [f"recovered: {_listed(ended)}"] if ended else []
     return "; ".join(parts)
 
@@ -86,43 +90,43 @@ def benchmark_words(material: Material) -> str:
     if not answers:
         return ""
     right, wrong = (sum(bool(m.get(name)) for m in answers) for name in ("right", "named_wrong"))
-    return f"{right} of {len(answers)} hidden causes told right, {wrong or 'none'} named and wrong"
+    return f"{right} of {len(answers)} hidden causes diagnosed correctly, {wrong or 'none'} named wrongly"
 
 
 def rehearsal_words(material: Material) -> str:
-    """What its tables come to; without a result what was tried, for pieces are grouped under their rehearsal's name."""
+    """The summaries of its tables; without a result, the names of the plans."""
     tables = rehearsal_tables(material)
-    if any(told.get("said") for told in tables):
-        words = "; ".join(str(told["said"]) for told in tables if told.get("said"))
+    if any(entry.get("said") for entry in tables):
+        words = "; ".join(str(entry["said"]) for entry in tables if entry.get("said"))
         return words[:1].upper() + words[1:]
     groups = [str(m.get("group", "")) for m in material.of("/study/trial")] if material.kind == "rehearsal" else []
-    tried = _listed(list(dict.fromkeys(group.partition("/")[0] for group in groups)))
-    return tried[:1].upper() + tried[1:] + ("" if tables or not tried else ", without a result yet")
+    plans = _listed(list(dict.fromkeys(group.partition("/")[0] for group in groups)))
+    return plans[:1].upper() + plans[1:] + ("" if tables or not plans else ", without a result yet")
 
 
 def study_words(material: Material) -> str:
-    """How many trials, and how the errors of the study's own estimator compare with what no estimator can beat."""
+    """Number of trials, and the errors of the study's first estimator over the Cramér-Rao bound."""
     trials, settings = material.counts.get("/study/trial", 0), material.of("/study/summary")
     if not trials and not settings:
         return ""
-    said = f"{trials} trial{'s' if trials != 1 else ''}"
-    said += f" in {len(settings)} setting{'s' if len(settings) != 1 else ''}" if settings else ""
-    own = next((name for name in ESTIMATORS if any(f"{name}.failures" in m for m in settings)), "")
+    text = f"{trials} trial{'s' if trials != 1 else ''}"
+    text += f" in {len(settings)} setting{'s' if len(settings) != 1 else ''}" if settings else ""
+    estimator = next((name for name in ESTIMATORS if any(f"{name}.failures" in m for m in settings)), "")
     ratios = [
         float(v)
         for m in settings
         for k, v in m.items()
-        if own and k.startswith(f"{own}.") and k.endswith(".over_bound") and isinstance(v, int | float)
+        if estimator and k.startswith(f"{estimator}.") and k.endswith(".over_bound") and isinstance(v, int | float)
     ]
     if not ratios:
-        return said
+        return text
     low, high = number(min(ratios), 3), number(max(ratios), 3)
-    return f"{said}: errors {low if low == high else f'{low} to {high}'} times the Cramér-Rao bound"
+    return f"{text}: errors {low if low == high else f'{low} to {high}'} times the Cramér-Rao bound"
 
 
 def windows_words(material: Material) -> str:
-    """Which faults were there for a time, and when."""
-    windows, stretches = told_windows(material)
+    """Which faults were present for a time, and when."""
+    windows, stretches = logged_windows(material)
     if not windows:
         return ""
     when: dict[str, list[str]] = {}
@@ -130,12 +134,12 @@ def windows_words(material: Material) -> str:
         effect, place = fault_at(str(stretch["name"]))
         spans = when.setdefault(f"{effect} at {place}" if place else effect, [])
         spans.append(f"{number(float(stretch['start']), 6)} to {number(float(stretch['stop']), 6)} s")
-    said = "; ".join(f"{fault} from {_listed(spans)}" for fault, spans in when.items()) or "no fault in any window"
-    return said[:1].upper() + said[1:]
+    text = "; ".join(f"{fault} from {_listed(spans)}" for fault, spans in when.items()) or "no fault in any window"
+    return text[:1].upper() + text[1:]
 
 
 def how_it_ended(material: Material) -> list[str]:
-    """When, how long and how the run ended, one sentence each."""
+    """Start, duration and status of the run, one sentence each."""
     status, run = material.about("status"), material.about("run")
     ended = status.get("status", "no end in the log").replace("_", " ")
     reason = f" ({status['reason']})" if status.get("reason") else ""
@@ -143,8 +147,6 @@ def how_it_ended(material: Material) -> list[str]:
     parts += [f"started {run['started'][:19].replace('T', ' ')} UTC"] if run.get("started") else []
     parts += [f"took {status['wall_seconds']} s"] if status.get("wall_seconds") else []
     sentences = [" · ".join(parts)]
-    if material.about("result").get("explained") == "false":
-        sentences.append("This model does not explain the recording: residuals are larger than the sensors' noise.")
     return sentences
 
 

@@ -73,12 +73,12 @@ class Collocation:
         tanks = [f"{t.name}.start_level" for t in network.description.tanks]
         self._start_columns = {space.index(name): i for i, name in enumerate(tanks) if name in space}
         self._moving = [j for j in range(len(space)) if j not in self._start_columns]
-        self._below_rims = network.without_overflow()
+        self._without_overflow = network.without_overflow()
         self._rims = [t.height for t in network.description.tanks]
         self._length = length_scale(network.description)
         self._names = [space.names[j] for j in self._moving]
         self._actuation = Actuation(network, experiment, self._names)
-        self._sight = OutputMap(network, experiment, self._names)
+        self._output_map = OutputMap(network, experiment, self._names)
         self._fixed_commands: list[Tensor] | None = None
 
     def linearise(self, theta: Tensor, levels: Tensor) -> Linearised:
@@ -95,7 +95,7 @@ class Collocation:
         corrected, slopes, transition, gain, defect = newton_step(
             step, path, rates, by_level, by_theta, start, start_slopes
         )
-        look = self._sight.look(corrected, values, self._columns(theta))
+        look = self._output_map.look(corrected, values, self._columns(theta))
         return Linearised(
             corrected.movedim(2, 1),
             slopes.permute(0, 3, 1, 2),
@@ -157,12 +157,12 @@ class Collocation:
     def read(self, levels: Tensor, theta: Tensor) -> Tensor:
         """Readings (L, S, C) of given levels (L or 1, K+1, tanks), m."""
         path = levels.expand(len(theta), *levels.shape[1:]).movedim(1, 2)
-        return self._sight.read(path, self.network.bind(self.space, theta.unsqueeze(-2))).movedim(1, 2)
+        return self._output_map.read(path, self.network.bind(self.space, theta.unsqueeze(-2))).movedim(1, 2)
 
     def look(self, levels: Tensor, theta: Tensor) -> LinearisedOutputs:
         """The sensors linearised at given levels (L, K+1, tanks)."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
-        return self._sight.look(levels.movedim(1, 2), values, self._columns(theta))
+        return self._output_map.look(levels.movedim(1, 2), values, self._columns(theta))
 
     def constant_guess(self, theta: Tensor) -> Tensor:
         """Trajectories that stay at their start levels, (L, K+1, tanks)."""
@@ -198,7 +198,7 @@ class Collocation:
         lanes, n, steps = middle.shape
         shape = (lanes, steps)
         reaches_rim = bool((middle >= middle.new_tensor(self._rims).unsqueeze(-1)).any())
-        network = self.network if reaches_rim else self._below_rims
+        network = self.network if reaches_rim else self._without_overflow
         commands, command_slopes, columns = self._commands(values, moving, lanes)
         driven = [i for i, slopes in enumerate(command_slopes) if slopes is not None]
 

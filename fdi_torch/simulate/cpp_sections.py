@@ -84,8 +84,8 @@ class SectionWriter:
         slopes = [s for o in part for s in (*(slope for slope, _ in o.row.terms), *o.row.theta.values())]
         return [*(o.node for o in (*part, *ends)), *slopes]
 
-    def _loop(self, body: Statements, part: Section, ends: Sequence[Output], wanted: list[int]) -> list[str]:
-        lines = body.compute(wanted)
+    def _loop(self, body: Statements, part: Section, ends: Sequence[Output], needed: list[int]) -> list[str]:
+        lines = body.compute(needed)
         for o in part:
             for q, slope in o.row.theta.items():
                 row = self.row_index(o)

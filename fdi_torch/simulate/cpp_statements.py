@@ -38,17 +38,17 @@ class Statements:
             computed |= {i for i in order if self._is_computed(i)}
         self.kept = {i: k for k, i in enumerate(dict.fromkeys(needed))}
 
-    def compute(self, wanted: Sequence[int]) -> list[str]:
-        """The statements of a loop: one for each node on which the wanted ones depend."""
+    def compute(self, results: Sequence[int]) -> list[str]:
+        """The statements of a loop: one for each node on which the results depend."""
         self._inside = True
-        order = self._order(wanted, self._known)
+        order = self._order(results, self._known)
         for i in order:
             node = self.graph.nodes[i]
             if node.operation != "literal" and not node.varies & Varies.LANE and i not in self._shared:
                 self.common.append(f"    const {self._type(i)} v{i} = {self._formula(i)};")
                 self._shared.add(i)
         lanes = [i for i in order if self.graph.nodes[i].varies & Varies.LANE]
-        lines = self._lanes(lanes, guarded(self.graph, lanes, {*wanted, *self.kept}))
+        lines = self._lanes(lanes, guarded(self.graph, lanes, {*results, *self.kept}))
         fresh = [i for i in lanes if i not in self._known]
         lines += [stored(f"kept[{self.kept[i]}]", self.number(i)) for i in fresh if i in self.kept]
         self._known |= {i for i in fresh if self._is_computed(i)}
@@ -93,13 +93,13 @@ class Statements:
         """The expression of a node as a number, also for truth values."""
         return f"WHERE({self.text(i)}, real(1), real(0))" if self.graph.nodes[i].boolean else self.text(i)
 
-    def _order(self, wanted: Iterable[int], known: set[int]) -> list[int]:
-        """The nodes that the wanted nodes need, in order; known and constant nodes are not followed."""
+    def _order(self, results: Iterable[int], known: set[int]) -> list[int]:
+        """The nodes on which the results depend, in order; known and constant nodes are not followed."""
         if self.constant is None:
-            return self.graph.reach(wanted)
-        wanted = list(wanted)
-        constant = [i for i in self.graph.reach(wanted) if self._is_constant(i)]
-        return self.graph.reach(wanted, stop=[*known, *constant])
+            return self.graph.reach(results)
+        results = list(results)
+        constant = [i for i in self.graph.reach(results) if self._is_constant(i)]
+        return self.graph.reach(results, stop=[*known, *constant])
 
     def _is_computed(self, i: int) -> bool:
         """Whether the node is the result of an operation in a loop."""

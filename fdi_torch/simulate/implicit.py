@@ -61,7 +61,7 @@ class ImplicitStep:
         self.program, self.state, self.compute, self.full = program, state, compute, full
 
     def take(self, step: Tensor, tolerance: float) -> tuple[Tensor, Numbers]:
-        """Advance the levels by own (L,) s.
+        """Advance the levels by step (L,) s.
 
         Returns the error estimate of the levels relative to the tolerance (m), infinite where a stage has no solution,
         (L,); and the error estimate of the slopes by theta, one tensor (P, L) per tank, in their units.

@@ -470,7 +470,7 @@ static void end(Block &b, const real *clock, const real *channel) {
 #endif
 
 #if WITHIN
-// As `own_step` in own_steps.py. Returns whether any lane is on its way.
+// As `next_step` in step_control.py. Returns whether any lane is unfinished.
 static bool set_out(Block &b, real start, real span) {
     int open = 0;
     EACH_LANE {
@@ -602,7 +602,7 @@ static void step(const Job &job, Block &b, const real *clock, const real *channe
     }
 }
 
-// As `judged` in own_steps.py. Levels of no number are kept as they are.
+// As `accept_steps` in step_control.py. NaN levels are accepted unchanged.
 static void keep_or_undo(const Job &job, Block &b, real span) {
     const real tolerance = job.tolerance, shortest = job.shortest;
     Lane kept, error;

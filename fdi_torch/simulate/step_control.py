@@ -69,33 +69,35 @@ def _step_of_unit_error(plant: PlantDescription) -> float:
     return STEP_FOR_ONE_METRE * time_scale(plant)
 
 
-def next_step(gone: Tensor, pace: Tensor, span: Tensor) -> Tensor:
-    """Length of each lane's next step (L,), s, after `gone` s of `span`.
+def next_step(elapsed: Tensor, length: Tensor, span: Tensor) -> Tensor:
+    """Length of each lane's next step (L,), s, after `elapsed` s of `span`.
 
-    The step is the lane's `pace`, shortened so that no short step remains before the end; `span` for a finished lane.
+    The step is the lane's `length`, shortened so that no short step remains before the end; `span` for a finished lane.
     """
-    remaining = span - gone
-    step = torch.where(remaining <= pace, remaining, torch.where(remaining < 2.0 * pace, remaining / 2.0, pace))
+    remaining = span - elapsed
+    step = torch.where(remaining <= length, remaining, torch.where(remaining < 2.0 * length, remaining / 2.0, length))
     return torch.where(remaining > 0.0, step, span)
 
 
 def accept_steps(
-    step: Tensor, error: Tensor, gone: Tensor, pace: Tensor, span: Tensor, shortest: float
+    step: Tensor, error: Tensor, elapsed: Tensor, length: Tensor, span: Tensor, shortest: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Accept or reject the steps own (L,): the accepted lanes, the time they have reached and their next step, s.
+    """Accept or reject a step of each lane (L,): the accepted lanes, the times they have reached, and their next
+    lengths, s.
 
-    error: relative to the tolerance; infinite for a step without a solution. A step is accepted if its error is at most
-    1, or if it is the shortest allowed. The next step follows from the error, which grows with step^4. Levels that are
-    NaN are accepted unchanged.
+    step: length of the step taken; elapsed: time reached before it; length: the lane's planned length (a step may be
+    shorter at the end of the span). error: relative to the tolerance; infinite for a step without a solution. A step is
+    accepted if its error is at most 1, or if it is the shortest allowed. The next length follows from the error, which
+    grows with step^4. Levels that are NaN are accepted unchanged.
     """
     cut = torch.sqrt(torch.sqrt(torch.nan_to_num(error, nan=0.0))) / 0.9
     proposed = step / torch.clamp(cut, 1.0 / LONGER, 1.0 / SHORTER)
-    is_open, accurate = gone < span, ~(error > 1.0)
-    next_length = torch.where(accurate & (step < pace) & (proposed < pace), pace, proposed)
+    is_open, accurate = elapsed < span, ~(error > 1.0)
+    next_length = torch.where(accurate & (step < length) & (proposed < length), length, proposed)
     accepted = is_open & (accurate | (step <= shortest))
-    reached = torch.where(span - gone <= step, span, gone + step)
+    reached = torch.where(span - elapsed <= step, span, elapsed + step)
     return (
         accepted,
-        torch.where(accepted, reached, gone),
-        torch.where(is_open, torch.clamp(next_length, min=shortest), pace),
+        torch.where(accepted, reached, elapsed),
+        torch.where(is_open, torch.clamp(next_length, min=shortest), length),
     )

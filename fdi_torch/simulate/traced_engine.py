@@ -100,7 +100,7 @@ class _Run:
         self.state, self.compute, self.full = interpreter.state, interpreter.run, interpreter.full
         self.history: list[list[tuple[Tensor, Change]]] = []
         self.implicit = ImplicitStep(program, self.state, self.compute, self.full)
-        self.pace = lanes.new_full((len(lanes),), torch.inf)
+        self.step_length = lanes.new_full((len(lanes),), torch.inf)
         self.size = lanes.new_zeros(lanes.shape[::-1])
 
     def samples(self) -> Iterator[int]:
@@ -174,15 +174,15 @@ class _Run:
             return self.compute(p.step)
         self.compute(p.act)
         start, span = values["clock", 0], values["clock", 1]
-        elapsed = torch.zeros_like(self.pace)
+        elapsed = torch.zeros_like(self.step_length)
         while bool((elapsed < span).any()):
-            step = next_step(elapsed, self.pace, span)
+            step = next_step(elapsed, self.step_length, span)
             values["part", 0], values["part", 1] = start + elapsed, step
             before = self._levels()
             error, slope_errors = self.implicit.take(step, e.step_control.tolerance)
             size = self._largest_slopes(slope_errors)
-            accepted, elapsed, self.pace = accept_steps(
-                step, self._worst(error, slope_errors, size), elapsed, self.pace, span, e.step_control.shortest
+            accepted, elapsed, self.step_length = accept_steps(
+                step, self._worst(error, slope_errors, size), elapsed, self.step_length, span, e.step_control.shortest
             )
             self.size = torch.where(accepted, size, self.size)
             rows = zip(self._levels(), before, strict=True)

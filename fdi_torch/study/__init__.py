@@ -1,1 +1,1 @@
-"""Monte Carlo studies: many trials of one experiment, estimated in batches and summed up."""
+"""Monte Carlo studies: an experiment is repeated many times, estimated in batches and summarised."""

@@ -1,7 +1,7 @@
-"""The blocks of a study, or other independent work, on a Dask cluster. The only importer of the distributed engine.
+"""Blocks of a study, or other independent tasks, on a Dask cluster. Only this file imports Dask.
 
-A block is a pure function of the plan, so that one whose worker was lost is simply computed again elsewhere, with the
-same numbers. Which worker does what, when, and what to do about lost ones is left to Dask.
+A block is a pure function of the plan; if its worker is lost, it is computed again elsewhere with the same numbers.
+Dask schedules the work and handles lost workers.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 import torch
 
 from fdi_torch.study.monte_carlo import Trial, run_block
-from fdi_torch.study.plan import Block, Plan
+from fdi_torch.study.study_plan import Block, Plan
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -21,25 +21,25 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R")
 LOCAL = "local"
-LOOPBACK = "127.0.0.1"  # where a local cluster listens, and nobody else can reach it
-# A block may lose its worker this often before the study gives up.
+LOOPBACK = "127.0.0.1"  # address of a local cluster, not reachable from other machines
+# Number of lost workers per block after which the study fails.
 LOST_WORKERS = 20
 
 
 def run_on_cluster(
     plan: Plan, blocks: Iterable[Block], address: str, workers: int | None = None
 ) -> Iterator[list[Trial]]:
-    """The blocks as they get done, in any order. address: of a Dask scheduler (tcp://...), or 'local'.
+    """Yield the blocks as they are completed, in any order. address: of a Dask scheduler (tcp://...), or 'local'.
 
-    workers: of a local cluster, one a core where not given. Raises ValueError where Dask is not installed or nobody
-    answers at the address.
+    workers: of a local cluster, by default one per core. Raises ValueError if Dask is not installed or no scheduler
+    answers.
     """
     with connected(address, workers) as client:
         yield from run_with(client, plan, blocks)
 
 
 def run_with(client: Client, plan: Plan, blocks: Iterable[Block]) -> Iterator[list[Trial]]:
-    """The same on a cluster that is connected already."""
+    """Yield the blocks as they are completed on a connected cluster."""
     from distributed import as_completed
 
     shared = client.scatter(plan, broadcast=True, hash=False)
@@ -50,7 +50,7 @@ def run_with(client: Client, plan: Plan, blocks: Iterable[Block]) -> Iterator[li
 
 
 def each_on(client: Client, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """work(item) of each item, as they get done. Raises what a piece of work raises."""
+    """Yield work(item) of each item as it is completed. Exceptions of the work are raised."""
     from distributed import as_completed
 
     for done in as_completed([client.submit(_alone, work, item, pure=False) for item in items]):
@@ -60,9 +60,9 @@ def each_on(client: Client, work: Callable[[T], R], items: Iterable[T]) -> Itera
 
 @contextmanager
 def connected(address: str, workers: int | None = None) -> Iterator[Client]:
-    """A scheduler at an address, or so many worker processes here. Raises ValueError without Dask or a scheduler.
+    """Client of a scheduler at an address, or of local worker processes. Raises ValueError without Dask or scheduler.
 
-    A scheduler is trusted: it and its workers send objects that are unpickled here.
+    A scheduler must be trusted: it and its workers send objects that are unpickled here.
     """
     try:
         import dask
@@ -88,7 +88,7 @@ def connected(address: str, workers: int | None = None) -> Iterator[Client]:
 
 
 def _on_worker(plan: Plan, block: Block) -> list[Trial]:
-    """Each worker has one core; its neighbours have the others."""
+    """A worker uses one core, because its neighbours use the others."""
     torch.set_num_threads(1)
     return run_block(plan, block)
 

@@ -1,4 +1,4 @@
-"""The trials of a block, estimated all at once: search, refinement from coarse to fine steps, and the limits."""
+"""Estimation of all trials of a block at once: search, refinement from coarse to fine steps, and bounds."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_mar
 from fdi_torch.estimate.objectives import OBJECTIVES, Objective, Problem, Term, spread_of
 from fdi_torch.estimate.refined import CONVERGED, STATUSES, Refined
 from fdi_torch.simulate.engine import Engine, Readings
-from fdi_torch.study.plan import Block, Plan
-from fdi_torch.study.trials import limits, make_trials
+from fdi_torch.study.study_plan import Block, Plan
+from fdi_torch.study.trial_readings import limits, make_trials
 
-# Residuals within this share of a channel's spread are due to the steps of integration.
+# Residuals within this share of a channel's standard deviation are attributed to the integration steps.
 STEP_SHARE = 1e-4
-# A standard error's worth of the sum of correlations is 1e-8 at an SNR of 50 dB: this is less than a hundredth of it.
+# The sum of correlations has a standard error of 1e-8 at an SNR of 50 dB, a hundred times this tolerance and more.
 CORRELATION_TOLERANCE = 1e-13
-# Starts closer than this share of the box are one start.
+# Starts closer than this share of the box count as one.
 APART = 0.05
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial's outcome as it is logged. numbers: arrays over the parameters, or single numbers, SI."""
+    """Result of one trial as logged. numbers: arrays over the parameters, or single numbers, SI."""
 
     number: int
     setting: str
@@ -38,40 +38,40 @@ class Trial:
 
 
 def run_block(plan: Plan, block: Block) -> list[Trial]:
-    """Every trial of a block, estimated by each estimator that the plan asks for."""
+    """Estimate every trial of a block with each requested estimator."""
     trials = make_trials(plan, block)
     data = Readings(trials.readings, torch.ones_like(trials.readings))
     fits = Fits(plan, data)
     members = fits.searched(plan.search_seeds(block))
     boxed = fits.searched_again(fits.refined(members), plan, block)
-    wanted = plan.method.estimators
-    found: dict[str, Tensor] = {"truth": trials.truth}
+    estimators = plan.method.estimators
+    results: dict[str, Tensor] = {"truth": trials.truth}
     status = boxed
-    if "boxed" in wanted:
-        found |= {"boxed": boxed.theta, "boxed_std": fits.standard_errors(boxed)}
-    if "free" in wanted:
+    if "boxed" in estimators:
+        results |= {"boxed": boxed.theta, "boxed_std": fits.standard_errors(boxed)}
+    if "free" in estimators:
         status = fits.unbounded(boxed.theta)
-        found |= {"free": status.theta, "free_std": fits.standard_errors(status)}
-    if "correlation" in wanted:
-        found["correlation"] = fits.unbounded(boxed.theta, "correlation").theta
-    if "search" in wanted:
-        found["search"] = members[:, 0]
+        results |= {"free": status.theta, "free_std": fits.standard_errors(status)}
+    if "correlation" in estimators:
+        results["correlation"] = fits.unbounded(boxed.theta, "correlation").theta
+    if "search" in estimators:
+        results["search"] = members[:, 0]
     limit = limits(fits.engines[-1], trials)
-    found |= {"bound": limit.bound, "correlation_bound": limit.correlation_bound}
-    if "linearised" in wanted:
-        found["linearised"] = limit.linearised
-    found["rho"] = fits.correlations(boxed.theta)
-    return _records(plan, block, found, status)
+    results |= {"bound": limit.bound, "correlation_bound": limit.correlation_bound}
+    if "linearised" in estimators:
+        results["linearised"] = limit.linearised
+    results["rho"] = fits.correlations(boxed.theta)
+    return _records(plan, block, results, status)
 
 
 def run_blocks(plan: Plan, blocks: Iterable[Block]) -> Iterator[list[Trial]]:
-    """The blocks one after the other, in this process."""
+    """Compute the blocks one after the other in this process."""
     for block in blocks:
         yield run_block(plan, block)
 
 
-def _records(plan: Plan, block: Block, found: dict[str, Tensor], refined: Refined) -> list[Trial]:
-    columns = {name: values.tolist() for name, values in found.items()}
+def _records(plan: Plan, block: Block, results: dict[str, Tensor], refined: Refined) -> list[Trial]:
+    columns = {name: values.tolist() for name, values in results.items()}
     columns["cost"] = refined.cost.tolist()
     columns["iterations"] = [float(n) for n in refined.iterations.tolist()]
     name, statuses = plan.settings[block.setting].name, refined.statuses()
@@ -82,7 +82,7 @@ def _records(plan: Plan, block: Block, found: dict[str, Tensor], refined: Refine
 
 
 class Fits:
-    """The readings of B trials, and the engines at each step, to which estimators are fitted."""
+    """Readings of B trials and the engines at each integration step, with the estimators applied to them."""
 
     def __init__(self, plan: Plan, data: Readings) -> None:
         self.method, self.fitting, self.data = plan.method, plan.fitting, data
@@ -90,9 +90,10 @@ class Fits:
         self.engines: list[Engine] = [plan.fitting.engines(step)[0] for step in plan.method.steps]
 
     def searched(self, seeds: Tensor, lanes: Tensor | None = None, again: int = 0) -> Tensor:
-        """The best members (B, K, P) of differential evolution for each trial; every second on the other objective.
+        """Best distant members (B, K, P) of differential evolution for each trial.
 
-        What one objective takes for the best basin the other may not: correlation is blind to gain and offset.
+        Repeated searches alternate between the objectives, because their best basins may differ: the correlation is
+        insensitive to gain and offset.
         """
         every, method = self.method.search_every, self.method
         data = self.data if lanes is None else self.data.of(lanes)
@@ -105,7 +106,7 @@ class Fits:
         return distant(result.population, result.cost, self.high - self.low, method.starts)
 
     def refined(self, starts: Tensor, lanes: Tensor | None = None) -> Refined:
-        """Levenberg-Marquardt within the box from every start (B, K, P), the best of which goes on to finer steps."""
+        """Levenberg-Marquardt within the box from every start (B, K, P); the best result continues at finer steps."""
         best = starts
         for engine in self.engines:
             refined = self._refine(engine, best, self.low, self.high, lanes=lanes)
@@ -114,7 +115,7 @@ class Fits:
         return chosen
 
     def searched_again(self, fit: Refined, plan: Plan, block: Block) -> Refined:
-        """Trials whose residuals stay larger than their noise are searched anew; the better of the two fits is kept."""
+        """Search again for trials whose residuals are larger than their noise, and keep the better fit."""
         for again in range(1, plan.method.searches):
             lanes = self._unexplained(fit.theta).nonzero()[:, 0]
             if not len(lanes):
@@ -126,7 +127,7 @@ class Fits:
         return fit
 
     def unbounded(self, theta: Tensor, objective: Objective = "likelihood") -> Refined:
-        """Levenberg-Marquardt at the finest steps without a box, from theta (B, P)."""
+        """Levenberg-Marquardt at the finest step without bounds, from theta (B, P)."""
         everywhere = torch.full_like(self.low, torch.inf)
         settings = self.method.refine
         if objective == "correlation":
@@ -135,12 +136,12 @@ class Fits:
         return refined.best()
 
     def standard_errors(self, fit: Refined) -> Tensor:
-        """(B, P): from the curvature of the likelihood at the estimate; 0 where a bound holds it."""
+        """Standard errors (B, P) from the curvature of the likelihood; 0 where a bound is active."""
         assert fit.curvature is not None
         return certainty(fit.curvature, held=fit.held).std
 
     def correlations(self, theta: Tensor) -> Tensor:
-        """rho of each channel at theta (B, P), (B, C)."""
+        """Correlation of each channel at theta (B, P), (B, C)."""
         problem = Problem(self.fitting.space, [Term(self.engines[-1], self.data)])
         return problem.correlations(theta[:, None], torch.arange(len(theta)))[:, 0]
 
@@ -165,33 +166,33 @@ class Fits:
         )
 
     def _unexplained(self, theta: Tensor) -> Tensor:
-        """(B,) bool: residuals larger than the readings' own sample-to-sample noise, in any channel."""
+        """(B,) bool: whether residuals exceed the sample-to-sample noise in any channel."""
         squares = self.engines[-1].moments(theta[:, None], self.data)[:, 0, :, 1]
         count = self.data.count
-        own = torch.stack([sample_noise(v, w) for v, w in zip(self.data.values, self.data.weight, strict=True)])
-        allowed = UNEXPLAINED_RATIO * own + STEP_SHARE * (spread_of(self.data) / count).sqrt()
+        noise = torch.stack([sample_noise(v, w) for v, w in zip(self.data.values, self.data.weight, strict=True)])
+        allowed = UNEXPLAINED_RATIO * noise + STEP_SHARE * (spread_of(self.data) / count).sqrt()
         return ((squares / count).sqrt() > allowed).any(-1)
 
 
 def thinned_fitting(fitting: Fitting, every: int) -> Fitting:
-    """The same with every so manieth sample of its recordings."""
+    """The problem with every n-th sample of its recordings."""
     return replace(fitting, recordings=tuple(r.every(every) for r in fitting.recordings))
 
 
 def distant(population: Tensor, cost: Tensor, width: Tensor, count: int) -> Tensor:
-    """Of each population (B, N, P), best first: the best member and the next best apart from those taken, (B, K, P).
+    """The best members (B, K, P) of populations (B, N, P), sorted by cost, that differ from each other.
 
-    Where too few are apart, the best is repeated.
+    If too few differ, the best is repeated.
     """
     usable = torch.isfinite(cost) & torch.isfinite(population).all(-1)
-    taken = [population[:, 0]]
+    chosen = [population[:, 0]]
     for _ in range(count - 1):
-        near = torch.stack([((population - t[:, None]) / width).abs().amax(-1) <= APART for t in taken]).any(0)
-        fits = usable & ~near
-        place = fits.to(torch.int8).argmax(-1)
-        next_best = population[torch.arange(len(population)), place]
-        taken.append(torch.where(fits.any(-1)[:, None], next_best, taken[0]))
-    return torch.stack(taken, dim=1)
+        near = torch.stack([((population - c[:, None]) / width).abs().amax(-1) <= APART for c in chosen]).any(0)
+        differs = usable & ~near
+        index = differs.to(torch.int8).argmax(-1)
+        next_best = population[torch.arange(len(population)), index]
+        chosen.append(torch.where(differs.any(-1)[:, None], next_best, chosen[0]))
+    return torch.stack(chosen, dim=1)
 
 
 def is_converged(status: str) -> bool:

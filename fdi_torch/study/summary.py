@@ -1,4 +1,4 @@
-"""What many trials of a setting say of each estimator, with the Monte Carlo error of every statement."""
+"""Summary of the trials of a setting for each estimator, with the Monte Carlo error of every number."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from torch import Tensor
 from fdi_torch.estimate.proportion import wilson
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.study.monte_carlo import Trial, is_converged
-from fdi_torch.study.plan import ESTIMATORS, Plan, Setting
+from fdi_torch.study.study_plan import ESTIMATORS, Plan, Setting
 
-# Intervals below are those of 95 %.
+# Quantile of 95 % intervals.
 _REACH = NormalDist().inv_cdf(0.975)
-# Further from the truth than this many Cramer-Rao bounds is no noise: stuck elsewhere.
+# An error of more Cramer-Rao bounds than this is not noise: the fit stopped elsewhere.
 STUCK = 6.0
 
 
@@ -32,10 +32,10 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Score:
-    """How one estimator does on one parameter. bias, bias_error, rmse in the parameter's unit.
+    """Performance of one estimator for one parameter. bias, bias_error, rmse in the parameter's unit.
 
     over_bound: RMSE over the Cramer-Rao bound; over_linearised: over the RMSE of the linearised efficient estimator on
-    the same draws; coverage: of the stated 95 % intervals. None where there is nothing to compare with.
+    the same draws; coverage: of the stated 95 % intervals. None if not available.
     """
 
     estimator: str
@@ -50,9 +50,9 @@ class Score:
 
 @dataclass(frozen=True)
 class Summary:
-    """failures: trials of each estimator that ended far from the truth; worst: largest error, share of the range.
+    """failures: trials of each estimator that ended far from the truth; worst: largest error, as a share of the range.
 
-    undetermined: trials of which the Fisher information at the truth says beforehand that a parameter cannot be told.
+    undetermined: trials in which, by the Fisher information at the truth, a parameter is not determined.
     """
 
     setting: str
@@ -65,7 +65,7 @@ class Summary:
     rho: Ratio
 
     def numbers(self) -> dict[str, float]:
-        """All of it as named numbers."""
+        """All values as named numbers."""
         flat: dict[str, float] = {"converged": self.converged, "undetermined": self.undetermined}
         flat |= _ends("rho", self.rho)
         flat |= {f"{name}.failures": count for name, count in self.failures.items()}
@@ -79,7 +79,7 @@ class Summary:
 
 
 def summarise(plan: Plan, setting: Setting, trials: Sequence[Trial], tolerance: float = 1e-5) -> Summary:
-    """The trials of one setting summed up. tolerance: largest error without noise, as a share of the range."""
+    """Summarise the trials of one setting. tolerance: largest error without noise, as a share of the range."""
     space = plan.fitting.space
     names: list[str] = [name for name in ESTIMATORS if name in trials[0].numbers]
     truth = column(trials, "truth")
@@ -98,12 +98,12 @@ def summarise(plan: Plan, setting: Setting, trials: Sequence[Trial], tolerance: 
 
 
 def column(trials: Sequence[Trial], name: str) -> Tensor:
-    """One array of all trials, (trials, ...)."""
+    """One array of all trials, stacked (trials, ...)."""
     return torch.tensor([trial.numbers[name] for trial in trials], dtype=torch.float64)
 
 
 def bound_name(estimator: str) -> str:
-    """Which of a trial's bounds is the estimator's own: correlation does not see a reading's scale."""
+    """Name of the bound that applies to an estimator: the correlation is insensitive to a reading's scale."""
     return "correlation_bound" if estimator == "correlation" else "bound"
 
 
@@ -115,17 +115,17 @@ def _scores(
     std = column(trials, f"{name}_std") if f"{name}_std" in trials[0].numbers else None
     compared = noisy and "linearised" in errors and name != "linearised"
     for i, parameter in enumerate(space.names):
-        own = error[:, i]
+        errors_i = error[:, i]
         scores.append(
             Score(
                 estimator=name,
                 parameter=parameter,
-                bias=float(own.mean()),
-                bias_error=float(own.std() / math.sqrt(len(own))) if len(own) > 1 else math.nan,
-                rmse=float(own.square().mean().sqrt()),
-                over_bound=rms_with_error(own / bound[:, i]) if noisy else None,
-                over_linearised=rms_ratio(own, errors["linearised"][:, i]) if compared else None,
-                coverage=None if std is None or not noisy else covered(own, std[:, i]),
+                bias=float(errors_i.mean()),
+                bias_error=float(errors_i.std() / math.sqrt(len(errors_i))) if len(errors_i) > 1 else math.nan,
+                rmse=float(errors_i.square().mean().sqrt()),
+                over_bound=rms_with_error(errors_i / bound[:, i]) if noisy else None,
+                over_linearised=rms_ratio(errors_i, errors["linearised"][:, i]) if compared else None,
+                coverage=None if std is None or not noisy else covered(errors_i, std[:, i]),
             )
         )
     return scores
@@ -138,34 +138,34 @@ def _failures(name: str, error: Tensor, trials: Sequence[Trial], setting: Settin
 
 
 def mean_with_error(values: Tensor) -> Ratio:
-    """Mean of (N,) and its interval, from the spread of the values."""
+    """Mean of (N,) with its 95 % interval from the sample variance."""
     mean = float(values.mean())
     reach = _REACH * float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else math.inf
     return Ratio(mean, mean - reach, mean + reach)
 
 
 def rms_with_error(values: Tensor) -> Ratio:
-    """Root mean square of (N,) and its interval, from the spread of the squares."""
+    """Root mean square of (N,) with its 95 % interval from the variance of the squares."""
     square = mean_with_error(values.square())
     return Ratio(math.sqrt(square.value), math.sqrt(max(square.low, 0.0)), math.sqrt(square.high))
 
 
 def rms_ratio(errors: Tensor, others: Tensor) -> Ratio:
-    """Ratio of the root mean squares of paired errors (N,), with the interval that pairing allows (delta method)."""
+    """Ratio of the root mean squares of paired errors (N,), with its 95 % interval (delta method)."""
     a, b = errors.square(), others.square()
     ratio = math.sqrt(float(a.mean() / b.mean()))
-    spread = float((a / a.mean() - b / b.mean()).std()) / math.sqrt(len(a)) if len(a) > 1 else math.inf
-    factor = math.exp(0.5 * _REACH * spread)
+    error = float((a / a.mean() - b / b.mean()).std()) / math.sqrt(len(a)) if len(a) > 1 else math.inf
+    factor = math.exp(0.5 * _REACH * error)
     return Ratio(ratio, ratio / factor, ratio * factor)
 
 
 def covered(error: Tensor, std: Tensor) -> Ratio:
-    """The share of 95 % intervals that hold the truth, with its interval (Wilson 1927)."""
+    """Share of 95 % intervals that contain the truth, with its interval (Wilson 1927)."""
     return share(int((error.abs() <= _REACH * std).sum()), len(error))
 
 
 def share(count: int, trials: int) -> Ratio:
-    """Of so many trials, with its interval (Wilson 1927)."""
+    """A share of trials with its 95 % interval (Wilson 1927)."""
     return Ratio(count / trials, *wilson(count, trials))
 
 

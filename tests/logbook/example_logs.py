@@ -1,4 +1,4 @@
-"""Logs to test with: a run with every topic in it, written with a frozen clock; a log of several chunks."""
+"""Example logs: a run with every topic, written with a fixed clock, and a log of several chunks."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 
 from fdi_torch.logbook import RunLog
 from fdi_torch.logbook.channel import Channel
-from fdi_torch.logbook.schemas import json_schema, topic_definition
+from fdi_torch.logbook.schemas import json_schema
 from fdi_torch.logbook.sink import Sink
+from fdi_torch.logbook.topic_definitions import topic_definition
 
 FROZEN = 1_790_000_000_123_456_789
 FIXED: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Runs side by side, and a run against its replay."""
+"""Comparison of runs, and of a run with its replay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs of every format version stay readable, and the layout for viewers names what the logs hold."""
+"""Logs of every format version remain readable, and the viewers' layout names existing topics and fields."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 from fdi_torch.cli import DONE, main
 from fdi_torch.logbook import arrays, content_hash, inspect_log, last_state, own_signals, read_run, series, unpack
-from fdi_torch.logbook.schemas import TOPICS
+from fdi_torch.logbook.topic_definitions import TOPICS
 
 TESTS = Path(__file__).parents[1]
 FORMAT_1 = TESTS / "data/log_format_1.mcap"

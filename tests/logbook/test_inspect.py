@@ -1,4 +1,4 @@
-"""What `inspect` tells about a log, and what comes out by export."""
+"""Inspection of logs, and export from them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from mcap.reader import make_reader
 
 from fdi_torch.logbook import LogError, RunLog, export, export_attachment, inspect_log, read_run
 from fdi_torch.logbook.export import safe_name
-from fdi_torch.logbook.schemas import TOPICS
 from fdi_torch.logbook.sink import Sink
+from fdi_torch.logbook.topic_definitions import TOPICS
 
 
 def test_a_whole_log_on_one_screen(finished: Path) -> None:

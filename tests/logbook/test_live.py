@@ -1,4 +1,4 @@
-"""A running job's log as a viewer gets it over the Foxglove WebSocket protocol."""
+"""The log of a running job as received by a viewer over the Foxglove WebSocket protocol."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The readers that viewers use take our logs, by index and as a stream."""
+"""The readers used by viewers accept the logs, by index and as a stream."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One message to JSON and back, bit for bit."""
+"""Lossless conversion of messages to JSON and back."""
 
 from __future__ import annotations
 

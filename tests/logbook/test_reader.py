@@ -1,4 +1,4 @@
-"""Reading logs: arrays out of messages, foreign files, files that grow, files that lie."""
+"""Reading of logs: arrays from messages, logs of other programs, growing files and inconsistent files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from fdi_torch.logbook import (
     read_run,
     series,
 )
-from fdi_torch.logbook.copying import copy_log
+from fdi_torch.logbook.log_copy import copy_log
 from fdi_torch.logbook.payload import unpack
 from fdi_torch.logbook.sink import Sink
 
@@ -193,7 +193,7 @@ def bomb(path: Path, size: int, claimed: int) -> Path:
     body = struct.pack("<QQQI", 0, 0, claimed, zlib.crc32(b"")) + struct.pack("<I", 4) + b"zstd"
     body += struct.pack("<Q", len(content)) + content
     sink = Sink(path, "x")
-    sink._stream.write(struct.pack("<BQ", 6, len(body)) + body)
+    sink._file.write(struct.pack("<BQ", 6, len(body)) + body)
     sink.finish()
     return path
 

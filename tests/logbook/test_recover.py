@@ -1,4 +1,4 @@
-"""Broken logs: everything whole is saved, nothing damaged is passed on, nothing raises."""
+"""Recovery of damaged logs: everything undamaged is saved, nothing damaged is copied, nothing raises."""
 
 from __future__ import annotations
 

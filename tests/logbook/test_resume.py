@@ -1,4 +1,4 @@
-"""A killed run goes on, and its log says the same as that of a run that was not."""
+"""An interrupted run continues, and its log equals that of an uninterrupted run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writing a log: what is in it, byte for byte the same however it came there."""
+"""Writing of logs: the contents, and identical bytes for every order of writing."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import pytest
 from example_logs import FIXED, FROZEN, VERDICT, write_everything, write_finished
 from mcap.reader import make_reader
 
-from fdi_torch.logbook import RunLog, Trickle, content_hash, read_run, rest
+from fdi_torch.logbook import DeferredTopic, RunLog, content_hash, read_run, tail_buffer
 from fdi_torch.logbook.provenance import environment, git_state
-from fdi_torch.logbook.schemas import TOPICS
+from fdi_torch.logbook.topic_definitions import TOPICS
 
 
 def test_the_reference_reader_finds_everything(finished: Path) -> None:
@@ -180,11 +180,11 @@ def test_chunks_cut_within_or_after_a_recording_leave_no_trace(tmp_path: Path, c
     assert sum(1 for _ in read_run(tmp_path / "b.mcap").messages()) == 2005
 
 
-@pytest.mark.parametrize("in_memory", [rest.IN_MEMORY, 1])
+@pytest.mark.parametrize("in_memory", [tail_buffer.IN_MEMORY, 1])
 def test_chunks_cut_between_messages_and_attachments_leave_no_trace(
     tmp_path: Path, in_memory: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rest, "IN_MEMORY", in_memory)  # beyond so much, the file as it shall be lies on disk
+    monkeypatch.setattr(tail_buffer, "IN_MEMORY", in_memory)  # beyond it, the buffer is a file
     for name, cuts in (("a", ()), ("b", (1, 5, 2500, 4000))):
         with RunLog(tmp_path / f"{name}.mcap", "train", **FIXED) as log:
             for number in range(5000):
@@ -218,14 +218,14 @@ def test_what_is_put_off_while_the_clock_writes_keeps_its_order(tmp_path: Path) 
             time.sleep(0.002)  # the clock is still at it when the next comes
             yield number, {"problem": 0, "generation": number}
 
-    trickle = Trickle("/estimator/de/population", slow)
+    deferred = DeferredTopic("/estimator/de/population", slow)
 
     with RunLog(tmp_path / "a.mcap", "train", **FIXED, flush_seconds=0.01) as log:
         for number in range(200):
             if number == 0 or log.due or number % 50 == 0:
-                log.later(trickle, number)
+                log.later(deferred, number)
             else:
-                log.keep((trickle, number))
+                log.keep((deferred, number))
             time.sleep(0.0005)
     told = [orjson.loads(m.data)["generation"] for m in read_run(tmp_path / "a.mcap").messages()]
     assert told == list(range(200))

@@ -1,4 +1,4 @@
-"""Writing a log: what is left of it when the run, the disk or the machine fails."""
+"""Writing of logs: the remaining file after failures of the run, the disk or the machine."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from sample_runs import (
 
 from fdi_torch.config import load_plant
 from fdi_torch.logbook import RunLog, read_run
-from fdi_torch.report.findings import findings
+from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.material import gather
 from fdi_torch.report.page import RunReport, page, report_of
 from fdi_torch.report.sections.before_after import profile_section, sample_noise
@@ -58,8 +58,8 @@ def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> No
         "Before and after",
         "Calibration constants",
         "What the gap depends on",
-        "What to run next",
-        "What these inputs cannot tell",
+        "Next experiment",
+        "Limits of these inputs",
     ]
     assert {
         "gap_where",
@@ -71,7 +71,7 @@ def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> No
         "gap_next_input_1",
     } <= names(made)
     assert "99.8 % of the gap is closed on data not used for fitting (95 % interval 99 % to 100 %)." in text
-    assert "8.10 ± 0.20" in text and "pump lag at Q1 is the same as pump delay at Q1." in text
+    assert "8.10 ± 0.20" in text and "pump lag at Q1 is equivalent to pump delay at Q1." in text
     assert ">91 %<" in text and "cannot be shown" not in text
 
 
@@ -102,7 +102,7 @@ def test_every_verdict_has_its_words(changes: dict[str, Any], words: str, tmp_pa
         log.gap_verdict({**GAP_ANSWER, **changes, "closure": {**GAP_ANSWER["closure"], "closed": None}})
     made = report_of(material_of(tmp_path / "run.mcap"))
     assert headline(made.material) == words
-    assert "is undefined: it is too small against its own standard error" in page([made])
+    assert "is undefined: the gap is too small compared with its standard error" in page([made])
 
 
 def test_a_page_of_the_second_format_shows_what_the_first_could_not_say(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_a_page_of_the_second_format_shows_what_the_first_could_not_say(tmp_path
         "The gap comes from leak at T1 (size 0.200 ± 0.010) and something unknown at Q1, probability 90.0 %; no effect "
         "of the library describes it"
     )
-    assert "Whichever explanation is true, there is with 95 %: leak at T1." in text
+    assert "With 95 % probability, whichever explanation is true: leak at T1." in text
     assert "Probability that something is wrong there." in text and "share of the gap" not in text
     assert "leak at T1 and something unknown at T1" in text and "not examined" in text
     assert "<td>2.5</td><td>cm³/s</td><td>15 s</td>" in re.sub(r"<td[^>]*>", "<td>", text)
@@ -152,13 +152,13 @@ def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
     assert headline(made.material) == "40 trials in 2 settings"
     assert titles(made)[1:4] == ["Settings", "Isolation", "Errors"]
     assert {"trials_1", "errors_2", "isolation"} <= names(made) and ">T1.leak<" in page([made])
-    assert "38 of 40 modes stated as they are; 2 faults missed" in page([made]) and "none (10 %)" in page([made])
+    assert "38 of 40 modes stated correctly; 2 faults missed" in page([made]) and "none (10 %)" in page([made])
 
 
 def test_a_challenge_page_shows_scores_confusion_and_misses(tmp_path: Path) -> None:
     made = report(write_challenge, tmp_path)
-    assert headline(made.material) == "45 of 60 hidden causes told right, 13 named and wrong"
-    assert titles(made)[1:4] == ["Right answers", "What was named for what", "Not right"]
+    assert headline(made.material) == "45 of 60 hidden causes diagnosed correctly, 13 named wrongly"
+    assert titles(made)[1:4] == ["Right answers", "Confusion of causes", "Wrong answers"]
     assert "Trials" not in titles(made)
     assert {"challenge_1_right", "challenge_1_sure", "challenge_1_seconds", "challenge_4_seconds"} <= names(made)
     assert {"challenge_confusion_1", "challenge_unknown", "challenge_left_out"} <= names(made)
@@ -170,7 +170,7 @@ def test_a_rehearsal_page_shows_the_tables_of_the_command(tmp_path: Path) -> Non
     made = report(write_rehearsal, tmp_path)
     text = page([made])
     assert headline(made.material) == "0 of 2 faults missed, 1 of 1 named right"
-    assert titles(made)[:3] == ["The rig", "What the monitor did", "Configuration"]
+    assert titles(made)[:3] == ["The rig", "Validation of the monitor", "Configuration"]
     assert "1 of 1 (21 .. 100 %)" in text and "too short" not in text.partition("Provenance")[0]
     assert NASTY not in text
     del made.material.run.metadata["fdi_torch.result"]
@@ -204,7 +204,7 @@ def test_several_runs_share_a_page(tmp_path: Path) -> None:
 
 def test_a_cause_shows_its_size_in_whatever_order_its_parameters_were_logged() -> None:
     log = read_run(Path(__file__).parents[1] / "data/log_format_1_gap.mcap")
-    (found,) = findings(gather(log, load_plant("three_tank")))
+    (found,) = diagnosed_effects(gather(log, load_plant("three_tank")))
     assert (found.words, round(found.size, 3), found.unit) == ("leak at T1", 0.295, "1")
 
 

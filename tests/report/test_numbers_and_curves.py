@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdi_torch.report.curves import held_steps, thinned
+from fdi_torch.report.downsampling import corner_points, thinned
 from fdi_torch.report.html import MOST_ROWS, short, table, tag
 from fdi_torch.report.numbers import number, percent, raised, shown_unit, with_error
 
@@ -42,11 +42,11 @@ def test_a_spike_and_a_hole_survive_thinning() -> None:
 
 
 def test_held_signals_keep_their_corners() -> None:
-    x, y = held_steps(np.arange(6.0), np.array([1.0, 1, 2, 2, 2, 2]))
+    x, y = corner_points(np.arange(6.0), np.array([1.0, 1, 2, 2, 2, 2]))
     assert x.tolist() == [0, 2, 5] and y.tolist() == [1, 2, 2]
 
 
 def test_text_is_escaped_once_and_tables_say_what_they_leave_out() -> None:
     assert tag("p", "<b>", tag("i", "&"), title='"') == '<p title="&quot;">&lt;b&gt;<i>&amp;</i></p>'
-    assert "and 5 rows more" in table(["a"], [["x"]] * (MOST_ROWS + 5))
+    assert "and 5 more rows" in table(["a"], [["x"]] * (MOST_ROWS + 5))
     assert short("a" * 50, 10) == "a" * 9 + "…"

@@ -81,14 +81,14 @@ def test_a_message_that_makes_no_sense_costs_its_section_only(tmp_path: Path) ->
     report = report_of(material_of(tmp_path / "odd.mcap"))
     assert headline(report.material) == "Fault: leak at T1"
     assert "The log cannot be shown here: IndexError" in page([report])
-    assert "Health of the log" in [s.title for s in report.sections]
+    assert "Integrity of the log" in [s.title for s in report.sections]
 
 
 def test_a_torn_log_is_shown_and_said_to_be_torn(log: Path, tmp_path: Path) -> None:
     torn = tmp_path / "torn.mcap.partial"
     torn.write_bytes(log.read_bytes()[:-5000])
     text = page([report_of(material_of(torn))])
-    assert "not sound" in text and "fdi recover" in text
+    assert "damaged" in text and "fdi recover" in text
 
 
 def test_pictures_are_written_as_png_and_svg_and_repeat(log: Path, tmp_path: Path) -> None:

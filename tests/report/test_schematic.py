@@ -9,7 +9,7 @@ import pytest
 
 from fdi_torch.config import load_plant
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.report.layout import tank_places
+from fdi_torch.report.rig_layout import tank_places
 from fdi_torch.report.schematic import Overlay, schematic
 from fdi_torch.report.style import inline_svg
 

@@ -28,7 +28,7 @@ class ShowKeys(argparse.Action):
         self.models = models
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from fdi_torch.config.reference import config_reference
+        from fdi_torch.config.key_reference import config_reference
 
         for model in self.models:
             module, name = model.split(":")

@@ -21,4 +21,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", metavar="NAME|FILE", help="a shipped plant such as three_tank, or a plant file")
     parser.add_argument("--picture", metavar="FILE", help="draw the rig (PNG or SVG)")
     add_config(parser)
-    add_keys(parser, "a plant file", "fdi_torch.config.plant:PlantConfig")
+    add_keys(parser, "a plant file", "fdi_torch.config.plant_file:PlantConfig")

@@ -16,7 +16,7 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.monitor:MonitorConfig", required=True)
+    add_config(parser, "fdi_torch.config.monitor_file:MonitorConfig", required=True)
     parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
     parser.add_argument(
         "--follow", action="store_true", help="the file is still being written; process its samples as they come"

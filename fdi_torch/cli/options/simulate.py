@@ -14,5 +14,5 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.run:RunConfig")
+    add_config(parser, "fdi_torch.config.run_file:RunConfig")
     add_run(parser)

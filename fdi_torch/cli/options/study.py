@@ -18,7 +18,7 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.study:StudyFile", required=True)
+    add_config(parser, "fdi_torch.config.study_file:StudyFile", required=True)
     add_run(parser)
     add_live(parser)
     parser.add_argument("--resume", action="store_true", help="continue from the log of a killed run")

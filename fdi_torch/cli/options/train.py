@@ -19,7 +19,7 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.run:RunConfig")
+    add_config(parser, "fdi_torch.config.run_file:RunConfig")
     add_run(parser)
     add_live(parser)
     parser.add_argument("--resume", action="store_true", help="continue a killed run of the same file")

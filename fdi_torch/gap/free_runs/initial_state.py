@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription

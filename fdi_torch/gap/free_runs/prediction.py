@@ -21,9 +21,9 @@ from torch import Tensor
 
 from fdi_torch.effects import effect, without_startup_effects
 from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, data_set_of
 from fdi_torch.gap.free_runs.initial_state import estimate_initial_state
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.names import matching
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription

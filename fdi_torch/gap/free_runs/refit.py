@@ -19,9 +19,9 @@ import torch
 from fdi_torch.effects import build_network, effect
 from fdi_torch.gap.answer import with_constants
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
+from fdi_torch.gap.channel_noise import Noise, estimate_noise
 from fdi_torch.gap.dataset import DataSet, RecordingPart
 from fdi_torch.gap.free_runs.between_runs import DETERMINED, RunConstant
-from fdi_torch.gap.noise_model import Noise, estimate_noise
 from fdi_torch.gap.preprocess.sensor_limits import limits_of
 from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.names import matching

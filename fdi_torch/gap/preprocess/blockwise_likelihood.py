@@ -22,8 +22,8 @@ from torch import Tensor
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.candidate_fit import CAP, Candidate, Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, data_set_of
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement

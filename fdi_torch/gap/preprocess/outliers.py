@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet
-from fdi_torch.gap.noise_model import Noise
 
 FAR = 5.0  # size of a jump in usual differences of neighbours: seven standard deviations of white noise
 NEARER = 3.5  # the same for a sensor that is known to have outliers

@@ -14,9 +14,9 @@ from collections.abc import Iterator, Sequence
 import torch
 
 from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.marginal_likelihood import log_prior
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.gap.preprocess.blockwise_likelihood import (
     BlockwiseFit,
     blocked_recording,

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet
-from fdi_torch.gap.noise_model import Noise
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording

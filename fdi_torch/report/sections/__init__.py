@@ -1,4 +1,4 @@
-"""The sections of the page, in their order. Each makes itself from what the log holds, or is left out."""
+"""The sections of the page in order. Each is made from the log, or left out if the log has no content for it."""
 
 from fdi_torch.report.section import Maker
 from fdi_torch.report.sections.before_after import holdout_section, profile_section

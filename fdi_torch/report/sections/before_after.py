@@ -1,4 +1,4 @@
-"""The gap before and after its cause was added: on the hold-out, and by time, level, input and direction of flow."""
+"""Residuals before and after the cause was added: on the hold-outs, and by time, level, input and flow."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BINS = 24
 
 
 def holdout_section(material: Material) -> Section | None:
-    """What is left of the hold-outs' readings by each model, sensor by sensor."""
+    """Residuals of the hold-outs for each model, sensor by sensor."""
     if not material.recordings:
         return None
     blocks: list[str | list[Picture]] = []
@@ -27,7 +27,7 @@ def holdout_section(material: Material) -> Section | None:
         pictures = _holdout_panels(material, holdout_prefix(count))
         blocks += [pictures] if pictures else []
         count += 1
-    words = "What each model leaves of readings that were not used for fitting."
+    words = "Residuals of each model on readings that were not used for fitting."
     return Section("Before and after", [words, *blocks]) if blocks else None
 
 
@@ -38,10 +38,10 @@ def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
         unit, scale = shown_unit(recording.output_units[i])
         lines: list[Line] = []
         for model in ("recalibrated", "augmented"):
-            said = arrays.get(f"{prefix}_{model}")
-            if said is not None:
+            predicted = arrays.get(f"{prefix}_{model}")
+            if predicted is not None:
                 words, colour = MODELS[model]
-                lines.append((words, time, scale * (read[:, i] - said[:, i]), colour))
+                lines.append((words, time, scale * (read[:, i] - predicted[:, i]), colour))
         if lines:
             title_here = f"{name}, {title.replace('_', ' ')}"
             figure = line_panel(title_here, "time, s", axis("read − model", unit), lines)
@@ -50,34 +50,34 @@ def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
 
 
 def profile_section(material: Material) -> Section | None:
-    """Size of the residual, in units of the sensors' noise, over everything it may depend on."""
+    """Size of the residual in units of the sensors' noise, over each variable it may depend on."""
     if not material.recordings:
         return None
     recording = material.recordings[0]
-    left = {
+    excess = {
         m: residual for m in ("recalibrated", "augmented") if (residual := _excess(material, recording, m)) is not None
     }
-    if not left:
+    if not excess:
         return None
     pictures = []
-    varied = (told for told in _variables(material, recording) if np.nanmin(told[2]) < np.nanmax(told[2]))
+    varied = (v for v in _variables(material, recording) if np.nanmin(v[2]) < np.nanmax(v[2]))
     for k, (title, label, variable) in enumerate(varied):
-        lines: list[Line] = [(MODELS[m][0], *_binned(variable, size), MODELS[m][1]) for m, size in left.items()]
+        lines: list[Line] = [(MODELS[m][0], *_binned(variable, size), MODELS[m][1]) for m, size in excess.items()]
         figure = line_panel(title, label, "residual, × noise", lines)
         figure.axes[0].axhline(1.0, color=SOFT, lw=0.8, ls=":")
         figure.axes[0].set_ylim(bottom=0.0)
         pictures.append(Picture(f"gap_by_{k + 1}", figure))
-    words = "Root mean square residual of all sensors, each divided by its noise; at 1 nothing but noise is left."
+    words = "Root mean square residual of all sensors, each divided by its noise; 1 means noise only."
     return Section("What the gap depends on", [words, pictures])
 
 
 def _excess(material: Material, recording: Signals, model: str) -> np.ndarray | None:
-    """Squared residual over squared noise, mean of the sensors (T,)."""
-    said = material.arrays.get(model)
-    if said is None or said.shape != recording.outputs.shape:
+    """Squared residual over squared noise, mean over the sensors (T,)."""
+    predicted = material.arrays.get(model)
+    if predicted is None or predicted.shape != recording.outputs.shape:
         return None
     read = np.where(recording.mask, recording.outputs, np.nan)
-    ratio = ((read - said) / sample_noise(read)) ** 2
+    ratio = ((read - predicted) / sample_noise(read)) ** 2
     counted = np.isfinite(ratio)
     return np.where(counted, ratio, 0.0).sum(1) / np.maximum(counted.sum(1), 1)
 
@@ -85,14 +85,14 @@ def _excess(material: Material, recording: Signals, model: str) -> np.ndarray | 
 def sample_noise(read: np.ndarray) -> np.ndarray:
     """Noise (N,) of readings (T, N) from their second differences, by the median (Hall, Kay & Titterington 1990)."""
     second = np.abs(np.diff(read, 2, axis=0)) / np.sqrt(6.0)
-    found = [
+    noise = [
         np.median(column[np.isfinite(column)]) / 0.6745 if np.isfinite(column).any() else 0.0 for column in second.T
     ]
-    return np.maximum(np.array(found), 1e-12)
+    return np.maximum(np.array(noise), 1e-12)
 
 
 def _variables(material: Material, recording: Signals) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Title, axis label and values (T,) of everything the gap may depend on."""
+    """Title, axis label and values (T,) of each variable that the gap may depend on."""
     yield "By time", "time, s", recording.time
     for i, name in enumerate(recording.output_names):
         unit, scale = shown_unit(recording.output_units[i])
@@ -105,7 +105,7 @@ def _variables(material: Material, recording: Signals) -> Iterator[tuple[str, st
 
 
 def _heads(material: Material, recording: Signals) -> Iterator[tuple[str, np.ndarray]]:
-    """Level difference in m over each pipe between two tanks that both have a sensor."""
+    """Level difference in m across each pipe between two tanks with sensors."""
     if material.plant is None:
         return
     levels = {}
@@ -119,14 +119,14 @@ def _heads(material: Material, recording: Signals) -> Iterator[tuple[str, np.nda
 
 
 def _binned(variable: np.ndarray, squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Root mean of `squares` for each value of the variable where those are few, or in bins of equal counts."""
+    """Root mean of `squares` by value of the variable if it has few values, otherwise in bins of equal counts."""
     usable = np.isfinite(variable) & np.isfinite(squares)
     variable, squares = variable[usable], squares[usable]
-    values, which = np.unique(variable, return_inverse=True)
+    values, index = np.unique(variable, return_inverse=True)
     if len(values) > BINS:
         edges = np.quantile(variable, np.linspace(0.0, 1.0, BINS + 1)[1:-1])
-        which = np.searchsorted(edges, variable)
-    count = np.maximum(np.bincount(which, minlength=1), 1)
-    x, y = (np.bincount(which, weights=w) / count for w in (variable, squares))
-    kept = np.bincount(which, minlength=1) > 0
+        index = np.searchsorted(edges, variable)
+    count = np.maximum(np.bincount(index, minlength=1), 1)
+    x, y = (np.bincount(index, weights=w) / count for w in (variable, squares))
+    kept = np.bincount(index, minlength=1) > 0
     return x[kept], np.sqrt(y[kept])

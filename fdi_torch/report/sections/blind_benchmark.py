@@ -1,4 +1,4 @@
-"""A blind benchmark: how often the diagnosis was right, what it named for what, how sure it was, how long it took."""
+"""Sections about a blind benchmark: scores, confusion of causes, wrong answers, computing time."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from fdi_torch.blind.rows import Scores, group_of, tables
 from fdi_torch.blind.score import Row
-from fdi_torch.blind.table import OWN, Sheet, misses, sheets
+from fdi_torch.blind.score_tables import OWN, Sheet, misses, sheets
+from fdi_torch.blind.scored_rows import Scores, group_of, tables
 from fdi_torch.report.blind_benchmark_figures import calibration_panel, confusion_panel, shares_panel
 from fdi_torch.report.html import Markup, folded, join, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.sections.study import TRIAL, group_panel
 
-# Where an effect sits is its first word, or said here.
+# Effects by component: first words of their names.
 PLACES = {
     "pumps": ("pump_",),
     "pipes and outlets": ("laminar_flow", "flow_exponent", "outlet_drop", "coefficient_drift", "plugging"),
@@ -28,19 +28,19 @@ NAMELESS = ("unknown, there", "unknown, elsewhere", "named", "several", "no gap"
 
 
 def benchmark_rows(material: Material) -> list[Row]:
-    """The judged answers; none where the log is of another kind."""
+    """The scored answers; empty for a log of another kind."""
     return [_row(message) for message in material.of(TRIAL)] if material.kind == "challenge" else []
 
 
 def scores_section(material: Material) -> Section | None:
-    """Every score with its interval, kind by kind, beside the baselines."""
+    """Every score with its interval, by kind of case, with the baselines."""
     rows = benchmark_rows(material)
     if not rows:
         return None
     words = (
-        "Rigs of other equations than the library's; their causes stayed sealed until every answer was in. Lines and "
-        "brackets are 95 % intervals. Of how sure it was, orange is the mean probability that the best explanation was "
-        "given, blue how often it was the true one. Of the times, a point is a case, blue the median."
+        "The rigs use other equations than the library, and their causes stayed sealed until every answer was "
+        "in. Lines and brackets are 95 % intervals. Calibration: orange is the mean stated probability of the best "
+        "explanation, blue the share in which it was true. Times: a point is a case, blue the median."
     )
     blocks: list[Markup | str | list[Picture]] = [words]
     for k, (group, by) in enumerate(tables(rows).items()):
@@ -52,21 +52,24 @@ def scores_section(material: Material) -> Section | None:
 
 
 def _pictures(by: Mapping[str, Scores], own: Sequence[Row], name: str) -> list[Picture]:
-    """How often it was right beside the baselines, how sure it was, how long it took."""
+    """Right answers with the baselines, calibration, and computing times."""
     strata, bins = by[OWN]["strata"], by[OWN]["calibration"]
     kinds = list(strata)
     others = {n: [s["strata"].get(kind, {}).get("right", {}) for kind in kinds] for n, s in by.items() if n != OWN}
-    found = [
-        Picture(f"{name}_right", shares_panel("How often right", kinds, [s["right"] for s in strata.values()], others))
+    pictures = [
+        Picture(f"{name}_right", shares_panel("Right answers", kinds, [s["right"] for s in strata.values()], others))
     ]
-    found += [Picture(f"{name}_sure", calibration_panel("How sure, and how often right", bins))] if bins else []
-    told = [kind for kind in kinds if kind != "all"]
-    seconds = [np.array([float(r["sec"]) for r in own if r["kind"] == kind]) for kind in told]
-    return [*found, Picture(f"{name}_seconds", group_panel("How long", "time of a diagnosis, s", told, seconds))]
+    pictures += [Picture(f"{name}_sure", calibration_panel("Calibration", bins))] if bins else []
+    timed = [kind for kind in kinds if kind != "all"]
+    seconds = [np.array([float(r["sec"]) for r in own if r["kind"] == kind]) for kind in timed]
+    return [
+        *pictures,
+        Picture(f"{name}_seconds", group_panel("Computing time", "time of a diagnosis, s", timed, seconds)),
+    ]
 
 
 def confusion_section(material: Material) -> Section | None:
-    """Cases with one cause: what was there, and what was answered."""
+    """True cause against answer, for cases with one cause."""
     rows = [row for row in benchmark_rows(material) if row["by"] == OWN]
     pictures = []
     for k, (place, names) in enumerate(PLACES.items()):
@@ -76,19 +79,19 @@ def confusion_section(material: Material) -> Section | None:
             pairs = [(r["effect"].removeprefix(prefix), _answered(r).removeprefix(prefix)) for r in own]
             pictures.append(_confusion(f"challenge_confusion_{k + 1}", place, pairs))
     for title, kind in (
-        ("laws without a name", "unknown"),
-        ("effects denied", "left_out"),
-        ("laws without a name, on networks", "law"),
+        ("laws outside the library", "unknown"),
+        ("effects left out of the library", "left_out"),
+        ("laws outside the library, on networks", "law"),
     ):
         pairs = [(r["effect"], _nameless(r)) for r in rows if r["kind"] == kind]
         if pairs:
             pictures.append(_confusion(f"challenge_{kind}", title, pairs, NAMELESS))
-    words = "A row is what was there, a column the best explanation; numbers are cases. Blue is right, orange is not."
-    return Section("What was named for what", [words, pictures]) if pictures else None
+    words = "Row: true cause; column: best explanation; numbers: cases. Blue is right, orange is wrong."
+    return Section("Confusion of causes", [words, pictures]) if pictures else None
 
 
 def misses_section(material: Material) -> Section | None:
-    """Every case that was not right, by name."""
+    """Every wrong answer."""
     sheet = misses(benchmark_rows(material))
     return Section(sheet.title, [_shown(sheet)]) if sheet.rows else None
 
@@ -99,7 +102,7 @@ def _row(message: Payload) -> Row:
 
 
 def _answered(row: Row) -> str:
-    """The effect of the best explanation; what there is instead where that is not one effect."""
+    """The effect of the best explanation, or the verdict if it is not one effect."""
     if row["verdict"] in ("no_gap", "unknown", "crash"):
         return str(row["verdict"]).replace("_", " ")
     return row["causes"][0][0] if len(row["causes"]) == 1 else "several"
@@ -114,14 +117,14 @@ def _nameless(row: Row) -> str:
 def _confusion(name: str, title: str, pairs: Sequence[tuple[str, str]], columns: Iterable[str] = ()) -> Picture:
     counts = Counter(pairs)
     rows = sorted({true for true, _ in pairs})
-    rest = ("several", "unknown", "no gap", "crash")
-    answered = {said for _, said in pairs}
+    verdicts = ("several", "unknown", "no gap", "crash")
+    answers = {answer for _, answer in pairs}
     across = [*columns] or [
         *rows,
-        *sorted(said for said in answered if said not in rows and said not in rest),
-        *(said for said in rest if said in answered),
+        *sorted(answer for answer in answers if answer not in rows and answer not in verdicts),
+        *(verdict for verdict in verdicts if verdict in answers),
     ]
-    matrix = np.array([[counts[true, said] for said in across] for true in rows])
+    matrix = np.array([[counts[true, answer] for answer in across] for true in rows])
     return Picture(name, confusion_panel(title, _words(rows), _words(across), matrix))
 
 

@@ -1,4 +1,4 @@
-"""The estimate: its table, what is present, and its uncertainty."""
+"""Sections about the estimate: its table, the faults that are present, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.report.findings import findings
+from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import number, shown_unit, with_error
@@ -18,7 +18,7 @@ MOST_ELLIPSES = 6
 
 
 def estimate_section(material: Material) -> Section | None:
-    """Values with standard errors and 95 % intervals, beside what was simulated where it was."""
+    """Values with standard errors and 95 % intervals, and the simulated values if known."""
     final = last_estimate(material)
     if final is None:
         return None
@@ -33,7 +33,7 @@ def estimate_section(material: Material) -> Section | None:
 
 
 def posterior_section(material: Material) -> Section | None:
-    """Ellipses of the pairs that depend on each other most, and the correlation of all."""
+    """Ellipses of the most correlated pairs, and the correlation matrix."""
     final = last_estimate(material)
     if final is None or len(final["names"]) < 2:
         return None
@@ -41,25 +41,25 @@ def posterior_section(material: Material) -> Section | None:
     if covariance is None:
         return None
     std = np.sqrt(np.diag(covariance))
-    known = [i for i in range(len(names)) if np.isfinite(std[i]) and std[i] > 0]
+    determined = [i for i in range(len(names)) if np.isfinite(std[i]) and std[i] > 0]
     correlation = covariance / np.outer(std, std)
-    ranked = sorted(combinations(known, 2), key=lambda pair: -abs(correlation[pair]))[:MOST_ELLIPSES]
+    ranked = sorted(combinations(determined, 2), key=lambda pair: -abs(correlation[pair]))[:MOST_ELLIPSES]
     pictures = [_ellipse(material, final, covariance, pair, k) for k, pair in enumerate(ranked)]
-    words = "Regions that hold 50 % and 95 % of the probability, the most correlated pairs first."
-    words += " The green cross is what was simulated." if material.truth else ""
-    rows = [[names[i], *(f"{correlation[i, j]:z.2f}" for j in known)] for i in known]
-    grid = table(["correlation", *(str(names[j]) for j in known)], rows)
+    words = "Regions with 50 % and 95 % of the probability, most correlated pairs first."
+    words += " The green cross marks the simulated values." if material.truth else ""
+    rows = [[names[i], *(f"{correlation[i, j]:z.2f}" for j in determined)] for i in determined]
+    grid = table(["correlation", *(str(names[j]) for j in determined)], rows)
     return Section("Uncertainty", [words, pictures, grid]) if pictures else None
 
 
 def last_estimate(material: Material) -> Payload | None:
-    """The last final estimate, of the first problem where several were estimated."""
+    """The last final estimate, of the first problem if there are several."""
     finals = [m for m in material.of("/estimate/final") if not m.get("problem")]
     return finals[-1] if finals else None
 
 
 def covariance_of(final: Payload) -> np.ndarray | None:
-    """(P, P); None where the message has none of that size."""
+    """Covariance (P, P); None if the message has none of that size."""
     flat, count = np.asarray(final.get("covariance", ()), dtype=float), len(final["names"])
     return flat.reshape(count, count) if flat.size == count * count else None
 
@@ -84,16 +84,16 @@ def _decades(value: float, reach: float) -> int:
 
 
 def _finding(material: Material, name: str) -> Any:
-    for finding in findings(material):
+    for finding in diagnosed_effects(material):
         if name in (f"{finding.location}.{finding.effect}", f"{finding.location}.{finding.effect}.size"):
             return tag("span", "present", class_="bad") if finding.present else "not found"
     return ""
 
 
 def _water(material: Material) -> list[Any]:
-    """Sizes as flows and as holes, where the log says them."""
+    """Sizes as flows and equivalent holes, if the log has them."""
     lines = []
-    for finding in findings(material):
+    for finding in diagnosed_effects(material):
         if finding.present and np.isfinite(finding.flow):
             text = f"{finding.words} moves {number(1e6 * finding.flow, 3)} cm³/s"
             if np.isfinite(finding.hole):
@@ -109,7 +109,7 @@ def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: t
     scale = np.array(scales)
     centre = scale * np.array([final["values"][i], final["values"][j]], dtype=float)
     part = covariance[np.ix_(pair, pair)] * np.outer(scale, scale)
-    known = all(name in material.truth for name in names)
-    truth = (scales[0] * material.truth[names[0]], scales[1] * material.truth[names[1]]) if known else None
+    simulated = all(name in material.truth for name in names)
+    truth = (scales[0] * material.truth[names[0]], scales[1] * material.truth[names[1]]) if simulated else None
     rho = part[0, 1] / np.sqrt(part[0, 0] * part[1, 1])
     return Picture(f"ellipse_{k + 1}", ellipse_panel(names, units, centre, part, truth), f"correlation {rho:z.2f}")

@@ -1,4 +1,4 @@
-"""A gap diagnosis: where the gap lies, and what causes it. The answer is JSON from a log, and so untrusted."""
+"""Sections about a gap diagnosis: location and causes of the gap. The answer is JSON from a log, hence untrusted."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from fdi_torch.gap.verdict_words import causes_of
 from fdi_torch.gap.verdict_words import explanation_words as in_words
 from fdi_torch.report.html import table, tag
-from fdi_torch.report.loose import as_float
+from fdi_torch.report.json_numbers import as_float
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, shown_unit, with_error
 from fdi_torch.report.panels import bar_panel
@@ -18,11 +18,11 @@ from fdi_torch.report.section import Picture, Section
 
 MOST_BARS = 10
 LEAST_SHOWN = 1e-4  # of a probability
-CONTENT = 0.95  # of the explanations that an answer calls plausible
+CONTENT = 0.95  # probability of the plausible explanations together
 
 
 def where_section(material: Material) -> Section | None:
-    """How likely it is that something is wrong at each component, its law not asked for."""
+    """Probability of a discrepancy at each component, whatever its law."""
     where = {str(m["location"]): m for m in material.of("/gap/where")}
     where |= {str(place["location"]): place for place in material.answer.get("where", [])}
     ranked = sorted(where.items(), key=lambda item: -float(item[1]["share"]))[:MOST_BARS]
@@ -42,7 +42,7 @@ def where_section(material: Material) -> Section | None:
 
 
 def causes_section(material: Material) -> Section | None:
-    """The best explanation with its parameters, and the others with their probabilities."""
+    """Parameters of the best explanation, and all explanations with their probabilities."""
     answer = material.answer
     if not answer:
         return None
@@ -52,23 +52,24 @@ def causes_section(material: Material) -> Section | None:
     blocks += _twins(answer.get("causes", []))
     certain = answer.get("certain") or []
     if certain and answer.get("verdict") != "named":
-        blocks.append(f"Whichever explanation is true, there is with 95 %: {explanation_words(certain)}.")
+        blocks.append(f"With 95 % probability, whichever explanation is true: {explanation_words(certain)}.")
     plausible = [explanation_words(causes) for causes in answer.get("ambiguity_set") or _content(answer)]
     if len(plausible) > 1:
-        blocks += ["These explanations hold 95 % together:", tag("ul", *(tag("li", words) for words in plausible))]
+        blocks += ["Explanations with 95 % of the probability together:"]
+        blocks.append(tag("ul", *(tag("li", words) for words in plausible)))
     blocks += _posterior(answer)
     blocks += [tag("ul", *(tag("li", str(remark)) for remark in answer["remarks"]))] if answer.get("remarks") else []
     return Section("What causes it", blocks) if blocks else None
 
 
 def disturbances_section(material: Material) -> Section | None:
-    """The random flows into the tanks beside the likeliest explanation."""
+    """Random flows into the tanks, estimated together with the likeliest explanation."""
     flows = material.answer.get("disturbances")
     rows = [_flow_row(tank, flow) for tank, flow in flows.items()] if isinstance(flows, dict) else []
     if not rows:
         return None
     words = (
-        "Random flows into each tank that the recording shows beside the likeliest explanation: waves, pulsation, "
+        "Random disturbance flows into each tank, estimated together with the likeliest explanation: waves, pulsation, "
         "splashing. They are no fault."
     )
     header = ("into", "standard deviation", "unit", "correlation time")
@@ -83,21 +84,21 @@ def _flow_row(tank: str, flow: Any) -> list[str]:
 
 
 def _content(answer: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
-    """The fewest explanations that hold 95 % together, by their probabilities."""
-    held, kept = 0.0, []
+    """The fewest explanations with 95 % of the probability together."""
+    total, chosen = 0.0, []
     for item in answer.get("posterior", []):
-        if held >= CONTENT:
+        if total >= CONTENT:
             break
-        held += as_float(item.get("probability"))
-        kept.append(causes_of(item))
-    return kept
+        total += as_float(item.get("probability"))
+        chosen.append(causes_of(item))
+    return chosen
 
 
 def _posterior(answer: Mapping[str, Any]) -> list[Any]:
-    """Bars of the explanations' probabilities, and of what was not examined."""
-    weighed = [item for item in answer.get("posterior", []) if as_float(item.get("probability")) >= LEAST_SHOWN]
-    names = [explanation_words(causes_of(item)) for item in weighed[:MOST_BARS]]
-    chances = [as_float(item["probability"]) for item in weighed[:MOST_BARS]]
+    """Bars of the explanations' probabilities, and of that of unexamined ones."""
+    weighted = [item for item in answer.get("posterior", []) if as_float(item.get("probability")) >= LEAST_SHOWN]
+    names = [explanation_words(causes_of(item)) for item in weighted[:MOST_BARS]]
+    chances = [as_float(item["probability"]) for item in weighted[:MOST_BARS]]
     within = [k < len(_content(answer)) for k in range(len(chances))]
     if as_float(answer.get("unexamined")) >= LEAST_SHOWN:
         names, chances, within = [*names, "not examined"], [*chances, as_float(answer["unexamined"])], [*within, False]
@@ -107,11 +108,11 @@ def _posterior(answer: Mapping[str, Any]) -> list[Any]:
     texts = [f"{percent:.3g} %" for percent in percents]
     figure = bar_panel("Explanations", "probability, %", names, percents, texts, within)
     _up_to_all(figure)
-    return [[Picture("gap_posterior", figure, "Orange: together they hold 95 %.")]]
+    return [[Picture("gap_posterior", figure, "Orange: together they have 95 % of the probability.")]]
 
 
 def _up_to_all(figure: Figure) -> None:
-    """No ticks beyond 100 %, where only the numbers at the ends of the bars stand."""
+    """Remove ticks beyond 100 %, where only the values of the bars are."""
     axes = figure.axes[0]
     axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= 100.0])
 
@@ -132,9 +133,9 @@ def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:
 
 
 def _twins(causes: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Causes that are one thing under two names."""
-    told = [(c, explanation_words(c["same_as"])) for c in causes if c.get("same_as")]
-    return [f"{explanation_words([cause])} is the same as {twin}." for cause, twin in told]
+    """Sentences about causes that are equivalent to another effect."""
+    equivalents = [(c, explanation_words(c["same_as"])) for c in causes if c.get("same_as")]
+    return [f"{explanation_words([cause])} is equivalent to {twin}." for cause, twin in equivalents]
 
 
 def explanation_words(causes: Sequence[Mapping[str, Any]]) -> str:

@@ -1,4 +1,4 @@
-"""How far a gap closes on data that no fit has seen, and what its calibration constants became."""
+"""Sections about the closure of a gap on data not used for fitting, and about the calibration constants."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from pathlib import PurePath
 from typing import Any
 
 from fdi_torch.report.html import table
-from fdi_torch.report.loose import as_float
+from fdi_torch.report.json_numbers import as_float
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, percent, shown_unit, with_error
 from fdi_torch.report.panels import bar_panel
 from fdi_torch.report.section import Picture, Section
 
 STAGES = {
-    "nominal": "as believed",
+    "nominal": "nominal model",
     "recalibrated": "recalibrated",
     "augmented": "with the cause",
     "ceiling": "with free functions",
     "noise_floor": "noise",
 }
-FROZEN = {"recalibrated": "constants as recalibrated without it", "nominal": "constants as believed"}
+FROZEN = {"recalibrated": "constants recalibrated without it", "nominal": "nominal constants"}
 
 
 def closure_section(material: Material) -> Section | None:
@@ -46,15 +46,15 @@ def closure_section(material: Material) -> Section | None:
     blocks += _each_holdout(closure, unit)
     if extra and "ceiling" in closure:
         blocks.append(
-            "Free functions of the guilty component's own variables, added to the cause, are what a better equation of "
-            "it could reach at most. Far larger errors with other constants show what recalibration without the cause "
-            "had taken for it: with both, the gap is counted twice."
+            "Free functions of the component's own variables, added to the cause, show the best that a better equation "
+            "could reach. If the errors with other constants are far larger, recalibration without the cause had "
+            "absorbed part of it; using both would count the gap twice."
         )
     return Section("How far it closes", blocks)
 
 
 def constants_section(material: Material) -> Section | None:
-    """What each calibration constant is believed to be, and what it became without and with the cause."""
+    """Nominal value of each calibration constant, and its values without and with the cause."""
     constants = material.answer.get("constants") or {}
     rows = []
     for name, c in constants.items():
@@ -62,24 +62,24 @@ def constants_section(material: Material) -> Section | None:
         values = {key: scale * as_float(c.get(key)) for key in ("nominal", "tolerance", "recalibrated", "augmented")}
         off = [(values[m] - values["nominal"]) / values["tolerance"] for m in ("recalibrated", "augmented")]
         fitted = with_error(values["augmented"], scale * as_float(c.get("std")))
-        believed = with_error(values["nominal"], values["tolerance"])
-        rows.append([str(name), believed, number(values["recalibrated"]), number(off[0], 2), fitted, number(off[1], 2)])
+        nominal = with_error(values["nominal"], values["tolerance"])
+        rows.append([str(name), nominal, number(values["recalibrated"]), number(off[0], 2), fitted, number(off[1], 2)])
         rows[-1].append(unit)
     if not rows:
         return None
-    header = ["constant", "believed", "recalibrated", "tolerances off", "with the cause", "tolerances off", "unit"]
+    header = ["constant", "nominal", "recalibrated", "tolerances off", "with the cause", "tolerances off", "unit"]
     if not any(row[-1] for row in rows):
         header, rows = header[:-1], [row[:-1] for row in rows]
-    words = "Constants with a tolerance are refitted throughout; far out of it they stand in for what the model lacks."
+    words = "Constants with a tolerance are always refitted; a value far outside it compensates for a model error."
     return Section("Calibration constants", [words, table(header, rows)])
 
 
 def _closed(closure: Mapping[str, Any]) -> str:
     share, interval = closure.get("closed"), list(closure.get("closed_ci95") or [])
     if isinstance(share, int | float) and share < 0.0:
-        return "The gap does not close on data not used for fitting: what was found does not carry over to it."
+        return "The gap does not close on data not used for fitting: the causes do not carry over to them."
     if not isinstance(share, int | float):
-        return "How much of the gap closes is undefined: it is too small against its own standard error."
+        return "The closed share of the gap is undefined: the gap is too small compared with its standard error."
     between = f" (95 % interval {percent(interval[0])} to {percent(interval[1])})" if _is_interval(interval) else ""
     return f"{percent(share)} of the gap is closed on data not used for fitting{between}."
 
@@ -89,7 +89,7 @@ def _is_interval(interval: Any) -> bool:
 
 
 def _headed(closure: Mapping[str, Any]) -> list[str]:
-    """The sensors, each with its unit where these differ."""
+    """The sensors, with their units if these differ."""
     units = closure.get("units") or {}
     return [f"{s}, {units[s]}" if len(set(units.values())) > 1 and s in units else s for s in _sensors(closure)]
 
@@ -103,7 +103,7 @@ def _by_sensor(closure: Mapping[str, Any], stage: str) -> list[str]:
 
 
 def _each_holdout(closure: Mapping[str, Any], unit: str) -> list[Any]:
-    """One row a file, where there are several."""
+    """One row per file, if there are several."""
     rows = []
     for one in closure.get("per_holdout") or []:
         share = one.get("closed")

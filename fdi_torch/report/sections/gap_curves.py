@@ -1,4 +1,4 @@
-"""The discrepancy at the guilty component against its own variables: what a free form finds, what the cause does."""
+"""Section about the discrepancy as a function of the component's own variables: free function and named cause."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from fdi_torch.report.html import short
-from fdi_torch.report.loose import as_float, as_vector
+from fdi_torch.report.json_numbers import as_float, as_vector
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.panels import line_panel
@@ -22,25 +22,25 @@ _VARIABLE_UNITS = {"level": "m", "head": "m", "difference": "m", "time": "s", "p
 
 
 def curves_section(material: Material) -> Section | None:
-    """One panel for each variable of each guilty component."""
+    """One panel for each variable of each component with a discrepancy."""
     curves = [c for c in material.answer.get("curves") or [] if isinstance(c, dict)][:MOST_CURVES]
     if not curves:
         return None
     pictures = [Picture(f"gap_curve_{k + 1}", curve_panel(curve)) for k, curve in enumerate(curves)]
-    words = "What the component does beyond the plant file, averaged where its variable has the same value. "
+    words = "Discrepancy between the component and the plant file, averaged at equal values of its variable. "
     if any("effect" in curve for curve in curves):
         words += (
-            "Blue: a free function with two standard errors, which knows no library; orange: the cause that was named. "
-            "Where both agree, the cause's equation is right; a free function knows no memory, so that it sees little "
-            "of a lag or a delay."
+            "Blue: a free function with two standard errors, estimated without the library; orange: the named cause. "
+            "Where both agree, the cause's equation is right. A free function has no memory and hardly shows lags or "
+            "delays."
         )
     else:
-        words += "A free function with two standard errors: what a cause that has no name yet would have to do."
+        words += "The free function, with two standard errors, shows what an unnamed cause would have to do."
     return Section("The discrepancy", [words, pictures])
 
 
 def curve_panel(curve: Mapping[str, Any]) -> Figure:
-    """Free form with its band, and the effect over it."""
+    """Free function with its band, and the effect."""
     unit, scale = shown_unit(str(curve.get("unit", "")))
     quantity = str(curve.get("quantity", ""))
     y_unit, y_scale = ("%", 100.0) if quantity == "area" else shown_unit(str(curve.get("quantity_unit", "")))
@@ -58,7 +58,7 @@ def curve_panel(curve: Mapping[str, Any]) -> Figure:
 
 
 def shape_section(material: Material) -> Section | None:
-    """The free-form discrepancy as tables, of logs that have no curves."""
+    """The free-form discrepancy as tables, for logs without curves."""
     shape = material.answer.get("shape")
     if material.answer.get("curves") or not isinstance(shape, dict) or not shape.get("tables"):
         return None
@@ -71,5 +71,5 @@ def shape_section(material: Material) -> Section | None:
         figure = line_panel(title, axis(variable, unit), "discrepancy, SI", [("discrepancy", x, y, MARK)])
         figure.axes[0].axhline(0.0, color=SOFT, lw=0.8)
         pictures.append(Picture(f"gap_shape_{k + 1}", figure))
-    words = "What has to be added at this place so that the readings are met, whatever its cause."
+    words = "What must be added at this location to explain the readings, whatever its cause."
     return Section("The discrepancy", [words, pictures])

@@ -1,4 +1,4 @@
-"""What the inputs of a recording cannot tell, how much a name is therefore worth, and what to run next."""
+"""Sections about the limits of a recording's inputs, the reliability of a name, and the next experiment."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.report.html import folded, tag
-from fdi_torch.report.loose import as_float, as_vector
+from fdi_torch.report.json_numbers import as_float, as_vector
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, percent, shown_unit
 from fdi_torch.report.panels import line_panel
@@ -20,12 +20,12 @@ MOST_LISTED = 40
 
 
 def next_input_section(material: Material) -> Section | None:
-    """The input that would part the rivals."""
-    wanted = material.answer.get("next_input")
-    if not isinstance(wanted, dict) or not isinstance(wanted.get("input"), dict):
+    """The experiment that would distinguish the two likeliest explanations."""
+    proposal = material.answer.get("next_input")
+    if not isinstance(proposal, dict) or not isinstance(proposal.get("input"), dict):
         return None
-    steps = {name: c for name, c in wanted["input"].items() if isinstance(c, dict) and "at" in c}
-    units, end = wanted["input"].get("unit") or {}, as_float(wanted["input"].get("duration"))
+    steps = {name: c for name, c in proposal["input"].items() if isinstance(c, dict) and "at" in c}
+    units, end = proposal["input"].get("unit") or {}, as_float(proposal["input"].get("duration"))
     pictures = []
     for k, (name, channel) in enumerate(steps.items()):
         unit, scale = shown_unit(str(units.get(name, "")))
@@ -34,51 +34,51 @@ def next_input_section(material: Material) -> Section | None:
         figure = line_panel(name, "time, s", axis("command", unit), [line])
         figure.axes[0].lines[0].set_drawstyle("steps-post")
         pictures.append(Picture(f"gap_next_input_{k + 1}", figure))
-    return Section("What to run next", [_next_words(wanted), pictures])
+    return Section("Next experiment", [_next_words(proposal), pictures])
 
 
 def limits_section(material: Material) -> Section | None:
-    """Effects that these inputs hide or mix up, and how often another cause would have passed for the one named."""
+    """Effects that these inputs hide or confuse, and how often another cause would have got this name."""
     excitation = material.answer.get("excitation") or {}
     impostors = material.answer.get("impostors") or {}
-    blocks: list[Any] = [*_impostor_words(impostors)]
+    blocks: list[Any] = [*_confusability_words(impostors)]
     hidden = [explanation_words([cause]) for cause in excitation.get("hidden") or []]
     pairs = [" and ".join(explanation_words([c]) for c in p["between"]) for p in excitation.get("inseparable") or []]
-    seen = "effects too small to be seen at their typical size"
-    for title, items in ((seen, hidden), ("pairs of effects that look alike", pairs)):
+    small = "effects too small to be seen at their typical size"
+    for title, items in ((small, hidden), ("pairs of effects with the same signature", pairs)):
         if items:
             listed = tag("ul", *(tag("li", item) for item in items[:MOST_LISTED]))
             blocks.append(folded(f"With these inputs: {len(items)} {title}", listed))
-    return Section("What these inputs cannot tell", blocks) if blocks else None
+    return Section("Limits of these inputs", blocks) if blocks else None
 
 
-def _next_words(wanted: Mapping[str, Any]) -> str:
-    between = [explanation_words(causes) for causes in wanted.get("between") or []]
+def _next_words(proposal: Mapping[str, Any]) -> str:
+    between = [explanation_words(causes) for causes in proposal.get("between") or []]
     rivals = " from ".join(between) if len(between) == 2 else "the best two explanations"
     words = f"Of step inputs within the limits of pumps and levels, this one separates {rivals} most."
-    when, samples = wanted.get("parted_after"), wanted.get("parted_after_samples")
+    when, samples = proposal.get("parted_after"), proposal.get("parted_after_samples")
     if not isinstance(when, int | float):
-        return f"{words} It is too short to part them for certain."
+        return f"{words} It is too short to distinguish them with certainty."
     count = f" ({samples} samples)" if isinstance(samples, int) else ""
-    return f"{words} They are expected to part after {number(float(when))} s{count}."
+    return f"{words} They are expected to be distinguishable after {number(float(when))} s{count}."
 
 
-def _impostor_words(impostors: Mapping[str, Any]) -> list[str]:
-    told = []
-    best, left = impostors.get("best"), impostors.get("left_open")
-    if best and isinstance(left, int | float):
-        told.append(
-            f"Had the library lacked the cause, the best explanation would have been {explanation_words(best)}, with "
-            f"{percent(left)} of the gap left open."
+def _confusability_words(impostors: Mapping[str, Any]) -> list[str]:
+    sentences = []
+    best, unexplained = impostors.get("best"), impostors.get("left_open")
+    if best and isinstance(unexplained, int | float):
+        sentences.append(
+            f"If the library had lacked the cause, the best explanation would have been {explanation_words(best)}, "
+            f"with {percent(unexplained)} of the gap unexplained."
         )
     simulated = impostors.get("simulated")
     if isinstance(simulated, dict):
         passed_for = [explanation_words([c]) for c in simulated.get("passed_for") or []]
         mostly = f", mostly for {', '.join(passed_for[:3])}" if passed_for else ""
         rivals, draws = simulated.get("rivals"), simulated.get("draws")
-        told.append(
-            f"Had another of {rivals} causes made a gap of this size, this one would have been named in "
+        sentences.append(
+            f"If another of {rivals} causes had made a gap of this size, this one would have been named in "
             f"{simulated.get('confused')} of {draws} simulated recordings; with the true one missing from the library, "
             f"in {simulated.get('passed')}{mostly} (simulated to first order)."
         )
-    return told
+    return sentences

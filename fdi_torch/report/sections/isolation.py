@@ -1,4 +1,4 @@
-"""A study of fault modes: which set of faults was stated for which that was there."""
+"""Section about a study of fault modes: stated against true sets of faults."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ MOST_MODES = 64
 
 
 def isolation_section(material: Material) -> Section | None:
-    """The matrix of modes as a picture, and each mode in a row of a table."""
+    """The confusion matrix of the modes as a picture, and a table with one row per mode."""
     labels, counts = _labels(material), material.arrays.get("confusion")
     if counts is None or counts.shape != (len(labels), len(labels)) or not 0 < len(labels) <= MOST_MODES:
         return None
-    found = material.about("result")
-    told = [found.get(f"isolation.{name}", "?") for name in ("right", "trials", "missed", "false")]
+    result = material.about("result")
+    counts_ = [result.get(f"isolation.{name}", "?") for name in ("right", "trials", "missed", "false")]
     words = (
-        "{} of {} modes stated as they are; {} faults missed, {} stated that are not there. ".format(*told)
-        + "A row is the mode that is there, a column the one that is stated; the table names them."
+        "{} of {} modes stated correctly; {} faults missed, {} false faults. ".format(*counts_)
+        + "Row: true mode; column: stated mode; the table has their names."
     )
     rows = [_row(k, labels, counts) for k in range(len(labels)) if counts[k].sum()]
     listed = table(["", "mode", "trials", "right", "most often taken for"], rows)
@@ -33,8 +33,8 @@ def isolation_section(material: Material) -> Section | None:
 
 
 def matrix_panel(counts: np.ndarray) -> Figure:
-    """Shares of each row (M, M), the darker the larger; right is on the diagonal."""
-    figure, axes = panel("Stated against true", "mode stated", "mode that is there", height=4.0)
+    """Share of each row (M, M) as a heat map; right answers are on the diagonal."""
+    figure, axes = panel("Stated against true", "stated mode", "true mode", height=4.0)
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     for row, column in np.argwhere(share > 0):
         strength = 0.15 + 0.85 * float(share[row, column])
@@ -56,5 +56,5 @@ def _row(k: int, labels: list[str], counts: np.ndarray) -> list[str]:
 
 
 def _labels(material: Material) -> list[str]:
-    """The names of the modes, as the result record holds them."""
+    """Names of the modes from the result record."""
     return [str(label) for label in material.listed("isolation.labels")]

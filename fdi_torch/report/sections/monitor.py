@@ -1,4 +1,4 @@
-"""On-line monitoring: residuals with their thresholds, alarms on them, and every event in words."""
+"""Sections about a monitor: residuals with thresholds and alarms, and all events."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SUFFIXES = ("_statistic", "_threshold")
 
 
 def residual_section(material: Material) -> Section | None:
-    """One panel a channel for the residual, and one for its test statistic against the threshold."""
+    """One panel per channel for the residual, and one for the test statistic with its threshold."""
     columns = dict(material.residuals)
     time = columns.pop("t", np.zeros(0))
     if not len(time):
@@ -37,7 +37,7 @@ def residual_section(material: Material) -> Section | None:
 
 
 def event_section(material: Material) -> Section | None:
-    """What the monitor said, and when."""
+    """All events of the monitor."""
     events = material.of(ALARM)
     if not events:
         return None
@@ -51,4 +51,4 @@ def event_section(material: Material) -> Section | None:
         ]
         for m in events
     ]
-    return Section("Events", [table(("time, s", "event", "at", "in words", "onset, s"), rows, left=4)])
+    return Section("Events", [table(("time, s", "event", "at", "description", "onset, s"), rows, left=4)])

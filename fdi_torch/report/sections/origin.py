@@ -1,4 +1,4 @@
-"""What the run was asked to do, where it comes from, and whether its log is sound."""
+"""Sections about configuration, provenance and integrity of the log."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ _LEVELS = {3: "warning", 4: "error", 5: "fatal"}
 
 
 def configuration_section(material: Material) -> Section | None:
-    """The configuration exactly as it was given."""
+    """The original configuration file."""
     raw = material.run.attachment("config.yaml") if "config.yaml" in material.run.attachments else b""
     text = raw.decode(errors="replace")
     if not text:
         return None
-    cut = [tag("p", "The rest is in the log.", class_="note")] if len(text) > MOST_TEXT else []
-    return Section("Configuration", [folded("as it was given (YAML)", tag("pre", text[:MOST_TEXT]), *cut)])
+    cut = [tag("p", "The remainder is in the log.", class_="note")] if len(text) > MOST_TEXT else []
+    return Section("Configuration", [folded("original file (YAML)", tag("pre", text[:MOST_TEXT]), *cut)])
 
 
 def provenance_section(material: Material) -> Section | None:
-    """Versions, seeds, the data's fingerprints and the log's own path."""
+    """Versions, seeds, hashes of the data, and the log's name."""
     blocks = [pairs([("log", material.run.path.name), ("written by", material.run.library)])]
     for record, title in RECORDS.items():
         values = material.about(record)
@@ -36,28 +36,30 @@ def provenance_section(material: Material) -> Section | None:
 
 
 def health_section(material: Material) -> Section | None:
-    """CRCs, indices, completeness, what was said, and how many messages each topic has."""
-    found = material.inspection
-    problems = [*found.health.problems, *material.trouble]
-    state = tag("span", "not sound", class_="bad") if problems else tag("span", "sound", class_="good")
-    chunks = "chunk" if found.health.chunks == 1 else "chunks"
+    """CRCs, indices, completeness, log messages, and the number of messages per topic."""
+    inspection = material.inspection
+    problems = [*inspection.health.problems, *material.trouble]
+    state = tag("span", "damaged", class_="bad") if problems else tag("span", "intact", class_="good")
+    chunks = "chunk" if inspection.health.chunks == 1 else "chunks"
     counted = (
-        f"{found.messages} messages on {len(found.topics)} topics in {found.health.chunks} {chunks}, {found.size} bytes"
+        f"{inspection.messages} messages on {len(inspection.topics)} topics in {inspection.health.chunks} {chunks}, "
+        f"{inspection.size} bytes"
     )
-    rows = [[info.topic, str(info.messages), number(info.first), number(info.last)] for info in found.topics.values()]
-    said = [_spoken(message) for message in material.of("/log")]
+    topics = inspection.topics.values()
+    rows = [[info.topic, str(info.messages), number(info.first), number(info.last)] for info in topics]
+    messages = [_log_message(message) for message in material.of("/log")]
     return Section(
-        "Health of the log",
+        "Integrity of the log",
         [
             tag("p", "The file is ", state, f": {counted}."),
             *([tag("ul", *(tag("li", problem) for problem in problems))] if problems else []),
-            *([found.advice] if found.advice else []),
-            *([folded(f"What was said ({len(said)})", tag("ul", *said))] if said else []),
+            *([inspection.advice] if inspection.advice else []),
+            *([folded(f"Log messages ({len(messages)})", tag("ul", *messages))] if messages else []),
             folded("Topics", table(("topic", "messages", "from, s", "to, s"), rows)),
         ],
     )
 
 
-def _spoken(message: Mapping[str, Any]) -> str:
+def _log_message(message: Mapping[str, Any]) -> str:
     level = _LEVELS.get(message.get("level", 0), "")
     return tag("li", f"{level}: " if level else "", message.get("message", ""))

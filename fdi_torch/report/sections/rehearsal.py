@@ -1,4 +1,4 @@
-"""A rehearsal of a monitor: its tables, as the command prints them."""
+"""Section about the Monte Carlo validation of a monitor: its result tables."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from fdi_torch.report.section import Section
 def rehearsal_section(material: Material) -> Section | None:
     """Every table under its title."""
     blocks: list[Markup | str] = []
-    for told in rehearsal_tables(material):
-        title, header, rows = (told.get(name) for name in ("title", "header", "rows"))
+    for entry in rehearsal_tables(material):
+        title, header, rows = (entry.get(name) for name in ("title", "header", "rows"))
         if isinstance(header, list) and isinstance(rows, list):
-            whole = [row for row in rows if isinstance(row, list) and len(row) == len(header)]
-            blocks += [tag("h4", str(title)), table(header, whole)]
-    return Section("What the monitor did", blocks) if blocks else None
+            complete = [row for row in rows if isinstance(row, list) and len(row) == len(header)]
+            blocks += [tag("h4", str(title)), table(header, complete)]
+    return Section("Validation of the monitor", blocks) if blocks else None
 
 
 def rehearsal_tables(material: Material) -> list[dict[str, Any]]:
-    """The tables of the log's result; none where it has none, or none that can be read."""
+    """The tables in the log's result; empty if they are missing or unreadable."""
     if material.kind != "rehearsal":
         return []
-    return [told for told in material.listed("tables") if isinstance(told, dict)]
+    return [entry for entry in material.listed("tables") if isinstance(entry, dict)]

@@ -1,4 +1,4 @@
-"""The rig with the diagnosis on it."""
+"""Section with a drawing of the rig and the diagnosis on it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.report.findings import findings
+from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, shown_unit
 from fdi_torch.report.schematic import Overlay, schematic
@@ -15,20 +15,20 @@ from fdi_torch.report.section import Picture, Section
 
 
 def rig_section(material: Material) -> Section | None:
-    """The schematic: last levels read, what was found where, how sure a place is as strength of colour."""
+    """The schematic with the last levels, the diagnosed effects, and the probability of a discrepancy by location."""
     plant = material.plant
     if plant is None:
         return None
-    overlay = Overlay(last_levels(material, plant), marks_of(material), heat_of(material))
-    parts = ["Levels are the last ones read."] if overlay.levels else []
-    parts += ["Orange: what was found."] if overlay.marks else []
-    parts += [f"Strength of colour: {material.meaning_of_shares}."] if overlay.heat else []
+    overlay = Overlay(last_levels(material, plant), marks_of(material), probabilities_of(material))
+    parts = ["Levels are the last readings."] if overlay.levels else []
+    parts += ["Orange: diagnosed effects."] if overlay.marks else []
+    parts += [f"Strength of colour: {material.meaning_of_shares}."] if overlay.probabilities else []
     caption = " ".join([f"{plant.name}, not to scale.", *parts])
     return Section("The rig", [[Picture("rig", schematic(plant, overlay), caption, wide=True)]])
 
 
 def last_levels(material: Material, plant: PlantDescription) -> dict[str, float]:
-    """Tank -> level in m, from the last reading that counts."""
+    """Tank -> level in m, from the last valid reading."""
     levels: dict[str, float] = {}
     if not material.groups:
         return levels
@@ -44,9 +44,9 @@ def last_levels(material: Material, plant: PlantDescription) -> dict[str, float]
 
 
 def marks_of(material: Material) -> dict[str, list[str]]:
-    """Location -> what was found there, in a few words."""
+    """Location -> short texts of the diagnosed effects."""
     marks: dict[str, list[str]] = {}
-    for finding in findings(material):
+    for finding in diagnosed_effects(material):
         if finding.present:
             unit, scale = shown_unit(finding.unit)
             size = "" if math.isnan(finding.size) else f" {number(scale * finding.size, 3)} {unit}".rstrip()
@@ -54,7 +54,7 @@ def marks_of(material: Material) -> dict[str, list[str]]:
     return marks
 
 
-def heat_of(material: Material) -> dict[str, float]:
+def probabilities_of(material: Material) -> dict[str, float]:
     """Location -> its number between 0 and 1, see `Material.meaning_of_shares`."""
     where = {str(message["location"]): float(message["share"]) for message in material.of("/gap/where")}
     where |= {str(place["location"]): float(place["share"]) for place in material.answer.get("where", [])}

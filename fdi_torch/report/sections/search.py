@@ -1,4 +1,4 @@
-"""How the estimate was reached: the global search, then the refinement."""
+"""Sections about the estimation: global search, then refinement."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def refinement_section(material: Material) -> Section | None:
     colours = (MODEL, OTHER, MARK, SOFT)
     lines: list[Line] = []
     for colour, lane in zip(colours, lanes, strict=False):
-        own = [m for m in events if int(m.get("problem", 0)) == lane]
-        lines.append((f"start {lane + 1}", np.arange(len(own)), column(own, "cost"), colour))
+        start = [m for m in events if int(m.get("problem", 0)) == lane]
+        lines.append((f"start {lane + 1}", np.arange(len(start)), column(start, "cost"), colour))
     figure = line_panel("Cost", "iteration", "cost", lines, log=True)
     lowest = float(np.nanmin(column(events, "cost")))
     words = (
@@ -55,13 +55,13 @@ def refinement_section(material: Material) -> Section | None:
 
 
 def column(events: Sequence[Payload], name: str) -> np.ndarray:
-    """A number of each message, NaN where one lacks it."""
+    """A number of each message, NaN where it is missing."""
     values = (m.get(name) for m in events)
     return np.array([float(v) if isinstance(v, int | float) else np.nan for v in values])
 
 
 def _best_members(material: Material, events: Sequence[Payload], steps: np.ndarray) -> list[Picture]:
-    """The best member's parameters on their way to the final estimate."""
+    """Parameters of the best member over the generations."""
     final = last_estimate(material)
     names = [str(name) for name in (final or {}).get("names", ()) if name in events[-1]][:MOST_PARAMETERS]
     pictures = []

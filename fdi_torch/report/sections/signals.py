@@ -1,11 +1,11 @@
-"""What was read and commanded, against what the estimate predicts."""
+"""Sections about the signals: inputs, readings, predictions and residuals."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from fdi_torch.logbook import Signals
-from fdi_torch.report.curves import held_steps
+from fdi_torch.report.downsampling import corner_points
 from fdi_torch.report.html import table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit
@@ -16,7 +16,7 @@ from fdi_torch.report.style import MODEL, SOFT
 
 
 def fit_section(material: Material) -> Section | None:
-    """Outputs against estimate and what is left, one panel a sensor; outputs alone where nothing was predicted."""
+    """Readings, predictions and residuals of each sensor; readings only if the log has no predictions."""
     blocks: list[str | list[Picture]] = []
     fitted = False
     for k, recording in enumerate(material.recordings):
@@ -33,7 +33,7 @@ def fit_section(material: Material) -> Section | None:
 
 
 def inputs_section(material: Material) -> Section | None:
-    """What was commanded; panels where it moves, words where it is constant."""
+    """Inputs: panels for those that vary, text for constant ones."""
     blocks: list[str | list[Picture]] = []
     for k, recording in enumerate(material.recordings):
         suffix = f"_{k + 1}" if len(material.recordings) > 1 else ""
@@ -48,13 +48,13 @@ def inputs_section(material: Material) -> Section | None:
             figure = line_panel(name, "time, s", axis("command", unit), [(name, time, corners, MODEL)])
             figure.axes[0].lines[0].set_drawstyle("steps-post" if recording.hold == "zero_order" else "default")
             pictures.append(Picture(f"input{suffix}_{i + 1}", figure))
-        blocks += [f"Held throughout: {', '.join(constant)}."] if constant else []
+        blocks += [f"Constant: {', '.join(constant)}."] if constant else []
         blocks += [pictures] if pictures else []
     return Section("Inputs", blocks) if blocks else None
 
 
 def _steps(recording: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return held_steps(recording.time, values) if recording.hold == "zero_order" else (recording.time, values)
+    return corner_points(recording.time, values) if recording.hold == "zero_order" else (recording.time, values)
 
 
 def _output_panels(recording: Signals, model: np.ndarray | None, suffix: str) -> list[Picture]:
@@ -69,8 +69,8 @@ def _output_panels(recording: Signals, model: np.ndarray | None, suffix: str) ->
         pictures.append(Picture(f"output{suffix}_{i + 1}", figure))
     for i, name in enumerate(recording.output_names if model is not None else ()):
         unit, scale = shown_unit(recording.output_units[i])
-        left = scale * (readings[:, i] - model[:, i])  # type: ignore[index]
-        figure = residual_panel(f"{name}: what is left", axis("read − estimate", unit), recording.time, left)
+        residual = scale * (readings[:, i] - model[:, i])  # type: ignore[index]
+        figure = residual_panel(f"{name}: residual", axis("read − estimate", unit), recording.time, residual)
         pictures.append(Picture(f"residual{suffix}_{i + 1}", figure))
     return pictures
 
@@ -81,21 +81,23 @@ def _misfit_table(recording: Signals, model: np.ndarray) -> str:
     for i, name in enumerate(recording.output_names):
         unit, scale = shown_unit(recording.output_units[i])
         counted = recording.mask[:, i] & np.isfinite(model[:, i])
-        read, said = scale * recording.outputs[counted, i], scale * model[counted, i]
-        left = read - said
-        rows.append([name, unit or "1", str(int(counted.sum())), *_statistics(left), _correlation(read, said)])
+        read, estimate = scale * recording.outputs[counted, i], scale * model[counted, i]
+        residual = read - estimate
+        row = [name, unit or "1", str(int(counted.sum())), *_statistics(residual), _correlation(read, estimate)]
+        rows.append(row)
     header = ("sensor", "unit", "readings", "root mean square", "mean", "largest", "correlation")
     return table(header, rows, left=2)
 
 
-def _statistics(left: np.ndarray) -> list[str]:
-    if not len(left):
+def _statistics(residual: np.ndarray) -> list[str]:
+    if not len(residual):
         return ["–"] * 3
-    return [number(float(v), 3) for v in (np.sqrt(np.mean(left**2)), np.mean(left), np.max(np.abs(left)))]
+    statistics = (np.sqrt(np.mean(residual**2)), np.mean(residual), np.max(np.abs(residual)))
+    return [number(float(v), 3) for v in statistics]
 
 
-def _correlation(read: np.ndarray, said: np.ndarray) -> str:
-    """A dash where one of both is constant."""
-    if len(read) < 2 or np.ptp(read) == 0 or np.ptp(said) == 0:
+def _correlation(read: np.ndarray, estimate: np.ndarray) -> str:
+    """Pearson correlation; a dash if one of both is constant."""
+    if len(read) < 2 or np.ptp(read) == 0 or np.ptp(estimate) == 0:
         return "–"
-    return f"{float(np.corrcoef(read, said)[0, 1]):.6f}"
+    return f"{float(np.corrcoef(read, estimate)[0, 1]):.6f}"

@@ -1,4 +1,4 @@
-"""A study: its settings summed up, and its trials."""
+"""Sections about a study: summary by setting, errors, and trials."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _OWN = ("t", "trial", "trials", "group", "seed", "status")
 
 
 def summary_section(material: Material) -> Section | None:
-    """One column a setting, one row a number."""
+    """One column per setting, one row per number."""
     settings = material.of(SUMMARY)[:MOST_GROUPS]
     if not settings:
         return None
@@ -36,7 +36,7 @@ def summary_section(material: Material) -> Section | None:
 
 
 def error_section(material: Material) -> Section | None:
-    """Size of every trial's error in each parameter, beside the bound that no unbiased estimator beats on average."""
+    """Absolute error of every trial in each parameter, with the Cramér-Rao bound."""
     trials = [m for m in material.of(TRIAL) if isinstance(m.get("truth"), list)]
     estimator = next((name for name in ESTIMATORS if trials and name in trials[0]), None)
     if estimator is None:
@@ -59,14 +59,14 @@ def error_section(material: Material) -> Section | None:
 
 
 def _parameters(material: Material, estimator: str, count: int) -> list[str]:
-    """Names of the parameters, from the summary's ESTIMATOR.PARAMETER.rmse; their numbers where it tells none."""
+    """Names of the parameters, from the summary's ESTIMATOR.PARAMETER.rmse; numbers if the summary has none."""
     keys = [k for m in material.of(SUMMARY)[:1] for k in m if k.startswith(f"{estimator}.") and k.endswith(".rmse")]
     names = [key.removeprefix(f"{estimator}.").removesuffix(".rmse") for key in keys]
     return names if len(names) == count else [f"parameter {i + 1}" for i in range(count)]
 
 
 def trials_section(material: Material) -> Section | None:
-    """How often trials ended in which way, and every number of theirs by setting: each trial, and the median."""
+    """Shares of the trials' statuses, and each number of the trials by setting, with its median."""
     trials = material.of(TRIAL)
     if not trials or material.kind in ("challenge", "rehearsal"):  # they have tables of their own
         return None
@@ -90,12 +90,12 @@ def trials_section(material: Material) -> Section | None:
 
 
 def group_panel(title: str, label: str, groups: Sequence[str], values: Sequence[np.ndarray]) -> Figure:
-    """Points of every group beside each other, spread sideways so that they can be told apart; the median as a bar."""
+    """Points of every group side by side, with horizontal jitter, and the median as a bar."""
     figure, axes = panel(short(title), "", short(label))
     for k, points in enumerate(values):
         points = points[np.isfinite(points)][:2000]
-        spread = 0.3 * (np.modf(np.arange(len(points)) * 0.6180339887)[0] - 0.5)
-        axes.plot(k + spread, points, ".", color=SOFT, ms=2.5, alpha=0.7)
+        jitter = 0.3 * (np.modf(np.arange(len(points)) * 0.6180339887)[0] - 0.5)
+        axes.plot(k + jitter, points, ".", color=SOFT, ms=2.5, alpha=0.7)
         if len(points):
             axes.plot([k - 0.25, k + 0.25], [np.median(points)] * 2, color=MODEL, lw=2.0)
     turned = max((len(g) for g in groups), default=0) * len(groups) > 36
@@ -114,7 +114,7 @@ def _column(trials: Sequence[Payload], group: str, name: str) -> np.ndarray:
 
 
 def _shown(value: Any) -> str | None:
-    """Numbers, texts and short lists of them as text; None for what no table can hold."""
+    """Numbers, texts and short lists of them as text; None for values that do not fit a table."""
     if isinstance(value, bool | str):
         return str(value)
     if isinstance(value, int | float):

@@ -1,4 +1,4 @@
-"""Faults window by window: when each suspect was there, how large, and where the recording cannot tell."""
+"""Section about a window-by-window fit: when each suspected fault was present, and how large."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from fdi_torch.report.findings import as_number
+from fdi_torch.report.diagnosed_effects import as_number
 from fdi_torch.report.html import short, table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, shown_unit, with_error
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import FAINT, MARK, panel
-from fdi_torch.report.windows import told_windows
+from fdi_torch.report.windowed_fit_result import logged_windows
 
 MOST_SUSPECTS = 40
 
 
 def windows_section(material: Material) -> Section | None:
-    """A bar for each stretch in which a suspect was there, then its size."""
-    windows, stretches = told_windows(material)
+    """A bar for each period in which a fault was present, and its size."""
+    windows, stretches = logged_windows(material)
     if not windows:
         return None
     count = f"{len(windows)} windows, each" if len(windows) > 1 else "One window,"
-    words = f"{count} fitted on its own; neighbours with the same fault are one stretch."
+    words = f"{count} fitted separately; neighbouring windows with the same fault are one period."
     header = ["fault", "from, s", "to, s", "size", "flow"]
-    listed = table(header, [_row(s) for s in stretches]) if stretches else "No suspect was there in any window."
-    caption = "When each suspect was there (dark), and where its window cannot tell (pale)."
+    listed = table(header, [_row(s) for s in stretches]) if stretches else "No fault was present in any window."
+    caption = "When each fault was present (dark), and where its window does not determine it (pale)."
     return Section("Window by window", [words, [Picture("windows", _bars(windows), caption, wide=True)], listed])
 
 
 def _row(stretch: dict[str, Any]) -> list[str]:
-    """Sizes in the unit in which people read them; one that is beyond its range has no error."""
+    """Sizes in a practical unit; a size beyond its range has no error."""
     unit, scale = shown_unit(str(stretch.get("unit", "1")))
     size, std = (as_number(stretch.get(name)) * scale for name in ("size", "std"))
     shown = with_error(size, std) if math.isfinite(std) else f"> {number(size)}"
@@ -48,7 +48,7 @@ def _row(stretch: dict[str, Any]) -> list[str]:
 
 
 def _bars(windows: Sequence[dict[str, Any]]) -> Figure:
-    suspects = [name for name, told in windows[0].items() if isinstance(told, dict)][:MOST_SUSPECTS]
+    suspects = [name for name, entry in windows[0].items() if isinstance(entry, dict)][:MOST_SUSPECTS]
     figure, axes = panel("", "time, s", "", width=5.6, height=1.0 + 0.28 * len(suspects))
     for row, name in enumerate(suspects):
         for state, strength in (("present", 1.0), ("cannot tell", 0.25)):

@@ -1,0 +1,164 @@
+"""Kinds of cases (strata), and the choice of causes for a case of each kind: names and locations, without numbers."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdi_torch.blind.places import EFFECTS, TWINS, Cause, are_twins, canonical, effect_places, places
+from fdi_torch.blind.plants import Rig
+from fdi_torch.blind.unseen_laws import Unknown, unknown_to
+from fdi_torch.plant.description import PlantDescription
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of cases.
+
+    strength: of full effects (1 is usual). causes: number of full effects; perhaps: further ones in every other case;
+    faint: further ones of an eighth of the usual strength. unseen: whether a law outside the library is added. inputs:
+    see `draw_conditions`. coloured: probability of correlated noise. disturbed: random disturbance flows. unmeasured:
+    share of levels without a sensor. looped: whether a level is controlled. shows: whether causes are drawn again until
+    each is visible in the readings.
+    """
+
+    name: str
+    strength: float = 1.0
+    causes: int = 1
+    perhaps: int = 0
+    faint: int = 0
+    unseen: bool = False
+    inputs: str = "rich"
+    coloured: float = 0.0
+    disturbed: bool = False
+    unmeasured: float = 0.0
+    looped: bool = False
+    shows: bool = False
+
+
+FAINT = 0.125
+KINDS = {
+    kind.name: kind
+    for kind in (
+        Kind("single"),
+        Kind("weak", strength=0.2),
+        Kind("coloured", coloured=1.0),
+        Kind("null", causes=0, coloured=0.3),
+        Kind("pair", causes=2),
+        Kind("unknown", causes=0, unseen=True),
+        Kind("messy", faint=3),
+        Kind("poor", inputs="poor"),
+        Kind("twins", strength=0.6),
+        Kind("left_out"),
+        Kind("dnull", causes=0, inputs="steps", disturbed=True),
+        Kind("dsingle", inputs="steps", disturbed=True, shows=True),
+        Kind("site", perhaps=1, inputs="steps", shows=True),
+        Kind("hidden", inputs="steps", unmeasured=1 / 3, shows=True),
+        Kind("law", causes=0, unseen=True, inputs="steps", shows=True),
+        Kind("mixed", unseen=True, inputs="steps", shows=True),
+        Kind("loop", inputs="steps", looped=True, shows=True),
+    )
+}
+ON_NETWORKS = ("site", "hidden", "law", "mixed", "null", "loop", "dnull", "dsingle")
+"""Default kinds for random networks."""
+_EXTRA = {"left_out", "site", "hidden", "law", "mixed", "loop"}
+STANDARD = tuple(name for name in KINDS if name not in _EXTRA)
+"""Default kinds for all other rigs."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Causes of a case by name: `full` ones, then faint ones. `unknown`: a law outside the library."""
+
+    causes: tuple[Cause, ...] = ()
+    full: int = 0
+    unknown: Unknown | None = None
+    place: str = ""
+    leave_out: tuple[str, ...] = ()
+
+
+def case_generator(seed: int, kind: str, index: int, *more: int) -> np.random.Generator:
+    """Random generator of one case, independent of all other cases and of their number."""
+    return np.random.default_rng([seed, zlib.crc32(kind.encode()), index, *more])
+
+
+def in_turn(items: Sequence[str], seed: int, kind: str, index: int) -> str:
+    """The item at this index of a sequence of shuffled rounds, so that all items are equally frequent."""
+    turn, at = divmod(index, len(items))
+    order = case_generator(seed, kind, turn, 1).permutation(len(items))
+    return items[int(order[at])]
+
+
+def choose(
+    kind: Kind,
+    rig: Rig,
+    seed: int,
+    index: int,
+    library: Collection[str],
+    leave_out: Sequence[str],
+    trial: int = 0,
+) -> Chosen:
+    """The causes of case `index` of this kind. trial: number of earlier draws whose causes were not visible."""
+    rng, plant = case_generator(seed, kind.name, index, 2, *([trial] if trial else [])), rig.plant
+    if kind.name == "twins":
+        return Chosen((_twin(plant, index, rng),), 1)
+    if kind.name == "left_out":
+        return _left_out(plant, seed, index, leave_out, rng)
+    causes: list[Cause] = []
+    full = kind.causes + (int(rng.integers(kind.perhaps + 1)) if kind.perhaps else 0)
+    if full:
+        present = [e for e in EFFECTS if places(plant, EFFECTS[e])]
+        effect = in_turn(present, seed, kind.name, index) if trial < 2 else str(rng.choice(present))
+        causes.append((effect, str(rng.choice(places(plant, EFFECTS[effect])))))
+    while len(causes) < full + kind.faint:
+        causes.append(_another(plant, causes, rng))
+    if not kind.unseen:
+        return Chosen(tuple(causes), full)
+    unknown = _unseen(kind, plant, seed, index, library, trial, rng)
+    free = [p for p in places(plant, unknown.at) if all(p not in place.split("-") for _, place in causes)]
+    return Chosen(tuple(causes), full, unknown, str(rng.choice(free or places(plant, unknown.at))))
+
+
+def _another(plant: PlantDescription, causes: Sequence[Cause], rng: np.random.Generator) -> Cause:
+    """A further cause: another effect that is not collinear with those chosen."""
+    free = [c for c in effect_places(plant) if all(c[0] != o[0] and not are_twins(c, o, plant) for o in causes)]
+    return free[int(rng.integers(len(free)))]
+
+
+def _unseen(
+    kind: Kind,
+    plant: PlantDescription,
+    seed: int,
+    index: int,
+    library: Collection[str],
+    trial: int,
+    rng: np.random.Generator,
+) -> Unknown:
+    """A law outside the library. Laws that need reversing flow require inputs that are at rest for a while."""
+    laws = {u.law: u for u in unknown_to(library) if places(plant, u.at)}
+    if kind.inputs != "rich" or not any(not p.is_outlet for p in plant.pipes):
+        laws = {name: u for name, u in laws.items() if not u.reversing}
+    return laws[in_turn(sorted(laws), seed, kind.name, index) if trial < 2 else str(rng.choice(sorted(laws)))]
+
+
+def _twin(plant: PlantDescription, index: int, rng: np.random.Generator) -> Cause:
+    families = [(effects, places(plant, (at,))) for effects, at in TWINS if places(plant, (at,))]
+    effects, at = families[index % len(families)]
+    return str(rng.choice(effects)), str(rng.choice(at))
+
+
+def _left_out(
+    plant: PlantDescription, seed: int, index: int, leave_out: Sequence[str], rng: np.random.Generator
+) -> Chosen:
+    """An effect to leave out of the library, for which no equivalent effect remains in it."""
+    alike = {canonical(c, plant) for c in effect_places(plant) if canonical(c, plant) != c}
+    candidates = {e: places(plant, EFFECTS.get(e, ())) for e in leave_out}
+    free = {e: [p for p in at if canonical((e, p), plant) not in alike] for e, at in candidates.items()}
+    possible = [e for e in leave_out if free[e]]
+    if not possible:
+        raise ValueError("expected an effect to leave out that has a place in this plant, got none; name one")
+    effect = in_turn(possible, seed, "left_out", index)
+    return Chosen(((effect, str(rng.choice(free[effect]))),), 1, leave_out=(effect,))

@@ -1,0 +1,132 @@
+"""Monitor files: the plant, the recording to follow, its fault-free part, and the faults to detect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from fdi_torch.config.estimation import names_in_full
+from fdi_torch.config.loaded_recordings import separate_recordings
+from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.problems import naming_source
+from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.config.resolved_config import resolve, values_in
+from fdi_torch.config.run_file import OutputConfig
+from fdi_torch.config.strict import BenchSeconds, Seconds, Strict
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_setup import GainSpecification
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+
+
+class WindowConfig(Strict):
+    """Default times are those of a bench-top rig, and are multiplied by the time scale of the plant
+    (`plant.scales`).
+    """
+
+    lookback: BenchSeconds = Field(300.0, description="length before an alarm in which its onset is searched, s")
+    confirm: BenchSeconds = Field(60.0, description="time after an alarm until the fault is isolated, s")
+    longest: BenchSeconds = Field(1000.0, description="greatest length of a window, s")
+    stride: Seconds | None = Field(
+        None, description="distance of windows that are fitted separately, s; by default longest"
+    )
+    incipient: bool = Field(True, description="whether faults may also grow slowly")
+    together: int = Field(2, ge=1, description="greatest number of simultaneous faults")
+
+    def settings(self) -> MonitorSettings:
+        return MonitorSettings(
+            lookback=self.lookback,
+            confirm=self.confirm,
+            longest=self.longest,
+            incipient=self.incipient,
+            together=self.together,
+        )
+
+
+class ObserverConfig(Strict):
+    time_constant: Seconds | None = Field(None, description="time constant of its slowest error, s")
+    gain: list[list[float]] | None = Field(
+        None, description="explicit gain: rows of tanks, columns of sensors, m per unit of the reading and sample"
+    )
+
+    def wish(self) -> GainSpecification | None:
+        if self.time_constant is None and self.gain is None:
+            return None
+        return GainSpecification(self.time_constant, tuple(tuple(row) for row in self.gain or ()))
+
+
+class MonitorConfig(Strict):
+    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+    recording: RecordingConfig = Field(description="the recording to follow")
+    fault_free: tuple[Seconds, Seconds] = Field(description="interval from which the noise is estimated, s")
+    calibrate: list[str] = Field(default_factory=list, description="constants fitted to the fault-free part first")
+    faults: list[str] = Field(default_factory=list, description="parameters that may change; by default the usual ones")
+    ranges: dict[str, tuple[float, float]] = Field(
+        default_factory=dict, description="ranges of faults that replace the default ones, SI"
+    )
+    mode: Literal["changes", "hybrid", "evolution", "least_squares", "multi_start"] = Field(
+        "changes", description="isolate changes after alarms, or estimate all faults in each window by that method"
+    )
+    detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="detector that raises alarms")
+    false_alarms_every: BenchSeconds = Field(20000.0, description="mean time between false alarms, s")
+    window: WindowConfig = Field(default_factory=WindowConfig)
+    observer: ObserverConfig = Field(default_factory=ObserverConfig, description="gain; by default from the noise")
+    step: BenchSeconds = Field(1.0, description="longest integration step, s")
+    output: OutputConfig = Field(default_factory=OutputConfig)
+    seed: int = Field(0, ge=0, description="seed of the simulation that sets the threshold of the GLR")
+
+
+@dataclass(frozen=True)
+class MonitorRun:
+    """A resolved monitor file.
+
+    base: folder of relative paths. text: YAML of the same run, including the plant. given: recordings in memory, by the
+    name that `file` gives them.
+    """
+
+    config: MonitorConfig
+    plant: PlantDescription
+    base: Path
+    source: str
+    text: str
+    given: Mapping[str, Recording] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.config.output.name or Path(self.source).stem
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """All values, including defaults, as plain nested values."""
+        return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
+
+
+def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:
+    """A monitor file with overrides. Raises ConfigError with one sentence per problem."""
+    data, file = values_in(path, overrides)
+    return build_monitor(data, file.parent, str(file))
+
+
+def build_monitor(data: Mapping[str, Any], base: Path, source: str) -> MonitorRun:
+    """A monitor run from the mapping of a monitor file; base: folder of relative paths.
+
+    A `Plant` or a `Recording` object may replace the name of the plant or of the recording's file.
+    """
+    (listed, *_), given = separate_recordings([data.get("recording")])
+    config, plant, text = resolve(MonitorConfig, {**data, "recording": listed} if given else data, base, source)
+    with naming_source(source):
+        config = _in_full(config, plant)
+    return MonitorRun(config, plant, base, source, text, given)
+
+
+def _in_full(config: MonitorConfig, plant: PlantDescription) -> MonitorConfig:
+    """Expand short names of faults: 'T1.leak' means the leak's size."""
+    ranged = names_in_full(config.ranges, plant, "ranges")
+    ranges = dict(zip(ranged, config.ranges.values(), strict=True))
+    faults = names_in_full(config.faults, plant, "faults")
+    names_in_full(config.calibrate, plant, "calibrate")
+    return config.model_copy(update={"faults": faults, "ranges": ranges})

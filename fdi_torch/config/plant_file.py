@@ -1,0 +1,165 @@
+"""Plant files: YAML with units -> `Plant` in SI."""
+
+from __future__ import annotations
+
+from collections.abc import Sized
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field, ValidationError
+
+from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
+from fdi_torch.config.problems import ConfigError, explain
+from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Share, Strict, quantity
+from fdi_torch.config.yaml_files import find_plant, read_yaml
+from fdi_torch.names import unknown
+from fdi_torch.plant.description import (
+    LARGEST_DISCHARGE_COEFFICIENT,
+    OUTSIDE,
+    FaultPriority,
+    Pipe,
+    PlacedEffect,
+    Pump,
+    Sensor,
+    Tank,
+)
+from fdi_torch.untrusted_input import MOST_COMPONENTS
+
+
+def _start_level(value: Any) -> float | None:
+    return None if value in (None, "equilibrium") else quantity(value, "m")
+
+
+class TankConfig(Strict):
+    area: Area = Field(description="cross-section, m^2")
+    height: Length = Field(description="from the floor to the rim, m")
+    start_level: Annotated[float | None, BeforeValidator(_start_level)] = Field(
+        None, description="level at t = 0, m, or equilibrium (of the first inputs)"
+    )
+    overflow_to: str = Field(OUTSIDE, description="the tank that receives the overflow")
+    leak_reference: str | None = Field(None, description="the pipe whose capacity is a leak of size 1")
+
+
+class PipeConfig(Strict):
+    source: str = Field(description="the tank it starts from")
+    target: str = Field(OUTSIDE, description="the tank it leads to, or outside")
+    area: Area = Field(description="of the orifice, m^2")
+    discharge_coefficient: Share = Field(le=LARGEST_DISCHARGE_COEFFICIENT, description="of the orifice, without unit")
+    elevation: Length = Field(0.0, description="of the orifice above both floors, m")
+    free_fall: bool = Field(False, description="whether it pours into its target from above")
+    valve: str | None = Field(None, description="the input channel with its measured opening, 0 to 1")
+    unrecorded: Share | None = Field(None, ge=0, le=1, description="its opening in recordings that lack the channel")
+
+
+class PumpConfig(Strict):
+    target: str = Field(description="the tank it fills")
+    max_flow: Flow = Field(description="greatest flow, m^3/s")
+    gain: Amount = Field(1.0, description="flow for a command of 1: none, l/min/V, l/min/mA, l/min/Hz; l/min of a duty")
+    command: str | None = Field(None, description="its input channel, if it differs from its name")
+
+
+class SensorConfig(Strict):
+    tank: str = Field(description="the tank whose level it reads")
+    gain: Amount = Field(1.0, description="reading for a level of 1: no unit, or in mbar/cm, V/cm, mA/cm, %/cm")
+    offset: Amount | None = Field(None, description="reading at level 0, in the reading's unit")
+    channel: str | None = Field(None, description="its output channel, if it differs from its name")
+    low: Amount | None = Field(None, description="least reading, in its unit")
+    high: Amount | None = Field(None, description="greatest reading, in its unit")
+
+
+class EffectConfig(Strict):
+    effect: str = Field(description="name of the effect, such as pump_lag")
+    location: str = Field(description="the component that has it")
+    parameters: dict[str, Amount] = Field(default_factory=dict, description="with units, such as time_constant: 8 s")
+
+
+class MatterConfig(Strict):
+    smallest: Amount = Field(0.0, description="least deviation from nominal that is reported, with its unit")
+    urgency: str = Field("", description="a word that is added to its events, such as high")
+
+
+class PlantConfig(Strict):
+    name: str = ""
+    gravity: Acceleration = Field(9.81, description="m/s^2")
+    tanks: dict[str, TankConfig]
+    pipes: dict[str, PipeConfig] = Field(default_factory=dict)
+    pumps: dict[str, PumpConfig] = Field(default_factory=dict)
+    sensors: dict[str, SensorConfig] = Field(default_factory=dict)
+    tolerances: dict[str, Amount] = Field(
+        default_factory=dict,
+        description="relative standard deviation of a constant (of an offset, a start level or an effect's parameter: "
+        "in its unit); * is any name",
+    )
+    varying: list[str] = Field(
+        default_factory=list, description="constants with a tolerance that differ between recordings; * is any name"
+    )
+    effects: list[EffectConfig] = Field(default_factory=list, description="known effects of the plant")
+    matters: dict[str, MatterConfig] = Field(
+        default_factory=dict, description="least reported size and urgency of faults by name, such as T1.leak"
+    )
+
+
+def load_plant(name: str | Path, base: Path | None = None) -> Plant:
+    """The plant in a file, or a shipped one by its name ('three_tank'). Raises ConfigError."""
+    path = find_plant(str(name), base or Path.cwd())
+    data = read_yaml(path)
+    return build_plant({"name": path.stem, **data}, str(path))
+
+
+def build_plant(data: dict[str, Any], source: str) -> Plant:
+    """The plant in a mapping. Raises ConfigError, naming `source` and the field."""
+    try:
+        config = PlantConfig.model_validate(data)
+    except ValidationError as error:
+        raise explain(error, source) from None
+    try:
+        return _plant(config)
+    except ValueError as error:
+        raise ConfigError([f"{source}: {error}"]) from error
+
+
+def _plant(config: PlantConfig) -> Plant:
+    kinds: tuple[Sized, ...] = (config.tanks, config.pipes, config.pumps, config.sensors, config.effects)
+    parts = sum(len(kind) for kind in kinds)
+    if parts > MOST_COMPONENTS:
+        raise ValueError(f"expected at most {MOST_COMPONENTS} components and effects, got {parts}; split the plant")
+    plant = Plant(
+        tanks=[Tank(name, **dict(tank)) for name, tank in config.tanks.items()],
+        pipes=[Pipe(name, **dict(pipe)) for name, pipe in config.pipes.items()],
+        pumps=[Pump(name, **dict(pump)) for name, pump in config.pumps.items()],
+        sensors=[_sensor(name, sensor) for name, sensor in config.sensors.items()],
+        gravity=config.gravity,
+        name=config.name,
+    )
+    placed = [PlacedEffect(e.effect, e.location, e.parameters) for e in config.effects]  # type: ignore[arg-type]
+    plant = replace(plant, effects=tuple(effect_in_si(i, e, plant, quantity) for i, e in enumerate(placed)))
+    tolerances = tolerances_in_si(config.tolerances, plant, quantity)
+    matters = tuple(_matter(name, matter, plant) for name, matter in config.matters.items())
+    return replace(plant, tolerances=tolerances, varying=tuple(config.varying), matters=matters)
+
+
+def _matter(name: str, matter: MatterConfig, plant: Plant) -> FaultPriority:
+    """The priority of a fault; 'T1.leak' means the leak's size."""
+    location, _, rest = name.partition(".")
+    effect, _, field = rest.partition(".")
+    try:
+        parameters = effect_parameters(effect, location, plant)
+    except ValueError as error:
+        raise ValueError(f"matters.{name}: {error}") from error
+    size = parameters.get(field or next(iter(parameters)))
+    if size is None:
+        raise ValueError(f"matters.{name}: {unknown('a parameter', field, parameters)}")
+    smallest = si_value(f"matters.{name}.smallest", matter.smallest, size.unit, quantity)
+    if smallest < 0.0:
+        raise ValueError(f"matters.{name}.smallest: expected no negative size, got {matter.smallest}")
+    return FaultPriority(f"{location}.{effect}.{size.name}", smallest, matter.urgency)
+
+
+def _sensor(name: str, config: SensorConfig) -> Sensor:
+    sensor = Sensor(name, config.tank, gain=config.gain, channel=config.channel)  # type: ignore[arg-type]
+    given: dict[str, Any] = {}
+    for field in ("offset", "low", "high"):
+        if (value := getattr(config, field)) is not None:
+            given[field] = si_value(f"sensors.{name}.{field}", value, sensor.unit, quantity)
+    return replace(sensor, **given)

@@ -1,0 +1,153 @@
+"""The entry of a recording in a run file: its files, their columns and clocks, and the part to use."""
+
+from __future__ import annotations
+
+import math
+import re
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+from zoneinfo import ZoneInfo
+
+from pydantic import AllowInfNan, BeforeValidator, Field, model_validator
+
+from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.time_stamps import expect_zone
+from fdi_torch.untrusted_input import MOST_SAMPLES
+
+StartLevel = Literal["free", "equilibrium"] | float
+"""A tank's initial level: to be estimated, the equilibrium of the first inputs, or a value in m."""
+
+
+def _start_level(value: Any) -> StartLevel:
+    if value in ("free", "equilibrium"):
+        return value
+    try:
+        return quantity(value, "m")
+    except ValueError as error:
+        raise ValueError(f"expected free, equilibrium or a level such as '50 cm', got {value!r}") from error
+
+
+def _start_levels(value: Any) -> Any:
+    """free, equilibrium, or a mapping of tanks to these or to levels."""
+    if isinstance(value, dict):
+        return {str(tank): _start_level(level) for tank, level in value.items()}
+    return _start_level(value)
+
+
+StartLevels = Annotated[Any, BeforeValidator(_start_levels)]
+
+
+def _held(value: Any) -> float:
+    return math.inf if value == "always" else quantity(value, "s")
+
+
+def _words(value: Any) -> Any:
+    """The meaning of words by their text; YAML reads -9999 as a number and off as a truth value."""
+    if not isinstance(value, dict):
+        return value
+    texts = {True: "on", False: "off"}
+    return {texts[k] if isinstance(k, bool) else str(k): v for k, v in value.items()}
+
+
+def _zone(value: Any) -> Any:
+    expect_zone(str(value))
+    return value
+
+
+def _header(value: Any) -> Any:
+    """The number of a column is its header in files without one."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Header = Annotated[str, BeforeValidator(_header)]
+
+
+class ColumnConfig(Strict):
+    column: Header | None = Field(
+        None,
+        description="header of the column, its number from 1 in a file without one, its tag where rows have tags, "
+        "or TOPIC:FIELD of an MCAP file",
+    )
+    plus: list[Header] = Field(
+        default_factory=list, description="further columns that are added, for example of two pumps on one hose"
+    )
+    unit: str | None = Field(None, description="unit of its numbers, if the header does not end in it")
+    constant: Amount | None = Field(None, description="the value of an input that was not recorded")
+    recorded: bool = Field(True, description="false for an output that is missing in the file")
+    held: Annotated[float, AllowInfNan(True), BeforeValidator(_held)] = Field(
+        0.0, description="time for which an input is held over empty cells: 15 s, or always (until the next value)"
+    )
+    words: Annotated[dict[str, Amount | None], BeforeValidator(_words)] = Field(
+        default_factory=dict, description="meaning of words: {OPEN: 1, CLOSED: 0, -9999: null}; null: a bad reading"
+    )
+    quality: str | None = Field(None, description="header of the column that says whether the value counts")
+    good: list[str | int] = Field(default_factory=list, description="its words for valid; by default good, ok, 192 ...")
+    stamps: str | None = Field(None, description="of t: format of time stamps, as in '%d/%m/%Y %H:%M:%S'")
+    zone: Annotated[str | None, BeforeValidator(_zone)] = Field(
+        None, description="of t: time zone of local time, as in Europe/Berlin; by default UTC"
+    )
+    shift: Seconds = Field(0.0, description="of t: added to this clock, s")
+    sort: bool = Field(False, description="of t: rows may be in any order")
+
+
+class TagsConfig(Strict):
+    tag: str = Field(description="header of the column with the tag, which is a channel's `column`")
+    value: str = Field(description="header of the column with the value")
+    quality: str | None = Field(None, description="header of the column that says whether the value counts")
+
+
+class FileConfig(Strict):
+    file: str = Field(
+        description="CSV (plain or .gz), MCAP, Parquet, Excel, MATLAB or HDF5 file; looked for here and below "
+        "FDI_TORCH_DATA"
+    )
+    header: bool = Field(True, description="false: columns have numbers instead of names, {t: {column: 1, unit: s}}")
+    sheet: str | None = Field(None, description="of an Excel workbook; by default the first")
+    columns: dict[str, ColumnConfig] = Field(
+        default_factory=dict, description="for channels (time is t) whose header is not name_unit"
+    )
+    tags: TagsConfig | None = Field(None, description="for a CSV file with one row per value")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_name_alone_is_the_file(cls, data: Any) -> Any:
+        return {"file": data} if isinstance(data, str) else data
+
+
+def _moment(value: Any) -> float | datetime:
+    """Seconds of the recording's clock, or a time stamp (which YAML may already have parsed)."""
+    if isinstance(value, str) and _STAMP.match(value):
+        return datetime.fromisoformat(value)
+    return value if isinstance(value, datetime) else quantity(value, "s")
+
+
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d")
+Moment = Annotated[float | datetime, BeforeValidator(_moment)]
+
+
+def in_seconds(moment: float | datetime, recording: Recording, config: RecordingConfig) -> float:
+    """Time on the recording's clock, s. A stamp without offset is in the zone of `t`, or else UTC.
+
+    Raises ValueError if the clock has no date.
+    """
+    if not isinstance(moment, datetime):
+        return moment
+    if recording.began is None:
+        raise ValueError(f"{config.file}: expected a time in s as in '300 s', got {moment}: its clock has no date")
+    zone = config.columns["t"].zone if "t" in config.columns else None
+    local = moment if moment.tzinfo else moment.replace(tzinfo=ZoneInfo(zone) if zone else UTC)
+    return local.timestamp() - recording.began
+
+
+class RecordingConfig(FileConfig):
+    also: list[FileConfig] = Field(default_factory=list, description="CSV files with further channels of the same run")
+    start: Moment | None = Field(None, description="first time used, s, or a stamp such as 2026-03-29 08:30:00")
+    stop: Moment | None = Field(None, description="last time used, s, or a stamp")
+    mask: list[tuple[Moment, Moment]] = Field(
+        default_factory=list, description="intervals whose readings are ignored, s or stamps"
+    )
+    every: int = Field(1, ge=1, le=MOST_SAMPLES, description="use every n-th sample only")
+    hold: Literal["zero_order", "linear"] = Field("zero_order", description="course of inputs between samples")
+    trusted: bool = Field(False, description="do not check for wrong units, swapped channels and clock errors")
+    start_levels: StartLevels = Field("free", description="free, equilibrium, or a mapping such as {T1: 50 cm}")

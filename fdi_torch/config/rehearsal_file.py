@@ -1,0 +1,192 @@
+"""Rehearsal files: a simulated plant with noise, and the Monte Carlo validations of the monitor to run on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import BeforeValidator, Field
+
+from fdi_torch.capacity import expect_room
+from fdi_torch.config.estimation import full_name
+from fdi_torch.config.monitor_file import WindowConfig
+from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.reading_noise import reading_noise
+from fdi_torch.config.resolved_config import resolve, values_in
+from fdi_torch.config.run_file import OutputConfig
+from fdi_torch.config.strict import BenchSeconds, Decibel, Share, Strict, quantity
+from fdi_torch.effects import build_network, placements_for
+from fdi_torch.estimate.fitting import Fitting, set_up
+from fdi_torch.monitor.monitor_setup import with_shapes
+from fdi_torch.monitor.monte_carlo.detection_plan import DetectionPlan
+from fdi_torch.monitor.monte_carlo.estimator_comparison import ESTIMATOR_NAMES
+from fdi_torch.monitor.monte_carlo.estimator_comparison_plan import EstimatorComparisonPlan
+from fdi_torch.monitor.monte_carlo.false_alarm_plan import FalseAlarmPlan
+from fdi_torch.monitor.monte_carlo.isolation_plan import IsolationPlan
+from fdi_torch.monitor.monte_carlo.level_control import moving_commands, moving_set_points
+from fdi_torch.monitor.monte_carlo.simulated_runs import SimulatedRig
+from fdi_torch.parameters import ParameterSpace, parse_quantity
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.equilibrium import equilibrium
+
+Metres = Annotated[float, BeforeValidator(lambda value: quantity(value, "m"))]
+
+
+class NoiseConfig(Strict):
+    colour: float = Field(0.0, ge=0, lt=1, description="AR(1) coefficient of the measurement noise")
+    wander: Metres = Field(0.0, ge=0, description="standard deviation of the levels' random walk per sample")
+
+
+class FalseAlarmConfig(Strict):
+    noises: dict[str, NoiseConfig] = Field(min_length=1, description="each by a name")
+    runs: int = Field(500, ge=1, description="number of fault-free runs")
+    lasts: BenchSeconds = Field(3600.0, gt=0, description="duration of each run, and of runs for noise estimation, s")
+    calibrations: int = Field(8, ge=1, description="number of runs from which the noise is estimated")
+
+
+class FaultsFoundConfig(Strict):
+    faults: list[str] = Field(min_length=1, description="faults, one per run")
+    sizes: list[Share] = Field([0.02, 0.05, 0.1, 0.2], min_length=1, description="shares of the fault's range")
+    runs: int = Field(500, ge=1, description="number of runs of each size")
+    named: int = Field(100, ge=0, description="number of these runs in which the monitor also isolates the fault")
+    onset: BenchSeconds = Field(300.0, description="onset of the fault, s")
+    lasts: BenchSeconds = Field(900.0, description="duration of each run, s")
+    window: WindowConfig = Field(default_factory=WindowConfig)
+
+
+class NamingConfig(Strict):
+    faults: list[str] = Field(min_length=1, description="faults, abrupt and (if possible) incipient")
+    loops: list[Literal["closed", "open"]] = Field(["closed", "open"], description="level control, or commands alone")
+    swing: Metres = Field(0.03, description="change of the set points each minute")
+    share: Share = Field(0.5, description="relative change of the commands each minute")
+    runs: int = Field(200, ge=1, description="number of runs of each loop")
+    times: float = Field(3.0, gt=0, description="size of the faults as a multiple of the smallest isolable size")
+    onset: BenchSeconds = Field(300.0, description="onset of the fault, s")
+    lasts: BenchSeconds = Field(900.0, description="duration of each run, s")
+    window: WindowConfig = Field(default_factory=WindowConfig)
+
+
+class RivalConfig(Strict):
+    faults: list[str] = Field(min_length=1, description="faults from which random sets are drawn")
+    sets: int = Field(200, ge=1, description="number of sets of faults")
+    part: int = Field(50, ge=1, description="number of sets computed at once")
+    snr_db: list[Decibel] = Field([30.0, 10.0], min_length=1, description="signal-to-noise ratios, dB")
+    rivals: list[Literal[ESTIMATOR_NAMES]] = Field(list(ESTIMATOR_NAMES), min_length=1, description="who is compared")  # type: ignore[valid-type]
+    looks: list[int] = Field([30, 60, 100, 150, 200, 300, 400, 600, 800, 1000], description="in samples")
+
+
+class RehearsalConfig(Strict):
+    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+    inputs: list[str] = Field(description="constant commands, one per channel")
+    reading_noise: str = Field("1 mm", description="standard deviation: 1 mm (of the level), or h1 = 1 mm, p2 = 2 mV")
+    sampling: BenchSeconds = Field(1.0, gt=0, description="sampling interval, s")
+    false_alarms_every: BenchSeconds = Field(20000.0, description="design mean time between false alarms, s")
+    detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="detector that raises alarms under naming")
+    false_alarms: FalseAlarmConfig | None = Field(None, description="measure the false alarm rate")
+    faults_found: FaultsFoundConfig | None = Field(None, description="measure detection delay, power and isolation")
+    naming: NamingConfig | None = Field(None, description="measure isolation of component, sensor and actuator faults")
+    rivals: RivalConfig | None = Field(None, description="compare estimators")
+    output: OutputConfig = Field(default_factory=OutputConfig)
+    seed: int = Field(0, ge=0, description="seed of all random numbers")
+
+
+Plan = FalseAlarmPlan | DetectionPlan | IsolationPlan | EstimatorComparisonPlan
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """A resolved rehearsal file. plans: the validations to run. text: YAML of the same rehearsal."""
+
+    config: RehearsalConfig
+    plant: PlantDescription
+    plans: tuple[Plan, ...]
+    source: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        return self.config.output.name or Path(self.source).stem
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
+
+
+def load_rehearsal(path: str | Path, overrides: Iterable[str] = ()) -> Rehearsal:
+    """A rehearsal file with overrides. Raises ConfigError with one sentence per problem."""
+    data, file = values_in(path, overrides)
+    config, plant, text = resolve(RehearsalConfig, data, file.parent, str(file))
+    plans = tuple(_plans(config, plant))
+    if not plans:
+        raise ValueError(f"{file}: expected false_alarms, faults_found, naming or rivals, got none of them; add one")
+    return Rehearsal(config, plant, plans, str(file), text)
+
+
+def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:
+    every = c.false_alarms_every
+
+    def count(seconds: float) -> int:
+        samples = seconds / c.sampling
+        what = f"{samples:.3g} samples, one every {c.sampling:g} s for {seconds:g} s"
+        expect_room(samples, what, "simulate a shorter time, or sample more slowly")
+        return int(samples) + 1
+
+    if (f := c.false_alarms) is not None:
+        rigs = {name: _rig(c, plant, (), noise) for name, noise in f.noises.items()}
+        yield FalseAlarmPlan(rigs, f.runs, count(f.lasts), f.calibrations, every, c.seed)
+    if (d := c.faults_found) is not None:
+        rig, settings = _rig(c, plant, d.faults), d.window.settings()
+        yield DetectionPlan(
+            rig, settings, d.runs, d.named, count(d.lasts), tuple(d.sizes), d.onset, every, c.seed
+        )  # fmt: skip
+    if (n := c.naming) is not None:
+        for loop in n.loops:
+            rig, settings = _rig(c, plant, n.faults, None, loop), n.window.settings()
+            yield IsolationPlan(
+                rig, loop, c.detector, settings, n.runs, count(n.lasts), n.onset, n.times, every, c.seed
+            )  # fmt: skip
+    if (r := c.rivals) is not None:
+        expect_room(float(max(r.looks)) * (1 + len(plant.sensors)), f"{max(r.looks):.3g} samples", "look earlier")
+        fitting = _fitting(c, plant, r, max(r.looks) + 1)
+        yield EstimatorComparisonPlan(fitting, r.sets, r.part, tuple(r.snr_db), tuple(r.looks), c.seed, tuple(r.rivals))
+
+
+def _inputs(c: RehearsalConfig, plant: PlantDescription) -> torch.Tensor:
+    units = plant.channel_units()
+    if len(c.inputs) != len(units):
+        raise ValueError(f"inputs: expected {len(units)} ({', '.join(units)}), got {len(c.inputs)}")
+    amounts = [parse_quantity(text, unit) for text, unit in zip(c.inputs, units.values(), strict=True)]
+    return torch.tensor(amounts, dtype=torch.float64)
+
+
+def _rig(
+    c: RehearsalConfig,
+    plant: PlantDescription,
+    faults: Iterable[str],
+    noise: NoiseConfig | None = None,
+    loop: str | None = None,
+) -> SimulatedRig:
+    names = with_shapes([full_name(name, plant) for name in faults], plant)
+    network, inputs, noise = build_network(plant, placements_for(names)), _inputs(c, plant), noise or NoiseConfig()
+    space = ParameterSpace(network.constants[name] for name in names)
+    levels = equilibrium(network, inputs)
+    std = torch.tensor(reading_noise(c.reading_noise, plant), dtype=torch.float64)
+    controller = None
+    if loop == "open":
+        controller = moving_commands(inputs, c.naming.share if c.naming else 0.0)
+    elif loop == "closed":
+        controller = moving_set_points(plant, inputs, levels, c.naming.swing if c.naming else 0.0)
+    return SimulatedRig(network, space, inputs, levels, std, c.sampling, noise.wander, noise.colour, controller)
+
+
+def _fitting(c: RehearsalConfig, plant: PlantDescription, r: RivalConfig, samples: int) -> Fitting:
+    inputs, time = _inputs(c, plant), c.sampling * torch.arange(samples, dtype=torch.float64)
+    columns, units = tuple(s.column for s in plant.sensors), tuple(s.unit for s in plant.sensors)
+    unread = torch.full((samples, len(columns)), torch.nan, dtype=torch.float64)
+    channels, channel_units = tuple(plant.channels()), tuple(plant.channel_units().values())
+    blank = Recording(time, inputs.expand(samples, -1), unread, channels, columns, channel_units, units)
+    return set_up(plant, [blank], [full_name(name, plant) for name in r.faults], "equilibrium")

@@ -1,0 +1,54 @@
+"""Resolution of run, monitor and rehearsal files: values are validated, and the plant is loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from fdi_torch.config.key_reference import keys
+from fdi_torch.config.plant_file import build_plant, load_plant
+from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.problems import ConfigError, explain
+from fdi_torch.config.strict import Config, scaled_to_plant
+from fdi_torch.config.yaml_files import find_file, read_extended, with_overrides, write_yaml
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.scales import time_scale
+
+
+def values_in(path: str | Path, overrides: Iterable[str] = ()) -> tuple[dict[str, Any], Path]:
+    """The mapping of a file with overrides, and the file's path. Raises ConfigError."""
+    file = find_file(str(path), Path.cwd())
+    return with_overrides(read_extended(file), overrides), file
+
+
+def resolve(
+    model: type[Config], data: Mapping[str, Any], base: Path, source: str
+) -> tuple[Config, PlantDescription, str]:
+    """The validated configuration, its plant, and YAML of the same configuration including the plant.
+
+    base: folder of relative paths. Raises ConfigError with one sentence per problem.
+    """
+    try:
+        config = model.model_validate(dict(data))
+    except ValidationError as error:
+        raise explain(error, source, (path for path, _, _ in keys(model))) from None
+    try:
+        plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
+    except ConfigError as error:  # errors within a plant file already name that file
+        raise ConfigError([f"{source}: {p}" if p.startswith("plant: ") else p for p in error.problems]) from error
+    config = scaled_to_plant(config, time_scale(plant))
+    return config, plant, write_yaml({**data, "plant": plant_mapping(plant)})
+
+
+def plant_of(entry: Any, base: Path, source: str) -> PlantDescription:
+    """The plant by name, by file, or as a mapping or object. Raises ConfigError."""
+    if isinstance(entry, PlantDescription):
+        return entry
+    if isinstance(entry, str | Path):
+        return load_plant(entry, base)
+    if isinstance(entry, dict):
+        return build_plant({"name": "plant", **entry}, f"{source}: plant")
+    raise ConfigError([f"{source}: plant: expected a shipped plant, a plant file or a plant, got {entry!r}"])

@@ -1,0 +1,98 @@
+"""Run files: the plant, recordings or a simulation, what to estimate, and the place of the results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from fdi_torch.config.estimation import EstimationConfig
+from fdi_torch.config.loaded_recordings import separate_recordings
+from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.config.resolved_config import resolve, values_in
+from fdi_torch.config.simulation import SimulationConfig
+from fdi_torch.config.strict import Strict
+from fdi_torch.config.yaml_files import DEFAULT_RUN
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+
+LONGEST_NAME = 200
+
+
+class OutputConfig(Strict):
+    folder: str = Field("logs", description="for the log and the pictures")
+    name: str = Field("", description="name of the run and its log, without ending; by default the run file's name")
+
+    @field_validator("name")
+    @classmethod
+    def _stays_in_its_folder(cls, name: str) -> str:
+        if name != Path(name).name or name == ".." or not name.isprintable() or len(name) > LONGEST_NAME:
+            raise ValueError(f"expected a file's name without folders, got '{name}'; output.folder says where it goes")
+        return name
+
+
+class RunConfig(Strict):
+    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+    recordings: list[RecordingConfig] = Field(default_factory=list, description="real data")
+    simulate: SimulationConfig | None = Field(None, description="or a run to be simulated")
+    estimate: EstimationConfig = Field(default_factory=EstimationConfig)
+    output: OutputConfig = Field(default_factory=OutputConfig)
+    seed: int = Field(0, ge=0, description="seed of all random numbers")
+    device: str = Field("cpu", pattern=r"^(cpu|cuda(:\d{1,2})?)$", description="cpu or cuda")
+    engine: Literal["auto", "reference", "compiled"] = Field("auto", description="simulation engine")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> RunConfig:
+        if bool(self.recordings) == (self.simulate is not None):
+            got = "both" if self.recordings else "neither"
+            raise ValueError(f"expected either recordings or simulate, got {got}; keep one")
+        return self
+
+
+@dataclass(frozen=True)
+class Run:
+    """A resolved run file.
+
+    base: folder of relative paths. text: YAML of the same run, including the plant. given: recordings in memory, by the
+    name that `file` gives them.
+    """
+
+    config: RunConfig
+    plant: PlantDescription
+    base: Path
+    source: str
+    text: str
+    given: Mapping[str, Recording] = field(default_factory=dict)
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """All values, including defaults, as plain nested values."""
+        return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
+
+    @property
+    def name(self) -> str:
+        return self.config.output.name or Path(self.source).stem
+
+
+def load_run(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Run:
+    """A run file, or the built-in default, with overrides ('estimate.search.population=40').
+
+    Raises ConfigError with one sentence per problem.
+    """
+    data, file = values_in(DEFAULT_RUN if path is None else path, overrides)
+    return build_run(data, file.parent, str(file))
+
+
+def build_run(data: Mapping[str, Any], base: Path, source: str) -> Run:
+    """A run from the mapping of a run file; base: folder of relative paths.
+
+    A `Plant` or a `Recording` object may replace the name of a plant or of a recording's file.
+    """
+    recordings = data.get("recordings")
+    listed, given = separate_recordings(recordings) if isinstance(recordings, list | tuple) else (recordings, {})
+    config, plant, text = resolve(RunConfig, {**data, "recordings": listed} if given else data, base, source)
+    return Run(config, plant, base, source, text, given)

@@ -1,0 +1,88 @@
+"""The file of a log: written by one process only, with disk errors as sentences."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+from typing import BinaryIO
+
+from fdi_torch.logbook.errors import LogError, log_error
+
+_PIECE = 1 << 20
+
+
+class ExclusiveFile:
+    """An unbuffered file. Raises LogError if the path exists or is not writable; after a disk error it refuses writes.
+
+    size: bytes written. dead: the error that ended it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.size = 0
+        self.dead: LogError | None = None
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except FileExistsError:
+            raise LogError(_taken(path)) from None
+        except OSError as error:
+            raise log_error(path, error) from error
+
+    def write(self, data: bytes) -> None:
+        self.expect_alive()
+        remaining = memoryview(data)
+        try:
+            while remaining:
+                count = os.write(self._file, remaining)
+                remaining, self.size = remaining[count:], self.size + count
+        except OSError as error:
+            self.dead = log_error(self.path, error)
+            raise self.dead from error
+
+    def copy(self, source: BinaryIO, start: int, end: int) -> None:
+        """Copy the bytes `start` to `end` of another file."""
+        source.seek(start)
+        while start < end:
+            data = source.read(min(_PIECE, end - start))
+            self.write(data)
+            start += len(data)
+
+    def expect_alive(self) -> None:
+        if self.dead is not None:
+            raise LogError(f"{self.dead}; nothing more is logged")
+
+    def go_back(self, place: int) -> None:
+        """Discard everything from `place` on, and continue writing there."""
+        try:
+            os.lseek(self._file, place, os.SEEK_SET)
+        except OSError as error:
+            raise log_error(self.path, error) from error
+        self.size = place
+
+    def sync(self) -> None:
+        """Truncate the file to its size and flush it to disk."""
+        try:
+            os.ftruncate(self._file, self.size)
+            os.fsync(self._file)
+        except OSError as error:
+            raise log_error(self.path, error) from error
+
+    def close(self) -> None:
+        os.close(self._file)
+
+
+def _taken(path: Path) -> str:
+    """The reason why an existing file cannot be used: it is being written, or its writer was killed."""
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError as error:
+        return str(log_error(path, error))
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return f"{path}: another run is writing this file; choose another name"
+    finally:
+        os.close(file)
+    return f"{path}: left by a run that did not end; save it with `fdi recover {path}`, then delete it"

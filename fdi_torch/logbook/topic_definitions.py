@@ -1,0 +1,185 @@
+"""The topics of a log: the meaning, kind and unit of every field of their messages. All numbers are SI."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+FORMAT_VERSION = "1"
+
+Kind = Literal["number", "integer", "boolean", "text", "numbers", "integers", "texts", "time"]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One kind of message. fields: name -> (kind, unit, meaning). named: whether further named numbers are allowed."""
+
+    schema: str
+    meaning: str
+    fields: Mapping[str, tuple[Kind, str, str]] = field(default_factory=dict)
+    named: bool = False
+
+
+_EVENT: dict[str, tuple[Kind, str, str]] = {"problem": ("integer", "", "which of the batched problems")}
+
+TOPICS: dict[str, Topic] = {
+    "/plant/input": Topic("fdi_torch.plant_input", "what was commanded", named=True),
+    "/plant/output": Topic(
+        "fdi_torch.plant_output",
+        "what was read",
+        {"masked": ("texts", "", "readings that do not count")},
+        named=True,
+    ),
+    "/plant/truth": Topic("fdi_torch.plant_truth", "true states and faults of a simulated plant", named=True),
+    "/observer/residual": Topic(
+        "fdi_torch.residual", "reading less observer's output; *_statistic, *_threshold where tested", named=True
+    ),
+    "/observer/alarm": Topic(
+        "fdi_torch.alarm",
+        "an event of the detection",
+        {
+            "event": ("text", "", "raised, isolated, sized, cleared or recovered"),
+            "channel": ("text", "", "sensor or fault it concerns"),
+            "value": ("number", "", "test statistic"),
+            "threshold": ("number", "", "its threshold"),
+            "onset": ("number", "s", "estimated time of the change"),
+            "message": ("text", "", "the event in words"),
+        },
+        named=True,
+    ),
+    "/estimator/de/generation": Topic(
+        "fdi_torch.generation",
+        "a generation of differential evolution and its best member",
+        {
+            **_EVENT,
+            "generation": ("integer", "", "0 is the first population"),
+            "best_cost": ("number", "", "lowest cost"),
+            "mean_cost": ("number", "", "mean of the finite costs"),
+            "spread": ("number", "", "spread of the population"),
+            "evaluations": ("integer", "", "simulations so far"),
+        },
+        named=True,
+    ),
+    "/estimator/de/population": Topic(
+        "fdi_torch.population",
+        "state of the search: arrays as base64 of little-endian bytes, each with *_shape and *_dtype",
+        {**_EVENT, "generation": ("integer", "", "0 is the first population")},
+        named=True,
+    ),
+    "/estimator/refine/iteration": Topic(
+        "fdi_torch.refine_iteration",
+        "an iteration of the refinement",
+        {
+            **_EVENT,
+            "iteration": ("integer", "", "0 is the start"),
+            "cost": ("number", "", "objective"),
+            "step": ("number", "", "norm of the scaled step"),
+            "gradient": ("number", "", "norm of the scaled gradient"),
+            "damping": ("number", "", "Levenberg-Marquardt damping"),
+            "accepted": ("boolean", "", "was the step taken?"),
+        },
+        named=True,
+    ),
+    "/estimate/final": Topic(
+        "fdi_torch.estimate",
+        "the estimate and its uncertainty",
+        {
+            **_EVENT,
+            "names": ("texts", "", "parameters, in the order of the arrays"),
+            "units": ("texts", "", "their units"),
+            "values": ("numbers", "", "estimate"),
+            "std": ("numbers", "", "standard errors"),
+            "covariance": ("numbers", "", "row by row"),
+            "covariance_shape": ("integers", "", "its shape"),
+            "status": ("text", "", "converged, or why not"),
+            "reason": ("text", "", "status in words"),
+            "at_bound": ("texts", "", "parameters at a bound"),
+            "unidentifiable": ("texts", "", "directions the data do not determine"),
+        },
+        named=True,
+    ),
+    "/diagnosis/fault": Topic(
+        "fdi_torch.fault",
+        "a fault found, or found absent",
+        {
+            "fault": ("text", "", "parameter or effect"),
+            "location": ("text", "", "component"),
+            "present": ("boolean", "", "at the stated confidence"),
+            "confidence": ("number", "1", "that it is present"),
+            "size": ("number", "", "in its own unit"),
+            "size_std": ("number", "", "standard error"),
+            "unit": ("text", "", "unit of the size"),
+            "flow": ("number", "m^3/s", "size as flow"),
+            "hole_diameter": ("number", "m", "size as equivalent hole"),
+            "message": ("text", "", "the finding in words"),
+        },
+        named=True,
+    ),
+    "/gap/where": Topic(
+        "fdi_torch.gap_where",
+        "how likely it is that something is wrong at a component (answers of format 1: share of the gap it can close)",
+        {
+            "location": ("text", "", "component"),
+            "share": ("number", "1", "probability"),
+            "p_value": ("number", "1", "of no gap there"),
+        },
+        named=True,
+    ),
+    "/gap/verdict": Topic(
+        "fdi_torch.gap_verdict",
+        "the diagnosis of the sim-to-real gap",
+        {
+            "verdict": ("text", "", "no_gap, named, ambiguous or unknown"),
+            "p_value": ("number", "1", "of no gap"),
+            "locations": ("texts", "", "where"),
+            "shares": ("numbers", "1", "probability, per location"),
+            "causes": ("texts", "", "effect@location"),
+            "ambiguity_set": ("texts", "", "explanations that hold 95 % together"),
+            "explanations": ("texts", "", "explanations compared"),
+            "probabilities": ("numbers", "1", "posterior of each explanation"),
+            "unexamined": ("number", "1", "posterior of what was not examined"),
+            "certain": ("texts", "", "effect@location, there with 95 % whatever else is"),
+            "answer": ("text", "", "the whole answer as JSON text"),
+        },
+        named=True,
+    ),
+    "/study/trial": Topic(
+        "fdi_torch.trial",
+        "one trial of a study",
+        {
+            "trial": ("integer", "", "number"),
+            "group": ("text", "", "setting it belongs to"),
+            "seed": ("text", "", "its seed"),
+            "status": ("text", "", "how it ended"),
+        },
+        named=True,
+    ),
+    "/study/summary": Topic(
+        "fdi_torch.summary",
+        "a setting of a study, summed up",
+        {"group": ("text", "", "setting"), "trials": ("integer", "", "how many")},
+        named=True,
+    ),
+    "/log": Topic(
+        "foxglove.Log",
+        "what was said during the run",
+        {
+            "timestamp": ("time", "", "plant time since 2000-01-01"),
+            "level": ("integer", "", "1 debug, 2 info, 3 warning, 4 error, 5 fatal"),
+            "message": ("text", "", "one sentence"),
+            "name": ("text", "", "who said it"),
+            "file": ("text", "", "unused"),
+            "line": ("integer", "", "unused"),
+        },
+    ),
+}
+
+
+def topic_definition(topic: str) -> Topic:
+    """The definition of a topic; `/plant/GROUP/input` has that of `/plant/input`."""
+    parts = topic.split("/")
+    key = f"/{parts[1]}/{parts[3]}" if len(parts) == 4 and parts[1] == "plant" else topic
+    if key not in TOPICS:
+        raise ValueError(f"expected one of the topics {', '.join(TOPICS)}, got {topic}")
+    return TOPICS[key]

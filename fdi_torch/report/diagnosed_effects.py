@@ -1,0 +1,100 @@
+"""Diagnosed effects of a run of any kind: effect, location and size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fdi_torch.effects import effect
+from fdi_torch.gap.verdict_words import cause_words
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import fits
+from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import number, shown_unit, with_error
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class DiagnosedEffect:
+    """An effect at a location. quantity: name of the parameter whose value is `size`, with its std in `unit` (SI).
+
+    flow in m^3/s and hole diameter in m for effects that move water; NaN if unknown.
+    """
+
+    effect: str
+    location: str
+    present: bool
+    size: float = NAN
+    std: float = NAN
+    unit: str = ""
+    flow: float = NAN
+    hole: float = NAN
+    quantity: str = "size"
+
+    @property
+    def words(self) -> str:
+        """'leak at T1', 'something unknown at Q1'."""
+        return cause_words({"effect": self.effect, "location": self.location}).replace("_", " ")
+
+    @property
+    def sized(self) -> str:
+        """'leak at T1 (size 0.3000 ± 0.0020, 33.1 cm³/s)': the effect with its size and, if it has one, its flow."""
+        unit, scale = shown_unit(self.unit)
+        value = with_error(scale * self.size, scale * self.std)
+        size = f"{self.quantity.replace('_', ' ')} {value}" if unit in ("", "1") else f"{value} {unit}"
+        sizes = [size] if math.isfinite(self.size) else []
+        sizes += [f"{number(1e6 * self.flow, 3)} cm³/s"] if math.isfinite(self.flow) else []
+        return f"{self.words} ({', '.join(sizes)})" if sizes else self.words
+
+
+def diagnosed_effects(material: Material) -> list[DiagnosedEffect]:
+    """Faults of a diagnosis (the last message about each), then the causes of a gap."""
+    faults = {(m.get("fault"), m.get("location")): _fault(m) for m in material.of("/diagnosis/fault")}
+    return [*faults.values(), *(_cause(cause, material.plant) for cause in material.answer.get("causes", []))]
+
+
+def _fault(message: Mapping[str, Any]) -> DiagnosedEffect:
+    size, std, flow, hole = (as_number(message.get(name)) for name in ("size", "size_std", "flow", "hole_diameter"))
+    name, location, unit = (str(message.get(key, "")) for key in ("fault", "location", "unit"))
+    quantity = name.partition(".")[2] or "size"
+    return DiagnosedEffect(
+        _effect_name(name), location, message.get("present") is True, size, std, unit, flow, hole, quantity
+    )
+
+
+def fault_at(name: str) -> tuple[str, str]:
+    """A parameter's full name, 'L.leak.size', as an effect in words and its place: 'leak', 'L'."""
+    place, _, fault = name.partition(".")
+    return (_effect_name(fault).replace("_", " "), place) if fault else (name, "")
+
+
+def _effect_name(name: str) -> str:
+    """'leak.size' -> 'leak', 'sensor_bias.bias' -> 'sensor_bias'."""
+    return name.partition(".")[0]
+
+
+def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> DiagnosedEffect:
+    """A log may hold the parameters in any order: which is the size, the effect itself says."""
+    name, location, parameters = str(cause["effect"]), str(cause["location"]), cause.get("parameters", {})
+    quantity = _size_of(name, location, plant)
+    quantity = quantity if quantity in parameters else next(iter(parameters), "size")
+    size: Mapping[str, Any] = parameters.get(quantity, {})
+    value, std = as_number(size.get("value")), as_number(size.get("std"))
+    return DiagnosedEffect(name, location, True, value, std, str(size.get("unit", "")), quantity=quantity)
+
+
+def _size_of(name: str, location: str, plant: PlantDescription | None) -> str:
+    """The short name of an effect's size; empty where the library or the plant lacks it."""
+    try:
+        placed = plant is not None and fits(effect(name), plant, location)
+    except ValueError:
+        return ""
+    return effect(name).parameters(location, plant)[0].name if placed and plant is not None else ""
+
+
+def as_number(value: Any) -> float:
+    """A number of a log, or NaN."""
+    return float(value) if isinstance(value, int | float) else NAN

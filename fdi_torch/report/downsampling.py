@@ -1,0 +1,36 @@
+"""Downsampling of long signals for drawing, without visible change."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+BINS = 400
+
+
+def thinned(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
+    """A signal (T,) reduced to the minimum and maximum of each of `bins` segments, in order, so that spikes remain.
+
+    A segment without finite values becomes a gap (NaN).
+    """
+    if len(time) <= 2 * bins:
+        return time, values
+    edges = np.linspace(0, len(time), bins + 1).astype(int)
+    kept: list[int] = []
+    for first, last in pairwise(edges.tolist()):
+        part = values[first:last]
+        if not np.isfinite(part).any():
+            kept.append(int(first))
+            continue
+        kept += sorted({int(first + np.nanargmin(part)), int(first + np.nanargmax(part))})
+    return time[kept], values[kept]
+
+
+def corner_points(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The corners of a signal (T,) that is constant between changes."""
+    if not len(time):
+        return time, values
+    changes = np.flatnonzero(values[1:] != values[:-1]) + 1
+    corners = np.unique(np.concatenate(([0], changes, [len(time) - 1])))
+    return time[corners], values[corners]

@@ -1,0 +1,65 @@
+"""Layout of a rig's drawing: flow directions set the rows, connections the columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from fdi_torch.plant.description import OUTSIDE, PlantDescription
+
+Place = tuple[int, int]  # row from the top, column from the left
+
+
+def tank_places(plant: PlantDescription) -> dict[str, Place]:
+    """Row and column of every tank, all different.
+
+    A tank is below all tanks that flow into it, and as close as possible to the tanks it is connected to.
+    """
+    rows = _rows([t.name for t in plant.tanks], _falls(plant))
+    neighbours = _neighbours(plant)
+    places: dict[str, Place] = {}
+    for name in _walk(plant, neighbours):
+        above = [places[n][1] for n in neighbours[name] if n in places and places[n][0] != rows[name]]
+        column = above[0] if above else 1 + max((c for _, c in places.values()), default=-1)
+        while (rows[name], column) in places.values():
+            column += 1
+        places[name] = (rows[name], column)
+    return places
+
+
+def _falls(plant: PlantDescription) -> list[tuple[str, str]]:
+    """(upper, lower) tank for every pipe in free fall and every overflow."""
+    pipes = [(p.source, p.target) for p in plant.pipes if p.free_fall and p.target != OUTSIDE]
+    return pipes + [(t.name, t.overflow_to) for t in plant.tanks if t.overflow_to not in (OUTSIDE, t.name)]
+
+
+def _rows(names: Iterable[str], falls: list[tuple[str, str]]) -> dict[str, int]:
+    """Length of the longest path down to each tank; cycles are cut after as many steps as there are tanks."""
+    rows = dict.fromkeys(names, 0)
+    for _ in range(len(rows) - 1):
+        for above, below in falls:
+            rows[below] = min(max(rows[below], rows[above] + 1), len(rows) - 1)
+    return rows
+
+
+def _neighbours(plant: PlantDescription) -> dict[str, list[str]]:
+    joined: dict[str, list[str]] = {t.name: [] for t in plant.tanks}
+    ends = [(p.source, p.target) for p in plant.pipes if p.target != OUTSIDE]
+    for a, b in ends + _falls(plant):
+        if b not in joined[a]:
+            joined[a].append(b)
+            joined[b].append(a)
+    return joined
+
+
+def _walk(plant: PlantDescription, neighbours: dict[str, list[str]]) -> list[str]:
+    """The tanks in order along their pipes, each chain starting at one of its ends."""
+    ends_first = sorted((t.name for t in plant.tanks), key=lambda name: len(neighbours[name]) > 1)
+    order: dict[str, None] = {}
+    for start in ends_first:
+        pending = [start]
+        while pending:
+            name = pending.pop()
+            if name not in order:
+                order[name] = None
+                pending += [n for n in reversed(neighbours[name]) if n not in order]
+    return list(order)
