@@ -1,4 +1,4 @@
-"""Fits end at a minimum, wherever they began, and say where they did not."""
+"""Fits end at a minimum from any start, and report if they do not."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def plugging_fits(fitter: Fitter, null: Fit, sizes: list[float]) -> list[Fit]:
     return [fitter.fit(Candidate((PLUGGING,), ({SIZE: size},)), null) for size in sizes]
 
 
-def test_plugging_beside_a_leak_is_found_within_two_standard_errors(
+def test_plugging_and_leak_are_estimated_within_two_standard_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -81,7 +81,7 @@ def test_a_plugged_pipe_ends_at_the_best_of_several_starts(number: int) -> None:
     assert fit.cost < min(other.cost for other in others) + 0.5
 
 
-def test_a_fit_that_was_cut_short_says_so() -> None:
+def test_a_fit_without_enough_evaluations_has_not_converged() -> None:
     recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), {SIZE: 0.4}, seed=0)
     fitter, null = recalibrated(THREE_TANK, recording)
     candidate = Candidate((PLUGGING,), ({SIZE: 0.1},))
@@ -122,7 +122,7 @@ def six_tanks() -> PlantDescription:
 
 
 @pytest.mark.slow
-def test_a_recalibration_at_nearly_equal_levels_gains_nothing_from_an_effect_that_is_taken_away_again() -> None:
+def test_a_recalibration_at_nearly_equal_levels_gains_nothing_from_an_added_and_removed_effect() -> None:
     plant = six_tanks()
     time = torch.arange(3601, dtype=torch.float64)
     flows = [[8.6e-6, 30e-6, 18e-6], [19.6e-6, 12e-6, 25e-6], [12.8e-6, 20e-6, 6e-6]]

@@ -1,4 +1,4 @@
-"""Prior odds, and probabilities that are never certain."""
+"""Prior odds, and normalised probabilities."""
 
 from __future__ import annotations
 

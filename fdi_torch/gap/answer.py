@@ -44,7 +44,7 @@ class Cause:
 
 
 @dataclass(frozen=True)
-class Explanation:
+class ProbableExplanation:
     """A set of causes, empty for the nominal plant, and its posterior probability."""
 
     causes: tuple[CauseName, ...]
@@ -70,7 +70,7 @@ class Answer:
     where: Sequence[tuple[str, float]]
     causes: Sequence[Cause]
     ambiguity_set: Sequence[tuple[CauseName, ...]]
-    posterior: Sequence[Explanation]
+    posterior: Sequence[ProbableExplanation]
     closure: Mapping[str, Any]
     noise: Mapping[str, Any]
     unexamined: float = 0.0
@@ -213,6 +213,6 @@ def _cause(cause: Cause) -> dict[str, Any]:
     return named | ({"same_as": names(cause.same_as)} if cause.same_as else {})
 
 
-def _explanation(explanation: Explanation) -> dict[str, Any]:
+def _explanation(explanation: ProbableExplanation) -> dict[str, Any]:
     shown: dict[str, Any] = {"causes": names(explanation.every), "probability": explanation.probability}
     return shown | ({"unknown_at": explanation.unknown_at} if explanation.unknown_at else {})

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from fdi_torch.gap.answer import UNKNOWN, Amount, Answer, Cause, CauseName, Explanation, names
+from fdi_torch.gap.answer import UNKNOWN, Amount, Answer, Cause, CauseName, ProbableExplanation, names
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, p_value
@@ -46,7 +46,7 @@ def build_answer(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer
         where=_where(result),
         causes=_causes(result),
         ambiguity_set=[_names(result, h) for h in result.credible_set] if has_causes else [],
-        posterior=[Explanation((*h.causes, *result.from_readings), p, h.unknown_at) for h, p in hypotheses],
+        posterior=[ProbableExplanation((*h.causes, *result.from_readings), p, h.unknown_at) for h, p in hypotheses],
         unexamined=posterior.unexamined,
         converged=result.best.converged,
         closure=closure_to_dict(runs, result) if runs else {},
@@ -139,7 +139,7 @@ def _confusability(result: DiagnosisResult) -> dict[str, object]:
 def _identifiability(result: DiagnosisResult) -> dict[str, Any]:
     """Effects that this recording's inputs cannot show or separate, by the names of the answer."""
     shown = identifiability(result.search.shown, result.fitter.data.plant)
-    pairs = [{"between": names((a, b)), "parted_by": left} for a, b, left in shown.inseparable]
+    pairs = [{"between": names((a, b)), "parted_by": separation} for a, b, separation in shown.inseparable]
     return {"hidden": names(shown.hidden), "inseparable": pairs}
 
 

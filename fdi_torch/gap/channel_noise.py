@@ -128,15 +128,15 @@ def estimate_noise(
     step do not count for the common correlation, because rounding errors have their own. rows: segments without a jump
     between their samples.
     """
-    rounded = [step > 0.0 for step in steps]
+    quantized = [step > 0.0 for step in steps]
     spectra = [_spectrum_of_all([residual[r][mask[r][:, c], c] for r in rows]) for c in range(residual.shape[1])]
-    plain = [not r for r in rounded] if rounded and not all(rounded) else [True] * len(spectra)
+    plain = [not r for r in quantized] if quantized and not all(quantized) else [True] * len(spectra)
     levels = [_levels(*s) for s in spectra]
     # (C, colours, errors)
     likelihoods = torch.stack([_likelihood(*s, x) for s, x in zip(spectra, levels, strict=True)])
     counts = [int(mask[:, c].sum()) for c in range(residual.shape[1])]
     likelihoods = likelihoods + torch.stack([_cost_of_error(n) for n in counts]).unsqueeze(1)
-    likelihoods[:, len(_AR) :] += math.inf if any(rounded) else MEAN_PENALTY
+    likelihoods[:, len(_AR) :] += math.inf if any(quantized) else MEAN_PENALTY
     best = likelihoods.min(dim=-1).values
     common = _most_likely(best[torch.tensor(plain)].sum(dim=0), int(mask.sum()))
     chosen = [common if is_plain else _most_likely(best[c], counts[c]) for c, is_plain in enumerate(plain)]

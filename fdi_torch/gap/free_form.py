@@ -82,10 +82,10 @@ class FreeFlow(_Free):
     places: ClassVar[tuple[str, ...]] = ("pump", "pipe", "outlet")
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
-        own = self.curve("command", local.command, p) + self.curve("head", local.head, p)
+        local_part = self.curve("command", local.command, p) + self.curve("head", local.head, p)
         time = self.curve("time", local.clock.middle, p) + self.waves(local.clock, p)
         factor = self.curve("level", local.level, p) + time
-        return flow + self.scale * own + flow * factor
+        return flow + self.scale * local_part + flow * factor
 
 
 class FreeInflow(_Free):
@@ -96,8 +96,8 @@ class FreeInflow(_Free):
     places: ClassVar[tuple[str, ...]] = ("tank", "tank_pair")
 
     def inflow(self, local: Local, p: Values) -> Tensor:
-        own = self.curve("level", local.level, p) + self.curve("difference", local.level - local.far_level, p)
-        return self.scale * (own + self.curve("time", local.clock.middle, p) + self.waves(local.clock, p))
+        local_part = self.curve("level", local.level, p) + self.curve("difference", local.level - local.far_level, p)
+        return self.scale * (local_part + self.curve("time", local.clock.middle, p) + self.waves(local.clock, p))
 
 
 class FreeArea(_Free):

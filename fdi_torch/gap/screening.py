@@ -135,10 +135,10 @@ class _ProjectedRegression:
         rows = torch.diag(weight), 1e-6 * torch.eye(len(weight), dtype=weight.dtype)
         q, _ = torch.linalg.qr(torch.cat([(jacobian * scale).flatten(0, 1), *rows]))
         r = torch.cat([residual.flatten(), -deviation, torch.zeros_like(deviation)])
-        seen = residual.numel()
-        remaining = (r - q @ (q.T @ r))[:seen]
+        count = residual.numel()
+        remaining = (r - q @ (q.T @ r))[:count]
         return _ProjectedRegression(
-            fitter, fit, remaining.reshape(residual.shape), q[:seen].reshape(*residual.shape, -1)
+            fitter, fit, remaining.reshape(residual.shape), q[:count].reshape(*residual.shape, -1)
         )
 
     def screened(self, options: Sequence[Option]) -> tuple[Tensor, Tensor]:

@@ -34,12 +34,12 @@ class BetweenRunSpread:
     high: float
 
 
-def between_run_spread(own: Sequence[RunConstant], tolerance: float) -> BetweenRunSpread | None:
+def between_run_spread(constants: Sequence[RunConstant], tolerance: float) -> BetweenRunSpread | None:
     """Standard deviation over the recordings that determine the constant; None for fewer than two.
 
     For independent normal values, (n - 1) s^2 / sigma^2 is chi-square with n - 1 degrees of freedom.
     """
-    values = torch.tensor([o.value for o in own if o.std < DETERMINED * tolerance], dtype=torch.float64)
+    values = torch.tensor([o.value for o in constants if o.std < DETERMINED * tolerance], dtype=torch.float64)
     count = len(values)
     if count < 2:
         return None

@@ -292,9 +292,9 @@ def _swap(a: str, b: str) -> RecordingFault:
 
 def _late(columns: tuple[str, ...], delay: float, everything: bool) -> RecordingFault:
     what = "the readings" if everything else ", ".join(columns)
-    beside = "the inputs" if everything else "the other channels"
+    reference = "the inputs" if everything else "the other channels"
     text = (
-        f"{what}: the clock seems to run {abs(delay):.3g} s {'behind' if delay > 0 else 'ahead of'} that of {beside}; "
+        f"{what}: the clock seems to run {abs(delay):.3g} s {'behind' if delay > 0 else 'ahead of'} that of {reference}; "
         "state the shift of each file under columns: {t: {shift: ...}}"
     )
     return RecordingFault(("all",) if everything else columns, text, physical=delay > 0 and not everything)

@@ -147,7 +147,7 @@ def _share_after_limit(at_end: Tensor) -> float:
 
 def _limits_per_sensor(data: DataSet) -> list[dict[str, float]]:
     """Limits of each sensor, as in `limits_of`."""
-    return [limits_of(data.readings[seen, c]) for c, seen in enumerate(data.mask.T)]
+    return [limits_of(data.readings[valid, c]) for c, valid in enumerate(data.mask.T)]
 
 
 def _longest_run(flags: Tensor) -> int:

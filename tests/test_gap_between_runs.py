@@ -1,4 +1,4 @@
-"""What differs from recording to recording: its spread, and how well so few tell."""
+"""Between-run variance of a constant and its confidence interval."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_interval_holds_the_true_spread_in_19_of_20_cases() -> None:
     assert 0.92 < held / 400 < 0.98
 
 
-def test_recordings_that_do_not_tell_do_not_count() -> None:
+def test_recordings_that_do_not_determine_the_constant_do_not_count() -> None:
     told = between_run_spread([own(1.0), own(1.02), own(1.5, std=0.09)], 0.1)
     assert told is not None and told.count == 2 and told.mean == pytest.approx(1.01)
     assert between_run_spread([own(1.0), own(1.5, std=0.09)], 0.1) is None

@@ -1,4 +1,4 @@
-"""What one form of a component promises, against the regression that has all of its columns."""
+"""First-order gains of single regressors, against the regression on all of their columns."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegress
 from fdi_torch.gap.marginal_likelihood import with_estimated_noise
 from fdi_torch.gap.problem import problem_of
 from fdi_torch.plant.effect import Placement
-from tests.test_gap import believed, recorded
+from tests.test_gap import nominal_plant, recorded
 
 PLACES = ("Q1", "T1", "P13", "OUT2", "T1-T3", "h2")
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["plain", "with a lag of a sensor"])
 def surveyed(request: pytest.FixtureRequest) -> tuple[DiscrepancyRegression, Fitter, Fit]:
-    case = problem_of(believed(), (recorded({"Q1.pump_lag.time_constant": 8.0}, seed=3),), (), Settings())
+    case = problem_of(nominal_plant(), (recorded({"Q1.pump_lag.time_constant": 8.0}, seed=3),), (), Settings())
     fitter, null, _ = recalibrate(case.data)
     under, _ = with_estimated_noise(fitter, null)
     if request.param:
@@ -65,7 +65,9 @@ def test_products_are_those_of_the_columns(
     assert float(share.mean()) == pytest.approx(1.0, abs=0.15)
 
 
-def test_the_guilty_place_promises_most(surveyed: tuple[DiscrepancyRegression, Fitter, Fit]) -> None:
+def test_the_place_of_the_cause_has_the_largest_first_order_gain(
+    surveyed: tuple[DiscrepancyRegression, Fitter, Fit],
+) -> None:
     survey, under, null = surveyed
     found = promise.single_regressor_gains(survey, under, null, PLACES, torch.Generator().manual_seed(5))
     assert max(found, key=lambda place: found[place]) == "Q1"

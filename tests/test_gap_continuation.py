@@ -1,4 +1,4 @@
-"""A course of the levels that is found only by way of smoother plants."""
+"""Continuation: a trajectory that is found only through smoothed plants."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -33,7 +33,7 @@ class Stiff:
 NEAR = SimpleNamespace(jacobian=torch.zeros(1))
 
 
-def test_a_course_is_followed_from_the_smoothest_plant_to_the_sharp_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_continuation_runs_from_the_smoothest_plant_to_the_sharp_one(monkeypatch: pytest.MonkeyPatch) -> None:
     recording = recorded(STANDING, wandering(1024, 4)[256:400])
     data = problem_of(PLANT, (recording,), (), Settings()).data
     Stiff.asked, Stiff.sharp = [], float(data.experiment.resolution)

@@ -1,4 +1,4 @@
-"""Where a gap lies: the forms, their evidence, the trajectory that was read, and the place of what has no name."""
+"""Localization: regressors, their evidence, the smoothed trajectory, and the place of an unknown cause."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fdi_torch.gap.localization.regressors import (
 from fdi_torch.gap.localization.sparse_regression import sparse_fit
 from fdi_torch.gap.marginal_likelihood import with_estimated_noise
 from fdi_torch.gap.problem import problem_of
-from tests.test_gap import believed, noise, recorded
+from tests.test_gap import noise, nominal_plant, recorded
 
 
 def test_values_between_samples_lie_on_the_line_and_stay_beyond_the_ends() -> None:
@@ -30,7 +30,7 @@ def test_values_between_samples_lie_on_the_line_and_stay_beyond_the_ends() -> No
     assert interpolate(at, times, torch.tensor([0.0, 2.0, 5.0])).tolist() == [0.0, 1.0, 4.0, 5.0]
 
 
-def test_forms_with_memory_are_what_their_equations_say() -> None:
+def test_regressors_with_memory_follow_their_equations() -> None:
     x, step = torch.tensor([0.0, 1.0, 1.0, 1.0], dtype=torch.float64), torch.full((4,), 2.0, dtype=torch.float64)
     decay = torch.exp(torch.tensor(-0.5, dtype=torch.float64))
     assert lagged(x, step, 4.0) == pytest.approx(torch.stack([0 * decay, 1 - decay, 1 - decay**2, 1 - decay**3]))
@@ -44,14 +44,14 @@ def test_forms_with_memory_are_what_their_equations_say() -> None:
     assert rate_limited(torch.tensor([0.0, 5.0, 5.0, 1.0]), step, 1.0).tolist() == [0.0, 2.0, 4.0, 2.0]
 
 
-def test_what_switches_stays_between_its_thresholds_as_it_was() -> None:
+def test_a_relay_keeps_its_state_between_its_thresholds() -> None:
     x = torch.tensor([0.0, 0.5, 0.9, 0.5, 0.1, 0.5])
     assert relay(x, 0.2, 0.8).tolist() == [0.0, 0.0, 1.0, 1.0, 0.0, 0.0]
     assert stiction(x, 0.45).tolist() == pytest.approx([0.0, 0.5, 0.5, 0.5, 0.5, 0.5])
     assert [low for low, _ in relays(x, (0.0, 1.0), 3)] == pytest.approx([1 / 6, 1 / 6, 0.5])
 
 
-def test_bends_span_every_piecewise_linear_function_of_their_values() -> None:
+def test_hinges_span_every_piecewise_linear_function_of_their_nodes() -> None:
     x = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
     basis = torch.stack(hinges(x, (0.0, 1.0), 5), dim=1)
     kinked = (x - 0.25).abs() - 2.0 * (x - 0.75).clamp(min=0.0)
@@ -59,7 +59,7 @@ def test_bends_span_every_piecewise_linear_function_of_their_values() -> None:
     assert (basis @ found).squeeze(1) == pytest.approx(kinked, abs=1e-10)
 
 
-def test_the_forms_that_made_a_signal_have_more_evidence_than_as_many_others() -> None:
+def test_the_regressors_that_made_a_signal_have_more_evidence_than_others() -> None:
     generator = torch.Generator().manual_seed(2)
     true, other = (torch.randn(400, 30, generator=generator, dtype=torch.float64) for _ in range(2))
     noise = torch.randn(400, generator=generator, dtype=torch.float64)
@@ -73,9 +73,9 @@ def test_the_forms_that_made_a_signal_have_more_evidence_than_as_many_others() -
     assert 1.9 < float(found.needs[0]) < 10.0 < float(found.needs[1]), "two did it, and others need many to come near"
 
 
-def test_a_sluggish_pump_is_told_from_its_tank() -> None:
+def test_a_slow_pump_is_distinguished_from_its_tank() -> None:
     """Both make one balance; coarse steps in time, at the tank, do nearly as well as the pump's own forms."""
-    case = problem_of(believed(), (recorded({"Q2.actuator_slew.slowness": 3e6}, 4),), (), Settings())
+    case = problem_of(nominal_plant(), (recorded({"Q2.actuator_slew.slowness": 3e6}, 4),), (), Settings())
     fitter, null, _ = recalibrate(case.data)
     own, likely = with_estimated_noise(fitter, null)
     found = localize(own, null, likely.noise, ("Q2", "T2", "OUT2"))
@@ -83,7 +83,7 @@ def test_a_sluggish_pump_is_told_from_its_tank() -> None:
     assert sorted(place.location for place in found) == ["OUT2", "Q2", "T2"]
 
 
-def test_a_line_in_the_spectrum_is_found_beside_a_slow_misfit() -> None:
+def test_a_spectral_line_is_found_despite_a_slow_misfit() -> None:
     times = torch.arange(3000, dtype=torch.float64)
     slow = 0.01 * torch.sin(times / 200.0).unsqueeze(1) + noise(3000, 0.0, 0.002, 3)
     line = slow + 0.002 * torch.sin(2 * torch.pi * times / 47.3).unsqueeze(1)
@@ -91,8 +91,8 @@ def test_a_line_in_the_spectrum_is_found_beside_a_slow_misfit() -> None:
 
 
 @pytest.mark.parametrize("values", [{"Q1.pump_lag.time_constant": 15.0}, {"h2.sensor_hysteresis.play": 0.02}])
-def test_what_has_a_memory_and_no_name_is_unknown_at_its_place(values: dict[str, float]) -> None:
-    answer = diagnose(believed(), recorded(values, 5), settings=Settings(leave_out=("pump_lag", "pump_delay")))
+def test_an_effect_with_memory_that_the_library_lacks_is_unknown_at_its_place(values: dict[str, float]) -> None:
+    answer = diagnose(nominal_plant(), recorded(values, 5), settings=Settings(leave_out=("pump_lag", "pump_delay")))
     place = next(iter(values)).partition(".")[0]
     assert answer.verdict in ("unknown", "ambiguous")  # play looks much like a lag of the sensor
     assert answer.where[0][0] == place
@@ -102,7 +102,7 @@ def test_what_has_a_memory_and_no_name_is_unknown_at_its_place(values: dict[str,
     assert sum(e.probability for e in answer.posterior) + answer.unexamined == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_curvature_that_rounding_spoilt_harms_no_neighbour() -> None:
+def test_an_indefinite_curvature_does_not_change_its_neighbours() -> None:
     columns = torch.randn(3, 20, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     gram, score = columns.mT @ columns, torch.full((3, 6), 100.0, dtype=torch.float64)
     spoilt = gram.clone()
@@ -112,20 +112,20 @@ def test_a_curvature_that_rounding_spoilt_harms_no_neighbour() -> None:
     assert torch.equal(found.evidence[[0, 2]], expected.evidence[[0, 2]])
 
 
-def test_the_error_of_rounding_is_nothing_unknown() -> None:
+def test_a_rounding_error_is_no_unknown_cause() -> None:
     """It changes as slowly as the level does, but by no more than half a step."""
     run = recorded({}, 7, samples=1500)
     run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
-    fitter, fit, steps = recalibrate(problem_of(believed(), (run,), (), Settings()).data)
+    fitter, fit, steps = recalibrate(problem_of(nominal_plant(), (run,), (), Settings()).data)
     assert [step > 0.0 for step in steps] == [False, False, True]
     under, likely = with_estimated_noise(fitter, fit)
     assert all(place.gain < 0.0 for place in localize(under, fit, likely.noise, ["h3"]))
 
 
-def test_a_sensor_that_wanders_by_more_than_its_rounding_is_unknown() -> None:
+def test_a_sensor_that_drifts_by_more_than_its_rounding_is_unknown() -> None:
     run = recorded({}, 7, samples=1500)
     run.outputs[:, 2] += noise(1500, 0.95, 0.02, 3)[:, 0]
     run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
-    fitter, fit, _ = recalibrate(problem_of(believed(), (run,), (), Settings()).data)
+    fitter, fit, _ = recalibrate(problem_of(nominal_plant(), (run,), (), Settings()).data)
     under, likely = with_estimated_noise(fitter, fit)
     assert localize(under, fit, likely.noise, ["h3"])[0].gain > 10.0

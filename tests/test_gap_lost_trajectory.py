@@ -1,4 +1,4 @@
-"""A trajectory that was not followed to its end is no answer, however close its readings are."""
+"""A trajectory that did not converge is rejected, however close its readings are."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.rigs import constant_inputs, three_tank
 
 
 @pytest.mark.parametrize(("defect", "taken"), [(1.0, False), (1e-9, True)])
-def test_a_step_is_taken_only_where_its_trajectory_is_the_models(
+def test_a_step_is_accepted_only_if_its_trajectory_satisfies_the_model(
     defect: float, taken: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plant = three_tank()
