@@ -294,7 +294,8 @@ def _late(columns: tuple[str, ...], delay: float, everything: bool) -> Recording
     what = "the readings" if everything else ", ".join(columns)
     reference = "the inputs" if everything else "the other channels"
     text = (
-        f"{what}: the clock seems to run {abs(delay):.3g} s {'behind' if delay > 0 else 'ahead of'} that of {reference}; "
+        f"{what}: the clock seems to run {abs(delay):.3g} s {'behind' if delay > 0 else 'ahead of'} that of "
+        f"{reference}; "
         "state the shift of each file under columns: {t: {shift: ...}}"
     )
     return RecordingFault(("all",) if everything else columns, text, physical=delay > 0 and not everything)
