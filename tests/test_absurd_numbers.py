@@ -9,7 +9,7 @@ from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.study_file import load_study
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.jobs.train import train
-from tests.test_gap import believed, recorded
+from tests.test_gap import nominal_plant, recorded
 
 
 def test_a_simulated_fault_lies_within_its_range(tmp_path: pytest.TempPathFactory) -> None:
@@ -20,7 +20,7 @@ def test_a_simulated_fault_lies_within_its_range(tmp_path: pytest.TempPathFactor
 
 def test_a_step_of_a_diagnosis_lies_within_the_recording() -> None:
     with pytest.raises(ValueError, match=r"step: expected one within the 99 s recorded, got 1e\+18 s"):
-        diagnose(believed(), recorded({}, 1, samples=100), settings=Settings(step=1e18))
+        diagnose(nominal_plant(), recorded({}, 1, samples=100), settings=Settings(step=1e18))
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.acquisition import examined, usable
 from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.preprocess.acquisition import examined, usable
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
-from tests.test_gap import SMALL, believed, noise, recorded
+from tests.test_gap import SMALL, noise, nominal_plant, recorded
 
 
 def sound(seed: int = 11, **values: float) -> Recording:
@@ -36,7 +36,7 @@ def from_sample(recording: Recording, column: int, first: int, value: float | No
     return with_channel(recording, column, values)
 
 
-def test_readings_that_repeat_longer_than_noise_lets_them_are_held() -> None:
+def test_readings_that_repeat_longer_than_noise_explains_are_held() -> None:
     x = 0.3 + 0.1 * torch.sin(torch.arange(2000, dtype=torch.float64) / 90) + noise(2000, 0.0, 0.001, 1)[:, 0]
     assert stuck_runs(x) == []
     stuck = x.clone()
@@ -48,7 +48,7 @@ def test_readings_that_repeat_longer_than_noise_lets_them_are_held() -> None:
 
 @pytest.mark.parametrize("step", [3e-3, 1e-2, 3e-2])
 @pytest.mark.parametrize("slow", [90.0, 2000.0])
-def test_a_rounded_channel_is_not_held(step: float, slow: float) -> None:
+def test_a_quantized_channel_is_not_held(step: float, slow: float) -> None:
     for seed in range(5):
         level = 0.3 + 0.1 * torch.sin(torch.arange(4000, dtype=torch.float64) / slow)
         x = level + noise(4000, 0.0, 0.001, seed)[:, 0]
@@ -65,7 +65,7 @@ def test_a_run_is_called_too_long_in_one_recording_of_a_thousand() -> None:
     assert calls <= 3
 
 
-def test_a_sensor_that_never_moves_is_held_against_its_neighbours_noise() -> None:
+def test_a_sensor_that_never_moves_is_compared_with_its_neighbours_noise() -> None:
     still = torch.full((500,), 0.3, dtype=torch.float64)
     assert stuck_runs(still) == []
     assert stuck_runs(still, Scatter(1e-3, 1e-5)) == [(0, 500)]
@@ -78,10 +78,10 @@ EACH_SENSOR = [(0, None, 0), (1, None, 800), (2, 0.0, 800), pytest.param(1, 0.0,
 
 
 @pytest.mark.parametrize(("column", "value", "first"), EACH_SENSOR)
-def test_a_sensor_that_is_stuck_is_masked_and_told(column: int, value: float | None, first: int) -> None:
-    found = examined(believed(), from_sample(sound(), column, first, value))
+def test_a_stuck_sensor_is_masked_and_reported(column: int, value: float | None, first: int) -> None:
+    found = examined(nominal_plant(), from_sample(sound(), column, first, value))
     assert [(s.sensor.name, s.first, s.for_good) for s in found.stuck] == [(f"h{column + 1}", first, True)]
-    assert found.slip is None
+    assert found.fault is None
     counted = found.recording.mask.sum(dim=0).tolist()
     assert counted[column] == first
     assert [n for c, n in enumerate(counted) if c != column] == [2000, 2000]
@@ -89,18 +89,18 @@ def test_a_sensor_that_is_stuck_is_masked_and_told(column: int, value: float | N
 
 
 @pytest.mark.parametrize("factor", [1e-3, 0.1, *(pytest.param(f, marks=pytest.mark.slow) for f in (1e-2, 10.0, 1e3))])
-def test_a_unit_that_slipped_is_refused(factor: float) -> None:
+def test_a_wrong_unit_is_refused(factor: float) -> None:
     run = sound()
-    with pytest.raises(ValueError, match=r"h3: its unit seems wrong, for its numbers are \d+ times too"):
-        usable(believed(), with_channel(run, 2, factor * run.outputs[:, 2]))
+    with pytest.raises(ValueError, match=r"h3: its unit seems wrong: its values are \d+ times too"):
+        usable(nominal_plant(), with_channel(run, 2, factor * run.outputs[:, 2]))
 
 
 def test_a_command_in_the_wrong_unit_is_refused() -> None:
     run = sound()
     inputs = run.inputs.clone()
     inputs[:, 0] *= 0.1
-    with pytest.raises(ValueError, match="Q1: its unit seems wrong, for its numbers are 10 times too small"):
-        usable(believed(), replace(run, inputs=inputs))
+    with pytest.raises(ValueError, match="Q1: its unit seems wrong: its values are 10 times too small"):
+        usable(nominal_plant(), replace(run, inputs=inputs))
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (0, 2)])
@@ -109,13 +109,13 @@ def test_swapped_sensors_are_refused(pair: tuple[int, int]) -> None:
     outputs = run.outputs.clone()
     outputs[:, [i, j]] = outputs[:, [j, i]]
     with pytest.raises(ValueError, match=f"h{i + 1} and h{j + 1} seem to be swapped"):
-        usable(believed(), replace(run, outputs=outputs))
+        usable(nominal_plant(), replace(run, outputs=outputs))
 
 
 def test_swapped_commands_are_refused() -> None:
     run = sound()
     with pytest.raises(ValueError, match="Q1 and Q2 seem to be swapped"):
-        usable(believed(), replace(run, inputs=run.inputs.flip(1)))
+        usable(nominal_plant(), replace(run, inputs=run.inputs.flip(1)))
 
 
 def late(run: Recording, seconds: int) -> Recording:
@@ -126,37 +126,37 @@ def late(run: Recording, seconds: int) -> Recording:
 
 
 @pytest.mark.parametrize("seconds", [40, -20, pytest.param(-200, marks=pytest.mark.slow)])
-def test_clocks_that_run_apart_are_refused(seconds: int) -> None:
+def test_clock_offsets_are_refused(seconds: int) -> None:
     with pytest.raises(ValueError, match=rf"the readings: the clock seems to run {abs(seconds)}(\.\d)? s (be|ah)"):
-        usable(believed(), late(sound(), seconds))
+        usable(nominal_plant(), late(sound(), seconds))
 
 
 def test_a_sensor_that_reads_ahead_of_the_others_is_refused() -> None:
     run, early = sound(), 60
     ahead = with_channel(run, 1, torch.cat([run.outputs[early:, 1], run.outputs[-early:, 1]])).stretch(0, 1900)
     with pytest.raises(ValueError, match=r"h2: the clock seems to run \S+ s ahead of that of the other channels"):
-        usable(believed(), ahead)
+        usable(nominal_plant(), ahead)
 
 
-def test_a_sensor_that_reads_late_is_left_to_who_knows_the_delay_of_a_sensor() -> None:
+def test_a_late_sensor_is_accepted_if_the_caller_considers_sensor_delays() -> None:
     run, delay = sound(), 60
     late_one = with_channel(run, 1, torch.cat([run.outputs[:delay, 1], run.outputs[:-delay, 1]])).stretch(delay, 2000)
-    assert usable(believed(), late_one, effects=True).slip is not None
+    assert usable(nominal_plant(), late_one, effects=True).fault is not None
     with pytest.raises(ValueError, match=r"h2: the clock seems to run \S+ s behind that of the other channels"):
-        usable(believed(), late_one)
+        usable(nominal_plant(), late_one)
 
 
 def test_random_readings_are_refused() -> None:
     run = sound()
     random = torch.rand(2000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     with pytest.raises(ValueError, match="h1: its readings do not follow the level of T1"):
-        usable(believed(), with_channel(run, 0, random))
+        usable(nominal_plant(), with_channel(run, 0, random))
 
 
-def test_what_is_trusted_is_not_refused() -> None:
+def test_a_trusted_recording_is_not_refused() -> None:
     run = sound()
     wrong = with_channel(run, 2, 10.0 * run.outputs[:, 2])
-    assert usable(believed(), replace(wrong, trusted=True)).slip is None
+    assert usable(nominal_plant(), replace(wrong, trusted=True)).fault is None
 
 
 FAULTS = [
@@ -173,31 +173,31 @@ FAULTS = [
 
 
 @pytest.mark.parametrize("values", FAULTS, ids=lambda v: "+".join(v))
-def test_a_fault_however_large_is_no_slip(values: dict[str, float]) -> None:
-    found = examined(believed(), recorded(values, 5, samples=2000))
-    assert found.slip is None and not found.stuck
+def test_a_large_plant_fault_is_no_recording_fault(values: dict[str, float]) -> None:
+    found = examined(nominal_plant(), recorded(values, 5, samples=2000))
+    assert found.fault is None and not found.stuck
 
 
 def test_a_stuck_sensor_is_the_cause_and_hides_no_other() -> None:
     library = Settings((*SMALL, "sensor_stuck"))
-    answer = diagnose(believed(), from_sample(sound(), 0, 700), settings=library)
+    answer = diagnose(nominal_plant(), from_sample(sound(), 0, 700), settings=library)
     assert (answer.verdict, [(c.effect, c.location) for c in answer.causes]) == ("named", [("sensor_stuck", "h1")])
     assert answer.causes[0].parameters["onset"].value == 700.0
     leaking = recorded({"T1.leak.size": 0.1}, 51, samples=2000)
-    whole = diagnose(believed(), from_sample(leaking, 1, 0), settings=library)
+    whole = diagnose(nominal_plant(), from_sample(leaking, 1, 0), settings=library)
     assert {(c.effect, c.location) for c in whole.causes} == {("sensor_stuck", "h2"), ("leak", "T1")}
     assert whole.verdict == "named"
 
 
-def test_a_sensor_that_stands_still_for_a_while_is_unknown_there() -> None:
+def test_a_sensor_that_is_stuck_for_a_while_is_unknown() -> None:
     run = sound()
     values = run.outputs[:, 1].clone()
     values[500:900] = values[500]
-    answer = diagnose(believed(), with_channel(run, 1, values), settings=Settings(SMALL))
+    answer = diagnose(nominal_plant(), with_channel(run, 1, values), settings=Settings(SMALL))
     assert answer.verdict == "unknown" and answer.where[0] == ("h2", 1.0)
 
 
 def test_a_recording_without_a_sensor_that_reads_is_refused() -> None:
     run = replace(sound(), outputs=torch.full((2000, 3), 0.3, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"expected a sensor that reads its level"):
-        diagnose(believed(), run, settings=Settings(SMALL))
+        diagnose(nominal_plant(), run, settings=Settings(SMALL))

@@ -1,4 +1,4 @@
-"""The gap diagnosis against noise, plants and causes that are known."""
+"""The gap diagnosis on simulated recordings with known noise, plants and causes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.gap.answer import adopted
+from fdi_torch.gap.channel_noise import Noise, estimate_noise, low_frequency_excess, quantization_step
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step, slow_excess
+from fdi_torch.gap.identifiability import planned_identifiability
 from fdi_torch.gap.library import STANDARD, canonical, library_of
-from fdi_torch.gap.plan import plan
 from fdi_torch.gap.screening import Pairs
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
@@ -26,7 +26,7 @@ from tests.rigs import blank_recording, constant_inputs, three_tank
 SMALL = ("pump_gain", "pump_lag", "laminar_flow", "leak@T1", "sensor_bias")
 
 
-def believed() -> PlantDescription:
+def nominal_plant() -> PlantDescription:
     tolerances = {f"{p}.discharge_coefficient": 0.03 for p in ("P13", "P32", "OUT2")}
     return replace(three_tank(), tolerances=tolerances)
 
@@ -50,7 +50,7 @@ def recorded(
     inputs: Tensor | None = None,
 ) -> Recording:
     """The three tanks with some parameters changed, under random steps, steady or given inputs, read with noise (m)."""
-    plant = believed()
+    plant = nominal_plant()
     generator = torch.Generator().manual_seed(seed)
     time = torch.arange(samples, dtype=torch.float64)
     levels = 15e-6 + 60e-6 * torch.rand(samples // 70 + 1, 2, generator=generator, dtype=torch.float64)
@@ -67,7 +67,7 @@ def recorded(
 
 
 @pytest.mark.parametrize("ar", [0.0, 0.8])
-def test_level_and_colour_of_noise_are_found_beside_a_slow_misfit(ar: float) -> None:
+def test_level_and_correlation_of_noise_are_estimated_despite_a_slow_misfit(ar: float) -> None:
     x = noise(4000, ar, 0.002, 3)
     slow = 0.01 * torch.sin(torch.arange(4000, dtype=torch.float64) / 200.0).unsqueeze(1)
     found = estimate_noise(x + slow, torch.ones_like(x, dtype=torch.bool))
@@ -87,7 +87,7 @@ def test_whitened_noise_is_white_and_of_unit_variance_also_across_masked_samples
 
 
 @pytest.mark.parametrize(("samples", "slow"), [(3, 0.0), (8, 0.0), (8, 0.05)])
-def test_a_transmitter_that_averages_is_told_and_undone(samples: int, slow: float) -> None:
+def test_a_moving_average_is_detected_and_inverted(samples: int, slow: float) -> None:
     """Taken for AR(1), a mean has several times the slow power that it should."""
     fresh = noise(6000 + samples - 1, 0.0, 0.002, 9)
     mean = torch.stack([fresh[j : j + 6000] for j in range(samples)]).mean(dim=0)
@@ -96,9 +96,9 @@ def test_a_transmitter_that_averages_is_told_and_undone(samples: int, slow: floa
     found = estimate_noise(mean + misfit, mask)
     assert found.mean_of == samples
     assert found.std.tolist() == pytest.approx([0.002 / math.sqrt(samples)] * 3, rel=0.06)
-    assert found.alike.tolist() == pytest.approx([1.0 - 1.0 / samples] * 3, abs=0.01)
+    assert found.lag_one.tolist() == pytest.approx([1.0 - 1.0 / samples] * 3, abs=0.01)
     repeats = 1.0 + 2.0 * sum((1.0 - k / samples) ** 2 for k in range(1, samples))
-    assert found.repeats.tolist() == pytest.approx([repeats] * 3, rel=0.02)
+    assert found.squared_correlations.tolist() == pytest.approx([repeats] * 3, rel=0.02)
     white = found.whiten(mean, mask)
     power = torch.fft.rfft(white, dim=0).abs() ** 2 / len(white)
     assert float(power[1:200].mean()) == pytest.approx(1.0, abs=0.13)  # 600 values of variance 1, and what was undone
@@ -109,10 +109,10 @@ def test_a_transmitter_that_averages_is_told_and_undone(samples: int, slow: floa
 
 
 def test_a_constant_offset_is_slow_and_counts_with_all_its_squares() -> None:
-    assert slow_excess(torch.full((600, 2), 3.0, dtype=torch.float64)) == pytest.approx(2 * 600 * 3.0**2)
+    assert low_frequency_excess(torch.full((600, 2), 3.0, dtype=torch.float64)) == pytest.approx(2 * 600 * 3.0**2)
 
 
-def test_rounded_readings_are_no_mean_of_several() -> None:
+def test_quantized_readings_are_no_moving_average() -> None:
     """What rounding adds has a colour of its own, from which no averaging transmitter follows."""
     fresh = noise(6007, 0.0, 0.002, 9)
     mean = torch.stack([fresh[j : j + 6000] for j in range(8)]).mean(dim=0)
@@ -121,14 +121,14 @@ def test_rounded_readings_are_no_mean_of_several() -> None:
     assert estimate_noise(mean, mask, (0.0, 0.0, 0.1)).mean_of == 0
 
 
-def test_a_rounded_channel_shows_its_step_and_a_printed_one_does_not() -> None:
+def test_a_quantized_channel_has_a_step_and_a_printed_one_has_none() -> None:
     x = 0.3 + 0.1 * torch.sin(torch.arange(2000, dtype=torch.float64) / 90) + noise(2000, 0.0, 0.001, 1)[:, 0]
-    assert lattice_step((x / 0.013).round() * 0.013, 0.001) == pytest.approx(0.013, rel=1e-6)
-    assert lattice_step((x * 1e6).round() / 1e6, 0.001) == 0.0
-    assert lattice_step(x, 0.001) == 0.0
+    assert quantization_step((x / 0.013).round() * 0.013, 0.001) == pytest.approx(0.013, rel=1e-6)
+    assert quantization_step((x * 1e6).round() / 1e6, 0.001) == 0.0
+    assert quantization_step(x, 0.001) == 0.0
 
 
-def test_a_pair_promises_nothing_where_one_of_the_two_would_have_to_turn_round() -> None:
+def test_a_pair_gains_nothing_if_one_size_had_to_be_negative() -> None:
     """Columns along (1, 0) and (4, 3) / 5 close all of (2, 1); of (2, -1) only what the first does alone."""
     columns = torch.tensor([[1.0, 0.8], [0.0, 0.6]], dtype=torch.float64)
     for left, together in (([2.0, 1.0], 5.0), ([2.0, -1.0], 0.0)):
@@ -136,8 +136,8 @@ def test_a_pair_promises_nothing_where_one_of_the_two_would_have_to_turn_round()
         assert float(Pairs((), score, columns.T @ columns).gain()[0, 1]) == pytest.approx(together)
 
 
-def test_a_sound_rig_with_constants_within_tolerance_has_no_gap() -> None:
-    answer = diagnose(believed(), recorded({"P13.discharge_coefficient": 0.615}, 11), settings=Settings(SMALL))
+def test_a_fault_free_rig_with_constants_within_tolerance_has_no_gap() -> None:
+    answer = diagnose(nominal_plant(), recorded({"P13.discharge_coefficient": 0.615}, 11), settings=Settings(SMALL))
     assert answer.verdict == "no_gap" and not answer.causes
     assert answer.p_value > 1e-3
 
@@ -146,7 +146,7 @@ def test_a_sound_rig_with_constants_within_tolerance_has_no_gap() -> None:
 def test_a_known_cause_is_named_with_its_size_and_closes_the_gap(ar: float) -> None:
     values = {"Q1.pump_lag.time_constant": 12.0, "P32.discharge_coefficient": 0.61}
     recording, holdout = recorded(values, 21, ar=ar), recorded(values, 22, ar=ar)
-    answer = diagnose(believed(), recording, holdout, Settings(SMALL))
+    answer = diagnose(nominal_plant(), recording, holdout, Settings(SMALL))
     assert answer.verdict == "named"
     (cause,) = answer.causes
     assert (cause.effect, cause.location) == ("pump_lag", "Q1")
@@ -158,14 +158,14 @@ def test_a_known_cause_is_named_with_its_size_and_closes_the_gap(ar: float) -> N
 
 def test_two_causes_are_named_together() -> None:
     values = {"Q2.pump_gain.factor": 1.12, "h1.sensor_bias.bias": 0.03}
-    answer = diagnose(believed(), recorded(values, 31), settings=Settings(SMALL))
+    answer = diagnose(nominal_plant(), recorded(values, 31), settings=Settings(SMALL))
     assert answer.verdict == "named"
     assert {(c.effect, c.location) for c in answer.causes} == {("pump_gain", "Q2"), ("sensor_bias", "h1")}
 
 
 def test_a_cause_that_the_library_lacks_is_unknown_at_its_place() -> None:
     values = {"P13.plugging.size": 0.4, "P13.plugging.onset": 450.0}
-    answer = diagnose(believed(), recorded(values, 41), settings=Settings((*SMALL, "plugging"), ("plugging",)))
+    answer = diagnose(nominal_plant(), recorded(values, 41), settings=Settings((*SMALL, "plugging"), ("plugging",)))
     assert answer.verdict == "unknown"
     assert [(c.effect, c.location) for c in answer.causes] == [("unknown", "P13")]
     assert answer.where[0][0] == "P13"
@@ -174,13 +174,13 @@ def test_a_cause_that_the_library_lacks_is_unknown_at_its_place() -> None:
 def test_slow_noise_that_no_effect_explains_is_no_unknown_cause() -> None:
     recording = recorded({"P13.discharge_coefficient": 0.61}, 1, samples=1500)
     slow = replace(recording, outputs=recording.outputs + noise(1500, 0.95, 7e-4, 51))
-    answer = diagnose(believed(), slow, settings=Settings(("pump_delay", "pump_saturation", "sensor_lag")))
+    answer = diagnose(nominal_plant(), slow, settings=Settings(("pump_delay", "pump_saturation", "sensor_lag")))
     assert answer.p_value > 1e-3
     assert answer.verdict == "no_gap"
 
 
-def test_the_answer_is_the_protocols() -> None:
-    answer = diagnose(believed(), recorded({"Q2.pump_gain.factor": 1.12}, 51), settings=Settings(("pump_gain",)))
+def test_the_answer_follows_the_protocol() -> None:
+    answer = diagnose(nominal_plant(), recorded({"Q2.pump_gain.factor": 1.12}, 51), settings=Settings(("pump_gain",)))
     found, gain = answer.to_dict(), {"effect": "pump_gain", "location": "Q2"}
     assert found["format"] == "fdi_torch.gap/2"
     assert found["ambiguity_set"] == [[gain]] and found["certain"] == [gain]
@@ -190,12 +190,12 @@ def test_the_answer_is_the_protocols() -> None:
 
 
 def test_the_library_offers_62_effects_at_places_of_the_three_tanks() -> None:
-    assert len(library_of(believed(), STANDARD)) == 65
-    assert canonical(("plugging", "OUT2"), believed()) == ("leak", "T2")
+    assert len(library_of(nominal_plant(), STANDARD)) == 65
+    assert canonical(("plugging", "OUT2"), nominal_plant()) == ("leak", "T2")
 
 
-def test_a_pair_of_tanks_is_known_in_either_order() -> None:
-    assert [p.location for p in library_of(believed(), ("cross_flow@T2-T1",))] == ["T1-T2"]
+def test_a_pair_of_tanks_is_accepted_in_either_order() -> None:
+    assert [p.location for p in library_of(nominal_plant(), ("cross_flow@T2-T1",))] == ["T1-T2"]
 
 
 @pytest.mark.parametrize(
@@ -210,31 +210,31 @@ def test_a_pair_of_tanks_is_known_in_either_order() -> None:
         (("pump_lag",), ("leak@T1",), "expected an effect without a place"),
     ],
 )
-def test_a_wrong_library_is_said(names: tuple[str, ...], left_out: tuple[str, ...], message: str) -> None:
+def test_a_wrong_library_raises(names: tuple[str, ...], left_out: tuple[str, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        library_of(believed(), names, left_out)
+        library_of(nominal_plant(), names, left_out)
 
 
 def test_a_recording_without_a_sensor_is_refused() -> None:
     recording = recorded({"Q2.pump_gain.factor": 1.1}, 1, samples=100)
     with pytest.raises(ValueError, match="expected a sensor 'h1'"):
-        diagnose(believed(), replace(recording, output_names=("x", "h2", "h3")))
+        diagnose(nominal_plant(), replace(recording, output_names=("x", "h2", "h3")))
 
 
-def test_a_plan_knows_what_stays_hidden() -> None:
+def test_planned_inputs_show_which_effects_are_hidden() -> None:
     library = ("pump_gain", "pump_dead_zone@Q1", "sensor_bias@h2", "sensor_saturation@h1")
-    steady = constant_inputs(believed(), 600.0)
-    at_rest = plan(believed(), steady, 1e-3, library)
+    steady = constant_inputs(nominal_plant(), 600.0)
+    at_rest = planned_identifiability(nominal_plant(), steady, 1e-3, library)
     assert ("pump_gain", "Q1") in at_rest.hidden  # three constants with 3 % tolerance take it all
-    lively = plan(believed(), recorded({"P13.discharge_coefficient": 0.6}, 61), 1e-3, library)
+    lively = planned_identifiability(nominal_plant(), recorded({"P13.discharge_coefficient": 0.6}, 61), 1e-3, library)
     assert ("pump_gain", "Q1") not in lively.hidden
     assert ("sensor_saturation", "h1") in at_rest.hidden
 
 
-def test_what_was_found_can_be_adopted() -> None:
+def test_named_causes_can_be_adopted() -> None:
     recording = recorded({"Q2.pump_gain.factor": 1.12}, 71, samples=600)
-    answer = diagnose(believed(), recording, settings=Settings(("pump_gain", "sensor_bias@h1")))
-    plant = adopted(believed(), answer)
+    answer = diagnose(nominal_plant(), recording, settings=Settings(("pump_gain", "sensor_bias@h1")))
+    plant = adopted(nominal_plant(), answer)
     (placed,) = plant.effects
     assert placed.effect == "pump_gain" and placed.location == "Q2"
     again = diagnose(plant, recording, settings=Settings(("pump_gain@Q1", "sensor_bias@h1")))

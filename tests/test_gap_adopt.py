@@ -14,7 +14,7 @@ from fdi_torch.jobs.train import train
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import write_csv
-from tests.test_gap import believed, recorded
+from tests.test_gap import nominal_plant, recorded
 
 LAMINAR = {"P13.laminar_flow.transition_head": 0.1}
 LEAK = 0.15
@@ -44,20 +44,20 @@ def trained(plant: PlantDescription, recording: Recording, folder: Path) -> dict
 def better() -> PlantDescription:
     """The plant file with what a fault-free recording of the rig showed it to lack."""
     answer = diagnose(
-        believed(), recorded(LAMINAR, 3), settings=Settings(("laminar_flow", "pump_lag", "leak", "plugging"))
+        nominal_plant(), recorded(LAMINAR, 3), settings=Settings(("laminar_flow", "pump_lag", "leak", "plugging"))
     )
     assert [(c.effect, c.location) for c in answer.causes] == [("laminar_flow", "P13")]
-    return adopted(believed(), answer, constants=True)
+    return adopted(nominal_plant(), answer, constants=True)
 
 
-def test_a_fault_is_sized_rightly_once_the_gap_is_adopted(better: PlantDescription, tmp_path: Path) -> None:
+def test_the_size_of_a_fault_is_right_once_the_gap_is_adopted(better: PlantDescription, tmp_path: Path) -> None:
     faulty = recorded({**LAMINAR, "T1.leak.size": LEAK}, 11)
     found = trained(better, faulty, tmp_path / "better")
     leak, plugging = found["T1.leak.size"], found["P13.plugging.size"]
     assert abs(leak[0] - LEAK) < 4.0 * leak[1] and leak[1] < 0.01
     assert abs(plugging[0]) < 4.0 * plugging[1]
     print(found)
-    absorbed = trained(believed(), faulty, tmp_path / "nominal")
+    absorbed = trained(nominal_plant(), faulty, tmp_path / "nominal")
     leak, plugging = absorbed["T1.leak.size"], absorbed["P13.plugging.size"]
     print(absorbed)
     # Without it the pipe is taken to be plugged, far beyond what the estimate says it may be wrong.

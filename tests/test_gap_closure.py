@@ -1,4 +1,4 @@
-"""What a gap diagnosis says of hold-outs, constants and the guilty component, against rigs that are known."""
+"""Closure on hold-outs, reference models, curves and remarks, on rigs with known causes."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import torch
 
 from fdi_torch.effects import placements_for
 from fdi_torch.gap.answer import Answer
-from fdi_torch.gap.closure import Model, carried_over, run_all
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.floor import Noise
-from fdi_torch.gap.subject import subject_of
+from fdi_torch.gap.holdout import Model, run_reference_models, transferable_values
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlacedEffect
 from fdi_torch.recording import Recording
 from tests.rigs import three_tank
-from tests.test_gap import believed, recorded
+from tests.test_gap import nominal_plant, recorded
 
 LAMINAR = {"P13.laminar_flow.transition_head": 0.05}
 LIBRARY = ("laminar_flow", "pump_lag", "leak")
@@ -30,7 +30,7 @@ def answer() -> Answer:
     recording = recorded(LAMINAR, 3)
     holdouts = [recorded(LAMINAR, 5, samples=500), recorded(LAMINAR, 7, samples=700, std=2e-3)]
     holdouts = [replace(h, source=f"day{k}.csv") for k, h in enumerate(holdouts, 1)]
-    return diagnose(believed(), recording, holdouts, Settings(LIBRARY))
+    return diagnose(nominal_plant(), recording, holdouts, Settings(LIBRARY))
 
 
 def test_hold_outs_count_together_and_one_by_one(answer: Answer) -> None:
@@ -51,7 +51,7 @@ def test_the_ceiling_is_no_worse_than_the_right_effect(answer: Answer) -> None:
     assert closure["recalibrated"] > 1.5 * closure["augmented"]
 
 
-def test_what_recalibration_took_for_the_cause_shows_as_counted_twice(answer: Answer) -> None:
+def test_a_cause_absorbed_by_recalibration_counts_twice_with_frozen_constants(answer: Answer) -> None:
     constant = answer.constants["P13.discharge_coefficient"]
     assert constant["recalibrated"] < 0.585 < 0.59 < constant["augmented"] < 0.61
     frozen = answer.closure["frozen"]
@@ -70,29 +70,29 @@ def test_the_free_curve_finds_the_effect_that_is_there(answer: Answer) -> None:
     assert bool((effect < 0.0).all()) and float(effect.min()) < -3e-6
 
 
-def test_what_has_no_name_closes_a_gap_elsewhere_too_as_far_as_it_depends_on_local_variables() -> None:
+def test_a_free_form_of_local_variables_closes_part_of_the_gap_on_a_hold_out() -> None:
     recording, holdout = recorded(LAMINAR, 3), recorded(LAMINAR, 5)
-    answer = diagnose(believed(), recording, holdout, Settings(("pump_lag", "sensor_gain@h2")))
+    answer = diagnose(nominal_plant(), recording, holdout, Settings(("pump_lag", "sensor_gain@h2")))
     assert answer.verdict == "unknown" and answer.where[0][0] == "P13"
     assert answer.closure["closed"] > 0.8
     assert answer.closure["ceiling"] == pytest.approx(answer.closure["augmented"])
 
 
-def test_another_day_has_a_free_form_s_mean_course_and_none_of_its_waves() -> None:
+def test_the_mean_of_a_time_function_transfers_and_sinusoids_do_not() -> None:
     form = {"head_0": 0.1, "time_0": 0.2, "time_1": 0.4, "sine_0": 0.3, "cosine_0": 0.3}
     values = {f"P13.free_flow.{name}": value for name, value in form.items()} | {"Q1.pump_gain.time_0": 5.0}
-    carried = carried_over(values)
+    carried = transferable_values(values)
     expected = {"head_0": 0.1, "time_0": 0.3, "time_1": 0.3, "sine_0": 0.0, "cosine_0": 0.0}
     assert {n.removeprefix("P13.free_flow."): v for n, v in carried.items() if "P13" in n} == pytest.approx(expected)
     assert carried["Q1.pump_gain.time_0"] == 5.0, "no free form's"
 
 
-def test_the_floor_of_a_hold_out_is_the_noise_even_where_the_augmented_model_runs_away() -> None:
-    held = subject_of(believed(), (), recorded({}, 5, samples=600), 1.0)
+def test_the_noise_of_a_hold_out_is_right_even_if_the_augmented_model_diverges() -> None:
+    held = data_set_of(nominal_plant(), (), recorded({}, 5, samples=600), 1.0)
     noise = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     swinging = {"h1.sensor_oscillation.amplitude": 0.05, "h1.sensor_oscillation.period": 5.0}
     models = {"recalibrated": Model(), "augmented": Model(placements_for(swinging), swinging)}
-    found = run_all(held, noise, models, [0.0, 0.0, 0.0])
+    found = run_reference_models(held, noise, models, [0.0, 0.0, 0.0])
     assert found.squares("augmented").sum() > 1.5 * found.squares("recalibrated").sum()
     assert found.noise.std.tolist() == pytest.approx([1e-3] * 3, rel=0.1)
 
@@ -105,30 +105,30 @@ def test_arrays_of_all_models_are_there_for_the_page(answer: Answer) -> None:
     assert float(left.std()) == pytest.approx(2e-3, rel=0.1)
 
 
-def test_a_hold_out_of_another_rig_is_said_with_what_differs_there() -> None:
+def test_a_hold_out_of_another_rig_is_reported_with_the_constants_that_differ() -> None:
     recording = recorded(LAMINAR, 3, samples=600)
     same = replace(recorded(LAMINAR, 5, samples=600), source="same.csv")
     other = replace(recorded({**LAMINAR, "P32.discharge_coefficient": 0.5}, 5, samples=600), source="other.csv")
-    answer = diagnose(believed(), recording, [same, other], Settings(("laminar_flow",)))
+    answer = diagnose(nominal_plant(), recording, [same, other], Settings(("laminar_flow",)))
     (remark,) = answer.remarks
     needed = r"other.csv needs other constants than the recording \(P32.discharge_coefficient 0\.(49|50)"
     assert re.match(needed, remark)
     assert "of another rig" in remark
 
 
-def test_a_hold_out_on_which_something_else_acts_is_said() -> None:
+def test_a_hold_out_with_a_further_cause_is_reported() -> None:
     recording = recorded(LAMINAR, 3, samples=600)
     other = recorded({**LAMINAR, "h2.sensor_lag.time_constant": 60.0}, 5, samples=600)
-    answer = diagnose(believed(), recording, replace(other, source="other.csv"), Settings(("laminar_flow",)))
+    answer = diagnose(nominal_plant(), recording, replace(other, source="other.csv"), Settings(("laminar_flow",)))
     assert any("does not explain other.csv, whatever the constants" in remark for remark in answer.remarks)
 
 
 @pytest.mark.parametrize("same_object", [True, False])
-def test_the_recording_is_no_hold_out_of_its_own(same_object: bool) -> None:
+def test_a_recording_cannot_be_its_own_hold_out(same_object: bool) -> None:
     recording = replace(recorded(LAMINAR, 3, samples=100), sha256="ab")
     holdout = recording if same_object else replace(recording, source="copy.csv")
     with pytest.raises(ValueError, match="expected a hold-out other than the recording"):
-        diagnose(believed(), recording, holdout)
+        diagnose(nominal_plant(), recording, holdout)
 
 
 def short(recording: Recording, samples: int) -> Recording:
@@ -140,9 +140,9 @@ def short(recording: Recording, samples: int) -> Recording:
 def test_a_recording_too_short_is_refused_in_one_sentence() -> None:
     recording = replace(recorded(LAMINAR, 3, samples=200), source="run.csv")
     with pytest.raises(ValueError, match=r"run.csv: expected at least 60 readings of every sensor, got 40 of h1"):
-        diagnose(believed(), short(recording, 40))
+        diagnose(nominal_plant(), short(recording, 40))
     with pytest.raises(ValueError, match="got 40 of h1"):
-        diagnose(believed(), recording, short(recording, 40), Settings(("leak@T1",)))
+        diagnose(nominal_plant(), recording, short(recording, 40), Settings(("leak@T1",)))
 
 
 def test_an_unknown_input_is_refused_in_one_sentence() -> None:
@@ -150,34 +150,34 @@ def test_an_unknown_input_is_refused_in_one_sentence() -> None:
     inputs = recording.inputs.clone()
     inputs[50:60, 1] = torch.nan
     with pytest.raises(ValueError, match="expected a value of every input, got a missing one at 50 s"):
-        diagnose(believed(), replace(recording, inputs=inputs))
+        diagnose(nominal_plant(), replace(recording, inputs=inputs))
 
 
 def test_a_library_that_names_a_place_the_plant_lacks_is_refused() -> None:
     with pytest.raises(ValueError, match=r"expected a place of plant three_tank \(T1, .*\), got 'Q9'"):
-        diagnose(believed(), recorded(LAMINAR, 3, samples=100), settings=Settings(("pump_lag@Q9",)))
+        diagnose(nominal_plant(), recorded(LAMINAR, 3, samples=100), settings=Settings(("pump_lag@Q9",)))
 
 
-def test_a_plant_without_tolerances_is_said() -> None:
+def test_a_plant_without_tolerances_is_reported() -> None:
     answer = diagnose(three_tank(), recorded(LAMINAR, 3, samples=300), settings=Settings(("laminar_flow",)))
     assert any("lists no tolerances" in remark for remark in answer.remarks) and not answer.constants
 
 
-def test_a_plant_file_with_an_effect_outside_its_range_is_said() -> None:
-    slow = replace(believed(), effects=(PlacedEffect("pump_lag", "Q1", {"time_constant": 400.0}),))
+def test_a_plant_file_with_an_effect_outside_its_range_is_reported() -> None:
+    slow = replace(nominal_plant(), effects=(PlacedEffect("pump_lag", "Q1", {"time_constant": 400.0}),))
     answer = diagnose(slow, recorded(LAMINAR, 3, samples=300), settings=Settings(("leak",)))
     assert any("Q1.pump_lag.time_constant at 400 s, outside its sensible range" in r for r in answer.remarks)
 
 
-def test_constant_inputs_are_said_and_name_nothing_that_a_tolerance_explains_as_well() -> None:
+def test_constant_inputs_are_reported_and_nothing_within_tolerance_is_named() -> None:
     recording = recorded({"OUT2.plugging.size": 0.06, "P13.discharge_coefficient": 0.6}, 3, samples=600, steady=True)
-    answer = diagnose(believed(), recording, settings=Settings(("plugging", "pump_gain", "leak", "sensor_bias")))
+    answer = diagnose(nominal_plant(), recording, settings=Settings(("plugging", "pump_gain", "leak", "sensor_bias")))
     assert any("inputs never change" in remark for remark in answer.remarks)
     assert answer.verdict in ("no_gap", "ambiguous")
     assert answer.excitation["hidden"] or answer.excitation["inseparable"]
 
 
-def test_a_parameter_at_the_end_of_its_range_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_parameter_at_the_bound_of_its_range_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     from fdi_torch.effects.laminar_flow import LaminarFlow
 
     def narrow(self: LaminarFlow, place: str, plant: object) -> tuple[Parameter, ...]:
@@ -185,33 +185,35 @@ def test_a_parameter_at_the_end_of_its_range_is_said(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(LaminarFlow, "parameters", narrow)
     answer = diagnose(
-        believed(),
+        nominal_plant(),
         recorded({"P13.laminar_flow.transition_head": 0.05}, 3),
         settings=Settings(("laminar_flow@P13",), named_only=True),
     )
-    assert any("would lie at the end of its sensible range (4.5 cm)" in remark for remark in answer.remarks)
+    assert any("is at the bound of its sensible range (4.5 cm)" in remark for remark in answer.remarks)
 
 
-def test_an_unknown_oscillation_is_said_with_its_period() -> None:
+def test_an_unknown_oscillation_is_reported_with_its_period() -> None:
     truth = {"Q1.pump_oscillation.amplitude": 0.1, "Q1.pump_oscillation.period": 90.0}
-    answer = diagnose(believed(), recorded(truth, 3), settings=Settings(("sensor_gain@h2",)))
+    answer = diagnose(nominal_plant(), recorded(truth, 3), settings=Settings(("sensor_gain@h2",)))
     assert answer.verdict == "unknown" and answer.where[0][0] == "Q1"
-    (remark,) = [r for r in answer.remarks if "comes and goes" in r]
+    (remark,) = [r for r in answer.remarks if "oscillates" in r]
     period = float(remark.split("period of ")[1].split(" s")[0])
     assert period == pytest.approx(90.0, rel=0.03)  # the grid of periods is 5 % wide
     assert answer.curves[0]["variable"].startswith("time within each")
 
 
-def test_a_free_form_that_fails_on_a_hold_out_is_said() -> None:
+def test_a_free_form_that_fails_on_a_hold_out_is_reported() -> None:
     """A lag without its name: a function of what the pump sees now does not carry over."""
     lag = {"Q1.pump_lag.time_constant": 15.0}
-    answer = diagnose(believed(), recorded(lag, 41), recorded(lag, 42, samples=500), Settings(leave_out=("pump_lag",)))
+    answer = diagnose(
+        nominal_plant(), recorded(lag, 41), recorded(lag, 42, samples=500), Settings(leave_out=("pump_lag",))
+    )
     assert answer.verdict == "unknown" and answer.closure["augmented"] > answer.closure["recalibrated"]
-    assert any("stands for what is unknown at Q1 does worse on memory than none" in said for said in answer.remarks)
+    assert any("unknown discrepancy at Q1 predicts memory worse than" in said for said in answer.remarks)
 
 
-def test_sensors_of_several_units_are_told_each_in_its_own_and_together_in_levels_of_their_noise() -> None:
-    plant, volts = believed(), 20.0  # a metre of level
+def test_errors_of_sensors_with_several_units_are_pooled_in_standard_deviations_of_noise() -> None:
+    plant, volts = nominal_plant(), 20.0  # a metre of level
     mixed = replace(plant, sensors=(*plant.sensors[:2], replace(plant.sensors[2], unit="V", gain=volts)))
 
     def in_volts(r: Recording) -> Recording:

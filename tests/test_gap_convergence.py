@@ -1,4 +1,4 @@
-"""Fits end at a minimum, wherever they began, and say where they did not."""
+"""Fits end at a minimum from any start, and report if they do not."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import effect
 from fdi_torch.estimate.fitting import set_up
-from fdi_torch.gap.case import PLAIN, case_of
-from fdi_torch.gap.diagnose import _recalibrated
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter
-from fdi_torch.gap.standard_errors import standard_errors
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
+from fdi_torch.gap.diagnose import recalibrate
+from fdi_torch.gap.problem import PLAIN, problem_of
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
@@ -39,7 +38,7 @@ SIZE = "P32.plugging.size"
 
 
 def recalibrated(plant: PlantDescription, recording: Recording) -> tuple[Fitter, Fit]:
-    fitter, null, _ = _recalibrated(case_of(plant, [recording], [], PLAIN).subject)
+    fitter, null, _ = recalibrate(problem_of(plant, [recording], [], PLAIN).data)
     return fitter, null
 
 
@@ -57,7 +56,7 @@ def plugging_fits(fitter: Fitter, null: Fit, sizes: list[float]) -> list[Fit]:
     return [fitter.fit(Candidate((PLUGGING,), ({SIZE: size},)), null) for size in sizes]
 
 
-def test_plugging_beside_a_leak_is_found_within_two_standard_errors(
+def test_plugging_and_leak_are_estimated_within_two_standard_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -82,7 +81,7 @@ def test_a_plugged_pipe_ends_at_the_best_of_several_starts(number: int) -> None:
     assert fit.cost < min(other.cost for other in others) + 0.5
 
 
-def test_a_fit_that_was_cut_short_says_so() -> None:
+def test_a_fit_without_enough_evaluations_has_not_converged() -> None:
     recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), {SIZE: 0.4}, seed=0)
     fitter, null = recalibrated(THREE_TANK, recording)
     candidate = Candidate((PLUGGING,), ({SIZE: 0.1},))
@@ -123,14 +122,14 @@ def six_tanks() -> PlantDescription:
 
 
 @pytest.mark.slow
-def test_a_recalibration_at_nearly_equal_levels_gains_nothing_from_an_effect_that_is_taken_away_again() -> None:
+def test_a_recalibration_at_nearly_equal_levels_gains_nothing_from_an_added_and_removed_effect() -> None:
     plant = six_tanks()
     time = torch.arange(3601, dtype=torch.float64)
     flows = [[8.6e-6, 30e-6, 18e-6], [19.6e-6, 12e-6, 25e-6], [12.8e-6, 20e-6, 6e-6]]
     inputs = torch.tensor(flows, dtype=torch.float64).T[(time / 1200.1).long()]
     off = {"P3_4.discharge_coefficient": 0.582, "OUT6.discharge_coefficient": 0.627}
     fitter, null = recalibrated(plant, recorded(plant, blank_recording(plant, inputs, time), off, seed=0))
-    readings = float(fitter.subject.mask.sum())
+    readings = float(fitter.data.mask.sum())
     assert null.converged and null.cost < readings + 5.0 * (2.0 * readings) ** 0.5
     flow = Placement(effect("unmetered_flow"), "T6")
     beside = fitter.fit(Candidate((flow,), ({"T6.unmetered_flow.flow": 1e-7},)), null)

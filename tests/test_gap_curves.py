@@ -1,4 +1,4 @@
-"""The free curve at every kind of component finds what the effect does there, though it knows no effect."""
+"""The free curve at every kind of component agrees with the effect there, without knowing it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.case import laid_out
-from fdi_torch.gap.curves import curves_at
-from fdi_torch.gap.fitting import Candidate, Fitter
-from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.discrepancy_curves import curves_at
+from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
-from tests.test_gap import believed, recorded
+from tests.test_gap import nominal_plant, recorded
 
 
 @pytest.mark.parametrize(
@@ -32,9 +32,9 @@ def test_the_free_curve_agrees_with_the_effect_that_is_there(
     truth = {f"{place}.{name}.{key}": value for key, value in values.items()}
     recording = recorded(truth, 13, samples=600)
     white = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    fitter = Fitter(laid_out(believed(), (), [recording], None), white)
+    fitter = Fitter(checked_data_set(nominal_plant(), (), [recording], None), white)
     fit = fitter.fit(Candidate((Placement(effect(name), place),), (truth,)))
-    first, *_, last = curves_at(fitter, fit, place, operating_range_of(recording, believed()))
+    first, *_, last = curves_at(fitter, fit, place, operating_range_of(recording, nominal_plant()))
     assert (first.quantity, first.variable, last.variable) == (quantity, variable, "time")
     for curve in (first, last):
         assert curve.effect is not None

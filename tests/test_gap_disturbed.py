@@ -1,4 +1,4 @@
-"""Random flows into the tanks are no gap, and hide no cause that is larger; the rig here has its own integrator."""
+"""Random flows into the tanks are no gap and hide no larger cause; the rig here has its own integrator."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.recording import Recording
 from tests.rigs import blank_recording
-from tests.test_gap import believed
+from tests.test_gap import nominal_plant
 
 SUBSTEPS = 10  # a second
 LIBRARY = ("pump_gain", "plugging", "leak", "sensor_bias")
@@ -25,7 +25,7 @@ def recorded(flow: float, hold: int, seed: int, plugged: float = 0.0, onset: flo
     flow: standard deviation of the random flow into each tank, m^3/s, new every `hold` s. plugged: by how much the
     coefficient of P13 is lower from `onset` on.
     """
-    plant, generator = believed(), torch.Generator().manual_seed(seed)
+    plant, generator = nominal_plant(), torch.Generator().manual_seed(seed)
     tanks = [t.name for t in plant.tanks]
     levels = 15e-6 + 60e-6 * torch.rand(SAMPLES // 70 + 1, 2, generator=generator, dtype=torch.float64)
     inputs = levels.repeat_interleave(70, dim=0)[:SAMPLES]
@@ -54,7 +54,7 @@ def recorded(flow: float, hold: int, seed: int, plugged: float = 0.0, onset: flo
 
 
 def diagnosed(recording: Recording) -> Answer:
-    answer = diagnose(believed(), recording, settings=Settings(LIBRARY))
+    answer = diagnose(nominal_plant(), recording, settings=Settings(LIBRARY))
     total = sum(e.probability for e in answer.posterior) + answer.unexamined
     assert total < 1.0 + 1e-9 and answer.unexamined > 0.0
     assert all(0.0 <= share <= 1.0 + 1e-9 for _, share in answer.where)
@@ -71,7 +71,7 @@ def test_random_flows_are_no_gap(flow: float, hold: int) -> None:
         assert times == [0.0] * 3 and sizes == pytest.approx([flow] * 3, rel=0.3)
 
 
-def test_a_plugging_in_mid_record_is_named_beside_random_flows() -> None:
+def test_a_plugging_in_mid_record_is_named_despite_random_flows() -> None:
     answer = diagnosed(recorded(1.5e-6, 15, seed=5, plugged=0.4, onset=350.0))
     assert answer.verdict == "named"
     (cause,) = answer.causes

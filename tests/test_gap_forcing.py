@@ -1,4 +1,4 @@
-"""What an effect changes at its own place is what it changes in the whole plant."""
+"""The first-order forcing at an effect's place equals the change in the whole plant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Limits of a sensor that the values themselves tell."""
+"""Limits of a sensor that the readings show without a model."""
 
 import math
 from dataclasses import replace
@@ -9,9 +9,9 @@ import torch
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import place
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.limits import limits_of, told_limits
+from fdi_torch.gap.preprocess.sensor_limits import limits_from_readings, limits_of
 from fdi_torch.recording import Recording
-from tests.test_gap import believed, noise, recorded
+from tests.test_gap import noise, nominal_plant, recorded
 
 
 def noisy(count: int = 400) -> torch.Tensor:
@@ -20,33 +20,33 @@ def noisy(count: int = 400) -> torch.Tensor:
     return wave + 0.02 * torch.randn(count, dtype=torch.float64, generator=generator)
 
 
-def test_readings_that_stand_still_at_an_end_tell_the_limit() -> None:
+def test_constant_readings_at_an_end_show_the_limit() -> None:
     assert limits_of(noisy()) == {}
     assert limits_of(noisy().clamp(max=8.0)) == {"sensor_saturation": 8.0}
     assert limits_of(noisy().clamp(2.0, 8.0)) == {"sensor_saturation": 8.0, "sensor_floor": 2.0}
 
 
-def test_a_channel_at_rest_or_rounded_coarsely_tells_no_limit() -> None:
+def test_a_channel_at_rest_or_coarsely_quantized_shows_no_limit() -> None:
     assert limits_of((noisy() / 0.5).round() * 0.5) == {}
     assert limits_of(torch.cat([torch.zeros(200), torch.ones(200)]).double()) == {}
 
 
-def test_a_limit_that_the_plant_has_already_or_that_is_not_searched_is_not_told() -> None:
+def test_a_limit_that_the_plant_has_or_that_is_not_searched_is_not_added() -> None:
     plant = load_plant("quadruple_tank")
     sensor = plant.sensors[0]
     values = noisy().clamp(max=8.0).unsqueeze(1)
     time = torch.arange(len(values), dtype=torch.float64)
     recording = Recording(time, values[:, :0], values, (), (sensor.column,), (), (sensor.unit,))
     saturation = place("sensor_saturation", sensor.name)
-    (told,) = told_limits(plant, [recording], [], [saturation])
+    (told,) = limits_from_readings(plant, [recording], [], [saturation])
     assert told.prefix == saturation.prefix
     assert told.values == {"limit": pytest.approx(8.0)}
-    assert told_limits(plant, [recording], [saturation], [saturation]) == []
-    assert told_limits(plant, [recording], [], []) == []
+    assert limits_from_readings(plant, [recording], [saturation], [saturation]) == []
+    assert limits_from_readings(plant, [recording], [], []) == []
 
 
 @pytest.mark.parametrize("behind", [False, True])
-def test_noise_that_is_clipped_with_the_level_is_no_further_gap(behind: bool) -> None:
+def test_clipped_noise_is_no_further_gap(behind: bool) -> None:
     std, seed, samples = 4e-3, 11, 2000
     recording = recorded({}, seed, samples, std)
     e = noise(samples, 0.0, std, seed + 1)
@@ -55,13 +55,13 @@ def test_noise_that_is_clipped_with_the_level_is_no_further_gap(behind: bool) ->
     limits = torch.tensor([limit, math.inf, math.inf], dtype=torch.float64)
     reading = torch.minimum((torch.minimum(level, limits) if behind else level) + e, limits)
     library = ("sensor_saturation", "sensor_bias", "sensor_curvature", "pump_gain@Q1")
-    answer = diagnose(believed(), replace(recording, outputs=reading), settings=Settings(library))
+    answer = diagnose(nominal_plant(), replace(recording, outputs=reading), settings=Settings(library))
     assert answer.verdict == "named"
     assert [(c.effect, c.location, c.parameters["limit"].value) for c in answer.causes] == [
         ("sensor_saturation", "h1", limit)
     ]
     assert answer.noise["h1"]["std"] == pytest.approx(std, rel=0.08)
     known = replace(
-        believed(), sensors=tuple(replace(s, high=limit) if s.name == "h1" else s for s in believed().sensors)
+        nominal_plant(), sensors=tuple(replace(s, high=limit) if s.name == "h1" else s for s in nominal_plant().sensors)
     )
     assert diagnose(known, replace(recording, outputs=reading), settings=Settings(library)).verdict == "no_gap"

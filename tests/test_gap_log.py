@@ -1,4 +1,4 @@
-"""The log of a gap diagnosis holds all that was found, and the diagnosis comes out of it again."""
+"""The log of a gap diagnosis contains the whole answer, and replays to the same one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.recordings.csv_files import write_csv
 from fdi_torch.report.material import gather
 from fdi_torch.report.verdict import headline
-from tests.test_gap import believed, recorded
+from tests.test_gap import nominal_plant, recorded
 
 GAIN = {"Q2.pump_gain.factor": 1.12}
 LIBRARY = ("pump_gain", "sensor_bias@h1")
@@ -34,17 +34,17 @@ def logged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A diagnosis with one hold-out."""
     path = tmp_path_factory.mktemp("logs") / "gap.mcap"
     holdout = replace(recorded(GAIN, 5, samples=300), source="other.csv")
-    run_gap(path, believed(), recorded(GAIN, 3, samples=400), [holdout], Settings(LIBRARY))
+    run_gap(path, nominal_plant(), recorded(GAIN, 3, samples=400), [holdout], Settings(LIBRARY))
     return path
 
 
-def test_a_gap_log_says_all_that_was_found(logged: Path) -> None:
+def test_a_gap_log_contains_the_whole_answer(logged: Path) -> None:
     log = read_run(logged)
-    assert logged_plant(log) == believed()
+    assert logged_plant(log) == nominal_plant()
     recording, holdout = recorded(GAIN, 3, samples=400), recorded(GAIN, 5, samples=300)
     assert torch.equal(torch.as_tensor(own_signals(log).outputs), recording.outputs)
     assert torch.equal(torch.as_tensor(own_signals(log, "holdout").outputs), holdout.outputs)
-    found = gather(log, believed())
+    found = gather(log, nominal_plant())
     said = r"The gap comes from pump gain at Q2 \(factor 1\.1\d+ ± 0\.0\d+\), probability over 99\.9 %"
     assert re.fullmatch(said, headline(found))
     assert found.of("/gap/where")[0]["location"] == found.answer["where"][0]["location"]
@@ -62,7 +62,7 @@ def test_a_replay_with_another_library_is_another_diagnosis(logged: Path, tmp_pa
     words = ["replay", str(logged), "--set", "library=sensor_bias@h1", "--out", str(target), "--quiet"]
     assert cli.main(words) == cli.DONE
     again = read_run(target)
-    assert gather(again, believed()).answer["causes"] != gather(read_run(logged), believed()).answer["causes"]
+    assert gather(again, nominal_plant()).answer["causes"] != gather(read_run(logged), nominal_plant()).answer["causes"]
     assert again.metadata["fdi_torch.run"]["parent_run_id"] == read_run(logged).metadata["fdi_torch.run"]["run_id"]
 
 
@@ -74,7 +74,7 @@ def test_a_key_that_a_gap_diagnosis_lacks_is_refused(
     assert "expected one of library, leave_out, step, most, named_only, trusted, got seed" in capsys.readouterr().err
 
 
-def test_an_option_that_is_gone_is_said_and_the_rest_of_the_log_is_read(logged: Path) -> None:
+def test_a_removed_option_is_reported_and_the_rest_of_the_log_is_read(logged: Path) -> None:
     run = read_run(logged)
     assert removed_options(run) == []
     old = {**run.metadata["fdi_torch.config"], "settings.cross_validate": "true"}
@@ -86,7 +86,7 @@ def test_an_option_that_is_gone_is_said_and_the_rest_of_the_log_is_read(logged: 
     assert removed_options(run) == []
 
 
-def test_every_setting_of_a_diagnosis_can_be_asked_anew(logged: Path) -> None:
+def test_every_setting_of_a_diagnosis_can_be_overridden(logged: Path) -> None:
     run = read_run(logged)
     assert settings_of(run) == Settings(LIBRARY)
     words = ("library=leak@T1,pump_lag", "leave_out=pump_gain", "step=0.5", "most=2", "named_only=true")
@@ -97,11 +97,11 @@ def test_every_setting_of_a_diagnosis_can_be_asked_anew(logged: Path) -> None:
             settings_of(run, [wrong])
 
 
-def test_the_command_says_it_in_a_sentence_and_keeps_everything(
+def test_the_command_prints_the_verdict_and_writes_all_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plant, better = tmp_path / "rig.yaml", tmp_path / "new" / "better.yaml"
-    plant.write_text(dump_plant(believed()))
+    plant.write_text(dump_plant(nominal_plant()))
     files = [str(write_csv(recorded(GAIN, k, samples=300), tmp_path / f"day{k}.csv")) for k in (3, 5, 7)]
     words = ["gap", "--plant", str(plant), "--recording", files[0], "--holdout", *files[1:], "--library"]
     words += [",".join(LIBRARY), "--out", str(tmp_path / "out"), "--adopt", str(better), "--with-constants", "--quiet"]
@@ -118,23 +118,23 @@ def test_the_command_says_it_in_a_sentence_and_keeps_everything(
     assert found.pipes[0].discharge_coefficient == pytest.approx(fitted, rel=1e-6) and abs(fitted - 0.6) > 1e-5
     assert f"+++ {better}" in shown and "+  - {effect: pump_gain, location: Q2" in shown
     refitted_later = {"Q2.pump_gain.factor": found.tolerances["Q2.pump_gain.factor"]}
-    assert found.tolerances == believed().tolerances | refitted_later
+    assert found.tolerances == nominal_plant().tolerances | refitted_later
 
 
-def test_rivals_leave_the_next_input_as_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_ambiguous_answer_writes_the_next_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = recorded({"Q1.pump_lag.time_constant": 4.0}, 9, samples=400, std=2e-3)
     file = str(write_csv(recording, tmp_path / "run.csv"))
     words = ["gap", "--plant", "three_tank", "--recording", file, "--library", "pump_lag,pump_delay", "--quiet"]
     assert cli.main([*words, "--out", str(tmp_path)]) == cli.DONE
     shown = capsys.readouterr().out
-    assert shown.startswith("There is a gap that ")
+    assert shown.startswith("There is a gap; ")
     assert "next_input.csv; it should distinguish the two likeliest explanations" in shown
     planned = (tmp_path / "next_input.csv").read_text().splitlines()
     assert planned[0] == "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm" and len(planned) == 1501
     assert cli.main([*words[:3], "--recording", str(tmp_path / "next_input.csv"), "--plan"]) == cli.DONE
 
 
-def test_nothing_to_adopt_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_to_adopt_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = str(write_csv(recorded({"P13.discharge_coefficient": 0.6}, 3, samples=200), tmp_path / "run.csv"))
     words = ["gap", "--plant", "three_tank", "--recording", file, "--library", "pump_gain", "--out", str(tmp_path)]
     assert cli.main([*words, "--adopt", str(tmp_path / "better.yaml"), "--quiet"]) == cli.DONE
@@ -143,7 +143,7 @@ def test_nothing_to_adopt_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "nothing to adopt: the verdict is no gap" in told.err and not (tmp_path / "better.yaml").exists()
 
 
-def test_a_step_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_step_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = str(write_csv(recorded(GAIN, 3, samples=100), tmp_path / "run.csv"))
     words = ["gap", "--plant", "three_tank", "--recording", file, "--step", "0", "--out", str(tmp_path)]
     assert cli.main(words) == cli.MISUSE
@@ -166,14 +166,14 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
     assert "examples:" in shown and "--holdout other.csv" in shown and "The verdict is one of four" in shown
 
 
-def test_an_adopted_leak_flows_as_before_where_its_reference_was_recalibrated() -> None:
+def test_an_adopted_leak_keeps_its_flow_if_its_reference_was_recalibrated() -> None:
     leak = Cause("leak", "T1", {"size": Amount(0.3, 0.01, "1")})
     constants = {"P13.discharge_coefficient": {"augmented": 0.5}}
     answer = Answer("named", 0.0, [], [leak], [], [], {}, {}, constants=constants)
-    plant = adopted(believed(), answer, constants=True)
+    plant = adopted(nominal_plant(), answer, constants=True)
     flows = [
         p.effects[0].parameters["size"] * nominal_capacity(p, leak_pipe(p, "T1"))
-        for p in (adopted(believed(), answer), plant)
+        for p in (adopted(nominal_plant(), answer), plant)
     ]
     assert plant.pipes[0].discharge_coefficient == 0.5
     assert flows[0] == pytest.approx(flows[1], rel=1e-12)

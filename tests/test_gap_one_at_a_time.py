@@ -1,11 +1,11 @@
-"""The textbook baseline names what is plain and alone, and knows no pairs."""
+"""The baseline names single clear effects and no pairs."""
 
 from __future__ import annotations
 
 import pytest
 
 from fdi_torch.gap.one_at_a_time import one_at_a_time
-from tests.test_gap import SMALL, believed, recorded
+from tests.test_gap import SMALL, nominal_plant, recorded
 
 
 @pytest.mark.parametrize(
@@ -17,7 +17,7 @@ from tests.test_gap import SMALL, believed, recorded
     ],
 )
 def test_the_winner_is_one_effect_or_none(changed: dict[str, float], named: list[tuple[str, str]]) -> None:
-    answer = one_at_a_time(believed(), recorded(changed, 5, samples=600), SMALL)
+    answer = one_at_a_time(nominal_plant(), recorded(changed, 5, samples=600), SMALL)
     assert [(c["effect"], c["location"]) for c in answer["causes"]] == named
     assert answer["verdict"] == ("named" if named else "no_gap")
     assert answer["posterior"][0]["probability"] == 1.0

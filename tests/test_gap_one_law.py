@@ -1,14 +1,14 @@
-"""A pipe whose law lies between two laws of the library has a law that the library lacks."""
+"""A pipe whose law lies between two laws of the library."""
 
 from __future__ import annotations
 
 from fdi_torch.gap.diagnose import Settings, diagnose
-from tests.test_gap import believed, recorded
+from tests.test_gap import nominal_plant, recorded
 
 
-def test_two_laws_at_one_place_are_named_both() -> None:
+def test_two_laws_at_one_place_are_both_named() -> None:
     values = {"P13.laminar_flow.transition_head": 0.1, "P13.flow_exponent.excess": -0.3}
     library = ("laminar_flow", "flow_exponent", "pump_gain", "sensor_bias", "leak")
-    answer = diagnose(believed(), recorded(values, 81), settings=Settings(library))
+    answer = diagnose(nominal_plant(), recorded(values, 81), settings=Settings(library))
     assert answer.verdict == "named" and answer.where[0][0] == "P13"
     assert {(c.effect, c.location) for c in answer.causes} == {("laminar_flow", "P13"), ("flow_exponent", "P13")}

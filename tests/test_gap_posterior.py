@@ -1,4 +1,4 @@
-"""Prior odds, and probabilities that are never certain."""
+"""Prior odds, and normalised probabilities."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import pytest
 
 from fdi_torch.estimate.evidence import ODDS, posterior
-from fdi_torch.gap.evidence import log_prior
+from fdi_torch.gap.marginal_likelihood import log_prior
 
 
 def test_all_sets_of_effects_of_one_size_share_one_prior() -> None:

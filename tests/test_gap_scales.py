@@ -1,4 +1,4 @@
-"""A rig that is slower, larger or told in other units is diagnosed like the one on the bench."""
+"""A slower or larger rig, or one in other units, gets the same diagnosis as the bench-scale one."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import torch
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.where.forms import memories, slews
+from fdi_torch.gap.localization.regressors import lags_and_decays, rate_limits
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
-from tests.test_gap import SMALL, believed, recorded
+from tests.test_gap import SMALL, nominal_plant, recorded
 from tests.test_scales import scaled as similar
 
 SLOWER, WIDER = 20.0, 1000.0
@@ -23,7 +23,7 @@ FLOWS = WIDER / SLOWER  # A dh/dt = q
 
 
 def scaled_plant() -> PlantDescription:
-    plant = believed()
+    plant = nominal_plant()
     return replace(
         plant,
         tanks=tuple(replace(t, area=WIDER * t.area) for t in plant.tanks),
@@ -36,14 +36,14 @@ def scaled(recording: Recording) -> Recording:
     return replace(recording, time=SLOWER * recording.time, inputs=FLOWS * recording.inputs)
 
 
-def test_what_has_a_memory_has_it_for_as_long_as_the_plant_is_slow() -> None:
+def test_time_constants_of_regressors_scale_with_the_plant() -> None:
     x = torch.rand(50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     step, ends = torch.full_like(x, 2.0), (0.0, 1.0)
-    for slow, fast in zip(memories(x, 10.0 * step, 10.0), memories(x, step, 1.0), strict=True):
+    for slow, fast in zip(lags_and_decays(x, 10.0 * step, 10.0), lags_and_decays(x, step, 1.0), strict=True):
         assert slow == pytest.approx(fast, abs=1e-12)
-    for slow, fast in zip(slews(x, 10.0 * step, ends, 10.0), slews(x, step, ends, 1.0), strict=True):
+    for slow, fast in zip(rate_limits(x, 10.0 * step, ends, 10.0), rate_limits(x, step, ends, 1.0), strict=True):
         assert slow == pytest.approx(fast, abs=1e-12)
-    assert time_scale(scaled_plant()) == 10.0 * time_scale(believed())  # the power of ten next to 20
+    assert time_scale(scaled_plant()) == 10.0 * time_scale(nominal_plant())  # the power of ten next to 20
 
 
 @pytest.mark.parametrize("left_out", [(), ("pump_lag",)])
@@ -51,7 +51,7 @@ def test_a_rig_scaled_in_time_and_size_has_the_same_verdict(left_out: tuple[str,
     bench = recorded({"Q1.pump_lag.time_constant": 15.0}, 5)
     settings = Settings(SMALL, left_out)
     small, large = (
-        diagnose(believed(), bench, settings=settings),
+        diagnose(nominal_plant(), bench, settings=settings),
         diagnose(scaled_plant(), scaled(bench), settings=settings),
     )
     assert large.verdict == small.verdict == ("unknown" if left_out else "named")
@@ -68,12 +68,12 @@ def told(recording: Recording, metres: float, seconds: float) -> Recording:
 
 
 @pytest.mark.parametrize(("metres", "seconds"), [(0.1, 1.0), (10.0, 100.0)])
-def test_what_a_free_function_leaves_open_scales_with_the_rig(metres: float, seconds: float) -> None:
+def test_the_residual_of_a_free_function_scales_with_the_rig(metres: float, seconds: float) -> None:
     bench, later = recorded({"Q1.pump_lag.time_constant": 15.0}, 41), recorded({"Q1.pump_lag.time_constant": 15.0}, 42)
     closures = []
     for m, s in ((1.0, 1.0), (metres, seconds)):
         runs, settings = (told(bench, m, s), told(later, m, s)), Settings(("pump_lag", "leak"), ("pump_lag",))
-        answer = diagnose(similar(believed(), m, s), *runs, settings=settings)
+        answer = diagnose(similar(nominal_plant(), m, s), *runs, settings=settings)
         assert answer.verdict == "unknown"
         closures.append([answer.closure[model] / m for model in ("nominal", "noise_floor", "recalibrated", "ceiling")])
     assert closures[1][:2] == pytest.approx(closures[0][:2], rel=1e-6)
@@ -87,9 +87,9 @@ def test_what_a_free_function_leaves_open_scales_with_the_rig(metres: float, sec
 def test_a_rig_of_powers_of_ten_has_the_same_numbers(cause: dict[str, float], metres: float, seconds: float) -> None:
     """A constant in metres, seconds or m^3/s that is not the plant's own would show here."""
     bench, library = recorded(cause, 5), (*SMALL, "leak")
-    usual = diagnose(believed(), bench, settings=Settings(library))
+    usual = diagnose(nominal_plant(), bench, settings=Settings(library))
     other = told(bench, metres, seconds)
-    found = diagnose(similar(believed(), metres, seconds), other, settings=Settings(library))
+    found = diagnose(similar(nominal_plant(), metres, seconds), other, settings=Settings(library))
     assert found.verdict == usual.verdict
     assert [(c.effect, c.location) for c in found.causes] == [(c.effect, c.location) for c in usual.causes]
     # A hole's height has a kink at the floor, where fits end a part of a standard error apart.
@@ -118,10 +118,10 @@ tolerances: {"*.discharge_coefficient": 3 %}
 """
 
 
-def test_a_rig_told_in_other_units_has_the_same_verdict_and_numbers(tmp_path: Path) -> None:
+def test_a_rig_in_other_units_has_the_same_verdict_and_numbers(tmp_path: Path) -> None:
     """Minutes, litres an hour, inches and millimetres, by the headers, beside SI."""
     bench = recorded({"Q1.pump_lag.time_constant": 15.0}, 5)
-    usual = diagnose(believed(), bench, settings=Settings(SMALL))
+    usual = diagnose(nominal_plant(), bench, settings=Settings(SMALL))
     (tmp_path / "plant.yaml").write_text(SAME_TANKS)
     units = {"t [min]": 1 / 60, "Q1 (l/h)": 3.6e6, "Q2_l/min": 6e4, "h1 [mm]": 1e3, "h2 [in]": 1 / 0.0254, "h3_cm": 1e2}
     table = torch.cat([bench.time.unsqueeze(1), bench.inputs, bench.outputs], dim=1)

@@ -1,4 +1,4 @@
-"""Which effects are found where constants hide what one alone does: two tanks, the upper one's level not measured."""
+"""Structure search where constants hide single effects: two tanks, the upper level not measured."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def recorded(values: dict[str, float], voltage: torch.Tensor) -> Recording:
     return replace(blank, outputs=readings + noise, mask=None)  # type: ignore[arg-type]
 
 
-def test_what_stands_is_found_where_constants_hide_it_and_nothing_that_begins_in_mid_record() -> None:
+def test_permanent_effects_are_named_and_none_with_an_onset_though_constants_hide_them() -> None:
     """By what closes most first, from the recalibrated plant, it would be a leak and a plugging with an onset."""
     recording = recorded(STANDING | MISSING, wandering(1024, 4)[256:896])
     found = diagnose(PLANT, recording, settings=Settings(library=LIBRARY, most=2, named_only=True))
@@ -68,7 +68,7 @@ def test_what_stands_is_found_where_constants_hide_it_and_nothing_that_begins_in
     assert not any("onset" in c.parameters for c in found.causes)
 
 
-def test_unknown_leads_on_to_what_has_a_name() -> None:
+def test_an_unknown_verdict_suggests_the_next_step() -> None:
     unknown = Answer("unknown", 0.0, [("bottom", 0.99)], [], [], [], {}, {})
     assert any("--named-only" in step for step in next_steps(unknown, True, ("all",), None, "better.yaml"))
     sound = replace(unknown, verdict="no_gap")

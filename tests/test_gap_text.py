@@ -1,4 +1,4 @@
-"""The answer of a gap diagnosis on the terminal, from an answer that is given."""
+"""The printed answer of a gap diagnosis."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import pytest
 
 from fdi_torch.cli.gap_text import next_steps, show
 from fdi_torch.cli.screen import Screen
-from fdi_torch.gap.answer import Amount, Answer, Cause, Explanation, adopted
+from fdi_torch.gap.answer import Amount, Answer, Cause, ProbableExplanation, adopted
 from fdi_torch.gap.verdict_words import causes_of, probability_words, verdict_sentence
-from tests.test_gap import believed
+from tests.test_gap import nominal_plant
 
 LEAK = Cause("leak", "T1", {"size": Amount(0.2, 0.01, "1")})
 ODD = ("unknown", "Q1")
@@ -24,7 +24,7 @@ BOTH = Answer(
     where=[("Q1", 0.97), ("T1", 0.96), ("P13", 1e-6)],
     causes=[LEAK, Cause(*ODD)],
     ambiguity_set=[],
-    posterior=[Explanation((("leak", "T1"),), 0.97, "Q1"), Explanation((("leak", "T1"),), 0.01)],
+    posterior=[ProbableExplanation((("leak", "T1"),), 0.97, "Q1"), ProbableExplanation((("leak", "T1"),), 0.01)],
     closure={},
     noise={},
     unexamined=0.02,
@@ -32,12 +32,12 @@ BOTH = Answer(
 )
 
 
-def test_the_terminal_says_what_is_unknown_beside_what_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_terminal_prints_the_unknown_and_the_named_causes(capsys: pytest.CaptureFixture[str]) -> None:
     show(BOTH, Screen())
     said = capsys.readouterr().out
     assert said.startswith(
-        "The gap comes from leak at T1 and something unknown at Q1, probability 97.0 %; no effect of the library has "
-        "the law that is there."
+        "The gap comes from leak at T1 and something unknown at Q1, probability 97.0 %; no effect of the library "
+        "describes it."
     )
     rows = [line.split() for line in said.splitlines()]
     assert ["T1", "2.5", "cm^3/s", "15", "s"] in rows and ["T2", "1", "cm^3/s", "none"] in rows
@@ -45,30 +45,30 @@ def test_the_terminal_says_what_is_unknown_beside_what_is_named(capsys: pytest.C
     assert ["Q1", "97.0", "%"] in rows and not any(row[:1] == ["P13"] for row in rows)
 
 
-def test_ambiguity_says_what_is_certain_whatever_else_there_is() -> None:
+def test_an_ambiguous_verdict_states_which_causes_are_certain() -> None:
     sets = [(("leak", "T1"), ODD), (("leak", "T1"),)]
-    posterior = [Explanation((("leak", "T1"),), 0.6, "Q1"), Explanation((("leak", "T1"),), 0.39)]
+    posterior = [ProbableExplanation((("leak", "T1"),), 0.6, "Q1"), ProbableExplanation((("leak", "T1"),), 0.39)]
     answer = replace(BOTH, verdict="ambiguous", ambiguity_set=sets, posterior=posterior)
     assert answer.certain == [("leak", "T1")]
     assert verdict_sentence(answer.to_dict()) == (
-        "There is a gap that 2 explanations share at 95 %; the likeliest is leak at T1 and something unknown at Q1, "
-        "probability 60.0 %. All that is likely holds leak at T1."
+        "There is a gap; 2 explanations are plausible at 95 %, the likeliest is leak at T1 and something unknown at "
+        "Q1, probability 60.0 %. Present with at least 95 %: leak at T1."
     )
 
 
-def test_one_explanation_that_does_not_suffice_says_what_was_not_fitted() -> None:
-    posterior = [Explanation((("leak", "T1"),), 0.8)]
+def test_a_single_explanation_that_does_not_suffice_states_the_unfitted_probability() -> None:
+    posterior = [ProbableExplanation((("leak", "T1"),), 0.8)]
     answer = replace(BOTH, verdict="ambiguous", ambiguity_set=[(("leak", "T1"),)], posterior=posterior, unexamined=0.2)
     assert verdict_sentence(answer.to_dict()) == (
-        "There is a gap; the likeliest is leak at T1, probability 80.0 %; "
-        "explanations that were not fitted have 20.0 %."
+        "There is a gap; the likeliest is leak at T1, probability 80.0 %. "
+        "Explanations that were not fitted have 20.0 % together."
     )
 
 
 def test_an_unknown_is_nothing_to_adopt() -> None:
     alone = replace(BOTH, causes=[Cause(*ODD)])
-    assert adopted(believed(), alone).effects == ()
-    assert [p.effect for p in adopted(believed(), BOTH).effects] == ["leak"]
+    assert adopted(nominal_plant(), alone).effects == ()
+    assert [p.effect for p in adopted(nominal_plant(), BOTH).effects] == ["leak"]
     assert not any("--adopt FILE writes" in step for step in next_steps(alone, True, None, None, None))
     assert any("--adopt FILE writes" in step for step in next_steps(BOTH, True, None, None, None))
 

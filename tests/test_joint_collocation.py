@@ -12,10 +12,10 @@ from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.effects import place
 from fdi_torch.gap.answer import adopted
+from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.fitting import Candidate, Fitter
-from fdi_torch.gap.floor import Noise
-from fdi_torch.gap.subject import subject_of
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.network import TankNetwork
@@ -41,8 +41,8 @@ def run(seed: int, samples: int, effects: dict[str, float], offset: float = 0.0)
     recording = Recording(time, inputs, blank, ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
     names = [name.split(".") for name in effects]
     placements = [place(effect, at) for at, effect, _ in names]
-    subject = subject_of(plant(), [], recording, 2.0)
-    engine = Fitter(subject, Noise(torch.ones(3), torch.zeros(3))).engine(Candidate(tuple(placements)), list(effects))
+    data = data_set_of(plant(), [], recording, 2.0)
+    engine = Fitter(data, Noise(torch.ones(3), torch.zeros(3))).engine(Candidate(tuple(placements)), list(effects))
     start = {"T1.start_level": 10 * CM, "T2.start_level": 20 * CM, "T3.start_level": 30 * CM}
     theta = engine.space.vector(start | effects).unsqueeze(0)
     clean = engine.converge(theta, engine.constant_guess(theta), rounds=30).readings[0]
@@ -54,8 +54,8 @@ def run(seed: int, samples: int, effects: dict[str, float], offset: float = 0.0)
 def test_each_recording_is_simulated_as_if_it_were_alone() -> None:
     recordings = [run(1, 60, {}), run(2, 90, {}), run(3, 40, {})]
     believed = plant()
-    subject = subject_of(believed, (), recordings, 2.0)
-    engine = Fitter(subject, Noise(torch.ones(3), torch.zeros(3))).engine(Candidate(), ())
+    data = data_set_of(believed, (), recordings, 2.0)
+    engine = Fitter(data, Noise(torch.ones(3), torch.zeros(3))).engine(Candidate(), ())
     assert isinstance(engine, JointCollocation)
     starts = {
         f"{t}.start_level@{k}" if k else f"{t}.start_level": 0.1 + 0.05 * k
@@ -64,12 +64,12 @@ def test_each_recording_is_simulated_as_if_it_were_alone() -> None:
     }
     theta = engine.space.vector(starts | {"P13.discharge_coefficient": 0.55}).unsqueeze(0)
     joint = engine.converge(theta, engine.constant_guess(theta), rounds=30)
-    for k, (recording, rows) in enumerate(zip(recordings, subject.rows, strict=True)):
+    for k, (recording, rows) in enumerate(zip(recordings, data.rows, strict=True)):
         alone = _alone(believed, recording)
-        near = alone.converge(t := _own_theta(alone, k), alone.constant_guess(t), rounds=30)
-        torch.testing.assert_close(joint.readings[:, rows], near.readings, rtol=0.0, atol=1e-9)
+        linearised = alone.converge(t := _own_theta(alone, k), alone.constant_guess(t), rounds=30)
+        torch.testing.assert_close(joint.readings[:, rows], linearised.readings, rtol=0.0, atol=1e-9)
         columns = [engine.space.index(n if not k or "start" not in n else f"{n}@{k}") for n in alone.space.names]
-        torch.testing.assert_close(joint.jacobian[:, rows][..., columns], near.jacobian, rtol=1e-6, atol=1e-9)
+        torch.testing.assert_close(joint.jacobian[:, rows][..., columns], linearised.jacobian, rtol=1e-6, atol=1e-9)
         foreign = [j for j, n in enumerate(engine.space.names) if "start" in n and j not in columns]
         assert float(joint.jacobian[:, rows][..., foreign].abs().max()) == 0.0
 

@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from fdi_torch.config.plant_file import build_plant, load_plant
-from fdi_torch.gap.fitting import Fit, Fitter
-from fdi_torch.gap.in_turn import in_turn
-from fdi_torch.gap.prediction import predict
-from fdi_torch.gap.refit import refit
-from fdi_torch.gap.spread import spread
+from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.free_runs.between_runs import between_run_spread
+from fdi_torch.gap.free_runs.prediction import leave_one_file_out, predict
+from fdi_torch.gap.free_runs.refit import refit
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.recording import Recording
 
@@ -81,12 +80,17 @@ def test_a_refit_that_finds_no_course_of_the_levels_says_so(monkeypatch: pytest.
 
     def lost(fitter: Fitter, *asked: Any, **options: Any) -> Fit:
         fit = found(fitter, *asked, **options)
-        return replace(fit, near=replace(fit.near, jacobian=torch.full_like(fit.near.jacobian, torch.nan)))
+        return replace(
+            fit, linearised=replace(fit.linearised, jacobian=torch.full_like(fit.linearised.jacobian, torch.nan))
+        )
 
     plant = rig()
     run = replace(recording(plant), source="a.csv")
     monkeypatch.setattr(Fitter, "fit", lost)
-    with pytest.raises(ValueError, match=r"no course of the levels through a\.csv was found; begin with other values"):
+    with pytest.raises(
+        ValueError,
+        match=r"no trajectory of the levels along a\.csv was found from the plant file's values",
+    ):
         refit(plant, run)
 
 
@@ -171,7 +175,7 @@ def test_a_tank_at_rest_in_steps_of_its_sensor_leaves_the_zero_where_it_is_belie
 def test_a_run_needs_something_to_settle_in_and_something_left() -> None:
     run = filling(1.1, 0.0, 1)
     for seconds in (0.0, 200.0, 1e4):
-        with pytest.raises(ValueError, match="a stretch to settle in of more than 0 s and less than the 200 s"):
+        with pytest.raises(ValueError, match="an initial segment of more than 0 s and less than the 200 s"):
             predict(tank(), run, settle=seconds)
     with pytest.raises(ValueError, match=r"with a tolerance to vary .*got 'Z.gain'; the nearest is 'Q.gain'"):
         predict(tank(), run, vary=("Z.gain",))
@@ -248,7 +252,7 @@ def test_what_each_recording_has_for_itself_is_told_with_how_much_it_differs() -
     assert [own.source for own in gains] == ["a", "b", "c"]
     for own, truth in zip(gains, (0.9, 1.0, 1.1), strict=True):
         assert abs(own.value - truth) < 4.0 * own.std < 0.05
-    told = spread(gains, 0.2)
+    told = between_run_spread(gains, 0.2)
     assert told is not None and told.std == pytest.approx(0.1, rel=0.05) and told.low < 0.1 < told.high
     assert "Q.gain" not in found.fitted
     # The next recording is best believed to have what is typical: the plant file's 1.0 counts as one recording more.
@@ -260,10 +264,10 @@ def test_what_each_recording_has_for_itself_is_told_with_how_much_it_differs() -
 
 def test_a_file_is_predicted_by_what_the_others_say() -> None:
     runs = [filling(1.1, 0.0, 1), filling(1.1, 0.0, 2, "b"), filling(1.2, 0.0, 3, "c")]
-    trials = in_turn(tank(), runs, runs, lambda rest: refit(tank(), rest, white=1e-4).plant, 3)
+    trials = leave_one_file_out(tank(), runs, runs, lambda rest: refit(tank(), rest, white=1e-4).plant, 3)
     assert [t.source for t in trials] == ["a", "b", "c"]
     assert trials[0].refitted["h"] < trials[0].as_is["h"]  # 1.1 and 1.2 are nearer to 1.1 than the believed 1 is
-    alone = in_turn(tank(), runs[:2], runs[2:], lambda rest: refit(tank(), rest, white=1e-4).plant, 3)
+    alone = leave_one_file_out(tank(), runs[:2], runs[2:], lambda rest: refit(tank(), rest, white=1e-4).plant, 3)
     assert alone[0].refitted["h"] == pytest.approx(trials[2].refitted["h"], rel=1e-6)
     with pytest.raises(ValueError, match="recordings of another file"):
-        in_turn(tank(), runs[:1], runs[:1], lambda rest: tank(), 3)
+        leave_one_file_out(tank(), runs[:1], runs[:1], lambda rest: tank(), 3)

@@ -10,8 +10,8 @@ from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.gap.answer import adopted
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.prediction import predict
-from fdi_torch.gap.refit import refit
+from fdi_torch.gap.free_runs.prediction import predict
+from fdi_torch.gap.free_runs.refit import refit
 from fdi_torch.recording import Recording
 
 ROOT = Path(__file__).parents[1]

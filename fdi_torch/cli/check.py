@@ -11,7 +11,7 @@ from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.run_file import load_run
-from fdi_torch.gap.acquisition import examined
+from fdi_torch.gap.preprocess.acquisition import examined
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -44,7 +44,7 @@ def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
     """The check of a recording, with refused or masked channels first."""
     check = check_recording(whole, plant)
     examinations = [examined(plant, part) for part in whole.known_segments()]
-    problems = [ChannelFinding("slip", ", ".join(e.slip.channels), e.slip.text) for e in examinations if e.slip]
+    problems = [ChannelFinding("slip", ", ".join(e.fault.channels), e.fault.text) for e in examinations if e.fault]
     problems += [
         ChannelFinding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})
         for e in examinations

@@ -18,9 +18,9 @@ from fdi_torch.config.plant_file import load_plant
 from fdi_torch.disk import write_text
 from fdi_torch.gap.answer import UNKNOWN, Answer, adopted
 from fdi_torch.gap.diagnose import Settings
-from fdi_torch.gap.next_input import planned
-from fdi_torch.gap.plan import plan
-from fdi_torch.gap.prediction import predict
+from fdi_torch.gap.experiment_design import planned_recording
+from fdi_torch.gap.free_runs.prediction import predict
+from fdi_torch.gap.identifiability import planned_identifiability
 from fdi_torch.jobs.gap import one_thread, run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.plant.description import PlantDescription
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     library = _names(arguments.library) or None
     if arguments.plan:
         with one_thread():
-            return show_plan(plan(plant, recordings[0], arguments.noise, library), screen)
+            return show_plan(planned_identifiability(plant, recordings[0], arguments.noise, library), screen)
     if arguments.step is not None and not arguments.step > 0.0:
         raise ValueError(f"--step: expected a positive number of seconds, got {arguments.step:g}")
     if arguments.most < 1:
@@ -107,7 +107,7 @@ def _keep(
 def _next_input(plant: PlantDescription, answer: Answer, folder: Path) -> Path | None:
     if not answer.next_input:
         return None
-    return write_csv(planned(answer.next_input["input"], plant), folder / "next_input.csv")
+    return write_csv(planned_recording(answer.next_input["input"], plant), folder / "next_input.csv")
 
 
 def _error(plant: PlantDescription, recordings: Sequence[Recording]) -> float:

@@ -12,9 +12,9 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.screen import Screen
 from fdi_torch.effects import build_network
-from fdi_torch.gap.in_turn import Trial, in_turn
-from fdi_torch.gap.refit import Refit, refit
-from fdi_torch.gap.spread import spread
+from fdi_torch.gap.free_runs.between_runs import between_run_spread
+from fdi_torch.gap.free_runs.prediction import LeftOutRun, leave_one_file_out
+from fdi_torch.gap.free_runs.refit import Refit, refit
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -36,10 +36,10 @@ def run_refit(
     if arguments.adopt:
         write_adopted(arguments.plant, plant, fitted.plant, Path(arguments.adopt), screen)
         screen.note(f"plant file with the fitted values: {arguments.adopt}")
-    trials: list[Trial] = []
+    trials: list[LeftOutRun] = []
     if arguments.in_turn:
         with screen.progress("leave-one-file-out validation") as advance:
-            trials = in_turn(
+            trials = leave_one_file_out(
                 plant,
                 recordings,
                 holdouts or recordings,
@@ -88,7 +88,7 @@ def _show_run_specific(result: Refit, screen: Screen) -> None:
         for own in each:
             numbers = [f"{scale * own.value:.4g}", f"{scale * own.std:.2g}", unit]
             rows.append([name, Path(own.source).name, f"{own.start:g}", *numbers])
-        variation = spread(each, constants[name].std)
+        variation = between_run_spread(each, constants[name].std)
         if variation:
             interval = (
                 f"{scale * variation.std:.2g} (95 %: {scale * variation.low:.2g} to {scale * variation.high:.2g})"
@@ -100,7 +100,7 @@ def _show_run_specific(result: Refit, screen: Screen) -> None:
         screen.table("values of each recording", header, rows)
 
 
-def _show_trials(trials: Sequence[Trial], plant: PlantDescription, screen: Screen) -> None:
+def _show_trials(trials: Sequence[LeftOutRun], plant: PlantDescription, screen: Screen) -> None:
     """One line per free run: error of the plant file, and of the plant refitted without the run's file."""
     header = ["run", "from, s", "to, s"]
     header += [f"{s.name} {of}, {display_unit(s.unit)[0]}" for of in ("as is", "refitted") for s in plant.sensors]

@@ -9,7 +9,7 @@ from typing import Any
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.gap.answer import UNKNOWN, Answer, CauseName, names
-from fdi_torch.gap.excitation import Excitation
+from fdi_torch.gap.identifiability import Identifiability
 from fdi_torch.gap.verdict_words import causes_of, explanation_words, probability_words, verdict_sentence
 from fdi_torch.parameters import display_unit
 
@@ -68,28 +68,30 @@ def next_steps(
         steps.append(f"next: {written or f'--adopt FILE writes the plant file with the causes; with it {benefit}'}")
     if not has_holdout and answer.verdict != "no_gap":
         steps.append("next: --holdout FILE, another recording of the same rig, measures how far the gap closes")
-    hidden, twins = answer.excitation.get("hidden", []), answer.excitation.get("inseparable", [])
+    hidden, inseparable = answer.excitation.get("hidden", []), answer.excitation.get("inseparable", [])
     if hidden:
         shown = ", ".join(f"{c['effect']} at {c['location']}" for c in hidden[:3])
         more = f" and {len(hidden) - 3} more" if len(hidden) > 3 else ""
         steps.append(f"these inputs cannot show at their typical size: {shown}{more}")
-    if twins:
-        first = " and ".join(f"{c['effect']} at {c['location']}" for c in twins[0]["between"])
-        many = f"{len(twins)} pairs of effects, such as {first}" if len(twins) > 1 else first
+    if inseparable:
+        first = " and ".join(f"{c['effect']} at {c['location']}" for c in inseparable[0]["between"])
+        many = f"{len(inseparable)} pairs of effects, such as {first}" if len(inseparable) > 1 else first
         steps.append(f"these inputs cannot distinguish {many}")
     return steps
 
 
-def show_plan(limits: Excitation, screen: Screen) -> int:
+def show_plan(limits: Identifiability, screen: Screen) -> int:
     """Print which effects the planned inputs do not show and which they cannot distinguish."""
     for name, place in limits.hidden:
         screen.say(f"does not show at its typical size: {name} at {place}")
-    for (a, at), (b, there), distance in limits.twins:
+    for (a, at), (b, there), distance in limits.inseparable:
         screen.say(f"cannot be distinguished: {a} at {at} and {b} at {there} (chi-square distance {distance:.1f})")
-    if not limits.hidden and not limits.twins:
+    if not limits.hidden and not limits.inseparable:
         screen.say("every effect of the library shows at its typical size and is distinguishable from every other")
     shown = {f"{place}.{name}": residual for (name, place), residual in limits.shown.items()}
-    screen.result({"format": "fdi_torch.gap_plan/1", "hidden": limits.hidden, "twins": limits.twins, "shown": shown})
+    screen.result(
+        {"format": "fdi_torch.gap_plan/1", "hidden": limits.hidden, "twins": limits.inseparable, "shown": shown}
+    )
     return DONE
 
 

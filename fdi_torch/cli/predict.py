@@ -16,7 +16,7 @@ from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.yaml_files import find_data
-from fdi_torch.gap.prediction import Prediction, predict
+from fdi_torch.gap.free_runs.prediction import Prediction, predict
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording

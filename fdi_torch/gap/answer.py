@@ -1,4 +1,4 @@
-"""A diagnosis as it is handed over: verdict, places, causes with parameters, rivals, closure; the JSON of `fdi gap`."""
+"""The answer of a gap diagnosis: verdict, places, causes with parameters, rivals, closure; the JSON of `fdi gap`."""
 
 from __future__ import annotations
 
@@ -14,17 +14,20 @@ from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 
 FORMAT = "fdi_torch.gap/2"
-UNKNOWN = "unknown"  # the name of a cause that the library lacks
+UNKNOWN = "unknown"  # name of a cause that is not in the library
 CERTAIN = 0.95  # marginal probability
-OPEN_SHARE, OPEN_ERRORS = 0.2, 3.0  # of the value, and standard errors
+# Tolerance of an adopted cause: share of its value, or standard errors, whichever is larger
+TOLERANCE_SHARE, TOLERANCE_ERRORS = 0.2, 3.0
 Verdict = Literal["no_gap", "named", "ambiguous", "unknown"]
 CauseName = tuple[str, str]
-# Effects of a tank whose size is a share of what flows through its leak reference.
+# Effects of a tank whose size is a share of the capacity of its reference pipe.
 SHARES_OF_CAPACITY = ("leak", "cross_flow")
 
 
 @dataclass(frozen=True)
 class Amount:
+    """Value, standard error and SI unit of a parameter; the error is 0 if the readings show the value without a fit."""
+
     value: float
     std: float
     unit: str
@@ -32,7 +35,7 @@ class Amount:
 
 @dataclass(frozen=True)
 class Cause:
-    """An effect at a place; parameters by their short names, SI."""
+    """An effect at a place, with its parameters by short name, in SI. same_as: equivalent causes."""
 
     effect: str
     location: str
@@ -41,8 +44,8 @@ class Cause:
 
 
 @dataclass(frozen=True)
-class Explanation:
-    """A set of causes, empty for none; probability among all explanations weighed."""
+class ProbableExplanation:
+    """A set of causes, empty for the nominal plant, and its posterior probability."""
 
     causes: tuple[CauseName, ...]
     probability: float
@@ -50,16 +53,16 @@ class Explanation:
 
     @property
     def every(self) -> tuple[CauseName, ...]:
-        """The causes, and what is unknown."""
+        """All causes, something unknown included."""
         return (*self.causes, *(((UNKNOWN, self.unknown_at),) if self.unknown_at else ()))
 
 
 @dataclass(frozen=True)
 class Answer:
-    """See the protocol of gap diagnosis; `to_dict` is its JSON.
+    """The answer of a diagnosis; `to_dict` is its JSON.
 
-    excitation: what the inputs can never show or tell apart. constants: by name what each model takes it to be. curves:
-    the discrepancy at the guilty places. arrays: what the models predict, for the log; not in the JSON.
+    excitation: effects that the inputs cannot show or separate. constants: values in each model, by name. curves: the
+    discrepancy at the places with causes. arrays: predictions of the models, for the log only.
     """
 
     verdict: Verdict
@@ -67,7 +70,7 @@ class Answer:
     where: Sequence[tuple[str, float]]
     causes: Sequence[Cause]
     ambiguity_set: Sequence[tuple[CauseName, ...]]
-    posterior: Sequence[Explanation]
+    posterior: Sequence[ProbableExplanation]
     closure: Mapping[str, Any]
     noise: Mapping[str, Any]
     unexamined: float = 0.0
@@ -84,7 +87,7 @@ class Answer:
 
     @property
     def certain(self) -> list[CauseName]:
-        """Effects and unknowns that are there with 95 %, whatever else is."""
+        """Causes, unknown ones included, with a marginal probability of 95 %."""
         share: dict[CauseName, float] = {}
         for e in self.posterior:
             for cause in e.every:
@@ -118,49 +121,52 @@ class Answer:
 
 
 def adopted(plant: PlantDescription, answer: Answer, constants: bool = False) -> PlantDescription:
-    """The plant as the answer says it is: its file with the causes among its effects.
+    """The plant file with the causes of the answer among its effects.
 
-    constants: also with the calibration constants as they were fitted beside the causes. Their tolerances stay what the
-    file says: how far they may lie off another day, the fit does not know. The causes get a tolerance, so that a later
-    diagnosis refits them beside whatever else it finds.
+    The causes get a tolerance, so that a later diagnosis refits them together with what it finds.
+
+    constants: whether to adopt the fitted calibration constants as well. Their tolerances stay those of the file, since
+    a fit does not know how far they may vary from day to day.
     """
     named = [c for c in answer.causes if c.effect != UNKNOWN]
-    placed = [PlacedEffect(c.effect, c.location, {n: a.value for n, a in c.parameters.items()}) for c in named]
-    known = {(p.effect, p.location) for p in placed}
-    effects = (*(e for e in plant.effects if (e.effect, e.location) not in known), *placed)
+    causes = [PlacedEffect(c.effect, c.location, {n: a.value for n, a in c.parameters.items()}) for c in named]
+    adopted_places = {(p.effect, p.location) for p in causes}
+    effects = (*(e for e in plant.effects if (e.effect, e.location) not in adopted_places), *causes)
     if not constants:
         return replace(plant, effects=effects)
     values = {n: c["augmented"] for n, c in answer.constants.items() if n not in plant.varying}
     fitted = with_constants(plant, {n: v for n, v in values.items() if n.count(".") == 1})
     effects = tuple(_same_flow(_same_shape(_refitted(e, values), plant, fitted), plant, fitted) for e in effects)
-    return replace(fitted, effects=effects, tolerances=plant.tolerances | _open(answer))
+    return replace(fitted, effects=effects, tolerances=plant.tolerances | _tolerances_of_causes(answer))
 
 
 def _refitted(placed: PlacedEffect, values: Mapping[str, float]) -> PlacedEffect:
-    """An effect that the plant file has, with those of its parameters that have a tolerance as they were fitted."""
+    """An effect of the plant file with fitted values of its parameters that have a tolerance."""
     prefix = f"{placed.location}.{placed.effect}"
     return replace(placed, parameters={n: values.get(f"{prefix}.{n}", v) for n, v in placed.parameters.items()})
 
 
-def _open(answer: Answer) -> dict[str, float]:
-    """How far the parameters of the causes may still move when another diagnosis refits them beside what it finds."""
+def _tolerances_of_causes(answer: Answer) -> dict[str, float]:
+    """Tolerances of the causes' parameters, within which a later diagnosis may refit them."""
     return {
-        f"{cause.location}.{cause.effect}.{name}": max(OPEN_SHARE * abs(amount.value), OPEN_ERRORS * amount.std)
+        f"{cause.location}.{cause.effect}.{name}": max(
+            TOLERANCE_SHARE * abs(amount.value), TOLERANCE_ERRORS * amount.std
+        )
         for cause in answer.causes
         for name, amount in cause.parameters.items()
-        if amount.std > 0.0  # what was read off the values themselves is what it is
+        if amount.std > 0.0  # values that the readings show are exact
     }
 
 
 def _same_shape(placed: PlacedEffect, before: PlantDescription, after: PlantDescription) -> PlacedEffect:
-    """The effect with what was not fitted of it as it was, where that follows from constants that have changed."""
+    """The effect with unchanged parameters where their nominal values depend on constants that have changed."""
     old, new = (effect(placed.effect).parameters(placed.location, plant) for plant in (before, after))
     moved = {a.name: a.nominal for a, b in zip(old, new, strict=True) if a.nominal != b.nominal}
     return replace(placed, parameters={**moved, **placed.parameters})
 
 
 def _same_flow(placed: PlacedEffect, before: PlantDescription, after: PlantDescription) -> PlacedEffect:
-    """The effect with as large a flow as before, where its size is a share of a pipe's capacity that has changed."""
+    """The effect with an unchanged flow if its size is a share of a pipe's capacity that has changed."""
     if placed.effect not in SHARES_OF_CAPACITY:
         return placed
     tank = placed.location.split("-")[0]
@@ -188,7 +194,7 @@ def with_constants(plant: PlantDescription, values: Mapping[str, float]) -> Plan
 
 
 def finite(value: Any) -> Any:
-    """What is not finite becomes None: JSON has no other word for it."""
+    """Replace numbers that are not finite by None, since JSON has no such numbers."""
     if isinstance(value, Mapping):
         return {k: finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -197,7 +203,7 @@ def finite(value: Any) -> Any:
 
 
 def names(causes: Iterable[CauseName]) -> list[dict[str, str]]:
-    """Causes as they stand in the JSON."""
+    """Causes as the JSON lists them."""
     return [{"effect": name, "location": location} for name, location in causes]
 
 
@@ -207,6 +213,6 @@ def _cause(cause: Cause) -> dict[str, Any]:
     return named | ({"same_as": names(cause.same_as)} if cause.same_as else {})
 
 
-def _explanation(explanation: Explanation) -> dict[str, Any]:
+def _explanation(explanation: ProbableExplanation) -> dict[str, Any]:
     shown: dict[str, Any] = {"causes": names(explanation.every), "probability": explanation.probability}
     return shown | ({"unknown_at": explanation.unknown_at} if explanation.unknown_at else {})

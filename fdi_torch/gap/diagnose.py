@@ -1,4 +1,4 @@
-"""The gap diagnosis: recalibration, which effects, where, the posterior; then the answer, with the hold-out."""
+"""The gap diagnosis: recalibration, search for effects, localization, posterior of the hypotheses, answer."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from dataclasses import replace
 import torch
 
 from fdi_torch.gap.answer import Answer, Verdict
-from fdi_torch.gap.answering import answered
-from fdi_torch.gap.case import PLAIN, Case, Settings, case_of
-from fdi_torch.gap.disturbances import disturbed
-from fdi_torch.gap.finding import Finding
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter
-from fdi_torch.gap.floor import Noise, estimate_noise, lattice_step
-from fdi_torch.gap.freeform import fitted_free_form
+from fdi_torch.gap.answer_assembly import build_answer
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise, estimate_noise, quantization_step
+from fdi_torch.gap.dataset import DataSet
+from fdi_torch.gap.diagnosis_result import DiagnosisResult
+from fdi_torch.gap.free_form import fitted_free_form
 from fdi_torch.gap.library import possible_places
-from fdi_torch.gap.limits import unclipped, with_clipped_noise
-from fdi_torch.gap.posterior import Hypothesis, Posterior, weighed
+from fdi_torch.gap.marginal_likelihood import with_disturbances
+from fdi_torch.gap.posterior import CauseHypothesis, Posterior, posterior_of
+from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
+from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_noise_limits
+from fdi_torch.gap.problem import PLAIN, DiagnosisProblem, Settings, problem_of
 from fdi_torch.gap.screening import options_of
-from fdi_torch.gap.search import Judged, search
-from fdi_torch.gap.strays import most_astray
-from fdi_torch.gap.subject import Subject
+from fdi_torch.gap.structure_search import ExplanationPool, search
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of_all, with_simulated_levels
 from fdi_torch.recording import Recording
 
 CONTENT = 0.95
-Tell = Callable[[float, str], None]
+ProgressCallback = Callable[[float, str], None]
 
 
 def diagnose(
@@ -35,77 +35,96 @@ def diagnose(
     recording: Recording | Sequence[Recording],
     holdout: Recording | Sequence[Recording] | None = None,
     settings: Settings = PLAIN,
-    tell: Tell = lambda share, text: None,
+    progress: ProgressCallback = lambda share, text: None,
 ) -> Answer:
-    """What keeps the plant file from explaining the recording, or several recordings by the same causes.
+    """Find out why the plant file does not explain one or several recordings, by causes that are common to all.
 
-    Hold-outs only measure how far the gap closes.
+    Hold-outs are used only to measure which share of the gap the causes close.
     """
     recordings = (recording,) if isinstance(recording, Recording) else tuple(recording)
     holdouts = () if holdout is None else (holdout,) if isinstance(holdout, Recording) else tuple(holdout)
-    return solved(case_of(plant, recordings, holdouts, settings), tell)
+    return solve_problem(problem_of(plant, recordings, holdouts, settings), progress)
 
 
-def solved(case: Case, tell: Tell = lambda share, text: None) -> Answer:
-    """The diagnosis, stage by stage."""
-    subject, library, plant = case.subject, case.library, case.subject.plant
-    tell(0.05, "noise and recalibration")
-    fitter, null, lattice = _recalibrated(subject)
-    reach = with_simulated_levels(operating_range_of_all(case.recordings, plant), plant, null.near.levels[0])
-    tell(0.2, "which effects")
-    known = {p.prefix for p in case.told} | {name.rpartition(".")[0] for name in subject.nuisance}
-    options = options_of([p for p in library if not p.effect.quantizes and p.prefix not in known], fitter, reach)
-    judged = Judged(fitter, len(library))
-    found = search(judged, null, options, case.most)
-    tell(0.6, "where")
-    believed = weighed(judged, found, plant, possible_places(plant), case.named_only)
-    content = believed.content(CONTENT)
-    rounded = [("sensor_quantization", s.name) for s, step in zip(plant.sensors, lattice, strict=True) if step > 0.0]
-    rounded = [c for c in rounded if any((p.effect.name, p.location) == c for p in library)]
-    rounded += [(p.effect.name, p.location) for p in case.told]
-    straying = None if case.named_only else most_astray(case.strays[0])
-    unnamed = _free_form(believed, reach)
-    sure = believed.probabilities[0] >= CONTENT
-    verdict = _verdict(content, sure, bool(rounded), straying)
-    tell(0.8, "hold-out")
-    finding = Finding(
-        fitter, library, reach, found, believed, content, unnamed, verdict, rounded, lattice, case.told, case.strays
+def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda share, text: None) -> Answer:
+    """Run the stages of the diagnosis. progress: receives the share done and the name of the stage."""
+    data, library, plant = problem.data, problem.library, problem.data.plant
+    progress(0.05, "noise and recalibration")
+    fitter, null, quantization_steps = recalibrate(data)
+    reach = with_simulated_levels(operating_range_of_all(problem.recordings, plant), plant, null.linearised.levels[0])
+    progress(0.2, "which effects")
+    present = {p.prefix for p in problem.known_effects} | {name.rpartition(".")[0] for name in data.nuisance}
+    options = options_of([p for p in library if not p.effect.quantizes and p.prefix not in present], fitter, reach)
+    pool = ExplanationPool(fitter, len(library))
+    result = search(pool, null, options, problem.most)
+    progress(0.6, "where")
+    posterior = posterior_of(pool, result, plant, possible_places(plant), problem.named_only)
+    credible_set = posterior.credible_set(CONTENT)
+    from_readings = [
+        ("sensor_quantization", s.name) for s, step in zip(plant.sensors, quantization_steps, strict=True) if step > 0.0
+    ]
+    from_readings = [c for c in from_readings if any((p.effect.name, p.location) == c for p in library)]
+    from_readings += [(p.effect.name, p.location) for p in problem.known_effects]
+    outlier_sensor = None if problem.named_only else sensor_with_outliers(problem.outliers[0])
+    free_form_fit = _free_form(posterior, reach)
+    sure = posterior.probabilities[0] >= CONTENT
+    verdict = _verdict(credible_set, sure, bool(from_readings), outlier_sensor)
+    progress(0.8, "hold-out")
+    diagnosis = DiagnosisResult(
+        fitter,
+        library,
+        reach,
+        result,
+        posterior,
+        credible_set,
+        free_form_fit,
+        verdict,
+        from_readings,
+        quantization_steps,
+        problem.known_effects,
+        problem.outliers,
     )
-    return answered(finding, case.held)
+    return build_answer(diagnosis, problem.holdouts)
 
 
-def _verdict(content: Sequence[Hypothesis], sure: bool, rounded: bool, straying: str | None) -> Verdict:
-    """sure: that of the likeliest. straying: a sensor whose readings jump, as no effect of the library makes them."""
-    best = content[0]
-    if not best.causes and not best.place and not rounded:
-        return "unknown" if straying else "no_gap"
-    if all(h.place for h in content):
+def _verdict(
+    credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: bool, outlier_sensor: str | None
+) -> Verdict:
+    """The verdict of a credible set of hypotheses.
+
+    sure: whether the likeliest alone has 95 %. from_readings: whether the readings themselves show a quantization or a
+    limit. outlier_sensor: a sensor with outliers that no effect of the library explains.
+    """
+    best = credible_set[0]
+    if not best.causes and not best.place and not from_readings:
+        return "unknown" if outlier_sensor else "no_gap"
+    if all(h.place for h in credible_set):
         return "unknown"
     return "named" if sure else "ambiguous"
 
 
-def _free_form(believed: Posterior, reach: OperatingRange) -> Fit | None:
-    """The discrepancy of the likeliest hypothesis as functions of its place's variables, if it has one."""
-    best = believed.best
+def _free_form(posterior: Posterior, reach: OperatingRange) -> Fit | None:
+    """The free discrepancy of the likeliest hypothesis as a fit, if the hypothesis has an unknown."""
+    best = posterior.best
     if best.place is None:
         return None
-    # What a sensor wanders by is for the functions to tell.
-    under = disturbed(best.explanation.fitter, best.fit, replace(best.place.noise, wander=None))
-    kept = [p for p in best.fit.candidate.placements if (p.effect.name, p.location) in best.causes]
-    return fitted_free_form(under, best.fit, kept, best.place.location, best.place.periods, reach)
+    # The free functions shall explain what the drift of a sensor would absorb.
+    fitter = with_disturbances(best.explanation.fitter, best.fit, replace(best.place.noise, wander=None))
+    placements = [p for p in best.fit.candidate.placements if (p.effect.name, p.location) in best.causes]
+    return fitted_free_form(fitter, best.fit, placements, best.place.location, best.place.periods, reach)
 
 
-def _recalibrated(subject: Subject) -> tuple[Fitter, Fit, list[float]]:
-    """The noise of each channel, the recalibrated plant under it, and the step of each rounded channel."""
-    channels = len(subject.plant.sensors)
-    spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    first = Fitter(subject, Noise(1e-2 * spread, torch.zeros(channels, dtype=spread.dtype)))
-    null = first.fit(Candidate())
-    residual = subject.readings - null.near.readings[0]
-    noise = estimate_noise(residual, subject.mask, rows=subject.rows)
-    values = [subject.readings[subject.mask[:, c], c] for c in range(channels)]
-    lattice = [lattice_step(v, float(noise.std[c])) for c, v in enumerate(values)]
-    noise = estimate_noise(residual, subject.mask, lattice, subject.rows)
-    noise = unclipped(noise, subject, null.near.readings[0])
-    fitter = Fitter(with_clipped_noise(subject, null, noise), noise)
-    return fitter, fitter.fit(Candidate(), null), lattice
+def recalibrate(data: DataSet) -> tuple[Fitter, Fit, list[float]]:
+    """The noise of each channel, the constants fitted under it, and the quantization step of each channel."""
+    channels = len(data.plant.sensors)
+    spread = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+    preliminary = Fitter(data, Noise(1e-2 * spread, torch.zeros(channels, dtype=spread.dtype)))
+    null = preliminary.fit(Candidate())
+    residual = data.readings - null.linearised.readings[0]
+    noise = estimate_noise(residual, data.mask, rows=data.rows)
+    values = [data.readings[data.mask[:, c], c] for c in range(channels)]
+    quantization_steps = [quantization_step(v, float(noise.std[c])) for c, v in enumerate(values)]
+    noise = estimate_noise(residual, data.mask, quantization_steps, data.rows)
+    noise = noise_before_clipping(noise, data, null.linearised.readings[0])
+    fitter = Fitter(with_noise_limits(data, null, noise), noise)
+    return fitter, fitter.fit(Candidate(), null), quantization_steps

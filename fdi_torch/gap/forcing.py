@@ -1,7 +1,7 @@
-"""What an effect at one place changes there along a given trajectory: the rates of the levels, or a reading.
+"""First-order forcing by an effect: how it changes the level rates, or a reading, along a given trajectory.
 
-Only the component at which it sits is evaluated again. What its flow then does to the rates is the same for all
-effects, to first order: the whole library costs little more than one right-hand side.
+Only the component with the effect is evaluated again. The influence of its flow on the level rates is linearised once
+for all effects, so that the whole library costs little more than one right-hand side.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ Starts = Mapping[str, Tensor]
 
 
 class Forcing:
-    """A trajectory of a plant, levels (tanks, K+1) m at the nodes, beside which effects are tried.
+    """A trajectory of a plant, levels (tanks, K+1) m at the nodes, along which effects are tried.
 
-    union: the plant with every effect that is tried. present: prefixes of those that are there. values: its constants
-    as bound to one lane.
+    union: the plant with every effect that may be tried. present: prefixes of the effects that act. values: the plant's
+    constants, bound to one lane.
 
-    Along the trajectory, at the middle of each step: levels (1, K) m of each tank, commands of each actuator, pumps and
-    pipes: what flows through each, m^3/s; still: the rates without what is tried, m/s.
+    Attributes at the middle of each step: levels (1, K) m of each tank; commands of each actuator; pumps, pipes: flow
+    through each, m^3/s; still: level rates without the effect that is tried, m/s.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Forcing:
         self._readings = OutputMap(network, experiment, []).read(self._path, values)[0]
 
     def rates(self, placement: Placement, starts: Starts) -> Tensor:
-        """How the rates change with an effect, (tanks, M, K) in m/s. starts: its parameters, short names, (M, 1)."""
+        """Change of the level rates (tanks, M, K) m/s by an effect. starts: its parameters by short name, (M, 1)."""
         network, values, lanes = self._with(placement, starts)
         shape = (lanes, self.levels[0].shape[-1])
         if placement.effect.stage is Stage.STORAGE:
@@ -67,7 +67,7 @@ class Forcing:
         return self.by_inflows(self._inflows(network, placement, values, lanes), lanes)
 
     def by_inflows(self, inflows: Sequence[Tensor | None], lanes: int) -> Tensor:
-        """How the rates change with what more flows into each tank, (M, K) or (1, K) m^3/s; None for nothing."""
+        """Change of the level rates by additional flows into each tank, (M, K) or (1, K) m^3/s; None for no flow."""
         changed = []
         for row in self._by_inflow:
             total = self.levels[0].new_zeros(lanes, self.levels[0].shape[-1])
@@ -78,19 +78,19 @@ class Forcing:
         return torch.stack(changed)
 
     def by_rates(self, weights: Tensor) -> Tensor:
-        """The transpose of `by_inflows`: weights (tanks, M, K) of the rates -> of the inflows, the same shape."""
-        found = torch.zeros_like(weights)
+        """The transpose of `by_inflows`: weights of the rates (tanks, M, K) -> weights of the inflows, same shape."""
+        by_inflow = torch.zeros_like(weights)
         for row, weight in zip(self._by_inflow, weights, strict=True):
             for tank, slope in enumerate(row):
                 if slope is not None:
-                    found[tank] += slope * weight
-        return found
+                    by_inflow[tank] += slope * weight
+        return by_inflow
 
     def readings(self, placement: Placement, starts: Starts) -> Tensor:
-        """How the readings change with an effect, (C, M, S) in each sensor's unit."""
+        """Change of the readings (C, M, S) by an effect, in each sensor's unit."""
         network, values, lanes = self._with(placement, starts)
-        seen = OutputMap(network, self.experiment, []).read(self._path.expand(lanes, -1, -1), values)
-        return (seen - self._readings).movedim(0, 1)
+        with_effect = OutputMap(network, self.experiment, []).read(self._path.expand(lanes, -1, -1), values)
+        return (with_effect - self._readings).movedim(0, 1)
 
     def _with(self, placement: Placement, starts: Starts) -> tuple[TankNetwork, PlaceValues, int]:
         network = self.union.restricted_to({*self.present, placement.prefix})
@@ -101,7 +101,7 @@ class Forcing:
         return network.operating_point(self.levels, commands, self._clock, values)
 
     def _inflows(self, network: TankNetwork, placement: Placement, values: PlaceValues, lanes: int) -> Sequence[Tensor]:
-        """By how much more flows into each tank, (M, K) or (1, K) m^3/s."""
+        """Additional flow into each tank, (M, K) or (1, K) m^3/s."""
         plant, place, commands = network.description, placement.location, self.commands
         if placement.effect.stage is Stage.BALANCE:
             net = list(self._gathered)
@@ -110,19 +110,19 @@ class Forcing:
         if placement.effect.stage is Stage.COMMAND:
             commands = Actuation(network, self.experiment, []).commands(values, lanes)
         now = self._now(network, values, commands)
-        more = [torch.zeros_like(net) for net in self._gathered]
+        inflows = [torch.zeros_like(net) for net in self._gathered]
         for i, pump in enumerate(plant.pumps):
             if pump.name == place:
                 flow = network.pump_flow(now, pump)
-                network.transfer(more, OUTSIDE, pump.target, flow - self.pumps[i])
+                network.transfer(inflows, OUTSIDE, pump.target, flow - self.pumps[i])
         for j, pipe in enumerate(plant.pipes):
             if pipe.name == place:
                 flow = network.pipe_flow(now, pipe)
-                network.transfer(more, pipe.source, pipe.target, flow - self.pipes[j])
-        return more
+                network.transfer(inflows, pipe.source, pipe.target, flow - self.pipes[j])
+        return inflows
 
     def _inflow_slopes(self, network: TankNetwork) -> tuple[list[Tensor], list[Row]]:
-        """Rates, and by how much each tank's rate rises with what flows into each tank, 1/m^2."""
+        """Level rates, and slope of each tank's rate with the flow into each tank, 1/m^2."""
 
         now = self._now(network, self.values, self.commands)
 

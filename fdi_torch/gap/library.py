@@ -1,4 +1,4 @@
-"""Which effects a gap diagnosis can name, and which of them are one and the same thing."""
+"""The library of effects that a gap diagnosis can name, and which of them are physically the same."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fdi_torch.names import unknown
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.plant.effect import Placement, fits
 
-# The protocol's vocabulary, and what valves do. Further effects of the library are searched when they are named.
+# Effects searched by default. All others are searched if they are named.
 STANDARD = (
     "pump_gain",
     "pump_dead_zone",
@@ -48,12 +48,14 @@ STANDARD = (
 def library_of(
     plant: PlantDescription, names: Sequence[str] | None = None, leave_out: Iterable[str] = ()
 ) -> tuple[Placement, ...]:
-    """Every named effect ('all' for the whole library; 'pump_lag@Q1' for one place only) where it can sit and is not
-    the same as another one there. Raises ValueError for an effect or a place that does not exist.
+    """The effects to search, at all places where they fit.
+
+    Names select effects: 'all' for the whole library, 'pump_lag@Q1' for one place only. Raises ValueError for an
+    unknown effect or place.
     """
     wanted = STANDARD if names is None else tuple(e.name for e in EFFECTS) if tuple(names) == ("all",) else names
     left_out = {effect(name).name for name in map(_plain, leave_out)}
-    found: dict[str, Placement] = {}
+    placements: dict[str, Placement] = {}
     for entry in wanted:
         name, separator, at = (part.strip() for part in entry.partition("@"))
         if name == "all":
@@ -69,21 +71,21 @@ def library_of(
             if not fits(effect(name), plant, place):
                 kinds = " or ".join(effect(name).places)
                 raise ValueError(f"library: {entry}: expected a place of kind {kinds}, got {place}")
-            found[f"{place}.{name}"] = Placement(effect(name), place)
-    if not found:
+            placements[f"{place}.{name}"] = Placement(effect(name), place)
+    if not placements:
         raise ValueError("library: expected at least one effect that fits the plant, got none; name some")
-    return tuple(found.values())
+    return tuple(placements.values())
 
 
 def _plain(name: str) -> str:
-    """Raises ValueError for an effect at a place: one is denied everywhere."""
+    """Raises ValueError for an effect with a place, since effects are excluded everywhere."""
     if "@" in name:
-        raise ValueError(f"leave-out: expected an effect without a place, got {name}; it is denied everywhere")
+        raise ValueError(f"leave-out: expected an effect without a place, got {name}; it is excluded everywhere")
     return name.strip()
 
 
 def _known(entry: str, place: str, plant: PlantDescription) -> str:
-    """A place of the plant; a pair of tanks in either order. Raises ValueError for one that it has not."""
+    """A place of the plant; a pair of tanks in either order. Raises ValueError for an unknown place."""
     turned = "-".join(reversed(place.split("-")))
     for name in (place, turned):
         if name in plant.locations():
@@ -92,14 +94,14 @@ def _known(entry: str, place: str, plant: PlantDescription) -> str:
 
 
 def possible_places(plant: PlantDescription) -> tuple[str, ...]:
-    """All components, and the pairs of tanks that no pipe joins: beside a pipe another path is a wider pipe."""
+    """All components, and the pairs of tanks without a pipe; next to a pipe, a cross flow is a wider pipe."""
     joined = [{p.source, p.target} for p in plant.pipes]
     pairs = {f"{a}-{b}" for a, b in plant.tank_pairs() if {a, b} in joined}
     return tuple(place for place in plant.locations() if place not in pairs)
 
 
 def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:
-    """One name for what is one thing: an outlet at its tank's floor wider or narrower, and a leak of the tank."""
+    """One name for equivalent causes: plugging of an outlet at its tank's floor is a leak of the tank."""
     name, place = cause
     for pipe in plant.pipes:
         to_outside = pipe.target == OUTSIDE and pipe.elevation == 0.0
@@ -108,8 +110,8 @@ def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:
     return cause
 
 
-def twins(cause: CauseName, plant: PlantDescription) -> tuple[CauseName, ...]:
-    """Other names of the same thing."""
+def equivalent_causes(cause: CauseName, plant: PlantDescription) -> tuple[CauseName, ...]:
+    """Other names of the same cause."""
     name, place = canonical(cause, plant)
     others = [("plugging", p.name) for p in plant.pipes if canonical(("plugging", p.name), plant) == (name, place)]
     return tuple(c for c in dict.fromkeys([(name, place), *others]) if c != cause) if others else ()

@@ -1,9 +1,9 @@
-"""The textbook way, to compare with: every effect alone, white noise, the lowest BIC wins.
+"""Baseline for comparison: every effect alone, white noise, the lowest BIC wins.
 
     BIC = n log(RSS / n) + k log n        (Schwarz, 1978)
 
-for n readings, each scaled by the spread of its channel's residual, and k parameters besides the recalibrated ones.
-No pairs, no coloured noise, no "none of these", and always sure.
+for n readings, each divided by the standard deviation of its channel's residual, and k parameters besides the
+recalibrated ones. It considers neither pairs nor correlated noise nor unknown causes, and states no uncertainty.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.fitting import Candidate, Fit, Fitter
-from fdi_torch.gap.floor import Noise
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.library import library_of
-from fdi_torch.gap.screening import Option, Screen, options_of, screen
-from fdi_torch.gap.subject import subject_of
+from fdi_torch.gap.screening import Option, ScreeningResult, options_of, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
@@ -34,17 +34,19 @@ def one_at_a_time(
     library: tuple[str, ...] | None = None,
     leave_out: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """The answer, in the format of a diagnosis, of fitting those effects singly that promise most to first order."""
-    found = library_of(plant, library, leave_out)
-    believed = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    """Fit the most promising effects one by one and return an answer in the format of a diagnosis."""
+    placements = library_of(plant, library, leave_out)
+    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     step = recording.interval
-    subject = subject_of(plant, believed, recording, step)
-    spread = subject.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    null = Fitter(subject, _white(1e-2 * spread)).fit(Candidate())
-    residual = torch.where(subject.mask, subject.readings - null.near.readings[0], 0.0)
-    fitter = Fitter(subject, _white(residual.std(dim=0).clamp(min=1e-12)))
+    data = data_set_of(plant, nominal_effects, recording, step)
+    spread = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+    null = Fitter(data, _white(1e-2 * spread)).fit(Candidate())
+    residual = torch.where(data.mask, data.readings - null.linearised.readings[0], 0.0)
+    fitter = Fitter(data, _white(residual.std(dim=0).clamp(min=1e-12)))
     null = fitter.fit(Candidate(), null)
-    options = options_of([p for p in found if not p.effect.quantizes], fitter, operating_range_of(recording, plant))
+    options = options_of(
+        [p for p in placements if not p.effect.quantizes], fitter, operating_range_of(recording, plant)
+    )
     fits = [null, *(fitter.fit(c, null) for c in _singles(screen(fitter, null, options, pairs=False)))]
     winner = min(fits, key=lambda fit: _bic(fitter, fit))
     return _named([(p.effect.name, p.location) for p in winner.candidate.placements])
@@ -54,8 +56,8 @@ def _white(std: torch.Tensor) -> Noise:
     return Noise(std, torch.zeros_like(std))
 
 
-def _singles(screened: Screen) -> list[Candidate]:
-    """The effects that promise most, each from its best starts."""
+def _singles(screened: ScreeningResult) -> list[Candidate]:
+    """The most promising effects, each with its best starts."""
     by_cause: dict[CauseName, list[Option]] = {}
     for i in torch.argsort(screened.gain, descending=True).tolist():
         by_cause.setdefault(screened.options[i].cause, []).append(screened.options[i])
@@ -66,7 +68,7 @@ def _singles(screened: Screen) -> list[Candidate]:
 
 
 def _bic(fitter: Fitter, fit: Fit) -> float:
-    n = float(fitter.subject.mask.sum())
+    n = float(fitter.data.mask.sum())
     return n * math.log(fit.cost / n) + len(fit.effect_values) * math.log(n)
 
 

@@ -1,12 +1,12 @@
-"""The posterior over explanations: sets of effects, with something unknown at one place beside them or nowhere.
+"""Posterior over hypotheses: a set of effects, with or without an unknown discrepancy at one place.
 
     log weight(S)    = log evidence of S
-    log weight(S, p) = log evidence of S + what a free discrepancy at p gains beside it + log odds of an unknown there
+    log weight(S, p) = log evidence of S + gain of a free discrepancy at p + log odds of an unknown there
 
-each under the noise that is most likely beside it (gap/evidence.py, gap/where/localization.py). No library has the
-exact law of anything (Brynjarsdottir and O'Hagan, 2014): a discrepancy at a place where S has an effect, and small
-beside what that effect does, belongs to the effect, and its weight goes to S. A large one means that the law there is
-another one: then the effects at that place are part of the unknown.
+each under its most likely disturbance noise (`marginal_likelihood.py`, `localization/localize.py`). No library has the
+exact law of a rig (Brynjarsdottir and O'Hagan, 2014). A discrepancy at a place where S has an effect, and small
+compared with it, is therefore attributed to the effect, and its weight goes to S. A large one means that the law there
+is a different one: then the effects at that place are part of the unknown.
 """
 
 from __future__ import annotations
@@ -17,23 +17,24 @@ from dataclasses import dataclass
 
 from fdi_torch.estimate.evidence import ODDS, RARE, posterior
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.fitting import Fit, Fitter
+from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.library import canonical
-from fdi_torch.gap.search import Explanation, Judged, Search
-from fdi_torch.gap.where.localization import Place, localized
+from fdi_torch.gap.localization.localize import LocalizedDiscrepancy, localize
+from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, SearchResult
 from fdi_torch.plant.description import PlantDescription
 
 
 @dataclass(frozen=True)
-class Hypothesis:
-    """An explanation with an unknown discrepancy beside it, or without. causes: as the fit places them, without those
-    that the unknown replaces. weight: log of the posterior, not normalised.
+class CauseHypothesis:
+    """An explanation with or without an unknown discrepancy.
+
+    causes: effects of the explanation, without those that the unknown replaces. weight: log posterior, not normalised.
     """
 
-    explanation: Explanation
+    explanation: RankedExplanation
     causes: tuple[CauseName, ...]
     weight: float
-    place: Place | None = None
+    place: LocalizedDiscrepancy | None = None
 
     @property
     def unknown_at(self) -> str | None:
@@ -46,40 +47,42 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Posterior:
-    """hypotheses: the likeliest first, with their probabilities. unexamined: the share of what was never fitted.
-    places: marginal probability that something is wrong there, the likeliest first.
-    """
+    """hypotheses: the likeliest first, with their probabilities. unexamined: probability of all that was not fitted.
+    places: marginal probability of a cause at each place, the likeliest first."""
 
-    hypotheses: tuple[Hypothesis, ...]
+    hypotheses: tuple[CauseHypothesis, ...]
     probabilities: tuple[float, ...]
     unexamined: float
     places: tuple[tuple[str, float], ...]
 
     @property
-    def best(self) -> Hypothesis:
+    def best(self) -> CauseHypothesis:
         return self.hypotheses[0]
 
-    def content(self, level: float) -> tuple[Hypothesis, ...]:
-        """The fewest hypotheses that hold so much together of what was examined."""
-        held, kept = 0.0, []
+    def credible_set(self, level: float) -> tuple[CauseHypothesis, ...]:
+        """The smallest set of hypotheses with this share of the examined probability."""
+        total, hypotheses = 0.0, []
         for hypothesis, probability in zip(self.hypotheses, self.probabilities, strict=True):
-            kept.append(hypothesis)
-            held += probability
-            if held >= level * (1.0 - self.unexamined):
+            hypotheses.append(hypothesis)
+            total += probability
+            if total >= level * (1.0 - self.unexamined):
                 break
-        return tuple(kept)
+        return tuple(hypotheses)
 
 
-def weighed(
-    judged: Judged, found: Search, plant: PlantDescription, places: Sequence[str], named_only: bool
+def posterior_of(
+    pool: ExplanationPool, result: SearchResult, plant: PlantDescription, places: Sequence[str], named_only: bool
 ) -> Posterior:
-    """judged: what the search has judged, which may grow. named_only: without any unknown."""
-    hypotheses = [Hypothesis(e, in_order(e.fit), e.log_evidence) for e in found.explanations]
+    """Posterior over the explanations of a search, with and without an unknown discrepancy at each place.
+
+    pool: pool of the evaluated explanations, which may grow. named_only: without unknown discrepancies.
+    """
+    hypotheses = [CauseHypothesis(e, causes_in_order(e.fit), e.log_evidence) for e in result.explanations]
     if not named_only:
-        for explanation in {e.key: e for e in (found.best, found.null)}.values():
-            hypotheses += _beside(judged, found, explanation, places, len(places), _best(hypotheses))
-        hypotheses += _pruned(judged, found, _best(hypotheses), len(places))
-    best: dict[tuple[frozenset[CauseName], str | None], Hypothesis] = {}
+        for explanation in {e.key: e for e in (result.best, result.null)}.values():
+            hypotheses += _with_unknowns(pool, result, explanation, places, len(places), _likeliest(hypotheses))
+        hypotheses += _with_fewer_effects(pool, result, _likeliest(hypotheses), len(places))
+    best: dict[tuple[frozenset[CauseName], str | None], CauseHypothesis] = {}
     for h in hypotheses:
         key = frozenset(canonical(c, plant) for c in h.causes), h.unknown_at
         if key not in best or h.weight > best[key].weight:
@@ -87,65 +90,78 @@ def weighed(
     ranked = sorted(best.values(), key=lambda h: -h.weight)
     weights = [h.weight for h in ranked]
     *probabilities, unexamined = posterior(
-        [*weights, found.best.log_evidence + math.log(max(found.unexamined, 1e-300))]
+        [*weights, result.best.log_evidence + math.log(max(result.unexamined, 1e-300))]
     )
-    return Posterior(tuple(ranked), tuple(probabilities), unexamined, _guilty(ranked, probabilities, places))
+    return Posterior(tuple(ranked), tuple(probabilities), unexamined, _marginals(ranked, probabilities, places))
 
 
-def _best(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
+def _likeliest(hypotheses: Sequence[CauseHypothesis]) -> CauseHypothesis:
     return max(hypotheses, key=lambda h: h.weight)
 
 
-def _beside(
-    judged: Judged, found: Search, explanation: Explanation, at: Sequence[str], places: int, best: Hypothesis
-) -> list[Hypothesis]:
-    """Something unknown at some of the places beside an explanation, where it could matter beside the best."""
+def _with_unknowns(
+    pool: ExplanationPool,
+    result: SearchResult,
+    explanation: RankedExplanation,
+    at: Sequence[str],
+    places: int,
+    best: CauseHypothesis,
+) -> list[CauseHypothesis]:
+    """An explanation with an unknown discrepancy at each of some places, as far as relevant against the best."""
     needed = best.weight + math.log(RARE) - explanation.log_evidence - math.log(ODDS.unknown / places)
-    found_there = localized(explanation.fitter, explanation.fit, explanation.noise, at, needed)
-    return [_with_unknown(judged.fitter, found, explanation, place, places) for place in found_there]
+    discrepancies = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed)
+    return [_with_unknown(pool.fitter, result, explanation, place, places) for place in discrepancies]
 
 
-def _with_unknown(fitter: Fitter, found: Search, explanation: Explanation, place: Place, places: int) -> Hypothesis:
-    causes = in_order(explanation.fit)
+def _with_unknown(
+    fitter: Fitter, result: SearchResult, explanation: RankedExplanation, place: LocalizedDiscrepancy, places: int
+) -> CauseHypothesis:
+    """An explanation with a discrepancy at one place, which is attributed to an effect there if it is small."""
+    causes = causes_in_order(explanation.fit)
     here = [c for c in causes if c[1] == place.location]
     weight = explanation.log_evidence + place.gain
-    if here and _small(fitter, found, explanation, place):
-        return Hypothesis(explanation, causes, weight)
+    if here and _is_small(fitter, result, explanation, place):
+        return CauseHypothesis(explanation, causes, weight)
     weight += math.log(ODDS.unknown / places)
-    return Hypothesis(explanation, tuple(c for c in causes if c not in here), weight, place)
+    return CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight, place)
 
 
-def _small(fitter: Fitter, found: Search, explanation: Explanation, place: Place) -> bool:
-    """Whether a discrepancy is small beside what the explanation's effects at its place do to the readings."""
-    rest = frozenset(c for c in explanation.key if c[1] != place.location)
-    without = min((e for e in found.explanations if e.key <= rest), key=lambda e: _cost(fitter, e.fit))
-    closed = _cost(fitter, without.fit) - _cost(fitter, explanation.fit)
-    return place.size < ODDS.discrepancy * math.sqrt(max(closed, 0.0))
+def _is_small(
+    fitter: Fitter, result: SearchResult, explanation: RankedExplanation, place: LocalizedDiscrepancy
+) -> bool:
+    """Whether a discrepancy is small compared with the influence of the explanation's effects at its place."""
+    elsewhere = frozenset(c for c in explanation.key if c[1] != place.location)
+    without = min((e for e in result.explanations if e.key <= elsewhere), key=lambda e: _cost(fitter, e.fit))
+    reduction = _cost(fitter, without.fit) - _cost(fitter, explanation.fit)
+    return place.size < ODDS.discrepancy * math.sqrt(max(reduction, 0.0))
 
 
 def _cost(fitter: Fitter, fit: Fit) -> float:
-    return float(fitter.white(fit.near)[0].square().sum())
+    return float(fitter.white(fit.linearised)[0].square().sum())
 
 
-def _pruned(judged: Judged, found: Search, best: Hypothesis, places: int) -> list[Hypothesis]:
-    """Fewer effects: one may only have stood in for the unknown, or for what the law of another effect gets wrong."""
-    kept: list[Hypothesis] = []
+def _with_fewer_effects(
+    pool: ExplanationPool, result: SearchResult, best: CauseHypothesis, places: int
+) -> list[CauseHypothesis]:
+    """Hypotheses with fewer effects: an effect may only have compensated the unknown, or a wrong law of another."""
+    accepted: list[CauseHypothesis] = []
     while len(best.fit.key) > (0 if best.place else 1):
-        tried = []
+        trials = []
         for cause in best.fit.key:
-            rest = judged.without(best.explanation, cause)
-            at = [best.place.location] if best.place else list(dict.fromkeys(place for _, place in rest.key))
-            tried += _beside(judged, found, rest, at, places, best)
-        kept += tried
-        if not tried or _best(tried).weight <= best.weight:
+            reduced = pool.without(best.explanation, cause)
+            at = [best.place.location] if best.place else list(dict.fromkeys(place for _, place in reduced.key))
+            trials += _with_unknowns(pool, result, reduced, at, places, best)
+        accepted += trials
+        if not trials or _likeliest(trials).weight <= best.weight:
             break
-        best = _best(tried)
-    return kept
+        best = _likeliest(trials)
+    return accepted
 
 
-def _guilty(
-    ranked: Iterable[Hypothesis], probabilities: Iterable[float], places: Sequence[str]
+def _marginals(
+    ranked: Iterable[CauseHypothesis], probabilities: Iterable[float], places: Sequence[str]
 ) -> tuple[tuple[str, float], ...]:
+    """Marginal probability of a cause at each place, the likeliest first."""
     share = dict.fromkeys(places, 0.0)
     for h, probability in zip(ranked, probabilities, strict=True):
         for at in {place for _, place in h.causes} | ({h.unknown_at} if h.unknown_at else set()):
@@ -153,6 +169,6 @@ def _guilty(
     return tuple(sorted(share.items(), key=lambda item: -item[1]))
 
 
-def in_order(fit: Fit) -> tuple[CauseName, ...]:
-    """The causes of a fit as it places them."""
+def causes_in_order(fit: Fit) -> tuple[CauseName, ...]:
+    """The causes of a fit in the order of its placements."""
     return tuple((p.effect.name, p.location) for p in fit.candidate.placements)

@@ -1,4 +1,4 @@
-"""What a reader of the answer has to know beside it, one sentence each."""
+"""Remarks on an answer, one sentence each: doubts about the inputs, the plant file, the parameters, the hold-outs."""
 
 from __future__ import annotations
 
@@ -10,93 +10,91 @@ from typing import Any
 import torch
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.ceiling import guilty_places
-from fdi_torch.gap.closure import HeldOut
-from fdi_torch.gap.finding import Finding
-from fdi_torch.gap.freeform import shape_of
-from fdi_torch.gap.same_rig import other_rig
-from fdi_torch.gap.strays import Strays
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
+from fdi_torch.gap.channel_noise import low_frequency_excess
+from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_square
+from fdi_torch.gap.free_form import discrepancy_tables
+from fdi_torch.gap.holdout import HeldOut
+from fdi_torch.gap.model_comparison import causal_places
+from fdi_torch.gap.preprocess.outliers import SensorOutliers
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recordings.check import data_warnings
 
-AT_END = 1e-3  # of a parameter's range
-SHOWN_TIMES = 5  # of strays
-WORSE = 1.1  # times the error of the recalibrated plant
-SWINGS = 0.03  # amplitude of an oscillation worth a word, as a share of the free form's scale
+AT_END = 1e-3  # of a parameter's range: distance from a bound
+SHOWN_TIMES = 5  # outliers whose times are listed
+WORSE = 1.1  # error of the free form over that of the recalibrated plant
+SWINGS = 0.03  # smallest amplitude of an oscillation, as a share of the free form's scale
 
 
-def remarks_on(found: Finding, held: Sequence[HeldOut]) -> list[str]:
-    """Of the inputs, the plant file, the parameters found, and the hold-outs."""
-    subject = found.fitter.subject
+def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
+    """Remarks on the inputs, the plant file, the fitted parameters, and the hold-outs."""
+    data = result.fitter.data
     remarks: list[str] = []
-    remarks += dict.fromkeys(s for part in subject.parts for s in data_warnings(part.recording, subject.plant))
-    inputs = [column for part in subject.parts for column in part.recording.inputs.T]
+    remarks += dict.fromkeys(s for part in data.parts for s in data_warnings(part.recording, data.plant))
+    inputs = [column for part in data.parts for column in part.recording.inputs.T]
     if all(float(torch.diff(column).abs().max()) == 0.0 for column in inputs):
         remarks.append(
-            "the inputs never change, so that most effects cannot be told from another or from a constant within its "
-            "tolerance; `fdi gap --plan` with inputs that step shows what they would tell"
+            "the inputs never change, so that most effects cannot be distinguished from each other or from a constant "
+            "within its tolerance; test inputs with steps by `fdi gap --plan`, then record again"
         )
-    if not subject.plant.tolerances:
+    if not data.plant.tolerances:
         remarks.append(
-            "the plant file lists no tolerances, so that every constant is taken to be exact and what is a little off "
+            "the plant file lists no tolerances, so that every constant counts as exact and a small error of one "
             "looks like an effect; list them under tolerances, as in P13.discharge_coefficient: 3 %"
         )
-    if not found.best.converged:
+    if not result.best.converged:
         remarks.append(
             "the fit of the likeliest explanation has not converged: its sizes may be off by more than their standard "
-            "errors; a longer recording, or --library with fewer effects, may settle it"
+            "errors; use a longer recording, or fewer effects by --library"
         )
-    remarks += [_astray(s) for group in found.strays for s in group]
-    remarks += [*_believed_outside(subject.plant), *_at_their_ends(found), *_period(found)]
-    remarks += [_carries_nothing(found, h) for h in held if found.unnamed and _worse(h)]
-    return remarks + [sentence for h in held if (sentence := other_rig(found, h))]
+    remarks += [_masked_outliers(s) for group in result.outliers for s in group]
+    remarks += [*_nominal_values_out_of_range(data.plant), *_values_at_bounds(result), *_periods(result)]
+    remarks += [_free_form_fails(result, h) for h in held if result.free_form_fit and _free_form_is_worse(h)]
+    return remarks + [sentence for h in held if (sentence := rig_difference(result, h))]
 
 
-def _astray(strays: Strays) -> str:
-    """How many readings of a sensor were left out, and when."""
-    at = [f"{a:.6g}" if a == b else f"{a:.6g} to {b:.6g}" for a, b in (s.times for s in strays.each)]
+def _masked_outliers(outliers: SensorOutliers) -> str:
+    """How many readings of a sensor are masked, and when they occurred."""
+    at = [f"{a:.6g}" if a == b else f"{a:.6g} to {b:.6g}" for a, b in (s.times for s in outliers.each)]
     when = ", ".join(at[:SHOWN_TIMES]) + (f" s and {len(at) - SHOWN_TIMES} more" if len(at) > SHOWN_TIMES else " s")
-    count = f"{strays.samples} reading" + ("s" if strays.samples > 1 else "")
-    source = Path(strays.source).name or "the recording"
-    return (
-        f"{count} of {strays.sensor} in {source} jump away and back, or stand still, as no tank can; left out of all "
-        f"fits ({when})"
-    )
+    count = f"{outliers.samples} reading" + ("s" if outliers.samples > 1 else "")
+    source = Path(outliers.source).name or "the recording"
+    return f"{count} of {outliers.sensor} in {source}: outliers or stuck, masked in all fits ({when})"
 
 
-def _worse(held: HeldOut) -> bool:
-    """Whether the free form runs farther from a hold-out than the recalibrated plant does."""
+def _free_form_is_worse(held: HeldOut) -> bool:
+    """Whether the free form predicts a hold-out worse than the recalibrated plant."""
     with_form, without = (float((held.weight * held.squares(m)).sum()) for m in ("augmented", "recalibrated"))
     return with_form > WORSE**2 * without
 
 
-def _carries_nothing(found: Finding, held: HeldOut) -> str:
-    """What a free form says that fails on a hold-out."""
-    source = Path(held.subject.recording.source).name or "the hold-out"
+def _free_form_fails(result: DiagnosisResult, held: HeldOut) -> str:
+    """The remark on a free form that fails on a hold-out."""
+    source = Path(held.data.recording.source).name or "the hold-out"
     return (
-        f"the free function that stands for what is unknown at {' and '.join(guilty_places(found))} does worse on "
-        f"{source} than none: what is missing there keeps a memory or has times of its own, or goes beyond what the "
-        "recording shows; take the place from this answer, not the function"
+        f"the free function for the unknown discrepancy at {' and '.join(causal_places(result))} "
+        f"predicts {source} worse than the recalibrated plant: the discrepancy has memory, depends on time, or lies "
+        "outside the recorded range; use the place from this answer, but not the function"
     )
 
 
-def _period(found: Finding) -> list[str]:
-    """Whether what has no name comes and goes by itself."""
-    shape: Any = shape_of(found.unnamed)["tables"] if found.unnamed else {}
+def _periods(result: DiagnosisResult) -> list[str]:
+    """Oscillations of an unknown discrepancy."""
+    shape: Any = discrepancy_tables(result.free_form_fit)["tables"] if result.free_form_fit else {}
     waves = [(t["at"][0], t["share"][0]) for name, t in shape.items() if name.endswith(".period")]
     return [
-        f"what is unknown at {place} comes and goes with a period of {period:.3g} s; its phase belongs to each "
-        "recording's own clock, so that it closes nothing on a hold-out"
-        for place in guilty_places(found)
+        f"the unknown discrepancy at {place} oscillates with a period of {period:.3g} s; its phase differs between "
+        "recordings, so that it explains nothing of a hold-out"
+        for place in causal_places(result)
         for period, share in waves
         if share > SWINGS
     ]
 
 
-def _believed_outside(plant: PlantDescription) -> list[str]:
-    """Parameters of the plant file's own effects that lie outside their sensible range."""
-    told = []
+def _nominal_values_out_of_range(plant: PlantDescription) -> list[str]:
+    """Effect parameters of the plant file outside their sensible range."""
+    remarks = []
     for placed in plant.effects:
         for p in effect(placed.effect).parameters(placed.location, plant):
             value, (unit, scale) = placed.parameters.get(p.name, p.nominal), display_unit(p.unit)
@@ -105,25 +103,80 @@ def _believed_outside(plant: PlantDescription) -> list[str]:
                     f"{placed.location}.{placed.effect}.{p.name}",
                     f"{scale * p.low:.4g} to {scale * p.high:.4g}",
                 )
-                told.append(
+                remarks.append(
                     f"the plant file has {name} at {scale * value:.4g} {unit}".rstrip()
                     + f", outside its sensible range ({ends} {unit}".rstrip()
-                    + "): all that is found rests on it"
+                    + "), which affects all results; check it"
                 )
-    return told
+    return remarks
 
 
-def _at_their_ends(found: Finding) -> list[str]:
-    """Parameters that were stopped by the end of their sensible range."""
-    told, fit = [], found.named
+def _values_at_bounds(result: DiagnosisResult) -> list[str]:
+    """Fitted parameters that reached a bound of their sensible range."""
+    remarks, fit = [], result.effects_fit
     for name, value in fit.effect_values.items():
         parameter, (unit, scale) = fit.space[name], display_unit(fit.space[name].unit)
         width = parameter.high - parameter.low
         ends = [e for e in (parameter.low, parameter.high) if math.isfinite(e) and e != parameter.nominal]
-        near = [e for e in ends if abs(value - e) < AT_END * (width if math.isfinite(width) else abs(e))]
-        if near:
-            end = f"{scale * near[0]:.4g} {unit}".rstrip()
-            told.append(
-                f"{name} would lie at the end of its sensible range ({end}): that effect alone is hardly the cause"
+        reached = [e for e in ends if abs(value - e) < AT_END * (width if math.isfinite(width) else abs(e))]
+        if reached:
+            end = f"{scale * reached[0]:.4g} {unit}".rstrip()
+            remarks.append(
+                f"{name} is at the bound of its sensible range ({end}): that effect alone is probably not the cause"
             )
-    return told
+    return remarks
+
+
+OPEN_SHARE, OPEN_LEAST = 0.2, 200.0  # unexplained share of the hold-out's gap, and chi-square, that require a refit
+REFIT_EXPLAINS = 0.3  # share of the unexplained chi-square that a successful refit may leave
+DIFFERENT = 5.0  # standard errors
+
+
+def rig_difference(result: DiagnosisResult, held: HeldOut) -> str | None:
+    """Whether the hold-out is of another rig, in one sentence, or None.
+
+    If the best explanation leaves much of the hold-out unexplained, its causes and constants are fitted to the
+    hold-out. If that succeeds, the sentence names what differs; otherwise the hold-out has a further cause.
+    """
+    if result.free_form_fit or not result.explained:
+        return None
+    mask, noise = held.data.mask, held.noise
+    white = noise.whiten(held.data.readings - held.runs["augmented"], mask)
+    unexplained = low_frequency_excess(white)
+    gap = low_frequency_excess(noise.whiten(held.data.readings - held.runs["recalibrated"], mask))
+    if unexplained < max(OPEN_SHARE * gap, OPEN_LEAST):
+        return None
+    fitter = Fitter(held.data, noise)
+    refit = fitter.fit(Candidate(result.best.candidate.placements, (result.best.effect_values,)))
+    source = held.data.recording.source or "the hold-out"
+    changed = (
+        _changed(result, fitter, refit) if unexplained_chi_square(fitter, refit) < REFIT_EXPLAINS * unexplained else []
+    )
+    if changed:
+        needed = ", ".join(changed[:3])
+        return (
+            f"{source} needs other constants than the recording ({needed}): it is of another rig, or the rig was "
+            "changed in between; its closure is not meaningful"
+        )
+    return (
+        f"the explanation of the recording does not explain {source}, whatever the constants: the hold-out has a "
+        "further cause, or it is of another rig"
+    )
+
+
+def _changed(result: DiagnosisResult, fitter: Fitter, refit: Fit) -> list[str]:
+    """Parameters that differ by many standard errors, the largest first: 'P13.discharge_coefficient 0.66, not 0.6'."""
+    before, after = result.best.values, refit.values
+    errors = standard_errors(result.fitter, result.best), standard_errors(fitter, refit)
+    distance = {
+        n: abs(after[n] - before[n]) / max(math.hypot(errors[0][n], errors[1][n]), 1e-300)
+        for n in after
+        if not n.endswith(".start_level")
+    }
+    names = sorted((n for n in distance if distance[n] > DIFFERENT), key=lambda n: -distance[n])
+    return [f"{n} {_shown(after[n], refit, n)}, not {_shown(before[n], refit, n)}" for n in names]
+
+
+def _shown(value: float, fit: Fit, name: str) -> str:
+    unit, scale = display_unit(fit.space[name].unit)
+    return f"{scale * value:.4g} {unit}".rstrip()

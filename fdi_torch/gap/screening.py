@@ -1,8 +1,9 @@
-"""What each effect would do to the readings, to first order along a trajectory, all effects and starts at once.
+"""First-order screening: which chi-square each effect of the library could explain in addition to a fit.
 
-An effect changes the rates by w_k = f(effect) - f(without) along the fitted trajectory (`gap/forcing.py`), at the size
-of a start and not by a slope at zero, so that dead zones and thresholds show too. The linearised plant turns w into
-readings, and a regression beside the nuisances gives the chi-square that each could close.
+An effect changes the level rates by w_k = f(with effect) - f(without) along the fitted trajectory (`forcing.py`). The
+size of the effect is that of a start, not a slope at zero, so that dead zones and thresholds are visible. The
+linearised plant maps w to readings, and a regression with the nuisance parameters projected out gives the gain of each
+effect.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.fitting import Fit, Fitter
+from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.forcing import Forcing
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.effect import Placement, Stage
@@ -24,12 +25,12 @@ from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
 from fdi_torch.simulate.scan import scan_in_time
 
 Start = Mapping[str, float]
-AT_ONCE = 256  # options whose columns are in memory together
+BATCH = 256  # options whose columns are in memory together
 
 
 @dataclass(frozen=True)
 class Option:
-    """One effect at one place from one start (full names, SI)."""
+    """One effect at one place with one start (full names, SI)."""
 
     placement: Placement
     start: Start
@@ -42,55 +43,60 @@ class Option:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Of each effect at each place the start that shows most, and the one that closes most: score (M,), gram (M, M) as
-    in `Screen`."""
+    """Regression on pairs of effects: of each effect at each place, the most visible start and the one with the largest
+    gain.
+
+    score (M,), gram (M, M) as in `ScreeningResult`.
+    """
 
     options: tuple[Option, ...]
     score: Tensor
     gram: Tensor
 
     def gain(self) -> Tensor:
-        """(M, M): chi-square closed by two together; 0 where one of them would have to turn round."""
+        """Reduction of chi-square by two options together (M, M); 0 if one of them had to have a negative size."""
         g, b = torch.diagonal(self.gram), self.score
         det = g.unsqueeze(0) * g.unsqueeze(1) - self.gram**2
         first = b.unsqueeze(1) * g.unsqueeze(0) - self.gram * b.unsqueeze(0)
-        fine = (det > 1e-3 * g.unsqueeze(0) * g.unsqueeze(1)) & (first > 0) & (first.T > 0)
+        valid = (det > 1e-3 * g.unsqueeze(0) * g.unsqueeze(1)) & (first > 0) & (first.T > 0)
         gain = (b.unsqueeze(1) * first + b.unsqueeze(0) * first.T) / det.clamp(min=1e-300)
-        return torch.where(fine, gain, 0.0)
+        return torch.where(valid, gain, 0.0)
 
 
 @dataclass(frozen=True)
-class Screen:
-    """What options would close beside a fit: with their columns C, less the nuisances' part, and what the fit leaves r,
-    score (M,) = C'r and strength (M,), the diagonal of C'C."""
+class ScreeningResult:
+    """Regression of a residual r on the column C of each option, with the nuisance parameters projected out.
+
+    score (M,) = C'r; strength (M,) = diagonal of C'C.
+    """
 
     options: tuple[Option, ...]
     score: Tensor
     strength: Tensor
-    found_pairs: Pairs | None = None
+    computed_pairs: Pairs | None = None
 
     @property
     def pairs(self) -> Pairs:
-        """Raises ValueError where they were not asked for."""
-        if self.found_pairs is None:
+        """Raises ValueError if the pairs were not computed."""
+        if self.computed_pairs is None:
             raise ValueError("expected a screen with pairs, got one without; ask `screen` for them")
-        return self.found_pairs
+        return self.computed_pairs
 
     @property
     def size(self) -> Tensor:
-        """(M,): by how much the start is to be multiplied."""
+        """The factor (M,) by which each start would be multiplied."""
         return self.score / self.strength.clamp(min=1e-300)
 
     @property
     def gain(self) -> Tensor:
-        """(M,): chi-square closed by each alone; 0 where only the opposite would help, or nothing is seen."""
+        """Reduction of chi-square by each option alone (M,); 0 if its size had to be negative or nothing is visible."""
         strength = self.strength
         return torch.where((self.score > 0) & (strength > 1e-6), self.score**2 / strength.clamp(min=1e-300), 0.0)
 
 
 def options_of(placements: Sequence[Placement], fitter: Fitter, reach: OperatingRange) -> list[Option]:
     """All starts of all placements."""
-    plant = fitter.subject.plant
+    plant = fitter.data.plant
     return [
         Option(p, {f"{p.prefix}.{name}": value for name, value in start.items()}, parameters)
         for p in placements
@@ -99,107 +105,115 @@ def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Operating
     ]
 
 
-def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], pairs: bool = True) -> Screen:
-    """All options about a fit, beside its own parameters with their priors. pairs: whether to say what pairs do."""
-    beside = _Beside.of(fitter, fit)
-    found = [beside.screened(options[k : k + AT_ONCE]) for k in range(0, len(options), AT_ONCE)]
-    score, strength = (torch.cat([f[k] for f in found]) if found else torch.zeros(0).double() for k in range(2))
-    whole = Screen(tuple(options), score, strength)
-    return replace(whole, found_pairs=beside.pairs(whole)) if pairs else whole
+def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], pairs: bool = True) -> ScreeningResult:
+    """Screen all options about a fit. pairs: whether to compute the regression on pairs as well."""
+    regression = _ProjectedRegression.of(fitter, fit)
+    batches = [regression.screened(options[k : k + BATCH]) for k in range(0, len(options), BATCH)]
+    score, strength = (torch.cat([f[k] for f in batches]) if batches else torch.zeros(0).double() for k in range(2))
+    whole = ScreeningResult(tuple(options), score, strength)
+    return replace(whole, computed_pairs=regression.pairs(whole)) if pairs else whole
 
 
 @dataclass(frozen=True)
-class _Beside:
-    """A regression beside the parameters of a fit. left (S, C): its whitened residual without what they can do; basis
-    (S, C, P) of that."""
+class _ProjectedRegression:
+    """A regression with the parameters of a fit projected out.
+
+    remaining (S, C): whitened residual after the projection. basis (S, C, P): orthonormal basis of the parameters'
+    influence.
+    """
 
     fitter: Fitter
     fit: Fit
-    left: Tensor
+    remaining: Tensor
     basis: Tensor
 
     @staticmethod
-    def of(fitter: Fitter, fit: Fit) -> _Beside:
-        residual, jacobian = (x[0] for x in fitter.white(fit.near))
-        scale, pull, off = fitter.priors(fit.space, fit.theta)
-        # The priors' rows of the columns are zero: no constant's tolerance speaks of an effect.
-        rows = torch.diag(pull), 1e-6 * torch.eye(len(pull), dtype=pull.dtype)
+    def of(fitter: Fitter, fit: Fit) -> _ProjectedRegression:
+        residual, jacobian = (x[0] for x in fitter.white(fit.linearised))
+        scale, weight, deviation = fitter.priors(fit.space, fit.theta)
+        # Effects have no rows in the priors of the constants.
+        rows = torch.diag(weight), 1e-6 * torch.eye(len(weight), dtype=weight.dtype)
         q, _ = torch.linalg.qr(torch.cat([(jacobian * scale).flatten(0, 1), *rows]))
-        r = torch.cat([residual.flatten(), -off, torch.zeros_like(off)])
-        seen = residual.numel()
-        left = (r - q @ (q.T @ r))[:seen]
-        return _Beside(fitter, fit, left.reshape(residual.shape), q[:seen].reshape(*residual.shape, -1))
+        r = torch.cat([residual.flatten(), -deviation, torch.zeros_like(deviation)])
+        count = residual.numel()
+        remaining = (r - q @ (q.T @ r))[:count]
+        return _ProjectedRegression(
+            fitter, fit, remaining.reshape(residual.shape), q[:count].reshape(*residual.shape, -1)
+        )
 
     def screened(self, options: Sequence[Option]) -> tuple[Tensor, Tensor]:
-        """Score and strength, (M,) each."""
+        """Score and strength of options, (M,) each."""
         columns = effect_columns(self.fitter, self.fit, options)
         score, strength = columns.new_zeros(2, len(options)).unbind()
         shared = columns.new_zeros(len(options), self.basis.shape[-1])
         for c in range(columns.shape[1]):
-            own = columns[:, c].T
-            score += own @ self.left[:, c]
-            strength += torch.linalg.vecdot(own, own)
-            shared += own @ self.basis[:, c]
+            channel_columns = columns[:, c].T
+            score += channel_columns @ self.remaining[:, c]
+            strength += torch.linalg.vecdot(channel_columns, channel_columns)
+            shared += channel_columns @ self.basis[:, c]
         return score, strength - torch.linalg.vecdot(shared, shared)
 
-    def pairs(self, found: Screen) -> Pairs:
+    def pairs(self, screening: ScreeningResult) -> Pairs:
+        """The regression on pairs of the most promising options."""
         chosen: set[int] = set()
-        for value in (found.strength, found.gain):
+        for value in (screening.strength, screening.gain):
             best: dict[tuple[str, str], int] = {}
             for i in torch.argsort(value, descending=True).tolist():
-                best.setdefault(found.options[i].cause, i)
+                best.setdefault(screening.options[i].cause, i)
             chosen |= set(best.values())
-        kept = sorted(chosen)
-        options = tuple(found.options[i] for i in kept)
+        indices = sorted(chosen)
+        options = tuple(screening.options[i] for i in indices)
         columns = effect_columns(self.fitter, self.fit, options).permute(1, 0, 2)
         shared = (columns.mT @ self.basis.permute(1, 0, 2)).sum(dim=0)
         gram = (columns.mT @ columns).sum(dim=0) - shared @ shared.T
-        return Pairs(options, found.score[kept], gram)
+        return Pairs(options, screening.score[indices], gram)
 
 
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:
-    """(S, C, M): whitened changes of the readings at the size of each start."""
-    own = fitter.engine(fit.candidate, list(fit.effect_values))
+    """Whitened changes of the readings (S, C, M) for each start."""
+    engine = fitter.engine(fit.candidate, list(fit.effect_values))
     pieces = (
-        own.apart(fit.theta.unsqueeze(0), fit.near)
-        if isinstance(own, JointCollocation)
-        else [(own, fit.theta, fit.near)]
+        engine.apart(fit.theta.unsqueeze(0), fit.linearised)
+        if isinstance(engine, JointCollocation)
+        else [(engine, fit.theta, fit.linearised)]
     )
     columns = with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
     return fitter.whiten(columns)
 
 
 def _columns(
-    fitter: Fitter, fit: Fit, options: Sequence[Option], own: Collocation, theta: Tensor, near: Linearised
+    fitter: Fitter, fit: Fit, options: Sequence[Option], engine: Collocation, theta: Tensor, linearised: Linearised
 ) -> Tensor:
-    """(S, C, M) of one recording."""
-    experiment = own.experiment
+    """Changes of the readings (S, C, M) of one recording."""
+    experiment = engine.experiment
     tried = {o.placement.prefix: o.placement for o in options}
     union = fitter.network([*(p for p in fit.candidate.placements if p.prefix not in tried), *tried.values()])
-    values = zip(own.space.names, theta.flatten().tolist(), strict=True)
-    known = {n: v for n, v in values if n in union.constants}
+    values = zip(engine.space.names, theta.flatten().tolist(), strict=True)
+    constants = {n: v for n, v in values if n in union.constants}
     theta = theta.reshape(1, -1)
-    present = {p.prefix for p in own.network.placements} - tried.keys()
-    forced = Forcing(union, present, union.bind(*_named(union, known)), near.levels[0].T.contiguous(), experiment)
+    present = {p.prefix for p in engine.network.placements} - tried.keys()
+    forcing_model = Forcing(
+        union, present, union.bind(*_named(union, constants)), linearised.levels[0].T.contiguous(), experiment
+    )
     groups = _groups(options)
     moving = [i for group in groups if options[group[0]].placement.effect.stage is not Stage.READING for i in group]
-    sensors, count = len(fitter.subject.plant.sensors), len(options)
+    sensors, count = len(fitter.data.plant.sensors), len(options)
     columns = theta.new_zeros(sensors, count, len(experiment.sample_times))
-    forcing = theta.new_zeros(1, near.levels.shape[-1], len(moving), len(experiment.steps))
+    forcing = theta.new_zeros(1, linearised.levels.shape[-1], len(moving), len(experiment.steps))
     row = {option: k for k, option in enumerate(moving)}
     for group in groups:
         placement = options[group[0]].placement
         starts = _starts([options[i] for i in group])
         if placement.effect.stage is Stage.READING:
-            columns[:, group] = forced.readings(placement, starts)
+            columns[:, group] = forcing_model.readings(placement, starts)
         else:
             first = row[group[0]]
-            forcing[0, :, first : first + len(group)] = forced.rates(placement, starts)
+            forcing[0, :, first : first + len(group)] = forcing_model.rates(placement, starts)
     if moving:
-        gain, transition = near.gain.permute(0, 2, 3, 1), near.transition.permute(0, 2, 3, 1)
-        still = forcing.new_zeros(1, forcing.shape[1], len(moving))
-        paths = scan_in_time(transition, forcing, still, gain)
-        columns[:, moving] = own.look(near.levels, theta).along(paths, [-1] * len(moving))[0]
+        gain, transition = linearised.gain.permute(0, 2, 3, 1), linearised.transition.permute(0, 2, 3, 1)
+        initial = forcing.new_zeros(1, forcing.shape[1], len(moving))
+        paths = scan_in_time(transition, forcing, initial, gain)
+        columns[:, moving] = engine.look(linearised.levels, theta).along(paths, [-1] * len(moving))[0]
     return columns.permute(2, 0, 1)
 
 
@@ -209,7 +223,7 @@ def _named(network: TankNetwork, values: Mapping[str, float]) -> tuple[Parameter
 
 
 def _starts(options: Sequence[Option]) -> dict[str, Tensor]:
-    """The parameters of options of one form by their short names, each (M, 1)."""
+    """Parameters of options with the same fitted names, by short name, (M, 1) each."""
     return {
         name.rpartition(".")[2]: torch.tensor([[o.start[name]] for o in options], dtype=torch.float64)
         for name in options[0].start
@@ -217,8 +231,8 @@ def _starts(options: Sequence[Option]) -> dict[str, Tensor]:
 
 
 def _groups(options: Sequence[Option]) -> list[list[int]]:
-    """Options that share a place, an effect and fitted parameters."""
-    found: dict[tuple[str, ...], list[int]] = {}
+    """Indices of options that share place, effect and fitted parameters."""
+    groups: dict[tuple[str, ...], list[int]] = {}
     for i, option in enumerate(options):
-        found.setdefault((option.placement.prefix, *sorted(option.start)), []).append(i)
-    return list(found.values())
+        groups.setdefault((option.placement.prefix, *sorted(option.start)), []).append(i)
+    return list(groups.values())

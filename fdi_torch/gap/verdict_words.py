@@ -1,6 +1,6 @@
-"""The verdict of a gap diagnosis in one sentence, and its explanations in words, for the terminal and the page alike.
+"""The verdict in one sentence, and explanations in words, for terminal and report pages.
 
-The answer is its JSON, of format 1 or 2, perhaps from a log that anyone may have written.
+The answer is its JSON in format 1 or 2, possibly from a log that anyone may have written.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Named = Mapping[str, Any]
 
 
 def causes_of(explanation: Named) -> list[Named]:
-    """What an item of the posterior holds. Format 1 says what is unknown in `unknown_at` alone."""
+    """The causes of an item of the posterior, something unknown included; format 1 has it in `unknown_at` only."""
     causes = [c for c in explanation.get("causes") or [] if isinstance(c, Mapping)]
     place = explanation.get("unknown_at")
     if place and not any(c.get("effect") == UNKNOWN for c in causes):
@@ -30,18 +30,22 @@ def cause_words(cause: Named) -> str:
 
 
 def explanation_words(causes: Sequence[Named]) -> str:
+    """'leak at T1 and pump_lag at Q1', or that nothing lies beyond tolerances."""
     return " and ".join(cause_words(c) for c in causes) or "nothing beyond tolerances"
 
 
 def probability_words(probability: float) -> str:
-    """No more digits than mean something: 'over 99.9 %', '97.2 %'."""
+    """A probability with significant digits only: 'over 99.9 %', '97.2 %'."""
     if probability >= 0.9995:
         return "over 99.9 %"
     return f"{100.0 * probability:.1f} %" if probability >= 0.001 else "under 0.1 %"
 
 
 def verdict_sentence(answer: Named, best: str = "") -> str:
-    """best: the likeliest explanation in words, perhaps with sizes; by default without. Empty without a verdict."""
+    """What causes the gap, and how sure that is. Empty without a verdict.
+
+    best: the likeliest explanation in words, for example with sizes; by default without.
+    """
     verdict = answer.get("verdict", "")
     first: Named = next(iter(answer.get("posterior") or []), {})
     probability = first.get("probability")
@@ -53,22 +57,22 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
         return f"The gap comes from {best}{chance}."
     if verdict == "ambiguous":
         count = len(answer.get("ambiguity_set") or [])
-        shared = f"There is a gap that {count} explanations share at 95 %" if count > 1 else "There is a gap"
-        rest = "" if count > 1 else _rest(answer)
+        plausible = f"{count} explanations are plausible at 95 %, " if count > 1 else ""
+        rest = "" if count > 1 else _unfitted(answer)
         certain = answer.get("certain") or []
-        surely = f" All that is likely holds {explanation_words(certain)}." if certain else ""
-        return f"{shared}; the likeliest is {best}{chance}{rest}.{surely}"
+        surely = f" Present with at least 95 %: {explanation_words(certain)}." if certain else ""
+        return f"There is a gap; {plausible}the likeliest is {best}{chance}.{rest}{surely}"
     if verdict != "unknown":
         return ""
     if causes_of(first):
-        return f"The gap comes from {best}{chance}; no effect of the library has the law that is there."
+        return f"The gap comes from {best}{chance}; no effect of the library describes it."
     place = next((str(w["location"]) for w in answer.get("where") or []), "a sensor")
-    return f"Readings of {place} jump or stand still as no tank makes them; beyond them the plant file holds."
+    return f"Readings of {place} are outliers or stuck; apart from these, the plant file explains the recording."
 
 
-def _rest(answer: Named) -> str:
-    """Why a single explanation does not suffice: what was not fitted may be likely."""
+def _unfitted(answer: Named) -> str:
+    """Why a single explanation does not suffice: others, which were not fitted, may be likely."""
     unexamined = answer.get("unexamined")
     if not isinstance(unexamined, int | float):
         return ""
-    return f"; explanations that were not fitted have {probability_words(unexamined)}"
+    return f" Explanations that were not fitted have {probability_words(unexamined)} together."

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Answer
-from fdi_torch.gap.case import PLAIN, Settings, case_of
-from fdi_torch.gap.diagnose import Tell, solved
+from fdi_torch.gap.diagnose import ProgressCallback, solve_problem
+from fdi_torch.gap.problem import PLAIN, Settings, problem_of
 from fdi_torch.jobs.log_paths import STARTS_OVER
 from fdi_torch.logbook import RunLog
 from fdi_torch.plant.description import PlantDescription
@@ -27,7 +27,7 @@ def run_gap(
     recording: Recording | Sequence[Recording],
     holdouts: Sequence[Recording] = (),
     settings: Settings = PLAIN,
-    tell: Tell = lambda share, text: None,
+    tell: ProgressCallback = lambda share, text: None,
     parent_run_id: str | None = None,
 ) -> Answer:
     """Diagnose the gap, and write the log `path`: recordings, progress messages and the answer."""
@@ -35,7 +35,7 @@ def run_gap(
     every = (*recordings, *holdouts)
     settings = replace(settings, trusted=settings.trusted or any(r.trusted for r in every))
     with one_thread():
-        case = case_of(plant, recordings, holdouts, settings)
+        case = problem_of(plant, recordings, holdouts, settings)
     sources = [{"path": r.source, "sha256": r.sha256} for r in every]
     config = {"settings": asdict(settings), "recordings": len(recordings)}
     text = dump_plant(plant)
@@ -57,7 +57,7 @@ def run_gap(
             tell(share, text)
 
         with one_thread():
-            answer = solved(case, say)
+            answer = solve_problem(case, say)
         log_answer(log, answer.to_dict(), answer.arrays)
     return answer
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.logged_config import logged_plant
-from fdi_torch.gap.diagnose import Settings, Tell
-from fdi_torch.gap.search import DEEPEST
+from fdi_torch.gap.diagnose import ProgressCallback, Settings
+from fdi_torch.gap.structure_search import DEEPEST
 from fdi_torch.jobs.gap import groups, run_gap
 from fdi_torch.jobs.logged_recordings import logged_recording
 from fdi_torch.logbook import LogError
@@ -20,7 +20,7 @@ SWITCHES = ("named_only", "trusted")
 KEYS = (*LISTS, *NUMBERS, *SWITCHES)
 
 
-def replay_gap(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
+def replay_gap(log: LoggedRun, path: Path, overrides: Iterable[str], tell: ProgressCallback, parent: str) -> None:
     """Repeat a diagnosis into the log `path`.
 
     overrides: changed settings, such as library=pump_lag,leak@T1, leave_out=pump_lag, step=0.5, named_only=true.

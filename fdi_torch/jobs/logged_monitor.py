@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.config.monitor_file import MonitorRun
-from fdi_torch.gap.acquisition import usable
+from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.monitor.diagnosability import diagnosability
 from fdi_torch.monitor.events import FORMAT, Event

@@ -18,8 +18,8 @@ from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.diagnose import Settings
-from fdi_torch.gap.prediction import START_SAMPLES, Prediction
-from fdi_torch.gap.prediction import predict as run_freely
+from fdi_torch.gap.free_runs.prediction import START_SAMPLES, Prediction
+from fdi_torch.gap.free_runs.prediction import predict as run_freely
 from fdi_torch.gap.verdict_words import cause_words, explanation_words, verdict_sentence
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs import train as train_job

@@ -17,7 +17,7 @@ from fdi_torch.effects import build_network
 from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
 from fdi_torch.estimate.hybrid import HybridSettings
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings
-from fdi_torch.gap.acquisition import usable
+from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.operating_range import bounded_by_recording
 from fdi_torch.recording import Recording

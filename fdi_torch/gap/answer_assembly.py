@@ -1,0 +1,206 @@
+"""Assembly of the answer from the result of a diagnosis: causes with errors, probabilities, closure, remarks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from torch import Tensor
+
+from fdi_torch.gap.answer import UNKNOWN, Amount, Answer, Cause, CauseName, ProbableExplanation, names
+from fdi_torch.gap.candidate_fit import Fitter, standard_errors
+from fdi_torch.gap.dataset import DataSet
+from fdi_torch.gap.diagnosis_result import DiagnosisResult, p_value
+from fdi_torch.gap.discrepancy_curves import curves_at
+from fdi_torch.gap.experiment_design import discriminating_input
+from fdi_torch.gap.free_form import discrepancy_tables
+from fdi_torch.gap.holdout import HeldOut, run_reference_models
+from fdi_torch.gap.identifiability import identifiability, simulated_confusions
+from fdi_torch.gap.library import equivalent_causes
+from fdi_torch.gap.model_comparison import (
+    causal_places,
+    closure_to_dict,
+    constants_of,
+    prediction_arrays,
+    reference_models,
+)
+from fdi_torch.gap.posterior import CauseHypothesis
+from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
+from fdi_torch.gap.remarks import remarks_on
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+
+MOST_EXPLANATIONS = 12
+
+
+def build_answer(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer:
+    """Build the answer. holdouts: laid out for the same plant."""
+    has_causes = result.verdict in ("named", "ambiguous")
+    posterior = result.posterior
+    runs = _holdout_runs(result, holdouts)
+    hypotheses = zip(posterior.hypotheses[:MOST_EXPLANATIONS], posterior.probabilities, strict=False)
+    return Answer(
+        verdict=result.verdict,
+        p_value=_p_value(result),
+        where=_where(result),
+        causes=_causes(result),
+        ambiguity_set=[_names(result, h) for h in result.credible_set] if has_causes else [],
+        posterior=[ProbableExplanation((*h.causes, *result.from_readings), p, h.unknown_at) for h, p in hypotheses],
+        unexamined=posterior.unexamined,
+        converged=result.best.converged,
+        closure=closure_to_dict(runs, result) if runs else {},
+        noise=_noise(result.fitter, result.quantization_steps),
+        disturbances=_disturbances(result),
+        shape=discrepancy_tables(result.free_form_fit) if result.free_form_fit else None,
+        next_input=_next_input(result) if result.verdict == "ambiguous" else None,
+        impostors=_confusability(result) if has_causes else None,
+        excitation=_identifiability(result),
+        constants=_constants(result),
+        curves=_curves(result),
+        remarks=remarks_on(result, runs),
+        arrays=prediction_arrays(result, runs),
+    )
+
+
+def _names(result: DiagnosisResult, hypothesis: CauseHypothesis) -> tuple[CauseName, ...]:
+    """All causes of a hypothesis, something unknown among them."""
+    unknown = ((UNKNOWN, hypothesis.unknown_at),) if hypothesis.unknown_at else ()
+    return (*hypothesis.causes, *unknown, *result.from_readings)
+
+
+def _where(result: DiagnosisResult) -> list[tuple[str, float]]:
+    """Places by the probability of a cause there.
+
+    A sensor with outliers comes first if nothing else is wrong.
+    """
+    places = list(result.posterior.places)
+    best = result.posterior.best
+    if result.verdict == "unknown" and not best.place and (sensor := sensor_with_outliers(result.outliers[0])):
+        places = [(sensor, 1.0), *((p, share) for p, share in places if p != sensor)]
+    return places
+
+
+def _holdout_runs(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> list[HeldOut]:
+    """Free runs of all models on all hold-outs."""
+    if not holdouts:
+        return []
+    models, nominal_effects = reference_models(result), result.fitter.data.nominal_effects
+    return [
+        run_reference_models(
+            replace(each, nominal_effects=nominal_effects), result.fitter.noise, models, result.quantization_steps
+        )
+        for each in holdouts
+    ]
+
+
+def _curves(result: DiagnosisResult) -> list[dict[str, Any]]:
+    """Curves of the discrepancy at every place with a cause; not drawn for several recordings at once."""
+    if result.verdict == "no_gap" or result.fitter.data.further:
+        return []
+    places = causal_places(result)
+    return [curve.to_dict() for place in places for curve in curves_at(result.fitter, result.best, place, result.reach)]
+
+
+def _constants(result: DiagnosisResult) -> dict[str, dict[str, object]]:
+    """Each calibration constant: nominal, recalibrated, and fitted with the causes."""
+    errors = standard_errors(result.fitter, result.best)
+    null, best, space = constants_of(result.null), constants_of(result.best), result.best.space
+    return {
+        name: {
+            "nominal": space[name].nominal,
+            "tolerance": space[name].std,
+            "recalibrated": null[name],
+            "augmented": best[name],
+            "std": errors[name],
+            "unit": space[name].unit,
+        }
+        for name in null
+    }
+
+
+def _next_input(result: DiagnosisResult) -> Mapping[str, Any] | None:
+    """The input that distinguishes the two likeliest hypotheses."""
+    first, second = result.posterior.hypotheses[:2]
+    design = discriminating_input(result.fitter, first.fit, second.fit)
+    between = [names(_names(result, h)) for h in (first, second)]
+    return {"between": between, **design} if design else None
+
+
+def _confusability(result: DiagnosisResult) -> dict[str, object]:
+    """How often another cause would have been named in place of a single named one, by simulation."""
+    if len(result.effects_fit.key) != 1:
+        return {}
+    (cause,) = result.effects_fit.key
+    gap = max(result.gap, 1.0)
+    return {"simulated": simulated_confusions(result.search.shown.pairs, cause, gap, result.fitter.data.plant)}
+
+
+def _identifiability(result: DiagnosisResult) -> dict[str, Any]:
+    """Effects that this recording's inputs cannot show or separate, by the names of the answer."""
+    shown = identifiability(result.search.shown, result.fitter.data.plant)
+    pairs = [{"between": names((a, b)), "parted_by": separation} for a, b, separation in shown.inseparable]
+    return {"hidden": names(shown.hidden), "inseparable": pairs}
+
+
+def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
+    """Causes with parameters and standard errors; those that the readings show have none."""
+    fitter, fit = result.fitter, result.effects_fit
+    plant, stds = fitter.data.plant, standard_errors(fitter, fit)
+    causes = []
+    placements = [p for p in fit.candidate.placements if (p.effect.name, p.location) in result.posterior.best.causes]
+    for p in placements:
+        amounts = {}
+        for name, value in fit.effect_values.items():
+            if name.rpartition(".")[0] == p.prefix:
+                amounts[name.rpartition(".")[2]] = Amount(value, stds[name], fit.space[name].unit)
+        causes.append(Cause(p.effect.name, p.location, amounts, equivalent_causes((p.effect.name, p.location), plant)))
+    if result.posterior.best.unknown_at:
+        causes.append(Cause(UNKNOWN, result.posterior.best.unknown_at))
+    steps = {s.name: ("step", step) for s, step in zip(plant.sensors, result.quantization_steps, strict=True)}
+    limits = {(p.effect.name, p.location): p for p in result.limits}
+    units = {s.name: s.unit for s in plant.sensors}
+    for name, place in result.from_readings:
+        if (name, place) in limits:
+            causes.append(Cause(name, place, _amounts_from_readings(limits[name, place], plant)))
+        else:
+            parameter, value = steps[place]
+            causes.append(Cause(name, place, {parameter: Amount(value, 0.0, units[place])}))
+    return tuple(causes)
+
+
+def _amounts_from_readings(placement: Placement, plant: PlantDescription) -> dict[str, Amount]:
+    """Parameters of an effect that the readings show without a fit."""
+    parameters, values = placement.effect.parameters(placement.location, plant), placement.values or {}
+    return {p.name: Amount(values[p.name], 0.0, p.unit) for p in parameters if p.name in values}
+
+
+def _p_value(result: DiagnosisResult) -> float:
+    """Probability that noise alone explains the gap; 0 if the readings themselves show a cause."""
+    if result.from_readings or (result.verdict == "unknown" and sensor_with_outliers(result.outliers[0])):
+        return 0.0
+    return p_value(result.search)
+
+
+def _disturbances(result: DiagnosisResult) -> dict[str, dict[str, object]]:
+    """The random flow into each tank under the likeliest hypothesis."""
+    best = result.posterior.best
+    noise = best.place.noise if best.place else best.explanation.noise
+    return {
+        t.name: {"std": float(noise.intensity[i]), "unit": "m^3/s", "correlation_time": noise.correlation_time}
+        for i, t in enumerate(result.fitter.data.plant.tanks)
+    }
+
+
+def _noise(fitter: Fitter, quantization_steps: Sequence[float]) -> Mapping[str, Any]:
+    sensors = fitter.data.plant.sensors
+    std: Tensor = fitter.noise.std
+    return {
+        s.name: {
+            "std": float(std[i]),
+            "ar1": float(fitter.noise.lag_one[i]),
+            "rounded_to": quantization_steps[i],
+            "unit": s.unit,
+        }
+        for i, s in enumerate(sensors)
+    }

@@ -1,0 +1,296 @@
+"""Least-squares fit of a candidate, a set of effects at places, to a data set, from many starts at once.
+
+    chi^2(theta) = |W (y - y(theta))|^2 + sum ((theta - nominal) / tolerance)^2
+
+W whitens the residual with the sensor noise and, where there are random flows, with a Kalman filter. Trajectories are
+fitted together with the parameters (`trajectory_problem.py`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import EFFECTS
+from fdi_torch.estimate.kalman import KalmanWhitening
+from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, levenberg_marquardt
+from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
+from fdi_torch.gap.dataset import DataSet, RecordingPart, interpolate
+from fdi_torch.gap.trajectory_problem import FAR, TrajectoryProblem
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.scales import length_scale
+from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.joint_collocation import JointCollocation, name_in_recording
+
+# A fit has converged if a further step is predicted to gain less than this share of the chi-square per reading, or of
+# one if that is more. Parameters are then within a tenth of a standard error, misfit included.
+DECREMENT = 0.01
+CAP = 200  # evaluations, a guard against descents without an end
+# A start is given up if it is so many chi-square units behind and gains less than a quarter of that in a step.
+BEHIND, SHARE = 30.0, 0.25
+Key = frozenset[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Effects at places. starts: the fitted parameters of these effects with initial values
+    ('Q1.pump_lag.time_constant')."""
+
+    placements: tuple[Placement, ...] = ()
+    starts: tuple[Mapping[str, float], ...] = ({},)
+
+    @property
+    def key(self) -> Key:
+        return frozenset((p.effect.name, p.location) for p in self.placements)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The best fit of a candidate: parameters theta (P,), cost (chi-square with priors), linearised trajectory.
+
+    converged: whether less than DECREMENT remained to gain. False if the fit was given up or ran out of evaluations.
+    """
+
+    candidate: Candidate
+    space: ParameterSpace
+    theta: Tensor
+    cost: float
+    linearised: Linearised
+    converged: bool
+
+    @property
+    def values(self) -> dict[str, float]:
+        return dict(zip(self.space.names, self.theta.tolist(), strict=True))
+
+    @property
+    def effect_values(self) -> dict[str, float]:
+        return {n: v for n, v in self.values.items() if n.count(".") == 2}
+
+    @property
+    def key(self) -> Key:
+        return self.candidate.key
+
+
+@dataclass(frozen=True)
+class DescentResult:
+    """End points of descents: theta (L, P), cost (L,) chi-square, linearised trajectories, converged (L,) bool."""
+
+    theta: Tensor
+    cost: Tensor
+    linearised: Linearised
+    converged: Tensor
+
+
+class Fitter:
+    """Fits candidates to one data set under one noise: of the sensors, and of random flows if `whitening` is given."""
+
+    def __init__(self, data: DataSet, noise: Noise, whitening: KalmanWhitening | None = None) -> None:
+        self.data, self.noise, self.whitening = data, noise, whitening
+        self.far = FAR * length_scale(data.plant)
+
+    @property
+    def log_det(self) -> float:
+        """Log determinant of the covariance that `whiten` reduces to the identity, over all readings."""
+        if self.whitening:
+            return self.whitening.log_det
+        return float((2.0 * torch.log(self.noise.innovation) * self.data.mask.sum(dim=0)).sum())
+
+    def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation | JointCollocation:
+        """The plant with the candidate's effects. Its parameters are the nuisance parameters and those in `free`."""
+        network = self.network(candidate.placements)
+        names = tuple(dict.fromkeys([*self.data.nuisance, *free]))
+        space = ParameterSpace(network.constants[n] for n in names if "@" not in n)
+        if not self.data.further:
+            return Collocation(network, space, self.data.experiment)
+        parts = [Collocation(network, space, part.experiment) for part in self.data.parts]
+        return JointCollocation(parts, ParameterSpace(replace(space[n.partition("@")[0]], name=n) for n in names))
+
+    def network(self, placements: Sequence[Placement]) -> TankNetwork:
+        """The plant with these effects added to its nominal effects, or in their place."""
+        replaced = {p.prefix for p in placements}
+        remaining = [p for p in self.data.nominal_effects if p.prefix not in replaced]
+        return TankNetwork(self.data.plant, _in_library_order([*remaining, *placements]))
+
+    def fit(
+        self,
+        candidate: Candidate,
+        base: Fit | None = None,
+        target: float = math.inf,
+        cap: int = CAP,
+    ) -> Fit:
+        """Fit all starts of a candidate and return the best. Nuisance parameters and trajectory start from `base`.
+
+        target: cost of the competitor; starts that approach it too slowly are given up. cap: most evaluations.
+        """
+        by_free: dict[tuple[str, ...], list[Mapping[str, float]]] = {}
+        for start in candidate.starts:
+            by_free.setdefault(tuple(sorted(start)), []).append(start)
+        fits = [self._fit(candidate, free, starts, base, target, cap) for free, starts in by_free.items()]
+        return min(fits, key=lambda f: f.cost)
+
+    def _fit(
+        self,
+        candidate: Candidate,
+        free: tuple[str, ...],
+        starts: Sequence[Mapping[str, float]],
+        base: Fit | None,
+        target: float,
+        cap: int,
+    ) -> Fit:
+        engine = self.engine(candidate, free)
+        theta, levels = self._initial_points(engine, starts, base)
+        descents = self.descend(engine, theta, levels, target, cap)
+        best = int(torch.nan_to_num(descents.cost, nan=torch.inf).argmin())
+        linearised = descents.linearised.lanes(torch.tensor([best]))
+        return Fit(
+            candidate,
+            engine.space,
+            descents.theta[best],
+            float(descents.cost[best]),
+            linearised,
+            bool(descents.converged[best]),
+        )
+
+    def _initial_points(
+        self, engine: Collocation | JointCollocation, starts: Sequence[Mapping[str, float]], base: Fit | None
+    ) -> tuple[Tensor, Tensor]:
+        initial = base.values if base else self.first_levels()
+        rows = [engine.space.vector({n: v for n, v in {**initial, **s}.items() if n in engine.space}) for s in starts]
+        theta = torch.stack(rows)
+        if base is None:
+            return theta, self.first_trajectory(engine, theta)
+        return theta, base.linearised.levels.expand(len(starts), -1, -1)
+
+    def first_trajectory(self, engine: Collocation | JointCollocation, theta: Tensor) -> Tensor:
+        """The model's levels (L, K+1, n) at theta (L, P), found from the levels that the sensors show.
+
+        Newton's method from constant levels is the second choice: it misses trajectories where levels become equal or
+        reach a rim, because the flow has a sharp bend there.
+        """
+        constant = engine.constant_guess(theta)
+        measured = torch.cat([self._measured_levels(part) for part in self.data.parts])
+        first = engine.converge(theta, torch.where(measured.isfinite(), measured, constant))
+        lost = (~(first.defect <= self.far)).nonzero().flatten()
+        if not len(lost):
+            return first.levels
+        second = engine.converge(theta[lost], constant[lost])
+        better = second.defect < first.defect[lost].nan_to_num(nan=torch.inf)
+        return first.levels.index_copy(0, lost[better], second.levels[better])
+
+    def _measured_levels(self, part: RecordingPart) -> Tensor:
+        """Measured levels at the ends of the steps (K+1, n); NaN for a tank without a sensor."""
+        plant, nodes = self.data.plant, part.experiment.nodes
+        names = [t.name for t in plant.tanks]
+        measured = nodes.new_full((len(nodes), len(names)), math.nan)
+        for i, sensor in enumerate(plant.sensors):
+            tank, valid = names.index(sensor.tank), part.mask[:, i]
+            if bool(valid.any()):
+                level = (part.readings[valid, i] - sensor.offset) / sensor.gain
+                level = level.clamp(0.0, plant.tanks[tank].height)
+                measured[:, tank] = interpolate(nodes, part.experiment.sample_times[valid], level)
+        return measured
+
+    def first_levels(self) -> dict[str, float]:
+        """Initial levels from the mean of the first readings, by name."""
+        levels = {}
+        for k, part in enumerate(self.data.parts):
+            for i, sensor in enumerate(self.data.plant.sensors):
+                readings = part.readings[:5, i][part.mask[:5, i]]
+                if len(readings):
+                    level = max(float(readings.mean() - sensor.offset) / sensor.gain, 0.0)
+                    levels[name_in_recording(f"{sensor.tank}.start_level", k)] = level
+        return levels
+
+    def descend(
+        self,
+        engine: Collocation | JointCollocation,
+        theta: Tensor,
+        levels: Tensor,
+        target: float = math.inf,
+        cap: int = CAP,
+    ) -> DescentResult:
+        """Least squares from theta (L, P), with guesses of the trajectories, levels (L, K+1, n)."""
+        problem = TrajectoryProblem(self, engine, levels)
+        competition = Competition(0.5 * BEHIND, SHARE, 0.5 * target)
+        # The optimiser's cost is a negative log-likelihood, half of chi-square.
+        share = DECREMENT / max(int(self.data.mask.sum()), 1)
+        settings = RefineSettings(cap, 0.5 * DECREMENT, share, step_tolerance=0.0, competition=competition)
+        low, high, _ = problem.box
+        minimum = levenberg_marquardt(problem.linearise, theta, low, high, settings, neighbourhood=problem)
+        assert isinstance(minimum.state, Linearised)
+        return DescentResult(minimum.theta, 2.0 * minimum.cost, minimum.state, minimum.converged)
+
+    def normal(
+        self, space: ParameterSpace, theta: Tensor, linearised: Linearised, scale: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost (L,), half its gradient (L, P), and curvature (L, P, P), in scaled parameters."""
+        residual, jacobian = self.white(linearised)
+        weight = 1.0 / space.std(theta)
+        deviation = (theta - space.nominal(theta)) * weight
+        j, r = (jacobian * scale).permute(0, 3, 2, 1).flatten(2), residual.transpose(1, 2).flatten(1)  # time last
+        cost = (r * r).sum(-1) + (deviation * deviation).sum(-1)
+        gradient = (j @ r.unsqueeze(-1)).squeeze(-1) - deviation * weight * scale
+        curvature = j @ j.mT + torch.diag_embed((weight * scale) ** 2)
+        return cost, gradient, curvature
+
+    def cost(self, fit: Fit) -> float:
+        """Chi-square of a fit under this fitter's noise, with priors."""
+        return float(self.normal(fit.space, fit.theta, fit.linearised, self.box(fit.space)[2])[0])
+
+    def white(self, linearised: Linearised) -> tuple[Tensor, Tensor]:
+        """Whitened residual (L, S, C) and Jacobian (L, S, C, P)."""
+        residual = self.whiten(self.data.readings - linearised.readings)
+        return residual, self.whiten(linearised.jacobian)
+
+    def whiten(self, x: Tensor) -> Tensor:
+        """Whiten x (*lanes, S, C) or (*lanes, S, C, P): unit variance, no correlation."""
+        return self.whitening(x) if self.whitening else self.noise.whiten(x, self.data.mask)
+
+    def priors(self, space: ParameterSpace, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Scales of the parameters (P,), and their normal priors in these scales: root of the precision (P,), and
+        deviation of theta from nominal in standard deviations (P,)."""
+        scale, std = self.box(space)[2], space.std(theta)
+        return scale, (scale / std).nan_to_num(0.0), ((theta - space.nominal(theta)) / std).nan_to_num(0.0)
+
+    def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]:
+        """Lower and upper bounds of the parameters, and the scale on which each varies, (P,) each."""
+        duration = max(float(part.experiment.nodes[-1]) for part in self.data.parts)
+        low, high, scale = [], [], []
+        for p in space:
+            timed = p.unit == "s"
+            top = min(p.high, duration) if timed else p.high
+            low.append(p.low)
+            high.append(max(top, p.nominal))
+            finite = math.isfinite(p.std)
+            span = top - p.low
+            scale.append(p.std if finite else 0.1 * (span if math.isfinite(span) else max(abs(p.nominal), 1.0)))
+        return tuple(torch.tensor(x, dtype=torch.float64) for x in (low, high, scale))  # type: ignore[return-value]
+
+
+def unexplained_chi_square(fitter: Fitter, fit: Fit) -> float:
+    """Chi-square that a fit leaves at low frequencies, beyond noise."""
+    return max(low_frequency_excess(fitter.white(fit.linearised)[0][0]), 0.0)
+
+
+def _in_library_order(placements: Sequence[Placement]) -> list[Placement]:
+    order = {e.name: i for i, e in enumerate(EFFECTS)}
+    return sorted(placements, key=lambda p: order.get(p.effect.name, len(order)))
+
+
+def covariance(fitter: Fitter, fit: Fit) -> Tensor:
+    """Covariance (P, P) of a fit's parameters: the inverse of the curvature, priors included."""
+    scale = fitter.box(fit.space)[2]
+    curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.linearised, scale)[2][0]
+    return torch.linalg.pinv(curvature, hermitian=True) * scale * scale.unsqueeze(1)
+
+
+def standard_errors(fitter: Fitter, fit: Fit) -> dict[str, float]:
+    """Standard errors by full name."""
+    variance = torch.diagonal(covariance(fitter, fit)).clamp(min=0.0)
+    return dict(zip(fit.space.names, torch.sqrt(variance).tolist(), strict=True))

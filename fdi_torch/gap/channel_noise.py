@@ -1,0 +1,279 @@
+"""Noise model of the sensors: standard deviation, correlation and quantization step of each channel.
+
+A model error is slow compared with the sampling, noise is not. The spectrum of AR(1) noise and of a model error whose
+slope jumps (levels are integrals of flows),
+
+    S(w) = s^2 (1 / |1 - a exp(-i w)|^2 + m / |1 - exp(-i w)|^4),
+
+is fitted to the periodogram above a corner frequency (Whittle, 1953), so that a gap is not mistaken for correlated
+noise, even if the samples are so far apart that the error reaches beyond the corner.
+
+A transmitter that returns the mean of its last n samples has zeros in its spectrum. Its kernel ends after n samples:
+
+    1, a, a^2, ..., a^(n-1):   |1 - a^n exp(-i n w)|^2 / |1 - a exp(-i w)|^2,   a^n = 0.9,
+
+which is nearly constant, and can be inverted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+DECAY_SHARE = 0.3  # share of a quantization step over which its error decorrelates
+MOST_BINS = 512  # bins of a spectrum
+CACHED = 2  # layouts whose spectra are cached, 40 MB each: of a recording and of its hold-out
+LEAST_SAMPLES = 20  # in a segment that is used for the estimate
+FAST_PERIOD = 30.0  # samples; slower parts of a residual may be model error
+
+
+MEAN_DECAY = 0.9  # a^n
+LONGEST_MEAN = 16  # samples of a moving average
+MEAN_PENALTY = 50.0  # twice the log-likelihood by which a moving average must be likelier than AR(1)
+DOUBLINGS = 6  # rounds in which a moving average is inverted: 0.9^64 is negligible
+
+
+@dataclass(frozen=True)
+class Noise:
+    """innovation (C,): standard deviation of the innovations, in the reading's unit. ar (C,): AR(1) coefficient.
+
+    mean_of: length of a moving average in samples; 0 for AR(1). steps (C,): quantization step of each channel in the
+    reading's unit, 0 if there is none; empty: none at all.
+    """
+
+    innovation: Tensor
+    ar: Tensor
+    mean_of: int = 0
+    steps: tuple[float, ...] = ()
+
+    @property
+    def energy(self) -> Tensor:
+        """Sum of the squared kernel, (C,): variance of the noise over that of the innovations."""
+        last = self.ar ** (2 * self.mean_of) if self.mean_of else 0.0
+        return (1.0 - last) / (1.0 - self.ar**2)
+
+    @property
+    def std(self) -> Tensor:
+        return self.innovation * torch.sqrt(self.energy)
+
+    @property
+    def lag_one(self) -> Tensor:
+        """Correlation of neighbouring samples, (C,)."""
+        if not self.mean_of:
+            return self.ar
+        return self.ar * (1.0 - self.ar ** (2 * self.mean_of - 2)) / (1.0 - self.ar ** (2 * self.mean_of))
+
+    @property
+    def squared_correlations(self) -> Tensor:
+        """Sum of all squared correlations, (C,): samples that count as one where squares are summed."""
+        if not self.mean_of:
+            return (1.0 + self.ar**2) / (1.0 - self.ar**2)
+        kernel = self.ar ** torch.arange(self.mean_of, dtype=self.ar.dtype).unsqueeze(1)
+        power = torch.fft.rfft(kernel, n=2 * self.mean_of, dim=0).abs() ** 2
+        return (torch.fft.irfft(power, n=2 * self.mean_of, dim=0) ** 2).sum(dim=0) / self.energy**2
+
+    def whiten(self, x: Tensor, mask: Tensor) -> Tensor:
+        """x (*lanes, S, C) or (*lanes, S, C, P), mask (S, C) -> independent samples of unit variance; masked samples
+        are 0.
+
+        x_k - a x_{k-1}; the first sample, and one after a masked sample, is divided by its standard deviation instead.
+        For a moving average of n, the sample that left it is added again: y_k = ... + a^n y_{k-n}.
+        """
+        columns = x.shape[-2:] != mask.shape
+        broadcast = (lambda t: t.unsqueeze(-1)) if columns else (lambda t: t)
+        ar, keep, time = broadcast(self.ar), broadcast(mask), -3 if columns else -2
+        whole = bool(mask.all())
+        scaled = (x if whole else torch.where(keep, x, 0.0)) / broadcast(self.innovation)
+        if not bool((ar != 0.0).any()):
+            return scaled
+        count, first_scale = x.shape[time], 1.0 / torch.sqrt(broadcast(self.energy))
+        first, previous = scaled.narrow(time, 0, 1), scaled.narrow(time, 0, count - 1)
+        following = scaled.narrow(time, 1, count - 1)
+        difference = following - ar * previous
+        if not whole:
+            difference = torch.where(keep[1:], torch.where(keep[:-1], difference, first_scale * following), 0.0)
+        white = torch.cat([first_scale * first, difference], dim=time)
+        for doubling in range(DOUBLINGS if self.mean_of else 0):
+            lag = self.mean_of * 2**doubling
+            if lag < count:
+                returned = ar**lag * white.narrow(time, 0, count - lag)
+                unchanged, later = white.narrow(time, 0, lag), white.narrow(time, lag, count - lag)
+                white = torch.cat([unchanged, later + returned], dim=time)
+        return white if whole or not self.mean_of else torch.where(keep, white, 0.0)
+
+
+def low_frequency_excess(white: Tensor) -> float:
+    """Chi-square of a whitened residual (S, C) below the corner frequency, beyond what its high frequencies predict.
+
+    The level is that of the high frequencies, so that a wrong noise level does not count.
+    """
+    power = torch.fft.rfft(white, dim=0).abs() ** 2 * 2.0 / len(white)
+    slow = torch.arange(len(power), dtype=white.dtype) / len(white) <= 1.0 / FAST_PERIOD
+    power[0] *= 0.5
+    level = power[~slow].mean(dim=0)
+    return float((power[slow].sum(dim=0) - (float(slow.sum()) - 0.5) * level).sum())
+
+
+def estimate_noise(
+    residual: Tensor, mask: Tensor, steps: Sequence[float] = (), rows: Sequence[slice] = (slice(None),)
+) -> Noise:
+    """Estimate the noise of each channel from residual (S, C) and mask (S, C).
+
+    All channels share one correlation, since one system reads them. steps (C,): quantization steps; channels with a
+    step do not count for the common correlation, because rounding errors have their own. rows: segments without a jump
+    between their samples.
+    """
+    quantized = [step > 0.0 for step in steps]
+    spectra = [_spectrum_of_all([residual[r][mask[r][:, c], c] for r in rows]) for c in range(residual.shape[1])]
+    plain = [not r for r in quantized] if quantized and not all(quantized) else [True] * len(spectra)
+    levels = [_levels(*s) for s in spectra]
+    # (C, colours, errors)
+    likelihoods = torch.stack([_likelihood(*s, x) for s, x in zip(spectra, levels, strict=True)])
+    counts = [int(mask[:, c].sum()) for c in range(residual.shape[1])]
+    likelihoods = likelihoods + torch.stack([_cost_of_error(n) for n in counts]).unsqueeze(1)
+    likelihoods[:, len(_AR) :] += math.inf if any(quantized) else MEAN_PENALTY
+    best = likelihoods.min(dim=-1).values
+    common = _most_likely(best[torch.tensor(plain)].sum(dim=0), int(mask.sum()))
+    chosen = [common if is_plain else _most_likely(best[c], counts[c]) for c, is_plain in enumerate(plain)]
+    errors = [int(x[i].argmin()) for x, i in zip(likelihoods, chosen, strict=True)]
+    level = torch.stack([x[i, j] for x, i, j in zip(levels, chosen, errors, strict=True)])
+    innovation = torch.sqrt(torch.clamp(level, min=torch.finfo(level.dtype).tiny))
+    return Noise(innovation, _CORRELATIONS.to(level)[torch.tensor(chosen)], int(_MEAN_LENGTHS[common]), tuple(steps))
+
+
+_AR = torch.cat([torch.linspace(-0.5, 0.9, 281), torch.linspace(0.901, 0.98, 80)])
+_LENGTHS = torch.arange(2, LONGEST_MEAN + 1)  # of means, samples
+_MEAN_LENGTHS = torch.cat([torch.zeros(len(_AR), dtype=torch.long), _LENGTHS])  # samples; 0: for ever
+_CORRELATIONS = torch.cat([_AR, MEAN_DECAY ** (1.0 / _LENGTHS)])
+_WHITE = int(_CORRELATIONS.abs().argmin())
+_ERRORS = torch.cat([torch.zeros(1), torch.logspace(-4, 2, 25)])  # of the model, as shares of the innovation
+
+
+Layout = tuple[tuple[int, int], ...]
+"""Segments of a spectrum: number of samples of each, and most bins."""
+
+
+def _spectrum_of_all(segments: Sequence[Tensor]) -> tuple[Tensor, Layout, int]:
+    """Power of several segments side by side, its layout, and the number of neighbours averaged in each bin.
+
+    Segments that are too short are left out.
+    """
+    if len(segments) == 1:
+        power, width = _fast_spectrum(segments[0], MOST_BINS)
+        return power, ((len(segments[0]), MOST_BINS),), width
+    usable = [x for x in segments if len(x) >= LEAST_SAMPLES] or [max(segments, key=len)]
+    return torch.cat([_fast_spectrum(x, len(x))[0] for x in usable]), tuple((len(x), len(x)) for x in usable), 1
+
+
+def _fast_spectrum(x: Tensor, bins: int) -> tuple[Tensor, int]:
+    """Tapered periodogram of x (S,) above the corner frequency, averaged in bins."""
+    taper = torch.hann_window(len(x), periodic=False, dtype=x.dtype)
+    power = torch.fft.rfft((x - x.mean()) * taper).abs() ** 2 / (taper**2).sum()
+    return _binned(power, len(x), bins)
+
+
+def _binned(each: Tensor, count: int, bins: int) -> tuple[Tensor, int]:
+    """Means of neighbouring values at the frequencies above the corner, and how many make a mean."""
+    fast = torch.arange(len(each), dtype=each.dtype) / count > 1.0 / FAST_PERIOD
+    width = -(-int(fast.sum()) // bins)
+    return each[fast][: int(fast.sum()) // width * width].reshape(-1, width).mean(dim=1), width
+
+
+def _cosine(count: int, bins: int) -> Tensor:
+    """Cosine of the frequency of each bin."""
+    frequency = torch.arange(count // 2 + 1, dtype=torch.float64) / count
+    return torch.cos(2 * math.pi * _binned(frequency, count, bins)[0])
+
+
+@dataclass(frozen=True)
+class _Shapes:
+    """Spectra with unit innovation at some frequencies (F,), for each correlation and model error.
+
+    inverse: (correlations, errors, F). mean_log: mean logarithm, (correlations, errors).
+    """
+
+    inverse: Tensor
+    mean_log: Tensor
+
+
+@lru_cache(maxsize=CACHED)
+def _shapes(layout: Layout) -> _Shapes:
+    """Cached for the last layouts, which all channels of a recording and the next estimate share."""
+    cosine = torch.cat([_cosine(count, bins) for count, bins in layout])
+    a, error = _CORRELATIONS.to(cosine).reshape(-1, 1, 1), _ERRORS.to(cosine).reshape(-1, 1)
+    lengths = _MEAN_LENGTHS.to(cosine).reshape(-1, 1, 1)
+    remainder = torch.where(lengths > 0, a**lengths, 0.0)
+    numerator = (
+        1.0 - 2.0 * remainder * torch.cos(lengths * torch.arccos(cosine.clamp(-1.0, 1.0))) + remainder * remainder
+    )
+    shape = numerator / (1.0 - 2.0 * a * cosine + a * a) + error / (2.0 - 2.0 * cosine) ** 2
+    return _Shapes(1.0 / shape, torch.log(shape).mean(dim=-1))
+
+
+def _levels(power: Tensor, layout: Layout, width: int) -> Tensor:
+    """Innovation variance for each correlation and model error, (correlations, errors)."""
+    return (_shapes(layout).inverse @ power) / len(power)
+
+
+def _likelihood(power: Tensor, layout: Layout, width: int, levels: Tensor) -> Tensor:
+    """Twice the negative log-likelihood for each correlation and model error.
+
+    The taper leaves one of 1.94 frequencies independent.
+    """
+    level = torch.log(torch.clamp(levels, min=torch.finfo(power.dtype).tiny))
+    return 2.0 * (level + _shapes(layout).mean_log) * len(power) * width / 1.94
+
+
+def _cost_of_error(count: int) -> Tensor:
+    """Twice the BIC penalty of one more parameter; a relevant model error gains far more."""
+    return torch.where(_ERRORS > 0.0, 2.0 * math.log(count), 0.0)
+
+
+def _most_likely(likelihood: Tensor, count: int) -> int:
+    """Index of the likeliest correlation; white unless the gain exceeds the BIC penalty of one parameter."""
+    best = int(likelihood.argmin())
+    return best if float(likelihood[_WHITE] - likelihood[best]) > math.log(count) else _WHITE
+
+
+def with_rounding(noise: Noise, steps: Sequence[float], readings: Tensor) -> Noise:
+    """Add the rounding error of channels (C,) with steps > 0. readings (S, C): about the unrounded readings.
+
+    Its variance is step^2 / 12 (Widrow and Kollar, 2008), added to the noise of the other channels. It is constant
+    until the level has moved by a good part of a step, which gives its correlation.
+    """
+    if not any(steps):
+        return noise
+    std, ar = noise.std.clone(), noise.ar.clone()
+    unrounded = [float(s) for s, step in zip(std, steps, strict=True) if not step]
+    for c, step in enumerate(steps):
+        if not step:
+            continue
+        noise_below = sorted(unrounded)[len(unrounded) // 2] if unrounded else 0.0
+        movement = float(readings[:, c].diff().abs().mean())
+        correlation = math.exp(-max(movement, 1e-4 * step) / (DECAY_SHARE * step))
+        std[c], ar[c] = math.hypot(noise_below, step / math.sqrt(12.0)), max(float(ar[c]), min(correlation, 0.98))
+    return Noise(std * torch.sqrt(1.0 - ar**2), ar)
+
+
+def quantization_step(values: Tensor, noise: float) -> float:
+    """Distance between the values of a quantized channel, or 0 if it is below a tenth of the noise.
+
+    values (S,) are quantized if all differences between distinct values are multiples of the smallest one.
+    """
+    distinct = torch.unique(values)
+    if len(distinct) < 3:
+        return 0.0
+    differences = torch.diff(distinct)
+    clear = differences[differences > 1e-9 * float(distinct.abs().max())]
+    if len(clear) < 2:
+        return 0.0
+    step = float(clear.min())
+    step = float(clear[clear < 1.5 * step].mean())
+    multiples = clear / step
+    on_lattice = bool(((multiples - multiples.round()).abs() < 0.02 * multiples.round()).all())
+    return step if on_lattice and step > 0.1 * noise and len(distinct) < 0.5 * len(values) else 0.0

@@ -1,0 +1,133 @@
+"""The data set of a diagnosis: a plant, and one or several recordings on the grid of their simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.experiment import Experiment, lay_out
+from fdi_torch.simulate.joint_collocation import name_in_recording
+
+
+@dataclass(frozen=True)
+class RecordingPart:
+    """One recording of a data set on its simulation grid. readings, mask: (S, C), in the plant's order of sensors."""
+
+    recording: Recording
+    experiment: Experiment
+    readings: Tensor
+    mask: Tensor
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A plant with its nominal effects, and one or several recordings of it.
+
+    recording, experiment: of the first recording. readings, mask (S, C): of all, with one masked row between
+    recordings. further: the other recordings.
+    """
+
+    plant: PlantDescription
+    nominal_effects: tuple[Placement, ...]
+    recording: Recording
+    experiment: Experiment
+    readings: Tensor
+    mask: Tensor
+    further: tuple[RecordingPart, ...] = ()
+
+    @property
+    def parts(self) -> tuple[RecordingPart, ...]:
+        first = len(self.recording)
+        return (RecordingPart(self.recording, self.experiment, self.readings[:first], self.mask[:first]), *self.further)
+
+    @property
+    def row_spacing(self) -> float:
+        """Median time between rows of the first recording, s."""
+        return float(torch.median(torch.diff(self.recording.time)))
+
+    @property
+    def rows(self) -> tuple[slice, ...]:
+        """The rows of each recording among all."""
+        slices, first = [], 0
+        for part in self.parts:
+            slices.append(slice(first, first + len(part.recording)))
+            first += len(part.recording) + 1
+        return tuple(slices)
+
+    def alone(self, recording: int) -> DataSet:
+        """A data set of one of the recordings."""
+        part = self.parts[recording]
+        return replace(
+            self,
+            recording=part.recording,
+            experiment=part.experiment,
+            readings=part.readings,
+            mask=part.mask,
+            further=(),
+        )
+
+    @cached_property
+    def per_recording(self) -> tuple[str, ...]:
+        """Parameters that each recording has for itself: initial levels, constants that vary between recordings."""
+        return (*self.plant.varying, *(f"{t.name}.start_level" for t in self.plant.tanks))
+
+    @cached_property
+    def nuisance(self) -> tuple[str, ...]:
+        """Parameters refitted with every candidate: initial levels; constants and effect parameters with tolerance."""
+        constants = TankNetwork(self.plant, self.nominal_effects).constants
+        common = [p.name for p in constants if math.isfinite(p.std) and p.name not in self.per_recording]
+        per_recording = [name_in_recording(n, k) for k in range(len(self.further) + 1) for n in self.per_recording]
+        return (*common, *per_recording)
+
+
+def data_set_of(
+    plant: PlantDescription,
+    nominal_effects: Sequence[Placement],
+    recordings: Recording | Sequence[Recording],
+    step: float,
+) -> DataSet:
+    """Lay recordings out on their simulation grid, step s. Raises ValueError if one lacks a sensor."""
+    each = [recordings] if isinstance(recordings, Recording) else recordings
+    first, *further = [_part(plant, recording, step) for recording in each]
+    readings, mask = [first.readings], [first.mask]
+    for part in further:
+        readings += [torch.zeros_like(part.readings[:1]), part.readings]
+        mask += [torch.zeros_like(part.mask[:1]), part.mask]
+    return DataSet(
+        plant,
+        tuple(nominal_effects),
+        first.recording,
+        first.experiment,
+        torch.cat(readings),
+        torch.cat(mask),
+        tuple(further),
+    )
+
+
+def _part(plant: PlantDescription, recording: Recording, step: float) -> RecordingPart:
+    names = [s.column for s in plant.sensors]
+    missing = [n for n in names if n not in recording.output_names]
+    if missing:
+        columns = ", ".join(recording.output_names) or "none"
+        raise ValueError(f"{recording.source}: expected a sensor '{missing[0]}', got {columns}; map the column to it")
+    order = [recording.output_names.index(n) for n in names]
+    experiment = lay_out(recording, plant.channels(), step)
+    return RecordingPart(recording, experiment, recording.outputs[:, order], recording.mask[:, order])
+
+
+def interpolate(at: Tensor, times: Tensor, values: Tensor) -> Tensor:
+    """Linear interpolation of values (S,) at increasing times (S,) to times `at` (K,); constant beyond the ends."""
+    after = torch.searchsorted(times, at).clamp(max=len(times) - 1)
+    before = (after - 1).clamp(min=0)
+    width = (times[after] - times[before]).clamp(min=1e-300)
+    share = ((at - times[before]) / width).clamp(0.0, 1.0)
+    return torch.lerp(values[before], values[after], share)

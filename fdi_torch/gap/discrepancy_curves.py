@@ -1,0 +1,216 @@
+"""Curves of the discrepancy at one component: a free function of its local variables with errors, and the named effect.
+
+All is to first order about the trajectory of the best explanation: the influence of the named effect is added to the
+residual again, and the free form is fitted to it with the nuisance parameters projected out. The variables of a free
+form (a head, the time) share what they have in common. The curves therefore compare what both do along the trajectory,
+averaged over samples with the same value of the variable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.free_form import UNIT, free_form
+from fdi_torch.gap.free_form_coefficients import coefficients_of, fitted_coefficients
+from fdi_torch.plant.description import Pipe, Pump, Sensor, Tank
+from fdi_torch.plant.effect import Placement, Stage
+from fdi_torch.plant.operating_range import OperatingRange
+
+BINS = 24  # points of a curve
+
+
+@dataclass(frozen=True)
+class Curve:
+    """at (K,): values of `variable`, in `unit`. free, free_std (K,): free form and standard error. effect (K,): named
+    effects, if any.
+
+    quantity: 'flow' (m^3/s, into the tank or along the pipe), 'area' (a share) or 'reading' (the sensor's unit).
+    """
+
+    location: str
+    variable: str
+    unit: str
+    quantity: str
+    quantity_unit: str
+    at: Tensor
+    free: Tensor
+    free_std: Tensor
+    effect: Tensor | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        curve: dict[str, Any] = {"location": self.location, "variable": self.variable, "unit": self.unit}
+        curve |= {"quantity": self.quantity, "quantity_unit": self.quantity_unit, "at": self.at.tolist()}
+        curve |= {"free": self.free.tolist(), "free_std": self.free_std.tolist()}
+        return curve | ({"effect": self.effect.tolist()} if self.effect is not None else {})
+
+
+def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> list[Curve]:
+    """One curve for each local variable of a place.
+
+    The causes that the fit has there are added to the residual of the free form; a free form that the fit contains is
+    shown itself.
+    """
+    here = tuple(p for p in fit.candidate.placements if p.location == place)
+    contains_free_form = any(p.effect.name.startswith("free_") for p in here)
+    free = here if contains_free_form else _of_stage(free_form(place, fitter.data.plant, reach), here)
+    if contains_free_form:
+        coefficients, effect = fitted_coefficients(fitter, fit, free), None
+    else:
+        coefficients = coefficients_of(fitter, fit, free, reach, returned=here)
+        effect = _effect(fitter, fit, place, here) if here else None
+    units = _local(fitter, fit, place, [_unit(free, name, coefficients.names) for name in coefficients.names]) / UNIT
+    quantity, quantity_unit = _quantity(fitter, free, place)
+    curves = []
+    for variable, unit, x in (*_phases(fitter, free, place), *_variables(fitter, fit, place)):
+        at, mean = _bins(x)
+        free_mean = mean @ units.T
+        error = torch.sqrt(torch.einsum("km,mn,kn->k", free_mean, coefficients.covariance, free_mean).clamp(min=0.0))
+        along = mean @ effect if effect is not None else None
+        curves.append(
+            Curve(place, variable, unit, quantity, quantity_unit, at, free_mean @ coefficients.values, error, along)
+        )
+    return curves
+
+
+def _neutral(fitter: Fitter, placements: Sequence[Placement]) -> tuple[tuple[Placement, ...], Mapping[str, float]]:
+    """Placements with their sizes at nominal, which switches them off."""
+    plant, sizes = fitter.data.plant, {}
+    for p in placements:
+        size = p.effect.parameters(p.location, plant)[0]
+        sizes[f"{p.prefix}.{size.name}"] = size.nominal
+    return tuple(placements), sizes
+
+
+def _effect(fitter: Fitter, fit: Fit, place: str, here: tuple[Placement, ...]) -> Tensor:
+    """What the fit's causes at the place do there, (X,)."""
+    without = _local(fitter, fit, place, [_neutral(fitter, here)])[0]
+    return -without / (1.0 + without) if any(p.effect.stage is Stage.STORAGE for p in here) else -without
+
+
+def _unit(
+    free: Sequence[Placement], name: str, names: Sequence[str]
+) -> tuple[tuple[Placement, ...], Mapping[str, float]]:
+    return tuple(free), {n: UNIT if n == name else 0.0 for n in names}
+
+
+def _of_stage(free: Sequence[Placement], here: Sequence[Placement]) -> tuple[Placement, ...]:
+    """At a tank: the free cross-section for effects on the cross-section, the free inflow for all others."""
+    storage = any(p.effect.stage is Stage.STORAGE for p in here)
+    return tuple(p for p in free if (p.effect.stage is Stage.STORAGE) == storage) or tuple(free)
+
+
+def _local(
+    fitter: Fitter, fit: Fit, place: str, changed: Sequence[tuple[tuple[Placement, ...], Mapping[str, float]]]
+) -> Tensor:
+    """Change of what happens at the place along the fit's trajectory by each change, (M, X): of the flow at the middle
+    of each step, the share of the cross-section, or the reading at each sample.
+
+    changed: placements that replace those of the same name in the fit, and the values that change.
+    """
+    plant, linearised = fitter.data.plant, fit.linearised
+    middle = 0.5 * (linearised.levels[:, 1:] + linearised.levels[:, :-1])
+    fitted_engine = fitter.engine(fit.candidate, [n for n in fit.space.names if n.count(".") == 2])
+    theta = fit.theta.unsqueeze(0)
+    placements = changed[0][0]
+    prefixes = {p.prefix for p in placements}
+    others = [p for p in fit.candidate.placements if p.prefix not in prefixes]
+    free = {n for n in fit.space.names if n.count(".") == 2} | {n for _, values in changed for n in values}
+    engine = fitter.engine(Candidate((*others, *placements)), sorted(free))
+    fitted = {n: v for n, v in fit.values.items() if n in engine.space}
+    base = {n: 0.0 for n in free if ".free_" in n}  # one coefficient at a time
+    rows = torch.stack([engine.space.vector({**fitted, **base, **values}) for _, values in changed])
+    if ".free_" in next(iter(changed[0][1])):
+        before = engine.space.vector({**fitted, **base}).unsqueeze(0)
+        rates, readings = engine.rates(middle, before), engine.read(linearised.levels, before)
+    else:
+        rates, readings = fitted_engine.rates(middle, theta), fitted_engine.read(linearised.levels, theta)
+    component = None if "-" in place and place not in _names(fitter) else plant.component(place)
+    if isinstance(component, Sensor):
+        index = [s.name for s in plant.sensors].index(place)
+        return (engine.read(linearised.levels, rows) - readings)[..., index]
+    tanks = {t.name: i for i, t in enumerate(plant.tanks)}
+    name, sign = _tank_and_sign(component, place)
+    after = engine.rates(middle, rows)[..., tanks[name]]
+    before_rate = rates[..., tanks[name]]
+    if any(p.effect.stage is Stage.STORAGE for p in placements):
+        moving = before_rate.abs() > 1e-9 * before_rate.abs().max()
+        return torch.where(moving, before_rate / torch.where(moving, after, 1.0) - 1.0, 0.0)
+    return sign * (after - before_rate) * plant.tanks[tanks[name]].area
+
+
+def _names(fitter: Fitter) -> set[str]:
+    return {c.name for c in fitter.data.plant.components()}
+
+
+def _tank_and_sign(component: Any, place: str) -> tuple[str, float]:
+    """The tank whose balance contains the component's flow, and the sign of the flow there."""
+    if isinstance(component, Pump):
+        return component.target, 1.0
+    if isinstance(component, Pipe):
+        return component.source, -1.0
+    if isinstance(component, Tank):
+        return component.name, 1.0
+    return place.split("-")[0], -1.0
+
+
+def _quantity(fitter: Fitter, free: Sequence[Placement], place: str) -> tuple[str, str]:
+    if any(p.effect.stage is Stage.STORAGE for p in free):
+        return "area", "1"
+    sensor = next((s for s in fitter.data.plant.sensors if s.name == place), None)
+    return ("reading", sensor.unit) if sensor else ("flow", "m^3/s")
+
+
+def _variables(fitter: Fitter, fit: Fit, place: str) -> list[tuple[str, str, Tensor]]:
+    """Name, SI unit and values (X,) of the local variables of a place, time last."""
+    data, linearised = fitter.data, fit.linearised
+    plant, experiment = data.plant, data.experiment
+    middle = 0.5 * (linearised.levels[0, 1:] + linearised.levels[0, :-1])
+    tanks = {t.name: middle[:, i] for i, t in enumerate(plant.tanks)}
+    clock = ("time", "s", experiment.nodes[:-1] + 0.5 * experiment.steps)
+    component = plant.component(place) if place in _names(fitter) else None
+    if isinstance(component, Sensor):
+        index = [s.name for s in plant.sensors].index(place)
+        read = (f"{component.name} read", component.unit, linearised.readings[0, :, index])
+        return [read, ("time", "s", experiment.sample_times)]
+    if isinstance(component, Pump):
+        channel = plant.channels().index(component.channel)
+        command = (f"{component.channel} commanded", component.command_unit, experiment.inputs[:, channel])
+        return [command, (f"level of {component.target}", "m", tanks[component.target]), clock]
+    if isinstance(component, Pipe):
+        far = 0.0 if component.is_outlet else tanks[component.target]
+        name = f"level of {component.source}" if component.is_outlet else f"{component.source} − {component.target}"
+        return [(name, "m", tanks[component.source] - far), clock]
+    if isinstance(component, Tank):
+        return [(f"level of {component.name}", "m", tanks[component.name]), clock]
+    first, second = place.split("-")
+    return [(f"{first} − {second}", "m", tanks[first] - tanks[second]), clock]
+
+
+def _phases(fitter: Fitter, free: Sequence[Placement], place: str) -> list[tuple[str, str, Tensor]]:
+    """The time within one period, for a free form with sinusoids."""
+    periods = [period for p in free for period in getattr(p.effect, "periods", ())]
+    if not periods:
+        return []
+    experiment, sensors = fitter.data.experiment, {s.name for s in fitter.data.plant.sensors}
+    middle = experiment.nodes[:-1] + 0.5 * experiment.steps
+    clock = experiment.sample_times if place in sensors else middle
+    return [(f"time within each {periods[0]:.3g} s", "s", torch.remainder(clock, periods[0]))]
+
+
+def _bins(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres (K,) and averaging weights (K, X) of values in groups of equal size, or one by one if they are few."""
+    resolution = 1e-6 * float(x.max() - x.min())
+    values, groups = torch.unique(torch.round(x / resolution) if resolution > 0.0 else x, return_inverse=True)
+    if len(values) > BINS:
+        edges = torch.quantile(x, torch.linspace(0.0, 1.0, BINS + 1, dtype=x.dtype)[1:-1])
+        groups = torch.searchsorted(edges, x.contiguous())
+    members = torch.nn.functional.one_hot(groups, int(groups.max()) + 1).to(x.dtype).T
+    members = members[members.sum(dim=1) > 0]
+    weights = members / members.sum(dim=1, keepdim=True)
+    return weights @ x, weights

@@ -1,0 +1,1 @@
+"""Free runs of a plant file: prediction, initial state, refit, and variance between recordings."""

@@ -1,0 +1,225 @@
+"""Free run of a plant file along a recording; only the first samples of the recording are used.
+
+The first samples determine the initial levels and, within their tolerances, the constants that vary from recording to
+recording (such as the zero of a sensor that is zeroed before each run): a tank whose sensor reads below zero is empty,
+and the sensor has an offset. If the recording was cut from a longer one in which a pump had run, the pump's hose is
+full. A longer initial segment determines what varies more accurately, and the levels at its end; it is then no part of
+the prediction (`initial_state.py`).
+
+`leave_one_file_out` predicts each file by a plant fitted to all others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import effect, without_startup_effects
+from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.dataset import DataSet, data_set_of
+from fdi_torch.gap.free_runs.initial_state import estimate_initial_state
+from fdi_torch.names import matching
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.scales import length_scale
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.collocation import Collocation
+
+START_SAMPLES = 50  # for the initial levels
+CORRECTIONS, HALVINGS = 80, 4  # Newton steps, and halvings of the simulation step
+CONVERGED = 1e-5  # largest defect of a converged trajectory, m, for bench-scale tanks
+NEARLY = 10.0  # in units of CONVERGED: a defect that shorter steps need not improve
+MOST_STEPS = 4000  # in the first attempt; levels change more slowly than close samples
+UNMEASURED_STARTS = (0.1, 0.25, 0.5, 0.8)  # initial levels, as shares of the height, of a tank without a sensor
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """readings (S, C) in SI, in the order of the plant's sensors. start_levels: m. own: constants determined from the
+    first samples, SI. rmse: by sensor, over all samples or those after the initial segment.
+
+    settled: whether the trajectory converged to CONVERGED, scaled with the size of the tanks. defect: what remains, m.
+    """
+
+    readings: Tensor
+    residuals: Tensor
+    start_levels: Mapping[str, float]
+    own: Mapping[str, float]
+    rmse: Mapping[str, float]
+    settled: bool
+    defect: float
+
+
+def predict(
+    plant: PlantDescription,
+    recording: Recording,
+    start_samples: int = START_SAMPLES,
+    step: float | None = None,
+    settle: float | None = None,
+    vary: Collection[str] = (),
+) -> Prediction:
+    """Run the plant freely as its file has it.
+
+    step: of the simulation, s; None for half the sampling interval (in long recordings the MOST_STEPS-th part of them),
+    and less if a rim or another sharp bend keeps the trajectory from converging.
+
+    settle: length of the initial segment (s), used in place of start_samples. The run continues from the levels at its
+    end, and errors are counted after it. vary: patterns of further constants with a tolerance that the first samples
+    determine.
+
+    Raises ValueError if there is no sample to start from, or none left to predict.
+    """
+    skipped = 0
+    if settle is not None:
+        start_samples = skipped = _samples_within(recording, settle)
+    if start_samples < 1:
+        raise ValueError(f"expected at least 1 sample for the start levels, got {start_samples}")
+    plant = without_startup_effects(_varying(plant, vary), recording.ran)
+    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    duration = float(recording.time[-1] - recording.time[0])
+    step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), duration / MOST_STEPS)
+    defect = math.inf
+    for _ in range(HALVINGS):
+        data = data_set_of(plant, nominal_effects, recording, step)
+        prediction, previous = _run(data, start_samples, skipped), defect
+        defect = prediction.defect
+        stalled = defect < NEARLY * CONVERGED * length_scale(plant) and defect > 0.5 * previous
+        if prediction.settled or stalled:  # an empty tank oscillates at its floor with any step
+            break
+        step *= 0.5
+    return prediction
+
+
+def _samples_within(recording: Recording, seconds: float) -> int:
+    """Number of samples in the first seconds. Raises ValueError unless readings are left to predict."""
+    first = float(recording.time[0])
+    samples = int((recording.time <= first + seconds).sum())
+    if seconds <= 0 or not bool(recording.mask[samples:].any()):
+        length = float(recording.time[-1]) - first
+        raise ValueError(
+            f"{recording.source}: expected an initial segment of more than 0 s and less than the {length:g} s of "
+            f"the recording, got {seconds:g} s"
+        )
+    return samples
+
+
+def _varying(plant: PlantDescription, patterns: Collection[str]) -> PlantDescription:
+    """The plant with further varying constants. Raises ValueError for a pattern that matches none with a tolerance."""
+    more = matching("a constant with a tolerance to vary", patterns, plant.tolerances)
+    return replace(plant, varying=tuple(dict.fromkeys([*plant.varying, *more])))
+
+
+def _run(data: DataSet, start_samples: int, skipped: int) -> Prediction:
+    plant = data.plant
+    early = data.mask.clone()
+    early[start_samples:] = False
+    if not bool(early.any()):
+        source = data.recording.source
+        raise ValueError(f"{source}: expected readings among the first {start_samples} samples, got none")
+    std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+    fitter = Fitter(replace(data, mask=early), Noise(1e-2 * std, torch.zeros_like(std)))
+    engine, theta, levels = _start_from_segment(fitter, skipped) if skipped else _start_from_samples(fitter, data)
+    run = engine.converge(theta, levels, CORRECTIONS)
+    readings = run.readings[0]
+    residuals = torch.where(data.mask, data.readings - readings, torch.zeros_like(readings))
+    rmse = torch.sqrt((residuals[skipped:] ** 2).sum(dim=0) / data.mask[skipped:].sum(dim=0))
+    values = dict(zip(engine.space.names, theta[0].tolist(), strict=True))
+    return Prediction(
+        readings,
+        residuals,
+        {t.name: values[f"{t.name}.start_level"] for t in plant.tanks},
+        {name: values[name] for name in plant.varying},
+        dict(zip((s.name for s in plant.sensors), rmse.tolist(), strict=True)),
+        float(run.defect.max()) < CONVERGED * length_scale(plant),
+        float(run.defect.max()),
+    )
+
+
+Start = tuple[Collocation, Tensor, Tensor]
+"""The engine, parameters (1, P) and a guess of the levels (1, K+1, tanks)."""
+
+
+def _start_from_samples(fitter: Fitter, data: DataSet) -> Start:
+    """Initial levels and varying constants from the readings that the fitter sees."""
+    plant = fitter.data.plant
+    engine = _engine(fitter, (), [*(f"{t.name}.start_level" for t in plant.tanks), *plant.varying])
+    theta = torch.stack([engine.space.vector(start) for start in _starts(plant, fitter.first_levels())])
+    levels = Fitter(data, fitter.noise).first_trajectory(engine, theta)
+    ends = fitter.descend(engine, theta, levels)
+    best = int(torch.nan_to_num(ends.cost, nan=torch.inf).argmin())
+    return engine, ends.theta[best : best + 1], ends.linearised.levels[best : best + 1]
+
+
+def _start_from_segment(fitter: Fitter, samples: int) -> Start:
+    """The same from the first samples as an initial segment with unknown inflows."""
+    data = fitter.data
+    plant = replace(data.plant, tolerances={n: data.plant.tolerances[n] for n in data.plant.varying})
+    first, step = data.recording.stretch(0, samples), float(data.experiment.steps.max())
+    segment = data_set_of(plant, data.nominal_effects, first, step)
+    state = estimate_initial_state(segment, _starts(plant, fitter.first_levels()), fitter.noise)
+    engine = _engine(fitter, state.placements, list(state.values))
+    theta = engine.space.vector(state.values).unsqueeze(0)
+    return engine, theta, engine.constant_guess(theta)
+
+
+def _engine(fitter: Fitter, placements: Sequence[Placement], names: Sequence[str]) -> Collocation:
+    network = fitter.network(placements)
+    return Collocation(network, ParameterSpace(network.constants[n] for n in names), fitter.data.experiment)
+
+
+def _starts(plant: PlantDescription, measured: Mapping[str, float]) -> list[dict[str, float]]:
+    """Initial values: measured levels, and a grid for tanks without a sensor."""
+    unmeasured = [t for t in plant.tanks if f"{t.name}.start_level" not in measured]
+    grids = [[(f"{t.name}.start_level", share * t.height) for share in UNMEASURED_STARTS] for t in unmeasured]
+    return [{**measured, **dict(choice)} for choice in product(*grids)]
+
+
+@dataclass(frozen=True)
+class LeftOutRun:
+    """A free run along one recording from start to stop (s): root mean square errors by sensor (SI).
+
+    as_is: of the plant as it is. refitted: of the plant fitted to all files but that of this recording.
+    """
+
+    source: str
+    start: float
+    stop: float
+    as_is: Mapping[str, float]
+    refitted: Mapping[str, float]
+
+
+def leave_one_file_out(
+    plant: PlantDescription,
+    recordings: Sequence[Recording],
+    trials: Sequence[Recording],
+    fit: Callable[[Sequence[Recording]], PlantDescription],
+    start_samples: int,
+    progress: Callable[[float, str], None] = lambda share, text: None,
+    settle: float | None = None,
+) -> list[LeftOutRun]:
+    """Predict each trial by the plant as it is, and by the plant that `fit` returns for the recordings of all other
+    files.
+
+    Files are identified by the hash of their contents. settle: as in `predict`, s. Raises ValueError if no recording
+    would be left to fit.
+    """
+    refitted: dict[str, PlantDescription] = {}
+    runs = []
+    for k, run in enumerate(trials):
+        progress(k / len(trials), run.source)
+        if run.sha256 not in refitted:
+            others = [r for r in recordings if r.sha256 != run.sha256]
+            if not others:
+                raise ValueError(f"{run.source}: expected recordings of another file to fit to, got none; give more")
+            refitted[run.sha256] = fit(others)
+        plants = plant, refitted[run.sha256]
+        as_is, without = (predict(p, run, start_samples, settle=settle).rmse for p in plants)
+        runs.append(LeftOutRun(run.source, float(run.time[0]), float(run.time[-1]), as_is, without))
+    return runs

@@ -1,0 +1,236 @@
+"""Refit of all effects of a plant file together with its constants; the last step after causes were adopted.
+
+A cause that was adopted early was fitted while others were missing. No effect is searched here. A parameter with a
+tolerance stays near its value in the plant file; one without is free.
+
+`fit_by_continuation` finds a first trajectory where a sharp bend prevents it: rims and roots are first smoothed as for
+steps WIDENINGS times as long, and each solution is the start of the next (continuation: Allgower and Georg, 1990).
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from fdi_torch.effects import build_network, effect
+from fdi_torch.gap.answer import with_constants
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
+from fdi_torch.gap.channel_noise import Noise, estimate_noise
+from fdi_torch.gap.dataset import DataSet, RecordingPart
+from fdi_torch.gap.free_runs.between_runs import DETERMINED, RunConstant
+from fdi_torch.gap.preprocess.sensor_limits import limits_of
+from fdi_torch.gap.problem import checked_data_set
+from fdi_torch.names import matching
+from fdi_torch.plant.description import PlacedEffect, PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.operating_range import operating_range_of_all
+from fdi_torch.recording import Recording
+from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.joint_collocation import name_in_recording
+
+TURNS = 3  # alternations between noise and fit
+WIDE = 0.5  # share of a range; a larger standard error means undetermined
+
+
+@dataclass(frozen=True)
+class Refit:
+    """plant: with fitted effects and constants. before, rmse: errors by sensor (SI) with constants only, and with all,
+    fitted. parameters: how many were fitted, initial levels included. fitted: value and standard error, misfit
+    included, of what all recordings share. own: constants specific to each recording, without initial levels."""
+
+    plant: PlantDescription
+    before: Mapping[str, float]
+    rmse: Mapping[str, float]
+    parameters: int
+    fitted: Mapping[str, tuple[float, float]]
+    own: Sequence[RunConstant] = ()
+
+
+def refit(
+    plant: PlantDescription,
+    recordings: Recording | Sequence[Recording],
+    leave_out: Collection[str] = (),
+    step: float | None = None,
+    hold: Collection[str] = (),
+    white: float | None = None,
+    vary: Collection[str] = (),
+) -> Refit:
+    """Fit all effects and constants of a plant to recordings.
+
+    step: of the simulation, s; None for half the sampling interval. leave_out: effects to remove from the plant. hold:
+    patterns of constants that are not fitted. white: standard deviation (SI) of white noise that replaces the estimated
+    noise. Use it for free runs with equations that are not quite the rig's: the estimated noise weights fast errors
+    more than slow ones. vary: patterns of further constants with a tolerance that each recording has for itself.
+
+    Raises ValueError for a pattern that matches no name.
+    """
+    kept = tuple(e for e in plant.effects if e.effect not in leave_out)
+    placements = [Placement(effect(e.effect), e.location, e.parameters) for e in kept]
+    prefixes = {p.prefix for p in placements}
+    tolerances = {n: v for n, v in plant.tolerances.items() if n.count(".") == 1 or n.rpartition(".")[0] in prefixes}
+    held_names = set(matching("a constant of the plant to hold", hold, build_network(plant).constants.names))
+    varying = dict.fromkeys([*plant.varying, *matching("a constant with a tolerance to vary", vary, tolerances)])
+    held_plant = replace(
+        plant,
+        effects=kept,
+        tolerances={n: v for n, v in tolerances.items() if n not in held_names},
+        varying=tuple(n for n in varying if n not in held_names),
+    )
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    step = step or 0.5 * recordings[0].interval
+    data = checked_data_set(held_plant, placements, recordings, step)
+    start = {n: v for n, v in _initial_values(kept, plant, recordings).items() if n not in tolerances}
+    start = {n: v for n, v in start.items() if n not in held_names}
+    free = [p for p in placements if any(n.startswith(f"{p.prefix}.") for n in start)]
+    std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
+    size = 1e-2 * std if white is None else torch.full_like(std, white)
+    fitter = Fitter(data, Noise(size, torch.zeros_like(std)))
+    null = _with_a_trajectory(fit_by_continuation(fitter, Candidate()), recordings)
+    fit, base = null, null if white is None else None
+    for _ in range(TURNS if white is None else 1):
+        if white is None:
+            fitter = Fitter(data, estimate_noise(data.readings - fit.linearised.readings[0], data.mask))
+        candidate = Candidate(tuple(free), (start,))
+        fit = base = _with_a_trajectory(fit_by_continuation(fitter, candidate, base), recordings)
+        effect_values = {n: v for n, v in fit.effect_values.items() if n in start}
+        start = {n: v for n, v in effect_values.items() if n not in _undetermined(fitter, fit)}
+    run_constants = _run_constants(fitter, fit)
+    refitted = replace(
+        _refitted_plant(held_plant, fit, _typical(run_constants, fit, held_plant)),
+        tolerances=tolerances,
+        varying=plant.varying,
+    )
+    return Refit(refitted, _rmse(fitter, null), _rmse(fitter, fit), len(fit.space), _errors(fitter, fit), run_constants)
+
+
+def _with_a_trajectory(fit: Fit, recordings: Sequence[Recording]) -> Fit:
+    """The fit. Raises ValueError if its trajectory did not converge."""
+    if trajectory_found(fit):
+        return fit
+    named = ", ".join(dict.fromkeys(r.source for r in recordings if r.source)) or "the recordings"
+    raise ValueError(
+        f"refit: no trajectory of the levels along {named} was found from the plant file's values; start from other"
+        " values of its effects, leave one of them out (--leave-out), or simulate in finer steps (--step)"
+    )
+
+
+def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
+    """Parameters whose standard error, misfit included, is a large part of their range; they keep the plant file's
+    value."""
+    low, high, _ = fitter.box(fit.space)
+    errors = _errors(fitter, fit)
+    widths = dict(zip(fit.space.names, (high - low).tolist(), strict=True))
+    return {n for n in fit.effect_values if n in errors and errors[n][1] > WIDE * widths[n]}
+
+
+def _errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
+    """Values and standard errors, misfit included, of what all recordings share."""
+    per_recording = set(fitter.data.per_recording)
+    return {n: each for n, each in _all_errors(fitter, fit).items() if n.partition("@")[0] not in per_recording}
+
+
+def _all_errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
+    misfit = max(1.0, (fit.cost / float(fitter.data.mask.sum())) ** 0.5)
+    stds = standard_errors(fitter, fit)
+    return {n: (v, misfit * stds[n]) for n, v in fit.values.items()}
+
+
+def _run_constants(fitter: Fitter, fit: Fit) -> tuple[RunConstant, ...]:
+    """Constants that vary between recordings, by name and then in the order of the recordings."""
+    errors, parts = _all_errors(fitter, fit), fitter.data.parts
+    return tuple(
+        RunConstant(name, part.recording.source, float(part.recording.time[0]), *errors[name_in_recording(name, k)])
+        for name in fitter.data.plant.varying
+        for k, part in enumerate(parts)
+    )
+
+
+def _initial_values(
+    kept: Collection[PlacedEffect], plant: PlantDescription, recordings: Sequence[Recording]
+) -> dict[str, float]:
+    """Present values of the effects' parameters that a fit may change; limits that the readings show are not fitted."""
+    reach = operating_range_of_all(recordings, plant)
+    start: dict[str, float] = {}
+    for placed in kept:
+        movable = {n for s in effect(placed.effect).starts(placed.location, plant, reach) for n in s}
+        if not effect(placed.effect).quantizes and not any(
+            _is_limit_from_readings(placed, plant, r) for r in recordings
+        ):
+            values = {n: v for n, v in placed.parameters.items() if n in movable}
+            start |= {f"{placed.location}.{placed.effect}.{n}": v for n, v in values.items()}
+    return start
+
+
+def _is_limit_from_readings(placed: PlacedEffect, plant: PlantDescription, recording: Recording) -> bool:
+    """Whether the effect is a limit of a sensor that the readings themselves show."""
+    for sensor in plant.sensors:
+        if sensor.name == placed.location and sensor.column in recording.output_names:
+            i = recording.output_names.index(sensor.column)
+            limits = limits_of(recording.outputs[recording.mask[:, i], i])
+            return limits.get(placed.effect) == placed.parameters.get("limit", float("nan"))
+    return False
+
+
+def _typical(run_constants: Sequence[RunConstant], fit: Fit, plant: PlantDescription) -> dict[str, float]:
+    """Expected value of each varying constant in the next recording: the median of its well-determined values and of
+    the plant file's, which counts as one more."""
+    typical = {}
+    for name in plant.varying:
+        determined = [o.value for o in run_constants if o.name == name and o.std < DETERMINED * plant.tolerances[name]]
+        if determined:
+            typical[name] = statistics.median([*determined, fit.space[name].nominal])
+    return typical
+
+
+def _refitted_plant(plant: PlantDescription, fit: Fit, typical: dict[str, float]) -> PlantDescription:
+    """The plant with fitted constants and effects, and typical values of what varies between recordings."""
+    per_recording = {*plant.varying, *(f"{tank.name}.start_level" for tank in plant.tanks)}
+    common = {n: v for n, v in fit.values.items() if n.partition("@")[0] not in per_recording} | typical
+    constants = {n: v for n, v in common.items() if n.count(".") == 1}
+    effect_values = {n: v for n, v in common.items() if n.count(".") == 2}
+    effects = []
+    for placed in plant.effects:
+        prefix = f"{placed.location}.{placed.effect}"
+        fitted = {n.rpartition(".")[2]: v for n, v in effect_values.items() if n.rpartition(".")[0] == prefix}
+        effects.append(replace(placed, parameters={**placed.parameters, **fitted}))
+    return replace(with_constants(plant, constants), effects=tuple(effects))
+
+
+def _rmse(fitter: Fitter, fit: Fit) -> dict[str, float]:
+    mask = fitter.data.mask
+    squares = torch.where(mask, (fitter.data.readings - fit.linearised.readings[0]) ** 2, 0.0)
+    each = torch.sqrt(squares.sum(dim=0) / mask.sum(dim=0)).tolist()
+    return dict(zip((s.name for s in fitter.data.plant.sensors), each, strict=True))
+
+
+WIDENINGS = (64.0, 16.0, 4.0, 2.0)
+
+
+def fit_by_continuation(fitter: Fitter, candidate: Candidate, base: Fit | None = None) -> Fit:
+    """Fit a candidate; by continuation from smoothed plants if its trajectory does not converge at once."""
+    direct = fitter.fit(candidate, base)
+    if trajectory_found(direct):
+        return direct
+    for widening in WIDENINGS:
+        smooth = Fitter(_smoothed(fitter.data, widening), fitter.noise).fit(candidate, base)
+        if trajectory_found(smooth):
+            base = smooth
+    continued = fitter.fit(candidate, base) if base is not None else direct
+    return continued if trajectory_found(continued) else direct
+
+
+def trajectory_found(fit: Fit) -> bool:
+    """Whether the fit's trajectory converged."""
+    return math.isfinite(fit.cost) and bool(torch.isfinite(fit.linearised.jacobian).all())
+
+
+def _smoothed(data: DataSet, widening: float) -> DataSet:
+    def wider(experiment: Experiment) -> Experiment:
+        return replace(experiment, resolution=widening * experiment.resolution)
+
+    further: list[RecordingPart] = [replace(part, experiment=wider(part.experiment)) for part in data.further]
+    return replace(data, experiment=wider(data.experiment), further=tuple(further))

@@ -1,0 +1,192 @@
+"""The share of the gap that the causes close on hold-outs: free runs with and without the effects.
+
+    closed = 1 - (augmented^2 - noise^2) / (recalibrated^2 - noise^2), in mean squares
+
+Constants and effects come from the diagnosed recordings. Of a hold-out only the initial levels are fitted, to its first
+samples. Several hold-outs, each with its own clock, noise and initial levels, are pooled sample by sample.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise, estimate_noise, with_rounding
+from fdi_torch.gap.dataset import DataSet
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.effect import Placement
+from fdi_torch.simulate.collocation import Collocation
+
+START_SAMPLES = 120  # for the initial levels
+BLOCKS, DRAWS = 24, 400  # blocks of time, and draws of the bootstrap
+DEFINED = 5.0  # standard errors; a smaller gap is too uncertain to state a share of it
+
+
+@dataclass(frozen=True)
+class Model:
+    """A plant for a free run: its effects, and by full name all values that are not nominal."""
+
+    placements: tuple[Placement, ...] = ()
+    values: Mapping[str, float] | None = None
+
+
+def model_of(fit: Fit) -> Model:
+    """The model of a fit."""
+    return Model(fit.candidate.placements, fit.values)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Free runs (S, C) of each model on one hold-out, and the noise of the hold-out.
+
+    The noise is estimated from the residual of the augmented or the recalibrated model, whichever is smaller: a free
+    form may diverge outside the range where it was fitted.
+    """
+
+    data: DataSet
+    runs: Mapping[str, Tensor]
+    noise: Noise
+
+    @property
+    def weight(self) -> Tensor:
+        """Weights (C,) of the squares. Sensors of different units count in standard deviations of their noise."""
+        one_unit = len({s.unit for s in self.data.plant.sensors}) == 1
+        return torch.ones_like(self.noise.std) if one_unit else 1.0 / self.noise.std.clamp(min=1e-300) ** 2
+
+    def squares(self, model: str) -> Tensor:
+        """Squared residuals (S, C), 0 for masked readings."""
+        residual = self.data.readings - self.runs[model]
+        return torch.where(self.data.mask, residual * residual, 0.0)
+
+
+@dataclass(frozen=True)
+class Closure:
+    """RMSE of free runs by model, and 'noise_floor', in the reading's SI unit; pooled in standard deviations of the
+    noise if units differ.
+
+    closed: None if the gap is too small.
+    """
+
+    pooled: dict[str, float]
+    per_sensor: dict[str, dict[str, float]]
+    closed: float | None
+    closed_ci95: tuple[float, float] | None
+
+
+def run_reference_models(
+    data: DataSet, noise: Noise, models: Mapping[str, Model], quantization_steps: Sequence[float]
+) -> HeldOut:
+    """Free runs of all models by name, "augmented" among them. quantization_steps (C,): 0 for channels without one."""
+    runs, levels = {}, None
+    for name, model in models.items():
+        runs[name], levels = free_run(data, noise, model, levels)
+    residuals = (data.readings - runs[m] for m in ("augmented", "recalibrated") if m in runs)
+    nearest = min(residuals, key=lambda r: float(torch.where(data.mask, r * r, 0.0).sum()))
+    fast = estimate_noise(nearest, data.mask, quantization_steps)
+    return HeldOut(data, runs, with_rounding(fast, quantization_steps, data.readings - nearest))
+
+
+def closure(holdouts: Sequence[HeldOut]) -> Closure:
+    """The closure over all hold-outs together."""
+    count = torch.stack([h.data.mask.sum(dim=0) for h in holdouts]).sum(dim=0)
+    sums = {m: torch.stack([h.squares(m).sum(dim=0) for h in holdouts]).sum(dim=0) for m in holdouts[0].runs}
+    sums["noise_floor"] = torch.stack([h.noise.std**2 * h.data.mask.sum(dim=0) for h in holdouts]).sum(dim=0)
+    weighted = {m: torch.stack([(h.weight * h.squares(m)).sum() for h in holdouts]).sum() for m in holdouts[0].runs}
+    weighted["noise_floor"] = torch.stack([(h.weight * h.noise.std**2 * h.data.mask).sum() for h in holdouts]).sum()
+    pooled = {m: float(torch.sqrt(total / count.sum())) for m, total in weighted.items()}
+    rmse = {m: torch.sqrt(total / count.clamp(min=1)) for m, total in sums.items()}
+    names = [s.name for s in holdouts[0].data.plant.sensors]
+    sensors = {s: {m: float(v[i]) for m, v in rmse.items()} for i, s in enumerate(names)}
+    return Closure(pooled, sensors, *_closed(holdouts))
+
+
+def free_run(data: DataSet, noise: Noise, model: Model, guess: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Readings (S, C) and levels (1, K+1, tanks) of a free run, with initial levels from the first samples.
+
+    guess (1, K+1, tanks): levels from which the trajectory starts.
+    """
+    values = transferable_values(model.values or {})
+    fitter = Fitter(replace(data, mask=_first(data.mask)), noise)
+    network = fitter.engine(Candidate(model.placements), [n for n in values if n.count(".") == 2]).network
+    for name, value in values.items():
+        if name.partition("@")[0] in data.plant.varying or "@" in name:
+            continue  # specific to another recording
+        network.nominal[network.constants.index(name)] = value
+    starts = [f"{t.name}.start_level" for t in data.plant.tanks]
+    engine = Collocation(network, ParameterSpace(network.constants[n] for n in starts), data.experiment)
+    theta = engine.space.vector(fitter.first_levels()).unsqueeze(0)
+    if guess is None:  # all readings serve as a first guess of the trajectory only
+        levels = Fitter(data, noise).first_trajectory(engine, theta)
+    else:
+        levels = engine.converge(theta, guess).levels
+    start = fitter.descend(engine, theta, levels)
+    converged = engine.converge(start.theta, start.linearised.levels)
+    return converged.readings[0], converged.levels
+
+
+def transferable_values(values: Mapping[str, float]) -> dict[str, float]:
+    """Values of a model that hold for another recording.
+
+    Of a free form's function of time its mean holds; its sinusoids are dropped, because their phase belongs to the
+    recording's clock.
+    """
+    courses: dict[str, list[float]] = {}
+    for name, value in values.items():
+        if _free_part(name).startswith("time_"):
+            courses.setdefault(name.rpartition(".")[0], []).append(value)
+    transferable = dict(values)
+    for name in values:
+        course = courses.get(name.rpartition(".")[0], [0.0])
+        if _free_part(name).startswith("time_"):
+            transferable[name] = sum(course) / len(course)
+        elif _free_part(name).startswith(("sine_", "cosine_")):
+            transferable[name] = 0.0
+    return transferable
+
+
+def _free_part(name: str) -> str:
+    """Coefficient name of a free form, or '' for any other parameter."""
+    return name.rpartition(".")[2] if ".free_" in name else ""
+
+
+def _first(mask: Tensor) -> Tensor:
+    early = mask.clone()
+    early[START_SAMPLES:] = False
+    return early
+
+
+def _closed(holdouts: Sequence[HeldOut]) -> tuple[float | None, tuple[float, float] | None]:
+    """Share closed with its 95 % interval over blocks of time; None if the gap is below 5 standard errors.
+
+    The noise of a hold-out is the same in both runs. The gap is therefore the difference of their squares, plus the
+    excess of the augmented run over the noise, as far as it exceeds the uncertainty of the noise.
+    """
+    difference = torch.cat([_blocks(h.weight * (h.squares("recalibrated") - h.squares("augmented"))) for h in holdouts])
+    excess = sum(float((h.weight * (h.squares("augmented") - h.noise.std**2 * h.data.mask)).sum()) for h in holdouts)
+    noise_error = math.sqrt(sum(_floor_variance(h) for h in holdouts))
+    remaining = math.copysign(max(abs(excess) - noise_error, 0.0), excess)
+    total, error = float(difference.sum()) + max(remaining, 0.0), float(difference.std()) * math.sqrt(len(difference))
+    if total < DEFINED * min(error, noise_error) or total <= 0.0:
+        return None, None
+    generator = torch.Generator().manual_seed(0)
+    picks = torch.randint(len(difference), (DRAWS, len(difference)), generator=generator)
+    drawn_excess = max(remaining, 0.0) + noise_error * torch.randn(DRAWS, generator=generator, dtype=difference.dtype)
+    drawn = 1.0 - drawn_excess / (difference[picks].sum(dim=1) + drawn_excess.clamp(min=0.0)).clamp(min=1e-300)
+    low, high = torch.quantile(drawn, torch.tensor([0.025, 0.975], dtype=drawn.dtype)).tolist()
+    return 1.0 - max(remaining, 0.0) / total, (max(low, -9.0), min(high, 1.0))
+
+
+def _floor_variance(held: HeldOut) -> float:
+    """Variance of the sum of squares of the noise alone."""
+    std, count = held.noise.std * torch.sqrt(held.weight), held.data.mask.sum(dim=0)
+    return float((2.0 * std**4 * count * held.noise.squared_correlations).sum())
+
+
+def _blocks(x: Tensor) -> Tensor:
+    """Sums of x (S, C) over blocks of time."""
+    return torch.stack([b.sum() for b in torch.tensor_split(x.sum(dim=1), BLOCKS)])

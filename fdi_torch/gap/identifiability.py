@@ -1,0 +1,175 @@
+"""Identifiability of the effects under given inputs: which are hidden, inseparable, or easily confused.
+
+Each effect at its typical size changes the readings by a column of the linearised plant. Its norm in units of the
+noise, with calibration constants and initial levels projected out, says how visible the effect is; with another
+effect's column projected out as well, how separable the two are.
+
+`planned_identifiability` answers this before any recording, from the prediction of the plant file.
+
+`simulated_confusions` simulates how often another cause would have been named. In turn each other effect of the library
+causes a gap of the observed size, with fresh noise, and every effect is fitted to it by linear regression, with and
+without the true one in the library. Only single causes are simulated, at their start values, so that these are rates of
+a simpler search than the real one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import effect
+from fdi_torch.gap.answer import CauseName
+from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.dataset import data_set_of
+from fdi_torch.gap.library import canonical, library_of
+from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, options_of, screen
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.operating_range import operating_range_of
+from fdi_torch.recording import Recording
+
+SHOWN = 25.0  # chi-square of a visible effect: five standard errors
+PARTED = 25.0  # chi-square that separates two effects
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """hidden: causes that are invisible at their typical size. inseparable: pairs of nearly collinear causes, with the
+    chi-square that separates them, the smallest first. shown: chi-square of each cause."""
+
+    hidden: tuple[CauseName, ...]
+    inseparable: tuple[tuple[CauseName, CauseName, float], ...]
+    shown: Mapping[CauseName, float]
+
+
+def identifiability(screening: ScreeningResult, plant: PlantDescription) -> Identifiability:
+    """Identifiability from the screening of a library."""
+    pairs = screening.pairs
+    strength = torch.diagonal(pairs.gram)
+    most_visible = _most_visible_starts(pairs.options, strength)
+    hidden = tuple(cause for cause, i in most_visible.items() if float(strength[i]) < SHOWN)
+    return Identifiability(
+        hidden,
+        _inseparable_pairs(plant, most_visible, pairs.gram),
+        {c: float(strength[i]) for c, i in most_visible.items()},
+    )
+
+
+def _most_visible_starts(options: Sequence[Option], strength: Tensor) -> dict[CauseName, int]:
+    """The most visible start of each cause."""
+    best: dict[CauseName, int] = {}
+    for i, option in enumerate(options):
+        if option.cause not in best or strength[i] > strength[best[option.cause]]:
+            best[option.cause] = i
+    return best
+
+
+def _inseparable_pairs(
+    plant: PlantDescription, best: Mapping[CauseName, int], gram: Tensor
+) -> tuple[tuple[CauseName, CauseName, float], ...]:
+    """Pairs of visible causes that are nearly collinear."""
+    causes = [c for c, i in best.items() if float(gram[i, i]) >= SHOWN]
+    pairs = []
+    for k, a in enumerate(causes):
+        for b in causes[k + 1 :]:
+            i, j = best[a], best[b]
+            weaker = min(float(gram[i, i]), float(gram[j, j]))
+            separation = weaker * (1.0 - float(gram[i, j]) ** 2 / (float(gram[i, i]) * float(gram[j, j])))
+            if separation < PARTED and canonical(a, plant) != canonical(b, plant):
+                pairs.append((a, b, max(separation, 0.0)))
+    return tuple(sorted(pairs, key=lambda pair: pair[2]))
+
+
+def planned_identifiability(
+    plant: PlantDescription, recording: Recording, noise: float, library: Sequence[str] | None = None
+) -> Identifiability:
+    """Identifiability under planned inputs; readings are ignored. noise: standard deviation of a reading."""
+    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    step = float(torch.median(torch.diff(recording.time)))
+    fitter = _noise_free(plant, nominal_effects, recording, step, noise)
+    nominal_fit = fitter.fit(Candidate())
+    predicted = replace(fitter.data.recording, outputs=nominal_fit.linearised.readings[0])
+    placements = [p for p in library_of(plant, library) if not p.effect.quantizes]
+    options = options_of(placements, fitter, operating_range_of(predicted, plant))
+    return identifiability(screen(fitter, nominal_fit, options), plant)
+
+
+def _noise_free(
+    plant: PlantDescription, nominal_effects: Sequence[Placement], recording: Recording, step: float, noise: float
+) -> Fitter:
+    """A fitter whose readings are the plant file's prediction, from its initial levels or from rest."""
+    sensors = len(plant.sensors)
+    names = tuple(s.column for s in plant.sensors)
+    units = tuple(s.unit for s in plant.sensors)
+    blank = torch.zeros(len(recording), sensors, dtype=torch.float64)
+    planned = replace(
+        recording, outputs=blank, output_names=names, output_units=units, mask=torch.ones_like(blank, dtype=torch.bool)
+    )
+    data = data_set_of(plant, nominal_effects, planned, step)
+    white = Noise(torch.full((sensors,), noise, dtype=torch.float64), torch.zeros(sensors, dtype=torch.float64))
+    engine = Fitter(data, white).engine(Candidate(), ())
+    theta = engine.space.nominal().unsqueeze(0)
+    readings = engine.converge(theta, engine.constant_guess(theta), rounds=30).readings[0]
+    return Fitter(replace(data, readings=readings, recording=replace(planned, outputs=readings)), white)
+
+
+DRAWS, SEED = 40, 0
+PASSES = 0.02  # share of the gap that a wrong cause may leave if a test of fit shall accept it
+VISIBLE = 1e-6
+
+
+def simulated_confusions(pairs: Pairs, named: CauseName, gap: float, plant: PlantDescription) -> dict[str, Any] | None:
+    """How often another cause of a gap of this size (chi-square) would have been named `named`.
+
+    'confused': with the true cause in the library. 'passed': without it; 'passed_for' lists the causes for which this
+    happens most often. None if no other effect can cause such a gap within its range.
+    """
+    kinds = [canonical(o.cause, plant) for o in pairs.options]
+    named_kind = canonical(named, plant)
+    rivals = [i for i, o in enumerate(pairs.options) if kinds[i] != named_kind and _possible(o, pairs.gram[i, i], gap)]
+    if not rivals:
+        return None
+    scores = _scores(pairs.gram, rivals, gap)  # (R, D, M)
+    strength = torch.diagonal(pairs.gram)
+    gains = torch.where((scores > 0) & (strength > VISIBLE), scores**2 / strength.clamp(min=VISIBLE), 0.0)
+    is_named = torch.tensor([kind == named_kind for kind in kinds])
+    confused, passed = 0, dict.fromkeys((kinds[i] for i in rivals), 0)
+    for row, i in enumerate(rivals):
+        is_true = torch.tensor([kind == kinds[i] for kind in kinds])
+        best, others = gains[row][:, is_named].amax(1), gains[row][:, ~is_named & ~is_true]
+        confused += int((gains[row].amax(1) <= best).sum())
+        wins = best >= others.amax(1) if others.shape[1] else torch.ones_like(best, dtype=torch.bool)
+        passed[kinds[i]] += int((wins & (best > (1.0 - PASSES) * gains[row][:, is_true].amax(1))).sum())
+    worst = sorted((c for c in passed if passed[c]), key=lambda c: -passed[c])[:5]
+    return {
+        "draws": DRAWS * len(rivals),
+        "rivals": len(passed),
+        "confused": confused,
+        "passed": sum(passed.values()),
+        "passed_for": [{"effect": name, "location": at} for name, at in worst],
+    }
+
+
+def _possible(option: Option, strength: Tensor, gap: float) -> bool:
+    """Whether an effect can cause such a gap within its range, to first order from its start."""
+    if float(strength) <= VISIBLE:
+        return False
+    name, start = next(iter(option.start.items()))
+    size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
+    needed = size.nominal + (gap / float(strength)) ** 0.5 * (start - size.nominal)
+    return size.low <= needed <= size.high
+
+
+def _scores(gram: Tensor, rivals: Sequence[int], gap: float) -> Tensor:
+    """Scores (R, D, M) of all options for each rival at the size of the gap, with noise."""
+    generator = torch.Generator().manual_seed(SEED)
+    spectrum, basis = torch.linalg.eigh(gram)
+    root = basis * torch.sqrt(spectrum.clamp(min=0.0))
+    noise = torch.randn(DRAWS, len(gram), generator=generator, dtype=gram.dtype) @ root.T
+    sizes = torch.sqrt(gap / torch.diagonal(gram)[list(rivals)])
+    return (sizes.unsqueeze(1) * gram[list(rivals)]).unsqueeze(1) + noise

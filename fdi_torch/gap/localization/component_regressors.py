@@ -1,0 +1,187 @@
+"""Local signals of each kind of component, and the regressors of its discrepancy.
+
+A pump depends on its command and its tank's level, a pipe on its head and its valve, a tank on its level, a pair of
+tanks on their difference, a sensor on its reading. Pumps, pipes and sensors may also depend on the past of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.forcing import Forcing
+from fdi_torch.gap.localization.regressors import (
+    LAGS,
+    RAMPS,
+    backlashes,
+    fatigues,
+    hinges,
+    lagged,
+    lags_and_decays,
+    rate_limits,
+    relays,
+    steps_in_value,
+    stictions,
+)
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump
+from fdi_torch.plant.effect import place_kind
+from fdi_torch.plant.scales import time_scale
+
+Signals = dict[str, Tensor]
+RELAYS = 6  # thresholds of relays
+SLOW = (100.0, 300.0)  # time constants (s) of a side chamber of a tank
+
+
+class SignalRanges:
+    """Least and greatest value of each signal over all recordings, and regressors between them."""
+
+    def __init__(self, recordings: Sequence[Signals]) -> None:
+        self.recordings = recordings
+
+    def __call__(self, name: str) -> tuple[float, float]:
+        low, high = (
+            min(float(s[name].min()) for s in self.recordings),
+            max(float(s[name].max()) for s in self.recordings),
+        )
+        return low, max(high, low + 1e-9 * (max(abs(low), abs(high)) or 1.0))
+
+    def hinges(self, s: Signals, name: str, count: int) -> list[Tensor]:
+        return hinges(s[name], self(name), 2 * count)
+
+    def steps_in_value(self, s: Signals, name: str, count: int) -> list[Tensor]:
+        return steps_in_value(s[name], self(name), 3 * count)
+
+    def relays(self, s: Signals, name: str) -> list[tuple[float, Tensor]]:
+        return relays(s[name], self(name), RELAYS)
+
+
+# Local signals (K,), step lengths (K,) s -> regressors (K,) each
+RegressorFunction = Callable[[Signals, Tensor, SignalRanges], list[Tensor]]
+
+
+@dataclass(frozen=True)
+class DiscrepancyModel:
+    """Regressors of one component's discrepancy.
+
+    signals: the local signals along a recording. flows: regressors in m^3/s, or to be scaled to it, of a flow from
+    `source` to `target`. in_time: name of the signal that functions of time multiply. areas: regressors of a relative
+    change of the target's area, as level rates in m/s.
+    """
+
+    signals: Callable[[Forcing], Signals]
+    flows: RegressorFunction
+    in_time: str
+    source: str
+    target: str
+    areas: RegressorFunction | None = None
+
+
+def discrepancy_model_at(place: str, plant: PlantDescription) -> DiscrepancyModel:
+    """The discrepancy model of a place that is no sensor."""
+    kind = place_kind(plant, place)
+    if kind == "tank_pair":
+        return _pair(place, plant)
+    if kind == "tank":
+        return _tank(place, plant)
+    component = plant.component(place)
+    if isinstance(component, Pump):
+        return _pump(component, plant)
+    assert isinstance(component, Pipe)
+    return _pipe(component, plant)
+
+
+def reading_regressors(s: Signals, step: Tensor, ends: SignalRanges, scale: float) -> list[Tensor]:
+    """Regressors of a sensor's discrepancy. step: sampling intervals, s. scale: time scale of the plant."""
+    regressors = [*ends.hinges(s, "reading", 12), s["reading"] * s["time"] / ends("time")[1]]
+    lag = lagged(s["reading"], step, scale * LAGS[0]) - s["reading"]
+    regressors += [lag * (s["time"] / ends("time")[1] - j / RAMPS).clamp(min=0.0) for j in range(RAMPS)]  # clock drift
+    return [*regressors, *lags_and_decays(s["reading"], step, scale), *backlashes(s["reading"], ends("reading"))]
+
+
+def _pump(pump: Pump, plant: PlantDescription) -> DiscrepancyModel:
+    index, tank, scale = plant.pumps.index(pump), _index(plant, pump.target), time_scale(plant)
+
+    def signals(trajectory: Forcing) -> Signals:
+        return {
+            "command": trajectory.commands[index],
+            "flow": trajectory.pumps[index],
+            "level": trajectory.levels[tank],
+        }
+
+    def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
+        regressors = [*ends.hinges(s, "command", 9), *lags_and_decays(s["flow"], step, scale)]
+        regressors += [s["flow"] * b for b in ends.hinges(s, "level", 6)]
+        regressors += rate_limits(s["flow"], step, ends("flow"), scale)
+        regressors += stictions(s["flow"], ends("flow"))
+        return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
+
+    return DiscrepancyModel(signals, flows, "flow", OUTSIDE, pump.target)
+
+
+def _pipe(pipe: Pipe, plant: PlantDescription) -> DiscrepancyModel:
+    index, scale = plant.pipes.index(pipe), time_scale(plant)
+    valve = len(plant.pumps) + sum(1 for p in plant.pipes[:index] if p.valve)
+
+    def signals(trajectory: Forcing) -> Signals:
+        head = trajectory.levels[_index(plant, pipe.source)] - pipe.elevation
+        if not pipe.is_outlet:
+            far_head = trajectory.levels[_index(plant, pipe.target)] - pipe.elevation
+            head = head.clamp(min=0.0) - far_head.clamp(min=0.0) if pipe.elevation else head - far_head
+        signals_here = {"root": _root(head), "flow": trajectory.pipes[index]}
+        return signals_here | ({"opening": trajectory.commands[valve]} if pipe.valve else {})
+
+    def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
+        regressors = [*ends.hinges(s, "root", 16), *lags_and_decays(s["flow"], step, scale)]
+        regressors += [s["flow"] * j for j in ends.steps_in_value(s, "root", 24)]
+        regressors += [s["flow"] * on for _, on in ends.relays(s, "root")]
+        if pipe.valve:
+            regressors += [s["root"] * b for b in ends.hinges(s, "opening", 9)]
+            regressors += lags_and_decays(s["root"] * s["opening"], step, scale)
+        return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
+
+    return DiscrepancyModel(signals, flows, "flow", pipe.source, pipe.target)
+
+
+def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
+    first, second = place.split("-")
+
+    def signals(trajectory: Forcing) -> Signals:
+        head = trajectory.levels[_index(plant, first)] - trajectory.levels[_index(plant, second)]
+        return {"head": head, "root": _root(head)}
+
+    def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
+        return [*ends.hinges(s, "head", 10), *ends.hinges(s, "root", 10)]
+
+    return DiscrepancyModel(signals, flows, "root", first, second)
+
+
+def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
+    tank, scale = _index(plant, place), time_scale(plant)
+
+    def signals(trajectory: Forcing) -> Signals:
+        level = trajectory.levels[tank]
+        return {"level": level, "rate": trajectory.still[tank], "one": torch.ones_like(level)}
+
+    def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
+        regressors = [*ends.hinges(s, "level", 12), *ends.steps_in_value(s, "level", 24)]
+        for low, on in ends.relays(s, "level"):  # a constant draw, an orifice at the floor, and one at that height
+            regressors += [on, on * _root(s["level"]), on * _root((s["level"] - low).clamp(min=0.0))]
+        # No short lags: a short lag of the level is its rate, which the balance explains already.
+        regressors += [lagged(s["level"], step, scale * tau) - s["level"] for tau in SLOW]
+        return [*regressors, *backlashes(s["level"], ends("level"))]
+
+    def areas(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
+        return [s["rate"] * b for b in ends.hinges(s, "level", 12)]
+
+    return DiscrepancyModel(signals, flows, "one", OUTSIDE, place, areas)
+
+
+def _index(plant: PlantDescription, tank: str) -> int:
+    return [t.name for t in plant.tanks].index(tank)
+
+
+def _root(head: Tensor) -> Tensor:
+    return torch.sign(head) * torch.sqrt(head.abs())

@@ -1,0 +1,280 @@
+"""Ranking of the places of a discrepancy by evidence, whatever the law of the discrepancy.
+
+A discrepancy is a linear combination of a few regressors of the component's own variables (`regressors.py`), about the
+smoothed trajectory; that of a sensor may also be a slow random drift. The log evidence is that of a sparse regression
+(`sparse_regression.py`), with each regressor selected among all of the component, under the disturbance noise that is
+most likely with the discrepancy (as for named effects: `marginal_likelihood.py`).
+
+A drift is a random process of a sensor alone, with unknown size and correlation time. Random flows move levels, which
+later readings of other sensors show; a drift shows in one channel only. Its two parameters are estimated together with
+the other noise. Its evidence is the likelihood of the innovations less the cost of the two parameters: the prior of the
+size is log-uniform between a tenth of the sensor noise and the range of the readings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.evidence import RARE
+from fdi_torch.estimate.kalman import StateNoise, Wander
+from fdi_torch.estimate.state_noise import CORRELATION_TIMES
+from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression, normal_equations
+from fdi_torch.gap.localization.regressors import dominant_period
+from fdi_torch.gap.localization.single_regressor_gain import single_regressor_gains
+from fdi_torch.gap.localization.sparse_regression import sparse_fit
+from fdi_torch.gap.marginal_likelihood import estimate_disturbances, occam, with_disturbances
+from fdi_torch.simulate.collocation import Linearised
+
+HARMONICS = 3  # of a dominant period of the residual
+STEPS = 120  # step functions of time
+ROUNDS = 40  # iterations of the sparse regression
+MOST_TURNS = 4  # alternations between the disturbance noise and the discrepancy
+CONVERGED = 0.1  # nats; a smaller gain ends the alternation
+CALIBRATION_PLACES = 3  # places always evaluated; they show by how much first-order gains are too low
+
+
+@dataclass(frozen=True)
+class LocalizedDiscrepancy:
+    """A discrepancy at one component, in addition to a fit.
+
+    gain: in log evidence against the fit alone, without prior odds. size: norm of its influence on the readings, in
+    units of the sensor noise. periods: of its harmonics, s. noise: most likely disturbance noise with the discrepancy.
+    """
+
+    location: str
+    gain: float
+    size: float
+    periods: tuple[float, ...]
+    noise: StateNoise
+
+
+def localize(
+    fitter: Fitter, fit: Fit, noise: StateNoise, places: Sequence[str], needed: float = -math.inf
+) -> list[LocalizedDiscrepancy]:
+    """Evaluate the places and return the likeliest first.
+
+    fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
+    the result is empty if no discrepancy can reach it.
+    """
+    base = _likelihood(fitter, fit, fit.linearised)
+    period = dominant_period(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
+    periods = tuple(period / k for k in range(1, HARMONICS + 1)) if period else ()
+    regression = DiscrepancyRegression(fitter, fit, periods, STEPS)
+    if _evidence_bound(fitter, fit, noise, regression.steps) - base < needed:
+        return []
+    starts = [(n, with_disturbances(fitter, fit, n)) for n in (noise, _nearly_without_disturbances(noise))]
+    first_order = _first_order_gains(regression, starts, fit, places, base)
+
+    def evaluate(discrepancy: Discrepancy, place: str, noise: StateNoise, under: Fitter) -> _EvaluatedDiscrepancy:
+        (evidence,) = _regressions(under, fit, [discrepancy])
+        return _EvaluatedDiscrepancy(
+            place, noise, evidence, _likelihood(under, fit, discrepancy.linearised) + evidence.evidence - base
+        )
+
+    localized: list[LocalizedDiscrepancy] = []
+    # Largest differences seen so far: gain less its first-order estimate, and gain from re-estimated noise.
+    excess, noise_gain = -math.inf, 0.0
+    for place in sorted(places, key=lambda p: -first_order[p]):
+        if len(localized) >= CALIBRATION_PLACES and first_order[place] + excess < needed:
+            break
+        discrepancy, iteration = regression.of(place), 0
+        best = first = max((evaluate(discrepancy, place, *start) for start in starts), key=_gain)
+        while (len(localized) < CALIBRATION_PLACES or best.gain + noise_gain >= needed) and iteration < MOST_TURNS:
+            explained = discrepancy.columns @ best.evaluated.mean
+            likely_noise = estimate_disturbances(
+                fitter, fit, discrepancy.linearised, explained, best.noise, climb=iteration == 0
+            ).noise
+            updated = evaluate(discrepancy, place, likely_noise, with_disturbances(fitter, fit, likely_noise))
+            iteration, converged = iteration + 1, updated.gain < best.gain + CONVERGED
+            best = max(best, updated, key=_gain)
+            if converged:
+                break
+        excess, noise_gain = max(excess, best.gain - first_order[place]), max(noise_gain, best.gain - first.gain)
+        needed = max(needed, best.gain + math.log(RARE))
+        localized.append(
+            LocalizedDiscrepancy(
+                place, best.gain, _effect_size(fitter, discrepancy, best.evaluated), periods, best.noise
+            )
+        )
+    for drift in _drifting_sensors(fitter, fit, noise, places, base, needed):
+        localized = [p for p in localized if p.location != drift.location or p.gain > drift.gain]
+        if all(p.location != drift.location for p in localized):
+            localized.append(drift)
+    return sorted(localized, key=_gain, reverse=True)
+
+
+def _drifting_sensors(
+    fitter: Fitter, fit: Fit, noise: StateNoise, places: Sequence[str], base: float, needed: float
+) -> list[LocalizedDiscrepancy]:
+    """Sensors with a drift, as far as their gain in evidence can be relevant."""
+    sensors = [s.name for s in fitter.data.plant.sensors]
+
+    def evaluate(noise: StateNoise) -> LocalizedDiscrepancy:
+        assert noise.wander is not None
+        gain = (
+            _likelihood(with_disturbances(fitter, fit, noise), fit, fit.linearised)
+            - base
+            - _drift_cost(fitter, noise.wander)
+        )
+        return LocalizedDiscrepancy(sensors[noise.wander.channel], gain, _drift_size(fitter, noise.wander), (), noise)
+
+    starts = [
+        _initial_drift(fitter, fit, _nearly_without_disturbances(noise), sensors.index(p))
+        for p in places
+        if p in sensors
+    ]
+    drifts: list[LocalizedDiscrepancy] = []
+    noise_gain = 0.0
+    for initial in sorted(map(evaluate, starts), key=_gain, reverse=True):
+        if drifts and initial.gain + noise_gain < needed:
+            break
+        best = max(initial, evaluate(_most_likely_drift(fitter, fit, initial.noise)), key=_gain)
+        noise_gain = max(noise_gain, best.gain - initial.gain)
+        needed = max(needed, best.gain + math.log(RARE))
+        assert best.noise.wander is not None
+        if not _is_rounding_error(fitter, best.noise.wander):
+            drifts.append(best)
+    return drifts
+
+
+def _first_order_gains(
+    regression: DiscrepancyRegression,
+    starts: Sequence[tuple[StateNoise, Fitter]],
+    fit: Fit,
+    places: Sequence[str],
+    base: float,
+) -> dict[str, float]:
+    """Gain in log evidence of the best single regressor of each place, under the better of the noises."""
+    gains = dict.fromkeys(places, -math.inf)
+    for _, under in starts:
+        offset = _likelihood(under, fit, regression.linearised) - base
+        for place, gain in single_regressor_gains(
+            regression, under, fit, places, torch.Generator().manual_seed(0)
+        ).items():
+            gains[place] = max(gains[place], offset + gain)
+    return gains
+
+
+def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise, choices: int) -> float:
+    """Upper bound of the log evidence of a discrepancy in addition to a fit.
+
+    It is that of one regressor that explains everything except sensor noise. A regressor that reduces chi-square by G
+    costs (1 + log G) / 2 nats at its most likely precision, plus log(choices) for its selection.
+    """
+    undisturbed = with_disturbances(fitter, fit, replace(noise, intensity=torch.zeros_like(noise.intensity)))
+    count, (residual, _) = int(fitter.data.mask.sum()), undisturbed.white(fit.linearised)
+    cost = 0.5 * (1.0 + math.log(max(float(residual.square().sum()) - count, 1.0))) + math.log(choices)
+    # The parameters are determined no better than with the disturbances.
+    return (
+        -0.5 * count
+        - 0.5 * undisturbed.log_det
+        - cost
+        + occam(fitter, fit.space, fit.theta, fitter.white(fit.linearised)[1][0])
+    )
+
+
+def _effect_size(fitter: Fitter, discrepancy: Discrepancy, evaluated: _RegressionEvidence) -> float:
+    """Norm of the discrepancy's influence on the readings, in units of the sensor noise."""
+    influence = discrepancy.columns @ evaluated.mean
+    return float(torch.linalg.vector_norm(fitter.noise.whiten(influence, fitter.data.mask)))
+
+
+def _nearly_without_disturbances(noise: StateNoise) -> StateNoise:
+    """The noise with nearly no random flow into any tank."""
+    return replace(noise, intensity=(0.1 * noise.intensity.min()).expand_as(noise.intensity).clone())
+
+
+@dataclass(frozen=True)
+class _EvaluatedDiscrepancy:
+    """A discrepancy at a place under one disturbance noise."""
+
+    location: str
+    noise: StateNoise
+    evaluated: _RegressionEvidence
+    gain: float
+
+
+def _gain(discrepancy: _EvaluatedDiscrepancy | LocalizedDiscrepancy) -> float:
+    return discrepancy.gain
+
+
+@dataclass(frozen=True)
+class _RegressionEvidence:
+    """Log evidence, reduction of chi-square, and coefficients of a sparse regression."""
+
+    evidence: float
+    closes: float
+    mean: Tensor
+
+
+def _regressions(fitter: Fitter, fit: Fit, each: Sequence[Discrepancy]) -> list[_RegressionEvidence]:
+    """Log evidence of each discrepancy against none, each regressor selected among all of its place."""
+    equations = [normal_equations(fitter, fit, discrepancy) for discrepancy in each]
+    width = max(len(r.score) for r in equations)
+    gram, score = (torch.zeros(len(each), *(width,) * d, dtype=torch.float64) for d in (2, 1))
+    for k, r in enumerate(equations):
+        gram[k, : len(r.score), : len(r.score)], score[k, : len(r.score)] = r.gram, r.score
+    fits = sparse_fit(gram, score, ROUNDS)
+    choice = [math.log(len(r.score)) for r in equations]
+    return [
+        _RegressionEvidence(
+            float(fits.evidence[k] - choice[k] * fits.needs[k]), float(fits.closes[k]), fits.mean[k, : len(r.score)]
+        )
+        for k, r in enumerate(equations)
+    ]
+
+
+def _likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
+    """Log evidence of a fit about a linearised trajectory, without prior odds."""
+    space, theta = fit.space, fit.theta
+    residual, jacobian = (x[0] for x in fitter.white(linearised))
+    scale, pull, off = fitter.priors(space, theta)
+    rows = torch.cat([(jacobian * scale).flatten(0, 1), torch.diag(pull + 1e-9)])
+    target = torch.cat([residual.flatten(), -off])
+    basis, _ = torch.linalg.qr(rows)
+    remaining = target - basis @ (basis.T @ target)
+    return -0.5 * float(remaining @ remaining) - 0.5 * fitter.log_det + occam(fitter, space, theta, jacobian)
+
+
+SMALLEST_DRIFT = 0.1  # as a share of the sensor's noise
+
+
+def _initial_drift(fitter: Fitter, fit: Fit, quiet: StateNoise, channel: int) -> StateNoise:
+    """Start of the optimisation: the whole residual of the sensor is drift. quiet: nearly no random flows."""
+    valid = fitter.data.mask[:, channel]
+    residual = (fitter.data.readings - fit.linearised.readings[0])[valid, channel]
+    std = max(float(residual.square().mean().sqrt()), float(fitter.noise.std[channel]))
+    return replace(quiet, wander=Wander(channel, std, CORRELATION_TIMES[3] * fitter.data.row_spacing))
+
+
+def _most_likely_drift(fitter: Fitter, fit: Fit, start: StateNoise) -> StateNoise:
+    """The most likely size and correlation time of the drift, together with the other noise."""
+    return estimate_disturbances(fitter, fit, fit.linearised, start=start).noise
+
+
+def _drift_cost(fitter: Fitter, drift: Wander) -> float:
+    """Cost of the two parameters of a drift, nats."""
+    valid = fitter.data.mask[:, drift.channel]
+    readings = fitter.data.readings[valid, drift.channel]
+    noise = float(fitter.noise.std[drift.channel])
+    width = math.log(max(float(readings.max() - readings.min()), noise) / (SMALLEST_DRIFT * noise))
+    values = max(int(valid.sum()) * fitter.data.row_spacing / drift.correlation_time, 1.0)
+    return math.log(len(CORRELATION_TIMES) - 1) + max(math.log(width * math.sqrt(values / math.pi)), 0.0)
+
+
+def _is_rounding_error(fitter: Fitter, drift: Wander) -> bool:
+    """Whether the drift is as small as a rounding error, which varies slowly with the level: half a step."""
+    steps = fitter.noise.steps
+    return bool(steps) and drift.std < 0.5 * steps[drift.channel]
+
+
+def _drift_size(fitter: Fitter, drift: Wander) -> float:
+    """Norm of the drift in units of the sensor's noise."""
+    count = float(fitter.data.mask[:, drift.channel].sum())
+    return math.sqrt(count) * drift.std / float(fitter.noise.std[drift.channel])

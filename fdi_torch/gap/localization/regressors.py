@@ -1,0 +1,168 @@
+"""Candidate regressors of a discrepancy: signals along a recording, many more than a discrepancy needs.
+
+- Functions of a local variable: hinges (piecewise linear) and steps.
+- Functions with memory: lags, backlash, stiction, rate limits, relays, decays after a change.
+- Functions of time: steps, ramps, and sinusoids.
+
+Times are those of bench-scale tanks; `scale` multiplies them for other plants (`plant.scales.time_scale`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from fdi_torch.simulate.scan import scan_in_time
+
+LAGS = (3.0, 10.0, 30.0, 100.0, 300.0)  # time constants, s
+DECAY_TIMES = (10.0, 40.0, 160.0)  # s, of the decay after a step up or down
+BACKLASH_BANDS = (0.03, 0.08, 0.16, 0.3)  # backlash, as shares of the signal's range
+STICTION_BANDS = (0.1, 0.2, 0.3, 0.4)  # as shares of the signal's range
+TRAVEL_TIMES = (8.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # s, through the full range at the rate limit
+FATIGUE_TIMES = (150.0, 500.0)  # s, of the mean of a flow's recent past that changes it
+RAMPS = 12  # ramps in time, at equal distances
+
+
+def hinges(x: Tensor, ends: tuple[float, float], count: int) -> list[Tensor]:
+    """1, x - low, and max(x - c, 0) for `count` - 2 values c between the ends."""
+    at = torch.linspace(*ends, count, dtype=x.dtype).tolist()
+    return [torch.ones_like(x), x - at[0], *((x - c).clamp(min=0.0) for c in at[1:-1])]
+
+
+def steps_in_value(x: Tensor, ends: tuple[float, float], count: int) -> list[Tensor]:
+    """Whether x is at least c, for `count` values c between the ends."""
+    return [(x >= c).to(x.dtype) for c in torch.linspace(*ends, count + 2, dtype=x.dtype).tolist()[1:-1]]
+
+
+def lags_and_decays(x: Tensor, step: Tensor, scale: float) -> list[Tensor]:
+    """Difference between lagged x and x, and decays after each rise and fall of x."""
+    change = torch.diff(x, prepend=x[:1])
+    rises, falls = change.clamp(min=0.0), (-change).clamp(min=0.0)
+    lagging = [lagged(x, step, scale * tau) - x for tau in LAGS]
+    decays = [decayed(y, step, scale * tau) for tau in DECAY_TIMES for y in (rises, falls)]
+    return [*lagging, *decays]
+
+
+def backlashes(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
+    """Difference between x after a backlash and x, for each band."""
+    band = x.new_tensor(BACKLASH_BANDS).unsqueeze(1) * (ends[1] - ends[0])
+    return list((backlash(x, band) - x).unbind())
+
+
+def rate_limits(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -> list[Tensor]:
+    """Difference between x after a rate limit and x, for each travel time."""
+    return [rate_limited(x, step, (ends[1] - ends[0]) / (scale * time)) - x for time in TRAVEL_TIMES]
+
+
+def stictions(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
+    """Difference between x after stiction and x, for each band."""
+    return [stiction(x, share * (ends[1] - ends[0])) - x for share in STICTION_BANDS]
+
+
+def relays(x: Tensor, ends: tuple[float, float], count: int) -> list[tuple[float, Tensor]]:
+    """Pairs of the lower threshold and the output of a relay, for each pair of `count` thresholds."""
+    width = (ends[1] - ends[0]) / count
+    at = [ends[0] + width * (j + 0.5) for j in range(count)]
+    return [(low, relay(x, low, high)) for i, low in enumerate(at) for high in at[i + 1 :]]
+
+
+def fatigues(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -> list[Tensor]:
+    """x times its own recent mean, over the largest |x|."""
+    largest = max(abs(ends[0]), abs(ends[1]), 1e-12)
+    return [x * lagged(x, step, scale * tau) / largest for tau in FATIGUE_TIMES]
+
+
+def time_functions(time: Tensor, duration: float, periods: Sequence[float], steps: int) -> list[Tensor]:
+    """1, steps, ramps and sinusoids of time."""
+    stepped = [(time >= duration * j / steps).to(time.dtype) for j in range(1, steps)]
+    ramps = [(time / duration - j / RAMPS).clamp(min=0.0) for j in range(RAMPS)]
+    waves = [wave(2.0 * math.pi * time / period) for period in periods for wave in (torch.sin, torch.cos)]
+    return [torch.ones_like(time), *stepped, *ramps, *waves]
+
+
+def lagged(x: Tensor, step: Tensor, tau: float) -> Tensor:
+    """First-order lag of x (K,), initially at rest, at the end of each step."""
+    keep = torch.exp(-step / tau)
+    return _scanned(keep, (1.0 - keep) * x, x[0])
+
+
+def decayed(x: Tensor, step: Tensor, tau: float) -> Tensor:
+    """Sum of the inputs x (K,), each decaying exponentially from its step on."""
+    return _scanned(torch.exp(-step / tau), x, torch.zeros_like(x[0]))
+
+
+def backlash(x: Tensor, band: Tensor) -> Tensor:
+    """Play operator: the output (B, K) follows x (K,) when x is more than the band (B, 1) away.
+
+    Each step clamps the output to [x - band, x + band]. The composition of clamps is a clamp, so that all steps are
+    composed in log2(K) rounds.
+    """
+    low, high = x - band, x + band
+    reach = 1
+    while reach < x.shape[-1]:
+        now_low, now_high = low[:, reach:], high[:, reach:]
+        low, high = (
+            torch.cat([y[:, :reach], torch.minimum(torch.maximum(y[:, :-reach], now_low), now_high)], dim=1)
+            for y in (low, high)
+        )
+        reach *= 2
+    return torch.minimum(torch.maximum(x[0], low), high)
+
+
+def stiction(x: Tensor, band: float) -> Tensor:
+    """Stiction: the output holds its value until x is more than the band away, then jumps to x."""
+    held, output = float(x[0]), []
+    for value in x.tolist():
+        held = value if abs(value - held) > band else held
+        output.append(held)
+    return x.new_tensor(output)
+
+
+def relay(x: Tensor, low: float, high: float) -> Tensor:
+    """Relay with hysteresis: 1 after x exceeds `high`, 0 after x falls below `low`."""
+    on, output = float(x[0]) > 0.5 * (low + high), []
+    for value in x.tolist():
+        on = value >= low if on else value > high
+        output.append(float(on))
+    return x.new_tensor(output)
+
+
+def rate_limited(x: Tensor, step: Tensor, rate: float) -> Tensor:
+    """The output follows x with at most `rate` per second."""
+    held, output = float(x[0]), []
+    for value, most in zip(x.tolist(), (rate * step).tolist(), strict=True):
+        held += min(max(value - held, -most), most)
+        output.append(held)
+    return x.new_tensor(output)
+
+
+def _scanned(keep: Tensor, added: Tensor, first: Tensor) -> Tensor:
+    shape = (1, 1, 1, -1)
+    return scan_in_time(keep.reshape(shape), added.reshape(shape), first.reshape(1, 1, 1))[0, 0, 0, 1:]
+
+
+ZERO_PADDING = 4  # factor by which the spectrum is interpolated
+SURROUNDINGS = 15  # frequencies of the recording to each side, for the median
+CYCLES = 8  # fewest periods in the recording
+
+
+def dominant_period(white: Tensor, spacing: float) -> float | None:
+    """Period (s) of the strongest line in the spectrum of a whitened residual (S, C), or None.
+
+    A line is measured against the median of its surroundings in the tapered periodogram, summed over the channels.
+    """
+    samples = len(white)
+    taper = torch.hann_window(samples, periodic=False, dtype=white.dtype).unsqueeze(-1)
+    power = (torch.fft.rfft(white * taper, n=ZERO_PADDING * samples, dim=0).abs() ** 2).sum(dim=-1)
+    if len(power) < 2 * SURROUNDINGS * ZERO_PADDING:
+        return None
+    width = 2 * SURROUNDINGS * ZERO_PADDING + 1
+    padded = torch.nn.functional.pad(power.reshape(1, 1, -1), (width // 2, width // 2), mode="reflect")[0, 0]
+    median = padded.unfold(0, width, ZERO_PADDING)[:, ::ZERO_PADDING].median(dim=-1).values
+    ratio = power / median.repeat_interleave(ZERO_PADDING)[: len(power)]
+    ratio[: CYCLES * ZERO_PADDING] = 0.0
+    peak = int(ratio.argmax())
+    return ZERO_PADDING * samples * spacing / peak if peak else None

@@ -1,0 +1,163 @@
+"""Marginal likelihood (evidence) of an explanation, with the random flow disturbances that are most likely with it.
+
+    log E = -J / 2 - log det(V) / 2 - log det(H) / 2 + sum of the log prior densities of the parameters + log prior odds
+
+J is chi-square of the innovations including the priors, V the covariance of the innovations, H the curvature of J / 2
+(Laplace's approximation). Disturbances are estimated anew for each explanation: a wrong equation acts as a disturbance,
+and costs as much as a disturbance of that size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.evidence import log_det
+from fdi_torch.estimate.evidence import log_prior as prior_of_set
+from fdi_torch.estimate.kalman import KalmanWhitening, Propagation, SensorNoise, StateNoise
+from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
+from fdi_torch.gap.answer import CauseName
+from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.dataset import interpolate
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+
+
+def with_estimated_noise(
+    fitter: Fitter, fit: Fit, start: StateNoise | None = None, climb: bool = True
+) -> tuple[Fitter, Likelihood]:
+    """The fitter with the disturbance noise that is most likely with a fit, and that noise.
+
+    start: initial noise of the optimisation. climb: whether the correlation time may change.
+    """
+    likely = estimate_disturbances(fitter, fit, fit.linearised, start=start, climb=climb)
+    return with_disturbances(fitter, fit, likely.noise), likely
+
+
+def with_disturbances(fitter: Fitter, fit: Fit, noise: StateNoise) -> Fitter:
+    """The fitter with this disturbance noise, propagated along the trajectory of a fit."""
+    whitening = KalmanWhitening(propagation_of(fitter, fit, fit.linearised), _sensors(fitter), noise)
+    return Fitter(fitter.data, fitter.noise, whitening)
+
+
+def estimate_disturbances(
+    fitter: Fitter,
+    fit: Fit,
+    linearised: Linearised,
+    explained: Tensor | None = None,
+    start: StateNoise | None = None,
+    climb: bool = True,
+) -> Likelihood:
+    """The most likely disturbance noise about a linearised trajectory, with the parameters of a fit profiled out.
+
+    explained (S, C): further part of the readings that is explained.
+    """
+    data = fitter.data
+    scale, weight, deviation = fitter.priors(fit.space, fit.theta)
+    propagation, sensors = propagation_of(fitter, fit, linearised), _sensors(fitter)
+    residual = data.readings - linearised.readings[0]
+    if explained is not None:
+        residual = residual - explained
+    # Unit of the flows: it moves a level by a tenth of the sensor noise from one sample to the next.
+    gains = propagation.output.abs().amax(dim=0).amax(dim=-1).clamp(min=1e-12)
+    unit = _areas(fitter) * float((sensors.std / gains).median()) / (10.0 * propagation.interval)
+    return estimate_state_noise(
+        propagation, sensors, residual, linearised.jacobian[0] * scale, weight, deviation, unit, start, climb
+    )
+
+
+def smoothed_levels(fitter: Fitter, fit: Fit) -> Tensor:
+    """Smoothed levels (1, K+1, tanks) of all recordings: the fitted trajectory plus the most likely effect of the
+    disturbances."""
+    data, levels = fitter.data, fit.linearised.levels.clone()
+    if fitter.whitening is None:
+        return levels
+    correction = fitter.whitening.smoothed(data.readings - fit.linearised.readings[0])
+    first = 0
+    for part, rows in zip(data.parts, data.rows, strict=True):
+        nodes = part.experiment.nodes
+        at_nodes = [interpolate(nodes, part.experiment.sample_times, x) for x in correction[rows].unbind(1)]
+        levels[0, first : first + len(nodes)] += torch.stack(at_nodes, dim=1)
+        first += len(nodes)
+    return levels.clamp(min=0.0)
+
+
+def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagation:
+    """Propagation of flow disturbances to the readings along a trajectory, for all recordings in sequence."""
+    data = fitter.data
+    joint = fitter.engine(fit.candidate, list(fit.effect_values))
+    theta = fit.theta.unsqueeze(0)
+    pieces = joint.apart(theta, linearised) if isinstance(joint, JointCollocation) else [(joint, theta, linearised)]
+    matrices = [_between_samples(engine, theta, piece, _areas(fitter)) for engine, theta, piece in pieces]
+    transition, forcing, output = (with_blanks(each, dim=0) for each in zip(*matrices, strict=True))
+    starts = torch.zeros(len(data.mask), dtype=torch.bool)
+    starts[[rows.start for rows in data.rows]] = True
+    return Propagation(transition, forcing, output, data.row_spacing, starts, data.mask)
+
+
+def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised, areas: Tensor) -> Sequence[Tensor]:
+    """Transition (S, n, n), forcing (S, n, n) and output (S, C, n) between the samples of one recording."""
+    experiment, n = engine.experiment, len(areas)
+    node = experiment.sample_step + experiment.sample_share.round().to(torch.int64)
+    next_node = torch.cat([node[1:], node[-1:]])
+    identity = torch.eye(n, dtype=torch.float64)
+    transition, forcing = identity.repeat(len(node), 1, 1), torch.zeros(len(node), n, n, dtype=torch.float64)
+    for offset in range(int((next_node - node).max())):
+        step = node + offset
+        before_next = (step < next_node)[:, None, None]
+        step = step.clamp(max=len(experiment.steps) - 1)
+        a, b = linearised.transition[0, step], linearised.gain[0, step] / areas
+        forcing = torch.where(before_next, a @ forcing + b, forcing)
+        transition = torch.where(before_next, a @ transition, transition)
+    paths = identity.reshape(1, n, n, 1).expand(1, n, n, len(experiment.nodes)).contiguous()
+    output = engine.look(linearised.levels, theta).along(paths, [-1] * n)[0]
+    return transition, forcing, output.permute(2, 0, 1)
+
+
+def _sensors(fitter: Fitter) -> SensorNoise:
+    return SensorNoise(fitter.noise.std, fitter.noise.lag_one)
+
+
+def _areas(fitter: Fitter) -> Tensor:
+    return torch.tensor([t.area for t in fitter.data.plant.tanks], dtype=torch.float64)
+
+
+def log_evidence(fitter: Fitter, fit: Fit, choices: int) -> float:
+    """Log evidence of a fit under its own noise. choices: number of effects at places in the library.
+
+    Minus infinity for a fit whose likelihood is not finite.
+    """
+    jacobian = fitter.white(fit.linearised)[1][0]
+    likelihood = -0.5 * fit.cost - 0.5 * fitter.log_det
+    if not (math.isfinite(likelihood) and bool(jacobian.isfinite().all())):
+        return -math.inf
+    return likelihood + occam(fitter, fit.space, fit.theta, jacobian) + log_prior(fit.key, choices)
+
+
+def occam(fitter: Fitter, space: ParameterSpace, theta: Tensor, jacobian: Tensor) -> float:
+    """Log of the volume of the posterior over that of the prior (Occam factor). jacobian (S, C, P): whitened."""
+    scale = fitter.box(space)[2]
+    j = (jacobian * scale).flatten(0, 1)
+    weight = torch.nan_to_num(scale / space.std(theta), posinf=0.0)
+    widths = torch.tensor([_log_width(fitter, space, i) for i in range(len(space))], dtype=torch.float64)
+    return -0.5 * log_det(j.T @ j + torch.diag(weight**2)) + float((torch.log(scale) - widths).sum())
+
+
+def log_prior(causes: Iterable[CauseName], choices: int) -> float:
+    """Log prior of a set of effects, by its size, its places, and the number of choices."""
+    causes = list(causes)
+    return prior_of_set(len(causes), len({place for _, place in causes}), choices)
+
+
+def _log_width(fitter: Fitter, space: ParameterSpace, i: int) -> float:
+    """Log width of a parameter's prior over sqrt(2 pi), in the parameter's unit."""
+    p = space.parameters[i]
+    if math.isfinite(p.std):
+        return math.log(p.std)
+    low, high, _ = fitter.box(space)
+    width = float(high[i] - low[i])
+    return math.log(width if math.isfinite(width) else 1.0) - 0.5 * math.log(2.0 * math.pi)

@@ -1,0 +1,165 @@
+"""The reference models: their definition, their errors on the hold-outs, and their predictions, as the answer shows
+them.
+
+    nominal         the plant file
+    recalibrated    with the constants fitted
+    augmented       with the causes
+    augmented_on_*  with the causes, but nominal or recalibrated constants
+    ceiling         with the causes, and free functions of the variables of their components
+
+The ceiling is the limit of any memoryless equation of these components. Functions of time belong to the clock of one
+recording and are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.candidate_fit import Fit
+from fdi_torch.gap.dataset import DataSet
+from fdi_torch.gap.diagnosis_result import DiagnosisResult
+from fdi_torch.gap.free_form import free_form
+from fdi_torch.gap.free_form_coefficients import coefficients_of, without_time_course
+from fdi_torch.gap.holdout import Closure, HeldOut, Model, closure, free_run, model_of
+from fdi_torch.gap.posterior import causes_in_order
+from fdi_torch.parameters import display_unit
+from fdi_torch.plant.description import PlantDescription
+
+FROZEN = {"recalibrated": "augmented_on_recalibrated", "nominal": "augmented_on_nominal"}
+
+
+def reference_models(result: DiagnosisResult) -> dict[str, Model]:
+    """All models, by the names of the answer."""
+    best = result.best
+    return {
+        "nominal": Model(),
+        "recalibrated": model_of(result.null),
+        "augmented": model_of(best),
+        FROZEN["recalibrated"]: Model(best.candidate.placements, constants_of(result.null) | best.effect_values),
+        FROZEN["nominal"]: Model(best.candidate.placements, best.effect_values),
+        "ceiling": ceiling_model(result),
+    }
+
+
+def constants_of(fit: Fit) -> dict[str, float]:
+    """Calibration constants and refitted effects of the plant file, without values specific to one recording."""
+    new = {p.prefix for p in fit.candidate.placements}
+    constants = [n for n in fit.space.names if "@" not in n and not n.endswith(".start_level")]
+    return {n: fit.values[n] for n in constants if n.rpartition(".")[0] not in new}
+
+
+def ceiling_model(result: DiagnosisResult) -> Model:
+    """The best explanation with free functions added; if it has an unknown, its free form itself."""
+    best, plant = result.best, result.fitter.data.plant
+    if result.free_form_fit:
+        return model_of(best)
+    free = without_time_course([p for place in causal_places(result) for p in free_form(place, plant, result.reach)])
+    coefficients: Mapping[str, float] = coefficients_of(result.fitter, best, free, result.reach).by_name()
+    return Model((*best.candidate.placements, *free), {**best.values, **coefficients})
+
+
+def causal_places(result: DiagnosisResult) -> list[str]:
+    """Places of the best explanation's causes; the likeliest place if it has none."""
+    places = list(dict.fromkeys(p.location for p in result.best.candidate.placements))
+    return places or [result.posterior.places[0][0]]
+
+
+def closure_to_dict(holdouts: Sequence[HeldOut], result: DiagnosisResult) -> dict[str, Any]:
+    """The closure as the answer contains it: pooled, per sensor, per hold-out.
+
+    frozen: with the causes, but constants recalibrated without them, or nominal. ceiling_at: places of the free
+    functions.
+    """
+    scales = _Scales.of(result.fitter.data.plant)
+    errors = _numbers(closure(holdouts), scales)
+    answer = {
+        "metric": "free-run RMSE on the hold-out, per sensor and pooled, in the sensor's unit",
+        "unit": scales.unit,
+        "units": dict(scales.units),
+        **errors,
+        "augmented_with": [{"effect": n, "location": at} for n, at in causes_in_order(result.best)],
+        "ceiling_at": causal_places(result),
+        "holdouts": [h.data.recording.source for h in holdouts],
+    }
+    if len(holdouts) > 1:
+        answer["per_holdout"] = [
+            {"source": h.data.recording.source, **_numbers(closure([h]), scales)} for h in holdouts
+        ]
+    return answer
+
+
+@dataclass(frozen=True)
+class _Scales:
+    """unit, scale: of the pooled error. units, each: of every sensor."""
+
+    unit: str
+    scale: float
+    units: Mapping[str, str]
+    each: Mapping[str, float]
+
+    @classmethod
+    def of(cls, plant: PlantDescription) -> _Scales:
+        arranged = {s.name: display_unit(s.unit) for s in plant.sensors}
+        one_unit = len({s.unit for s in plant.sensors}) == 1
+        unit, scale = next(iter(arranged.values())) if one_unit else ("noise levels", 1.0)
+        return cls(unit, scale, {n: u for n, (u, _) in arranged.items()}, {n: x for n, (_, x) in arranged.items()})
+
+
+def _numbers(done: Closure, scales: _Scales) -> dict[str, Any]:
+    pooled, frozen = _without_frozen(done.pooled, scales.scale)
+    each = {sensor: _without_frozen(errors, scales.each[sensor])[0] for sensor, errors in done.per_sensor.items()}
+    return {
+        **pooled,
+        "frozen": frozen,
+        "per_sensor": each,
+        "closed": done.closed,
+        "closed_ci95": done.closed_ci95,
+    }
+
+
+def _without_frozen(errors: Mapping[str, float], scale: float) -> tuple[dict[str, float], dict[str, float]]:
+    names = {model: constants for constants, model in FROZEN.items()}
+    plain = {m: v * scale for m, v in errors.items() if m not in names}
+    return plain, {names[m]: v * scale for m, v in errors.items() if m in names}
+
+
+SHOWN = ("nominal", "recalibrated", "augmented", "ceiling")
+
+
+def prediction_arrays(result: DiagnosisResult, holdouts: Sequence[HeldOut]) -> dict[str, Tensor]:
+    """Predictions by name, SI, sensors in the order of the recording; hold-outs after the first carry their number."""
+    fitter = result.fitter
+    arrays: dict[str, Tensor] = {}
+    for k, rows in enumerate(fitter.data.rows):
+        data = fitter.data.alone(k)
+        predicted = {
+            "nominal": free_run(data, fitter.noise, Model())[0],
+            "recalibrated": result.null.linearised.readings[0, rows],
+            "augmented": result.best.linearised.readings[0, rows],
+        }
+        prefix = "" if k == 0 else f"recording_{k + 1}_"
+        arrays |= {f"{prefix}{name}": _as_recorded(data, values) for name, values in predicted.items()}
+    for k, holdout in enumerate(holdouts):
+        prefix = "holdout" if k == 0 else f"holdout_{k + 1}"
+        arrays[f"{prefix}_time"] = holdout.data.recording.time
+        read = torch.where(holdout.data.mask, holdout.data.readings, torch.nan)
+        arrays |= _prefixed(prefix, {"read": read} | {n: holdout.runs[n] for n in SHOWN}, holdout.data)
+    return arrays
+
+
+def _prefixed(prefix: str, values: Mapping[str, Tensor], data: DataSet) -> dict[str, Tensor]:
+    return {f"{prefix}_{name}": _as_recorded(data, each) for name, each in values.items()}
+
+
+def _as_recorded(data: DataSet, values: Tensor) -> Tensor:
+    """Map (S, C) in the plant's order of sensors to the recording's order; NaN for columns without a sensor."""
+    names = data.recording.output_names
+    arranged = values.new_full((len(values), len(names)), torch.nan)
+    for i, sensor in enumerate(data.plant.sensors):
+        arranged[:, names.index(sensor.column)] = values[:, i]
+    return arranged

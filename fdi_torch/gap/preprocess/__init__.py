@@ -1,0 +1,1 @@
+"""Preparation of recordings before a diagnosis: acquisition faults, stuck sensors, outliers, sensor limits."""

@@ -1,0 +1,266 @@
+"""Checks of a recording before a diagnosis: stuck sensors are masked, faulty recordings are rejected.
+
+A run of equal readings that noise and quantization cannot explain (`recordings/repeated_readings.py`) means that the
+sensor is stuck, unless its value is the end of the sensor's range: there the reading may be clipped, if the predicted
+level lies beyond that end. The commands check, gap, train and monitor all use these checks before they fit anything.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.preprocess.blockwise_likelihood import (
+    BlockwiseFit,
+    blocked_recording,
+    blockwise_fit,
+    noise_of,
+    thinned,
+)
+from fdi_torch.gap.preprocess.recording_fault_decision import SURE, log_odds, recording_fault
+from fdi_torch.gap.preprocess.recording_faults import RecordingFault
+from fdi_torch.parameters import display_unit
+from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
+
+FEWEST = 20
+"""Fewest samples for these checks; fewer cannot give a probability of 95 %."""
+
+
+@dataclass(frozen=True)
+class StuckSegment:
+    """A segment in which a sensor is stuck: rows first to beyond - 1, at `value`, from start to stop (s).
+
+    for_good: whether the segment lasts until the end of the recording.
+    """
+
+    sensor: Sensor
+    first: int
+    beyond: int
+    value: float
+    start: float
+    stop: float
+    for_good: bool
+
+    def column_in(self, recording: Recording) -> int:
+        return _column(recording, self.sensor)
+
+    @property
+    def text(self) -> str:
+        unit, scale = display_unit(self.sensor.unit)
+        until = "on" if self.for_good else f"to {self.stop:g} s"
+        return (
+            f"{self.sensor.column} is stuck at {scale * self.value:.4g} {unit} from {self.start:g} s {until}: "
+            "these readings do not count"
+        )
+
+
+@dataclass(frozen=True)
+class CheckedRecording:
+    """A recording whose stuck readings are masked. fault: a fault of the whole recording, or None."""
+
+    recording: Recording
+    stuck: tuple[StuckSegment, ...]
+    fault: RecordingFault | None
+
+
+def examined(plant: PlantDescription, recording: Recording) -> CheckedRecording:
+    """Check a recording, whose inputs are known, for stuck sensors and recording faults."""
+    plant = _with_recorded_sensors(plant, recording)
+    if len(recording) < FEWEST or not plant.sensors:
+        return CheckedRecording(recording, (), None)
+    stuck = list(stuck_in(plant, recording))
+    remaining, fault = without(recording, stuck), None
+    constant = _constant_sensors(plant, remaining)
+    while not recording.trusted and (fault := recording_fault(plant, remaining, tuple(s.column for s in constant))):
+        silent = [s for s in constant if s.column in fault.channels]
+        if not (fault.silent and silent):
+            break
+        stuck += _all_readings(remaining, silent)
+        remaining, constant = without(recording, stuck), [s for s in constant if s not in silent]
+    return CheckedRecording(_with_notes(remaining, stuck), tuple(stuck), fault)
+
+
+def usable(plant: PlantDescription, recording: Recording, effects: bool = False) -> CheckedRecording:
+    """Check a recording. Raises ValueError if it has a recording fault.
+
+    effects: whether the caller considers effects of sensors; a delayed sensor is then accepted.
+    """
+    checked = examined(plant, recording)
+    if checked.fault and not (effects and checked.fault.physical):
+        raise ValueError(
+            f"{recording.source}: {checked.fault.text}; if the recording is right, state trusted: true beside the file"
+        )
+    return checked
+
+
+def stuck_in(plant: PlantDescription, recording: Recording) -> tuple[StuckSegment, ...]:
+    """Segments in which a sensor is stuck and not clipped."""
+    plant = _with_recorded_sensors(plant, recording)
+    if len(recording) < FEWEST or not plant.sensors:
+        return ()
+    segments = {s: _segments(plant, recording, s) for s in plant.sensors}
+    stuck = [
+        each for of_sensor in segments.values() for each in of_sensor if not _may_be_clipped(plant, recording, each)
+    ]
+    unclear = [each for of_sensor in segments.values() for each in of_sensor if each not in stuck]
+    remaining = without(recording, [*stuck, *unclear])
+    if ambiguous := [each for each in unclear if _other_readings(recording, each).numel()]:
+        fitted = blockwise_fit(blocked_recording(plant, thinned(remaining), noise_of(plant, recording)))
+        stuck += [each for each in ambiguous if _level_inside_range(plant, recording, each, ambiguous, fitted)]
+    return tuple(stuck)
+
+
+def without_sensors(plant: PlantDescription, names: Collection[str]) -> PlantDescription:
+    """The plant without these sensors and without all that its file states of them."""
+    return replace(
+        plant,
+        sensors=tuple(s for s in plant.sensors if s.name not in names),
+        effects=tuple(e for e in plant.effects if e.location not in names),
+        tolerances={n: v for n, v in plant.tolerances.items() if n.partition(".")[0] not in names},
+        varying=tuple(n for n in plant.varying if n.partition(".")[0] not in names),
+    )
+
+
+def _with_recorded_sensors(plant: PlantDescription, recording: Recording) -> PlantDescription:
+    """The plant with only those sensors that the recording contains."""
+    return without_sensors(plant, {s.name for s in plant.sensors if s.column not in recording.output_names})
+
+
+def _with_notes(recording: Recording, stuck: Sequence[StuckSegment]) -> Recording:
+    """The recording with notes on its stuck segments."""
+    notes = tuple(f"{recording.source}: {each.text}" for each in _longest_first(stuck))
+    return replace(recording, notes=(*recording.notes, *notes))
+
+
+MANY = 3
+"""Most stuck segments of one sensor that are reported, the longest."""
+
+
+def _longest_first(stuck: Sequence[StuckSegment]) -> list[StuckSegment]:
+    """The longest segments of each sensor, in the order of time."""
+    kept = []
+    for sensor in dict.fromkeys(each.sensor for each in stuck):
+        segments = sorted((s for s in stuck if s.sensor is sensor), key=lambda s: s.first - s.beyond)
+        kept += sorted(segments[:MANY], key=lambda s: s.first)
+    return kept
+
+
+def _column(recording: Recording, sensor: Sensor) -> int:
+    return recording.output_names.index(sensor.column)
+
+
+def _values(recording: Recording, sensor: Sensor) -> tuple[Tensor, Tensor]:
+    """Valid rows of a sensor, and its readings there."""
+    column = _column(recording, sensor)
+    rows = recording.mask[:, column].nonzero().flatten()
+    return rows, recording.outputs[rows, column]
+
+
+def _segments(plant: PlantDescription, recording: Recording, sensor: Sensor) -> list[StuckSegment]:
+    """Segments of repeated readings of one sensor."""
+    rows, values = _values(recording, sensor)
+    usual = _typical_scatter(plant, recording, sensor) if len(values) and bool((values == values[0]).all()) else None
+    time = recording.time
+    return [
+        StuckSegment(
+            sensor,
+            int(rows[first]),
+            int(rows[beyond - 1]) + 1,
+            float(values[first]),
+            float(time[rows[first]]),
+            float(time[rows[beyond - 1]]),
+            beyond == len(values),
+        )
+        for first, beyond in stuck_runs(values, usual)
+    ]
+
+
+def _typical_scatter(plant: PlantDescription, recording: Recording, sensor: Sensor) -> Scatter:
+    """Scatter of the other sensors of this unit, converted to this sensor's gain; the median over them."""
+    others = [s for s in plant.sensors if s is not sensor and s.unit == sensor.unit]
+    scatters = [(scatter(_values(recording, s)[1]), abs(sensor.gain / s.gain)) for s in others]
+    moving = [(each, scale) for each, scale in scatters if each.step > 0.0]
+    if not moving:
+        return Scatter(0.0, 0.0)
+    return Scatter(median(s.noise * k for s, k in moving), median(s.step * k for s, k in moving))
+
+
+def _other_readings(recording: Recording, stuck: StuckSegment) -> Tensor:
+    """The sensor's valid readings at other values."""
+    _, values = _values(recording, stuck.sensor)
+    return values[values != stuck.value]
+
+
+def _may_be_clipped(plant: PlantDescription, recording: Recording, stuck: StuckSegment) -> bool:
+    """Whether the value is an end of the readings' range, or of the tank's if nothing else is read."""
+    sensor, rest = stuck.sensor, _other_readings(recording, stuck)
+    if len(rest):
+        return not float(rest.min()) < stuck.value < float(rest.max())
+    height = next(t.height for t in plant.tanks if t.name == sensor.tank)
+    level = (stuck.value - sensor.offset) / sensor.gain
+    return not 0.0 < level < height or stuck.value in (sensor.low, sensor.high)
+
+
+def _level_inside_range(
+    plant: PlantDescription,
+    recording: Recording,
+    stuck: StuckSegment,
+    ambiguous: list[StuckSegment],
+    fitted: BlockwiseFit,
+) -> bool:
+    """Whether the predicted level lies inside the range by more than the model error.
+
+    All segments at this value count together. Log odds as in `blockwise_likelihood`, against a clipped reading.
+    """
+    i = plant.sensors.index(stuck.sensor)
+    blocked, model = fitted.blocked, fitted.readings[:, i]
+    time, stuck_now = blocked.recording.time, torch.zeros(len(model), dtype=torch.bool)
+    for each in ambiguous:
+        if each.sensor is stuck.sensor and each.value == stuck.value:
+            stuck_now |= (time >= each.start) & (time <= each.stop)
+    if not bool(stuck_now.any()):
+        return False
+    at_top = stuck.value >= float(_other_readings(recording, stuck).max())
+    inside = (stuck.value - model if at_top else model - stuck.value).clamp(min=0.0)
+    means, samples = blocked.means(inside.unsqueeze(1), stuck_now.unsqueeze(1))
+    mean_square = float((samples * means**2).sum() / samples.sum())
+    gains = torch.tensor([s.gain for s in plant.sensors], dtype=torch.float64)
+    model_error = float(((fitted.variance / gains**2)[fitted.means > 0]).max()) * stuck.sensor.gain**2
+    count = blocked.blocks * float(stuck_now.double().mean())
+    return 0.5 * count * math.log(max(mean_square, model_error) / model_error) > log_odds(SURE)
+
+
+def _constant_sensors(plant: PlantDescription, recording: Recording) -> list[Sensor]:
+    """Sensors with one value only, which small noise or an end of the range may explain."""
+    constant = []
+    for sensor in plant.sensors:
+        _, values = _values(recording, sensor)
+        if len(values) and bool((values == values[0]).all()):
+            constant.append(sensor)
+    return constant
+
+
+def _all_readings(recording: Recording, sensors: Sequence[Sensor]) -> list[StuckSegment]:
+    """One segment per sensor that covers all its readings."""
+    stuck = []
+    for sensor in sensors:
+        rows, values = _values(recording, sensor)
+        first, last = int(rows[0]), int(rows[-1])
+        span = float(recording.time[first]), float(recording.time[last])
+        stuck.append(StuckSegment(sensor, first, last + 1, float(values[0]), *span, True))
+    return stuck
+
+
+def without(recording: Recording, stuck: Sequence[StuckSegment]) -> Recording:
+    """Mask these segments, including their first reading: that of a dead sensor is wrong as well."""
+    mask = recording.mask.clone()
+    for each in stuck:
+        mask[each.first : each.beyond, each.column_in(recording)] = False
+    return replace(recording, mask=mask)

@@ -1,0 +1,154 @@
+"""Likelihood of a recording under a model that is wrong by an unknown amount for a known time.
+
+    log p(y | D) = -1/2 sum_c n_c log v_c - chi^2(tolerances) / 2 + log prior
+
+- v_c: mean square of the residual of channel c, averaged over blocks of two time constants tau of the plant; at least
+  the variance of the sensor noise in such a mean.
+- n_c = T / (2 tau): number of blocks, which is the number of independent values of a model error that decays with tau
+  (Bartlett, 1946). The size of the error is integrated out under Jeffreys' prior.
+
+Each channel is weighted by its own v_c, so that one wrong channel does not bias the fit of the others: sensors that
+agree through the plant's equations outvote it (generalised observers: Frank, 1990, Automatica 26, 459-474).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import effect
+from fdi_torch.gap.candidate_fit import CAP, Candidate, Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.dataset import DataSet, data_set_of
+from fdi_torch.plant.constants import flow_scale, reading_span
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.repeated_readings import scatter
+
+SAMPLES = 1200
+"""Most samples of a thinned recording; recording faults show at the time scale of the plant."""
+ROUNDS = 3
+"""Alternations between the fit and the variances of its residuals."""
+BROAD = 0.1
+"""Standard deviation of a residual before the first fit, as a share of the sensor's span."""
+EXACT = 1e-5
+"""Error of the simulation in steps of thinned samples, as a share of the sensor's span."""
+
+
+@dataclass(frozen=True)
+class BlockedRecording:
+    """A thinned recording of a plant, divided into blocks of time.
+
+    noise (C,): smallest v_c, in the sensors' units squared. blocks: T / (2 tau).
+    """
+
+    plant: PlantDescription
+    recording: Recording
+    data: DataSet
+    noise: Tensor
+    blocks: float
+
+    @cached_property
+    def block(self) -> Tensor:
+        """Index of the block of each sample, (S,)."""
+        time = self.recording.time - self.recording.time[0]
+        return (time / float(time[-1]) * self.blocks * (1.0 - 1e-9)).long()
+
+    def means(self, x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Block means (B, C) of x (S, C), and the number of valid samples in each."""
+        count = torch.zeros(int(self.block[-1]) + 1, x.shape[1], dtype=x.dtype)
+        total = count.index_add(0, self.block, torch.where(mask, x, 0.0))
+        count = count.index_add(0, self.block, mask.to(x.dtype))
+        return total / count.clamp(min=1.0), count
+
+
+@dataclass(frozen=True)
+class BlockwiseFit:
+    """The plant fitted to a recording. variance (C,): v_c. means (C,): n_c. prior_chi_square: of the tolerances."""
+
+    blocked: BlockedRecording
+    fit: Fit
+    variance: Tensor
+    means: Tensor
+    prior_chi_square: float
+
+    @property
+    def readings(self) -> Tensor:
+        """Predicted readings (S, C)."""
+        return self.fit.linearised.readings[0]
+
+    @property
+    def log_likelihood(self) -> float:
+        return -0.5 * float((self.means * torch.log(self.variance)).sum()) - 0.5 * self.prior_chi_square
+
+    @property
+    def most(self) -> float:
+        """The log-likelihood of a fit whose residuals are sensor noise only."""
+        return -0.5 * float((self.means * torch.log(self.blocked.noise)).sum())
+
+
+def slowest(plant: PlantDescription) -> float:
+    """The largest time constant (s) of a full tank: volume over outflow."""
+    return max(t.area * t.height / flow_scale(plant, t.name) for t in plant.tanks)
+
+
+def thinned(recording: Recording) -> Recording:
+    """The recording with at most about SAMPLES samples."""
+    return recording.every(max(1, len(recording) // SAMPLES))
+
+
+def blocked_recording(plant: PlantDescription, recording: Recording, noise: Tensor) -> BlockedRecording:
+    """Divide a thinned recording into blocks.
+
+    noise (C,): standard deviation of each sensor's readings, in the plant's order.
+    """
+    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    data = data_set_of(plant, nominal_effects, recording, float(torch.median(torch.diff(recording.time))))
+    blocks = max(float(recording.time[-1] - recording.time[0]) / (2.0 * slowest(plant)), 1.0)
+    spans = torch.tensor([reading_span(plant, s) for s in plant.sensors], dtype=torch.float64)
+    least = noise**2 * blocks / len(recording) + (EXACT * spans) ** 2
+    return BlockedRecording(plant, recording, data, least, blocks)
+
+
+def noise_of(plant: PlantDescription, recording: Recording) -> Tensor:
+    """Standard deviation (C,) of each sensor's noise, quantization included, in the units of the readings."""
+    stds = []
+    for sensor in plant.sensors:
+        column = recording.output_names.index(sensor.column)
+        spread = scatter(recording.outputs[recording.mask[:, column], column])
+        stds.append(math.hypot(spread.noise, spread.step / math.sqrt(12.0)))
+    return torch.tensor(stds, dtype=torch.float64)
+
+
+def blockwise_fit(
+    blocked: BlockedRecording,
+    candidate: Candidate = Candidate(),  # noqa: B008
+    base: BlockwiseFit | None = None,
+    cap: int = CAP,
+    rounds: int = ROUNDS,
+) -> BlockwiseFit:
+    """Fit the plant, with the effects of a candidate, within its tolerances. cap: most evaluations of one fit."""
+    data, channels = blocked.data, len(blocked.plant.sensors)
+    spans = torch.tensor([reading_span(blocked.plant, s) for s in blocked.plant.sensors], dtype=torch.float64)
+    variance = (BROAD * spans) ** 2 if base is None else base.variance
+    fit = base.fit if base else None
+    _, samples = blocked.means(data.readings, data.mask)
+    means = (samples > 0).sum(dim=0).to(torch.float64) * blocked.blocks / (int(blocked.block[-1]) + 1)
+    count = data.mask.sum(dim=0)
+    for _ in range(rounds):
+        each = torch.sqrt(variance * count.clamp(min=1) / means.clamp(min=1.0))
+        fitter = Fitter(data, Noise(each, torch.zeros(channels, dtype=torch.float64)))
+        start = Candidate(candidate.placements, (fit.effect_values,)) if fit and fit.key == candidate.key else candidate
+        fit = fitter.fit(start, fit, cap=cap)
+        residual, samples = blocked.means(data.readings - fit.linearised.readings[0], data.mask)
+        mean_square = (samples * residual**2).sum(dim=0) / samples.sum(dim=0).clamp(min=1.0)
+        variance = torch.maximum(mean_square, blocked.noise)
+    assert fit is not None
+    deviation = ((fit.theta - fit.space.nominal(fit.theta)) / fit.space.std(fit.theta)).nan_to_num(0.0)
+    constants = torch.tensor([n.count(".") == 1 for n in fit.space.names])
+    return BlockwiseFit(blocked, fit, variance, means, float((deviation[constants] ** 2).sum()))

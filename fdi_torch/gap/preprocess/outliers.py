@@ -1,0 +1,160 @@
+"""Outliers of the readings: spikes and drop-outs, which no tank can cause, detected and masked before a fit.
+
+A level is the integral of flows. A reading that jumps within one sample and soon returns is therefore a fault of the
+sensor or its wiring. A jump that persists is no outlier. Outliers are searched in the residual of the fitted plant,
+which is smooth whatever else is wrong. Stuck readings are masked before (`acquisition.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.dataset import DataSet
+
+FAR = 5.0  # size of a jump in usual differences of neighbours: seven standard deviations of white noise
+NEARER = 3.5  # the same for a sensor that is known to have outliers
+LATE = 3.0  # samples of timing error; the change that the slope makes of them is no jump
+WING = 5  # samples to either side, whose median is the undisturbed reading
+BACK = 0.3  # share of an outlier's height to within which the reading must return
+ENOUGH = 100  # fewest readings of a sensor
+RETURNS = 8  # jumps after one with which it may return; a spike returns with the next
+MOST = 0.1  # share of a sensor's readings beyond which they are no outliers but its normal behaviour
+PASSES = 3  # each with a fit that leaves out the outliers found before
+CLEAR = 1.4  # times FAR; the median outlier of heavy-tailed noise is nearer (Laplace 1.1, Student with 3 degrees 1.26)
+EVENTS, SAMPLES = 3, 6  # so many outliers, or samples in all, mean that something is wrong with the sensor
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """rows: its samples, in a row. times: of the first and the last, s. jumps: its height in usual differences of
+    neighbours; infinite for stuck readings."""
+
+    rows: slice
+    times: tuple[float, float]
+    jumps: float
+
+
+@dataclass(frozen=True)
+class SensorOutliers:
+    """All outliers of one sensor in one recording."""
+
+    sensor: str
+    source: str
+    each: tuple[Outlier, ...]
+
+    @property
+    def samples(self) -> int:
+        return sum(s.rows.stop - s.rows.start for s in self.each)
+
+    @property
+    def clear(self) -> bool:
+        """Whether they are more than an accident, and more than heavy-tailed noise makes."""
+        far = [s.jumps for s in self.each if s.jumps > FAR]
+        many = len(self.each) >= EVENTS or self.samples >= SAMPLES
+        return many and bool(far) and median(far) > CLEAR * FAR
+
+
+def outliers_of(data: DataSet) -> tuple[SensorOutliers, ...]:
+    """Outliers of each sensor that has some. data: one recording."""
+    outliers: dict[int, list[Outlier]] = {}
+    original, mask = data.mask, data.mask
+    for _ in range(PASSES):
+        model, new_mask = _fitted_readings(replace(data, mask=mask)), mask.clone()
+        for c in range(mask.shape[1]):
+            threshold = NEARER if len(outliers.get(c, [])) >= EVENTS else FAR
+            new_outliers = _channel_outliers(data, model[:, c], mask[:, c], c, threshold)
+            masked = int((~mask[:, c] & original[:, c]).sum()) + sum(s.rows.stop - s.rows.start for s in new_outliers)
+            if new_outliers and masked <= MOST * int(original[:, c].sum()):
+                outliers.setdefault(c, []).extend(new_outliers)
+                new_mask = without(new_mask, new_outliers, c)
+        if bool((new_mask == mask).all()):
+            break
+        mask = new_mask
+    sensors, source = data.plant.sensors, data.recording.source
+    each = {c: tuple(sorted(new_outliers, key=lambda s: s.rows.start)) for c, new_outliers in sorted(outliers.items())}
+    return tuple(SensorOutliers(sensors[c].name, source, new_outliers) for c, new_outliers in each.items())
+
+
+def sensor_with_outliers(sensors: Sequence[SensorOutliers]) -> str | None:
+    """The sensor with most outlying readings, if they are more than an accident."""
+    clear = [s for s in sensors if s.clear]
+    return max(clear, key=lambda s: s.samples).sensor if clear else None
+
+
+def without(mask: Tensor, strays: Sequence[Outlier], channel: int) -> Tensor:
+    """The mask (S, C) without these readings of a channel."""
+    reduced = mask.clone()
+    for stray in strays:
+        reduced[stray.rows, channel] = False
+    return reduced
+
+
+def _fitted_readings(data: DataSet) -> Tensor:
+    """Readings (S, C) of the plant with its constants fitted."""
+    readings = torch.where(data.mask, data.readings, torch.nan)
+    size = (readings - readings.nanmedian(dim=0).values).abs().nanmedian(dim=0).values.clamp(min=1e-9)
+    return Fitter(data, Noise(1e-2 * size, torch.zeros_like(size))).fit(Candidate()).linearised.readings[0]
+
+
+def _channel_outliers(data: DataSet, model: Tensor, mask: Tensor, channel: int, far: float) -> list[Outlier]:
+    """Outliers of one channel. far: as FAR."""
+    at = mask.nonzero().flatten()
+    if len(at) < ENOUGH:
+        return []
+    values, predicted, time = data.readings[at, channel], model[at], data.recording.time[at]
+    spans = jumps_and_returns(values - predicted, torch.diff(predicted).abs(), _resolution(values), far)
+    return [
+        Outlier(slice(int(at[a]), int(at[b - 1]) + 1), (float(time[a]), float(time[b - 1])), jumps)
+        for a, b, jumps in spans
+    ]
+
+
+def _resolution(values: Tensor) -> float:
+    """Smallest distance between two distinct values (S,)."""
+    distinct = torch.unique(values)
+    return float(torch.diff(distinct).min()) if len(distinct) > 1 else 0.0
+
+
+def jumps_and_returns(x: Tensor, slope: Tensor, least: float, far: float = FAR) -> list[tuple[int, int, float]]:
+    """Segments in which x (n,) leaves its previous value within one sample and returns within one: first sample, first
+    sample after, height in usual differences.
+
+    slope (n - 1,): movement of the level between samples. least: smallest difference that counts. far: as FAR.
+    """
+    change = torch.diff(x)
+    usual = max(1.4826 * float((change - change.median()).abs().median()), least)
+    movement = torch.nn.functional.max_pool1d(slope.reshape(1, 1, -1), 2 * WING + 1, 1, WING).flatten()
+    limit = far * usual + LATE * movement
+    jumps = (change.abs() > limit).nonzero().flatten().tolist()
+    longest, values = int(MOST * len(x)), x.tolist()
+    if len(jumps) > 2 * longest:
+        return []
+    segments: list[tuple[int, int, float]] = []
+    in_segments: set[int] = set()
+    for n, last in enumerate(jumps):
+        if segments and last < segments[-1][1]:
+            continue
+        steady = [k for k in range(max(last - longest, 0), last + 1) if k not in in_segments]
+        before = median(values[k] for k in steady[-WING:])
+        for back in jumps[n + 1 : n + 1 + RETURNS]:
+            if back - last > longest:
+                break
+            block, following = values[last + 1 : back + 1], values[back + 1 : back + 1 + WING]
+            middle = 0.5 * (before + median(following))
+            height = median(abs(v - middle) for v in block)
+            mismatch = max(abs(median(following) - before), abs(following[0] - middle), abs(values[last] - middle))
+            if height > float(limit[last]) and mismatch < BACK * height:
+                # The samples before and after, as many as the block has, decide which of the two is the outlier.
+                around = [values[k] for k in steady[-len(block) :]] + values[back + 1 : back + 1 + len(block)]
+                if median(abs(v - median(around)) for v in block) > 0.5 * height:
+                    segments.append((last + 1, back + 1, height / usual))
+                    in_segments.update(range(last + 1, back + 1))
+                    break
+    return segments

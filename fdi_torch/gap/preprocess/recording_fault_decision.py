@@ -1,0 +1,119 @@
+"""The decision whether a recording has a fault, such as a wrong unit or a clock offset.
+
+    P(fault) = sum of the weights of all faults / (that sum + weights of the recording as it is)
+
+The recording as it is competes without an effect and with one or two effects of the library, so that an unusual plant
+does not pass for a wrong recording. A fault is reported if P(fault) exceeds 95 %.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import torch
+
+from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.library import library_of
+from fdi_torch.gap.marginal_likelihood import log_prior
+from fdi_torch.gap.preprocess.blockwise_likelihood import (
+    BlockwiseFit,
+    blocked_recording,
+    blockwise_fit,
+    noise_of,
+    thinned,
+)
+from fdi_torch.gap.preprocess.recording_faults import DECADES, FaultHypotheses, RecordingFault, WeightedFault
+from fdi_torch.gap.screening import Option, options_of, screen
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.operating_range import operating_range_of_all, with_simulated_levels
+from fdi_torch.recording import Recording
+
+FAULT_PROBABILITY = 0.02
+"""Prior probability that the recording has any fault, shared equally by all faults; as that of an effect that the
+library lacks (`estimate.evidence.Odds`)."""
+SURE = 0.95
+"""Posterior probability above which a fault is reported."""
+EVALUATIONS = 30
+"""Evaluations of the fit of a rival effect; its log-likelihood need not be exact."""
+RIVALS, MOST_EFFECTS = 6, 2
+"""Effects that are fitted about the likeliest combination, and effects in one combination."""
+
+
+def recording_fault(
+    plant: PlantDescription, recording: Recording, constant: tuple[str, ...] = ()
+) -> RecordingFault | None:
+    """The likeliest fault of a recording, or None if faults have less than 95 % together.
+
+    constant: columns of sensors that never move although noise should move them. They may also be clipped throughout.
+    """
+    as_is = blockwise_fit(blocked_recording(plant, thinned(recording), noise_of(plant, recording)))
+    count = len(plant.sensors) + len(plant.channels())
+    prior = math.log(FAULT_PROBABILITY / (len(DECADES) * count + math.comb(count, 2) + 2 * len(plant.sensors) + 1))
+    if as_is.most + prior < as_is.log_likelihood + log_odds(SURE):
+        return None  # even a perfect fit of a corrected recording would not reach 95 %
+    faults = list(FaultHypotheses(plant, recording, as_is, constant, prior).each())
+    rivals = [as_is.log_likelihood]
+    if not faults or not _surely_faulty(faults, rivals):
+        return None
+    silent = {c for f in faults if f.fault.silent for c in f.fault.channels}
+    for rival in _weights_with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}):
+        rivals.append(rival)
+        if not _surely_faulty(faults, rivals):
+            return None
+    return max(faults, key=lambda f: f.log_weight).fault
+
+
+def log_odds(probability: float) -> float:
+    """log(p / (1 - p))."""
+    return math.log(probability / (1.0 - probability))
+
+
+def _surely_faulty(faults: Sequence[WeightedFault], rivals: Sequence[float]) -> bool:
+    total = torch.logsumexp(torch.tensor([f.log_weight for f in faults]), 0)
+    return float(total - torch.logsumexp(torch.tensor(rivals), 0)) > log_odds(SURE)
+
+
+def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str]) -> Iterator[float]:
+    """Log weights of the uncorrected recording with one and with two effects of the library, by a greedy search.
+
+    excluded: places at which no effect is tried.
+    """
+    blocked, plant = as_is.blocked, as_is.blocked.plant
+    library = [p for p in library_of(plant) if not p.effect.quantizes and p.location not in excluded]
+    known = {p.prefix for p in blocked.data.nominal_effects}
+    placements = [p for p in library if p.prefix not in known]
+    parent = as_is
+    for _ in range(MOST_EFFECTS):
+        fit = parent.fit
+        ranges = operating_range_of_all([blocked.recording], plant)
+        reach = with_simulated_levels(ranges, plant, fit.linearised.levels[0])
+        fitter = _fitter(parent)
+        further = [p for p in placements if (p.effect.name, p.location) not in fit.key]
+        screening = screen(fitter, fit, options_of(further, fitter, reach), pairs=False)
+        best: dict[tuple[str, str], Option] = {}
+        for k in torch.argsort(screening.gain, descending=True).tolist():
+            best.setdefault(screening.options[k].cause, screening.options[k])
+        fits: list[BlockwiseFit] = []
+        for option in list(best.values())[:RIVALS]:
+            start = fit.effect_values | dict(option.start)
+            candidate = Candidate((*fit.candidate.placements, option.placement), (start,))
+            fits.append(blockwise_fit(blocked, candidate, as_is, EVALUATIONS))
+            yield _log_weight(fits[-1], len(library))
+        if not fits:
+            return
+        parent = max(fits, key=lambda each: each.log_likelihood)
+
+
+def _log_weight(fitted: BlockwiseFit, choices: int) -> float:
+    """Log posterior weight: log-likelihood, half a log n per effect parameter (BIC), and the log prior."""
+    shape = 0.5 * len(fitted.fit.effect_values) * math.log(float(fitted.means.sum()))
+    return fitted.log_likelihood - shape + log_prior(fitted.fit.key, choices)
+
+
+def _fitter(fitted: BlockwiseFit) -> Fitter:
+    """A fitter whose noise has the size of the residuals of a fit."""
+    data = fitted.blocked.data
+    each = torch.sqrt(fitted.variance * data.mask.sum(dim=0).clamp(min=1) / fitted.means.clamp(min=1.0))
+    return Fitter(data, Noise(each, torch.zeros_like(each)))

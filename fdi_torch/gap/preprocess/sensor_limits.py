@@ -1,0 +1,160 @@
+"""Limits of a sensor's range that the readings show without a model: constant values at an end of the range only.
+
+A rig that clips the noisy reading shows no noise in a clipped segment. A limit that applies before the noise is added
+is left to the search for effects. Near a limit the mean of the reading differs from the level by up to 0.4 standard
+deviations of the noise, which with 3600 samples is a gap by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import effect
+from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.dataset import DataSet
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.recording import Recording
+
+LIMITS = ("sensor_saturation", "sensor_floor")
+LONGEST_BY_CHANCE = 5  # equal samples in a row that chance explains
+CLEAR = 4.0  # standard deviations from a limit beyond which noise is not clipped
+FEWEST = 0.1  # smallest share of a sensor's samples from which its noise is estimated
+AT_REST = 0.05  # share of equal neighbours inside the range above which the level may simply be at rest
+
+
+def limits_of(values: Tensor) -> dict[str, float]:
+    """Limits that values (S,) of one sensor show, by effect name: 'sensor_saturation' and 'sensor_floor'."""
+    equal = torch.diff(values) == 0.0
+    limits = {}
+    ends = dict(zip(LIMITS, (float(values.max()), float(values.min())), strict=True))
+    at_end = (values[1:] == values.max()) | (values[1:] == values.min())
+    inside = equal[~at_end]
+    if len(inside) == 0 or float(inside.double().mean()) > AT_REST:
+        return {}
+    for name, end in ends.items():
+        if _longest_run(values == end) > LONGEST_BY_CHANCE:
+            limits[name] = end
+    return limits
+
+
+def limits_from_readings(
+    plant: PlantDescription,
+    recordings: Sequence[Recording],
+    nominal_effects: Sequence[Placement],
+    library: Sequence[Placement],
+) -> list[Placement]:
+    """Limits of sensors that all recordings together show and the plant does not have yet, as effects."""
+    limits = []
+    present, offered = {p.prefix for p in nominal_effects}, {p.prefix for p in library}
+    for sensor in plant.sensors:
+        values = [r.outputs[r.mask[:, i], i] for r in recordings for i in _columns(r, sensor.column)]
+        if not values:
+            continue
+        of_plant = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
+        for name, limit in limits_of(torch.cat(values)).items():
+            placement = Placement(effect(name), sensor.name, {"limit": limit})
+            if of_plant[name] is None and placement.prefix in offered - present:
+                limits.append(placement)
+    return limits
+
+
+def _columns(recording: Recording, name: str) -> list[int]:
+    return [i for i, column in enumerate(recording.output_names) if column == name]
+
+
+def noise_before_clipping(noise: Noise, data: DataSet, predicted: Tensor) -> Noise:
+    """The noise before clipping: its level is estimated from the samples far from the limits, by differences of
+    neighbours, which contain little model error. The correlation is that of all samples, since short segments determine
+    it badly.
+
+    predicted (S, C): about the readings without noise.
+    """
+    innovation, residual = noise.innovation.clone(), data.readings - predicted
+    for c, ends in enumerate(_limits_per_sensor(data)):
+        valid = unclipped = data.mask[:, c]
+        for name, end in ends.items():
+            unclipped = unclipped & (_beyond(name, predicted[:, c], end) < -CLEAR * float(noise.std[c]))
+        if ends and int(unclipped.sum()) > FEWEST * int(valid.sum()):
+            innovation[c] *= _rms_difference(residual[:, c], unclipped) / _rms_difference(
+                residual[:, c], valid, data.rows
+            )
+    return replace(noise, innovation=innovation)
+
+
+def _rms_difference(x: Tensor, selected: Tensor, tapered: Sequence[slice] = ()) -> float:
+    """Root mean square difference of neighbouring samples among some (S,).
+
+    tapered: segments weighted by the taper that the noise spectrum uses.
+    """
+    weight = torch.ones_like(x) if not tapered else torch.zeros_like(x)
+    for rows in tapered:
+        weight[rows] = torch.hann_window(len(x[rows]), periodic=False, dtype=x.dtype) ** 2
+    weight = weight[1:] * (selected[1:] & selected[:-1])
+    return float((weight * torch.diff(x) ** 2).sum() / weight.sum()) ** 0.5
+
+
+def with_noise_limits(data: DataSet, null: Fit, noise: Noise) -> DataSet:
+    """The data set with limits that clip the noise as well, for limits that the readings show and the plant file or
+    `limits_from_readings` has.
+
+    null: fit of the data set without further effects.
+    """
+    if not any(_limits_per_sensor(data)):
+        return data
+    levels = _unlimited(data, null, noise)
+    residual = torch.where(data.mask, data.readings - null.linearised.readings[0], 0.0)
+    rms = torch.sqrt(residual.square().sum(dim=0) / data.mask.sum(dim=0))  # the level of slow noise is determined badly
+    effects = {p.prefix: p for p in data.nominal_effects}
+    for c, (sensor, ends) in enumerate(zip(data.plant.sensors, _limits_per_sensor(data), strict=True)):
+        std = min(float(noise.std[c]), float(rms[c]))
+        of_plant = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
+        for name, end in ends.items():
+            placement = effects.get(f"{sensor.name}.{name}", Placement(effect(name), sensor.name))
+            values = dict(placement.values or {})
+            stated = [limit for limit in (values.get("limit"), of_plant[name]) if limit is not None]
+            if stated and all(abs(limit - end) < std for limit in stated):
+                beyond = data.mask[:, c] & (_beyond(name, levels[:, c], end) > CLEAR * std)
+                behind = _share_after_limit(data.readings[beyond, c] == end)
+                values = {"limit": end, **values, "noise": std, "behind": behind}
+                effects[placement.prefix] = replace(placement, values=values)
+    return replace(data, nominal_effects=tuple(effects.values()))
+
+
+def _unlimited(data: DataSet, null: Fit, noise: Noise) -> Tensor:
+    """Readings (S, C) of a fit if no sensor had a limit."""
+    sensors = tuple(replace(s, low=None, high=None) for s in data.plant.sensors)
+    nominal_effects = tuple(p for p in data.nominal_effects if p.effect.name not in LIMITS)
+    unlimited = replace(data, plant=replace(data.plant, sensors=sensors), nominal_effects=nominal_effects)
+    return Fitter(unlimited, noise).engine(null.candidate, ()).read(null.linearised.levels, null.theta.unsqueeze(0))[0]
+
+
+def _beyond(name: str, values: Tensor, end: float) -> Tensor:
+    """Distance outside a limit, in the readings' unit."""
+    return values - end if name == LIMITS[0] else end - values
+
+
+def _share_after_limit(at_end: Tensor) -> float:
+    """Share of the noise that is added after the limit: half of the samples far beyond with such noise are off the
+    limit."""
+    return min(2.0 * float((~at_end).double().mean()), 1.0) if len(at_end) else 0.0
+
+
+def _limits_per_sensor(data: DataSet) -> list[dict[str, float]]:
+    """Limits of each sensor, as in `limits_of`."""
+    return [limits_of(data.readings[valid, c]) for c, valid in enumerate(data.mask.T)]
+
+
+def _longest_run(flags: Tensor) -> int:
+    """Length of the longest run of true samples."""
+    edges = torch.diff(flags.to(torch.int64), prepend=flags.new_zeros(1, dtype=torch.int64))
+    starts = (edges == 1).nonzero().flatten()
+    ends = (edges == -1).nonzero().flatten()
+    if len(ends) < len(starts):
+        ends = torch.cat([ends, ends.new_tensor([len(flags)])])
+    return int((ends - starts).max()) if len(starts) else 0

@@ -1,0 +1,200 @@
+"""The problem of a diagnosis, checked before any fit: what cannot be diagnosed raises an error of one sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from fdi_torch.effects import effect
+from fdi_torch.gap.dataset import DataSet, data_set_of
+from fdi_torch.gap.library import library_of
+from fdi_torch.gap.preprocess.acquisition import StuckSegment, usable, without_sensors
+from fdi_torch.gap.preprocess.outliers import Outlier, SensorOutliers, outliers_of, without
+from fdi_torch.gap.preprocess.sensor_limits import limits_from_readings
+from fdi_torch.gap.structure_search import DEEPEST
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.scales import time_scale
+from fdi_torch.recording import Recording
+
+LEAST = 60
+"""Fewest readings of a sensor; with fewer, noise cannot be separated from a model error. Two of the slowest periods
+that count as noise."""
+
+LONGEST_STEP = 2.5  # s, for bench-scale tanks; with longer steps, fits that meet a rim depend on their start
+
+
+@dataclass(frozen=True)
+class Settings:
+    """library, leave_out: as in `library_of`. step: of the simulation, s; None: as in `checked_data_set`.
+
+    most: effects in one explanation. named_only: report the best set of named effects, however much it leaves
+    unexplained; an intermediate step if many causes act together. trusted: as in `Recording`, for all of them.
+    """
+
+    library: tuple[str, ...] | None = None
+    leave_out: tuple[str, ...] = ()
+    step: float | None = None
+    most: int = DEEPEST
+    named_only: bool = False
+    trusted: bool = False
+
+
+PLAIN = Settings()
+
+
+@dataclass(frozen=True)
+class DiagnosisProblem:
+    """library: the effects to search. known_effects: limits of sensors, and stuck sensors, that the readings show
+    without a model. data: the recordings, for the plant with these effects and without sensors that are stuck
+    throughout. holdouts: the hold-outs, likewise. outliers: masked readings of the recordings, and of the hold-outs.
+    most, named_only: as in `Settings`."""
+
+    library: tuple[Placement, ...]
+    recordings: tuple[Recording, ...]
+    known_effects: list[Placement]
+    data: DataSet
+    holdouts: tuple[DataSet, ...]
+    most: int
+    named_only: bool = False
+    outliers: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]] = ((), ())
+
+
+def problem_of(
+    plant: PlantDescription, recordings: Sequence[Recording], holdouts: Sequence[Recording], settings: Settings
+) -> DiagnosisProblem:
+    """Check the recordings and lay them out.
+
+    Raises ValueError for unknown effects or places, missing sensors or inputs, too few readings, and a hold-out that is
+    one of the recordings.
+    """
+    for one in holdouts:
+        check_holdout_differs(one, recordings)
+    library = library_of(plant, settings.library, settings.leave_out)
+    longest = max(float(r.time[-1] - r.time[0]) for r in recordings)
+    if settings.step is not None and settings.step > longest:
+        raise ValueError(f"step: expected one within the {longest:g} s recorded, got {settings.step:g} s; shorten it")
+    recordings, stuck = _examined(plant, recordings, settings.trusted)
+    holdouts, _ = _examined(plant, holdouts, settings.trusted)
+    offered = {p.prefix for p in library}
+    stuck_for_good = {s.sensor.name: s for s in stuck if s.for_good and f"{s.sensor.name}.sensor_stuck" in offered}
+    plant = _without_stuck_sensors(plant, recordings, stuck)
+    library = tuple(p for p in library if p.location in plant.locations())
+    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    recordings, outliers = _without_outliers(plant, nominal_effects, recordings, settings.step)
+    holdouts, holdout_outliers = _without_outliers(plant, nominal_effects, holdouts, settings.step)
+    known_effects = limits_from_readings(plant, recordings, nominal_effects, library)
+    nominal_effects += known_effects
+    known_effects += [
+        Placement(effect("sensor_stuck"), n, {"size": 1.0, "onset": s.start}) for n, s in stuck_for_good.items()
+    ]
+    outliers = _as_outliers([s for s in stuck if s.sensor.name not in stuck_for_good]) + outliers
+    data, *holdout_data = (
+        checked_data_set(plant, nominal_effects, r, settings.step) for r in (recordings, *((h,) for h in holdouts))
+    )
+    masked = (outliers, holdout_outliers)
+    options = settings.most, settings.named_only
+    return DiagnosisProblem(library, tuple(recordings), known_effects, data, tuple(holdout_data), *options, masked)
+
+
+def _without_outliers(
+    plant: PlantDescription, nominal_effects: Sequence[Placement], recordings: Sequence[Recording], step: float | None
+) -> tuple[list[Recording], list[SensorOutliers]]:
+    """The recordings with outliers masked, and these outliers."""
+    masked: list[Recording] = []
+    all_outliers: list[SensorOutliers] = []
+    columns = {s.name: s.column for s in plant.sensors}
+    for recording in recordings:
+        mask, of_recording = (
+            recording.mask,
+            outliers_of(data_set_of(plant, nominal_effects, recording, step or _step(plant, recording))),
+        )
+        for of_sensor in of_recording:
+            mask = without(mask, of_sensor.each, recording.output_names.index(columns[of_sensor.sensor]))
+        masked.append(replace(recording, mask=mask) if of_recording else recording)
+        all_outliers += of_recording
+    return masked, all_outliers
+
+
+def _examined(
+    plant: PlantDescription, recordings: Sequence[Recording], trusted: bool
+) -> tuple[list[Recording], list[StuckSegment]]:
+    """The recordings without readings of stuck sensors, and these. Raises ValueError for a faulty recording."""
+    checked = [usable(plant, replace(r, trusted=r.trusted or trusted), effects=True) for r in recordings]
+    return [f.recording for f in checked], [s for f in checked for s in f.stuck]
+
+
+def _without_stuck_sensors(
+    plant: PlantDescription, recordings: Sequence[Recording], stuck: Sequence[StuckSegment]
+) -> PlantDescription:
+    """The plant without sensors that have too few readings besides those that are stuck.
+
+    Raises ValueError if no sensor is left.
+    """
+    remaining = {
+        s.sensor.name: sum(int(r.mask[:, r.output_names.index(s.sensor.column)].sum()) for r in recordings)
+        for s in stuck
+    }
+    silent = {name for name, count in remaining.items() if count < LEAST}
+    if not silent:
+        return plant
+    if len(silent) == len(plant.sensors):
+        raise ValueError(
+            f"{recordings[0].source}: expected a sensor that reads its level, got none: {', '.join(sorted(silent))} "
+            "stand still throughout; check their wiring"
+        )
+    return without_sensors(plant, silent)
+
+
+def _as_outliers(stuck: Sequence[StuckSegment]) -> list[SensorOutliers]:
+    """Segments in which a sensor is stuck for some time, as outliers of that sensor."""
+    by_sensor: dict[str, list[Outlier]] = {}
+    for s in stuck:
+        by_sensor.setdefault(s.sensor.name, []).append(Outlier(slice(s.first, s.beyond), (s.start, s.stop), math.inf))
+    return [SensorOutliers(name, "", tuple(segments)) for name, segments in by_sensor.items()]
+
+
+def check_holdout_differs(holdout: Recording, recordings: Sequence[Recording]) -> None:
+    """Raises ValueError if a hold-out is one of the recordings that are diagnosed."""
+    same_file = bool(holdout.sha256) and any(_overlap(holdout, r) for r in recordings)
+    if same_file or any(holdout is r for r in recordings):
+        raise ValueError(
+            f"{holdout.source}: expected a hold-out other than the recording, got the same data; what was used for the "
+            "fits says nothing of how far the gap closes"
+        )
+
+
+def _overlap(a: Recording, b: Recording) -> bool:
+    """Whether both are cut from one file and overlap in time."""
+    return a.sha256 == b.sha256 and bool(a.time[0] < b.time[-1]) and bool(b.time[0] < a.time[-1])
+
+
+def checked_data_set(
+    plant: PlantDescription, nominal_effects: Sequence[Placement], recordings: Sequence[Recording], step: float | None
+) -> DataSet:
+    """Lay the recordings out on the grid of their simulation.
+
+    step: s; None for the sampling interval of the first recording, or the largest whole fraction of it that is not
+    longer than LONGEST_STEP.
+    """
+    data = data_set_of(plant, nominal_effects, recordings, step or _step(plant, recordings[0]))
+    check_enough_readings(data)
+    return data
+
+
+def _step(plant: PlantDescription, recording: Recording) -> float:
+    """A whole fraction of the sampling interval, s."""
+    interval = recording.interval
+    return interval / math.ceil(interval / (LONGEST_STEP * time_scale(plant)) - 1e-9)
+
+
+def check_enough_readings(data: DataSet) -> None:
+    """Raises ValueError if a sensor has too few readings."""
+    recording, plant = data.recording, data.plant
+    for sensor, count in zip(plant.sensors, data.mask.sum(dim=0).tolist(), strict=True):
+        if count < LEAST:
+            raise ValueError(
+                f"{recording.source}: expected at least {LEAST} readings of every sensor, got {count} of "
+                f"{sensor.name}; record longer or more often, or leave the sensor out of the plant file"
+            )

@@ -1,0 +1,304 @@
+"""Structure search: the sets of effects that explain a recording, each judged by its evidence.
+
+A forward search with a beam. About each of the best explanations so far, a first-order regression estimates what every
+effect of the library would gain (`screening.py`); the most promising are fitted, and the evidence of the best fits is
+computed with the noise of sensors and flows estimated anew. Finally, each effect of the best explanation is removed or
+exchanged while that improves it (floating search: Pudil, Novovicova and Kittler, 1994).
+
+The screening is made under two noises. The disturbance noise of an explanation that lacks a cause is too large, because
+it absorbs the cause, and hides further small causes. The sensor noise alone overrates effects that only compensate a
+wrong equation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from fdi_torch.estimate.evidence import RARE
+from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.gap.answer import CauseName
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, Key
+from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
+from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, screen
+
+DEEPEST = 4  # effects in one explanation
+BEAM = 2  # explanations of one size that are extended
+FITTED = 8  # effects fitted about each explanation and noise, by first-order gain
+STARTS = 2  # initial values of one effect
+EVALUATED = 3  # of these fits, the best whose evidence is computed
+CONVERGED = 0.1  # nats; a smaller gain ends the alternation between noise and fit
+TURNS = 4  # rounds in which further unfitted candidates are fitted
+PRIOR_GAIN = 3.0  # nats; gain at which an effect with odds of one in twenty becomes likely
+PAIRS = 3  # pairs of effects fitted together
+
+
+@dataclass(frozen=True)
+class RankedExplanation:
+    """A set of effects: its fit, the fitter with its own noise, that noise, and its log evidence with prior odds."""
+
+    fit: Fit
+    fitter: Fitter
+    noise: StateNoise
+    log_evidence: float
+
+    @property
+    def key(self) -> Key:
+        return self.fit.key
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """explanations: all that were evaluated, the likeliest first. null: the recalibrated plant among them. shown:
+    screening about the recalibrated plant under the noise of the best explanation. alarm: the same under its own noise.
+    unexamined: odds of the candidates that were not fitted, against the best explanation."""
+
+    null: RankedExplanation
+    explanations: tuple[RankedExplanation, ...]
+    shown: ScreeningResult
+    alarm: ScreeningResult
+    unexamined: float
+
+    @property
+    def best(self) -> RankedExplanation:
+        return self.explanations[0]
+
+
+def search(pool: ExplanationPool, null: Fit, options: Sequence[Option], most: int = DEEPEST) -> SearchResult:
+    """Search from the recalibrated plant `null`, fitted under sensor noise alone. most: effects in one explanation."""
+    base = pool.evaluate(null)
+    alarm = screen(base.fitter, base.fit, options)
+    pool.extend(base, alarm, screen(pool.fitter, base.fit, options))
+    frontier = pool.best_of(1)[:BEAM]
+    for depth in range(2, most + 1):
+        if not frontier or frontier[0].log_evidence < pool.best_of(depth - 2)[0].log_evidence:
+            break
+        for parent in frontier:
+            pool.extend_by(parent, options)
+        frontier = pool.best_of(depth)[:BEAM]
+    pool.exchange_effects(options)
+    for _ in range(TURNS):
+        if pool.unexamined() < RARE:
+            break
+        pool.fit_unexamined()
+    explanations = sorted(pool.explanations.values(), key=lambda e: -e.log_evidence)
+    shown = alarm if explanations[0] is base else screen(explanations[0].fitter, base.fit, options)
+    return SearchResult(base, tuple(explanations), shown, alarm, pool.unexamined())
+
+
+class ExplanationPool:
+    """The explanations evaluated so far, by their effects.
+
+    fitter: with sensor noise alone. choices: number of effects at places in the library.
+    """
+
+    def __init__(self, fitter: Fitter, choices: int) -> None:
+        self.fitter, self.choices = fitter, choices
+        self.explanations: dict[Key, RankedExplanation] = {}
+        self._expected_gains: dict[Key, dict[Key, _ExpectedGain]] = {}
+        self._failed: set[Key] = set()
+
+    def evaluate(self, fit: Fit, start: StateNoise | None = None) -> RankedExplanation:
+        """Estimate noise and fit alternately until the evidence converges; keep the better explanation.
+
+        Effects that were evaluated before are evaluated again only if this fit is better under the noise found then.
+        """
+        before = self.explanations.get(fit.key)
+        if before and before.fitter.cost(fit) > before.fit.cost - CONVERGED:
+            return before
+        best: RankedExplanation | None = None
+        while True:
+            own_fitter, likely = with_estimated_noise(self.fitter, fit, start, climb=best is None)
+            fit = own_fitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
+            updated = RankedExplanation(fit, own_fitter, likely.noise, log_evidence(own_fitter, fit, self.choices))
+            if best and not updated.log_evidence > best.log_evidence + CONVERGED:
+                break
+            best, start = updated, likely.noise
+        if fit.key not in self.explanations or best.log_evidence > self.explanations[fit.key].log_evidence:
+            self.explanations[fit.key] = best
+        return best
+
+    def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
+        """The explanation without one of its effects, refitted from its present values."""
+        fit, key = explanation.fit, explanation.key - {cause}
+        if key not in self.explanations:
+            placements = tuple(p for p in fit.candidate.placements if (p.effect.name, p.location) != cause)
+            prefixes = {p.prefix for p in placements}
+            start = {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] in prefixes}
+            self.evaluate(explanation.fitter.fit(Candidate(placements, (start,)), fit), explanation.noise)
+        return self.explanations[key]
+
+    def best_of(self, effects: int) -> list[RankedExplanation]:
+        """Explanations with this number of effects, the likeliest first."""
+        return sorted((e for e in self.explanations.values() if len(e.key) == effects), key=lambda e: -e.log_evidence)
+
+    def extend_by(self, parent: RankedExplanation, options: Sequence[Option]) -> None:
+        """Extend an explanation by one effect, screened under its own noise."""
+        further = [o for o in options if o.cause not in parent.key]
+        self.extend(parent, screen(parent.fitter, parent.fit, further, pairs=False))
+
+    def extend(
+        self, parent: RankedExplanation, own_noise: ScreeningResult, sensor_noise: ScreeningResult | None = None
+    ) -> None:
+        """Extend an explanation by the most promising effects, and by pairs of effects.
+
+        own_noise: screening under its own noise. sensor_noise: screening under sensor noise alone.
+        """
+        fits = self._fitted(parent, parent.fitter, self._extensions(parent, own_noise, own=True))[:EVALUATED]
+        if sensor_noise:
+            candidates = [*self._extensions(parent, sensor_noise, own=False), *_pairs(sensor_noise.pairs, PAIRS)]
+            undisturbed = self._fitted(parent, self.fitter, candidates)
+            costs = {parent.key: self.fitter.cost(parent.fit)} | {f.key: f.cost for f in undisturbed}
+            fits += [f for f in undisturbed if self._improves(f, costs)][:EVALUATED]
+        for fit in sorted(fits, key=lambda f: len(f.key)):
+            self.evaluate(fit, parent.noise)
+
+    def _fitted(self, parent: RankedExplanation, fitter: Fitter, candidates: Sequence[Candidate]) -> list[Fit]:
+        """Fits of the candidates, the best first. A fit that is worse than the explanation it contains has failed."""
+        parent_cost, fits = fitter.cost(parent.fit), list[Fit]()
+        for candidate in candidates:
+            if candidate.key not in self.explanations:
+                fit = fitter.fit(candidate, parent.fit, min((f.cost for f in fits), default=math.inf))
+                if fit.cost < parent_cost:
+                    fits.append(fit)
+                else:
+                    self._failed.add(candidate.key)
+        return sorted(fits, key=lambda f: f.cost)
+
+    def _improves(self, fit: Fit, costs: Mapping[Key, float]) -> bool:
+        """Whether a fit gains more than its prior odds cost, against every explanation that it contains.
+
+        costs: chi-square of each fit under sensor noise alone; under any other noise the gain would be smaller.
+        """
+        prior = log_prior(fit.key, self.choices)
+        return all(
+            0.5 * (cost - fit.cost) + prior > log_prior(key, self.choices)
+            for key, cost in costs.items()
+            if key < fit.key
+        )
+
+    def _extensions(self, parent: RankedExplanation, screening: ScreeningResult, own: bool) -> list[Candidate]:
+        """The most promising extensions of an explanation by one effect whose first-order gain exceeds the cost of its
+        prior.
+
+        own: whether the screening was made under the explanation's own noise; its expected gains are then recorded.
+        """
+        by_cause: dict[tuple[str, str], list[int]] = {}
+        for i in torch.argsort(screening.gain, descending=True).tolist():
+            by_cause.setdefault(screening.options[i].cause, []).append(i)
+        candidates: list[Candidate] = []
+        for cause, group in by_cause.items():
+            key = parent.key | {cause}
+            odds = log_prior(key, self.choices) - log_prior(parent.key, self.choices)
+            gain = 0.5 * float(screening.gain[group[0]])
+            candidate = _extended(parent.fit, screening, group[:STARTS])
+            if own:
+                expected = _ExpectedGain(candidate, gain, odds - _log_prior_width(screening, group[0]))
+                self._expected_gains.setdefault(parent.key, {})[key] = expected
+            if gain + odds > 0.0 and len(candidates) < FITTED:
+                candidates.append(candidate)
+        return candidates
+
+    def exchange_effects(self, options: Sequence[Option]) -> None:
+        """Remove each effect of the best explanation and try others in its place, while that improves it."""
+        while True:
+            best = max(self.explanations.values(), key=lambda e: e.log_evidence)
+            for cause in best.key if len(best.key) > 1 else ():
+                if best.key - {cause} not in self.explanations:
+                    self.extend_by(self.without(best, cause), options)
+            if max(self.explanations.values(), key=lambda e: e.log_evidence) is best:
+                return
+
+    def unexamined(self) -> float:
+        """Odds of all candidates that were not fitted, against the best explanation."""
+        return sum(math.exp(min(lead, 0.0)) for lead, _, _ in self._unfitted())
+
+    def fit_unexamined(self) -> None:
+        """Fit and evaluate the likeliest candidates that were not fitted."""
+        candidates = [e for e in self._unfitted() if e[2].candidate.key not in self._failed]
+        for _, parent, expected in sorted(candidates, key=lambda e: -e[0])[:FITTED]:
+            for fit in self._fitted(parent, parent.fitter, [expected.candidate]):
+                self.evaluate(fit, parent.noise)
+
+    def _unfitted(self) -> Iterator[tuple[float, RankedExplanation, _ExpectedGain]]:
+        """Candidates that were not fitted: expected lead in log evidence over the best explanation, parent, and
+        expected gain.
+
+        Fits gain more than the first-order estimate because the estimated noise shrinks. All candidates of one parent
+        are assumed to gain in the same proportion as those that were fitted, which is estimated by least squares.
+        """
+        best = max(self.explanations.values(), key=lambda e: e.log_evidence)
+        for key, expected_gains in self._expected_gains.items():
+            parent = self.explanations[key]
+            fitted_keys = [k for k in expected_gains if k in self.explanations and not k - key <= best.key]
+            fitted = [(self.explanations[k].log_evidence - parent.log_evidence, expected_gains[k]) for k in fitted_keys]
+            # Least squares of actual on expected gains; the prior observation gained PRIOR_GAIN nats as expected.
+            covariance = PRIOR_GAIN**2 + sum((more - expected.prior) * expected.gain for more, expected in fitted)
+            ratio = max(1.0, covariance / (PRIOR_GAIN**2 + sum(expected.gain**2 for _, expected in fitted)))
+            behind = best.log_evidence - parent.log_evidence
+            for k, expected in expected_gains.items():
+                if k not in self.explanations:
+                    yield ratio * expected.gain + expected.prior - behind, parent, expected
+
+
+@dataclass(frozen=True)
+class _ExpectedGain:
+    """A candidate with its expected gain in log-likelihood (nats), and the log prior odds that it costs."""
+
+    candidate: Candidate
+    gain: float
+    prior: float
+
+
+def _log_prior_width(screening: ScreeningResult, i: int) -> float:
+    """Cost of the size of an option with a uniform prior: log of its range in standard errors."""
+    option = screening.options[i]
+    name, start = next(iter(option.start.items()))
+    size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
+    width, unit = size.high - size.low, abs(start - size.nominal)
+    if not math.isfinite(width) or unit == 0.0:
+        return 0.0
+    strength = float(screening.strength[i])
+    return 0.5 * math.log(max(strength * (width / unit) ** 2 / (2.0 * math.pi), 1.0))
+
+
+def _extended(fit: Fit, screening: ScreeningResult, group: Sequence[int]) -> Candidate:
+    """The fit extended by one effect; each start has the size that the screening suggests."""
+    starts = [fit.effect_values | sized(screening.options[i], float(screening.size[i])) for i in group]
+    return Candidate((*fit.candidate.placements, screening.options[group[0]].placement), tuple(starts))
+
+
+def sized(option: Option, factor: float) -> dict[str, float]:
+    """The start with its size multiplied within bounds; that of a threshold stays."""
+    if not option.placement.effect.smooth:
+        return dict(option.start)
+    name = next(iter(option.start))
+    size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
+    factor = min(max(factor, 0.1), 4.0)
+    value = size.nominal + factor * (option.start[name] - size.nominal)
+    return {**option.start, name: min(max(value, size.low), size.high)}
+
+
+def _pairs(pairs: Pairs, count: int) -> list[Candidate]:
+    """The pairs of different effects with the largest joint gain; each alone may gain little."""
+    gain = pairs.gain()
+    best: dict[Key, tuple[int, int]] = {}
+    order = torch.argsort(gain.flatten(), descending=True)[:400].tolist()
+    for flat in order:
+        i, j = divmod(flat, gain.shape[1])
+        a, b = pairs.options[i], pairs.options[j]
+        if a.cause != b.cause:
+            best.setdefault(frozenset((a.cause, b.cause)), (i, j))
+    return [
+        Candidate((pairs.options[i].placement, pairs.options[j].placement), (_joint_start(pairs, i, j),))
+        for i, j in list(best.values())[:count]
+    ]
+
+
+def _joint_start(pairs: Pairs, i: int, j: int) -> dict[str, float]:
+    pick = torch.tensor([i, j])
+    sizes = torch.linalg.lstsq(pairs.gram[pick][:, pick], pairs.score[pick].unsqueeze(1)).solution.flatten().tolist()
+    return sized(pairs.options[i], sizes[0]) | sized(pairs.options[j], sizes[1])

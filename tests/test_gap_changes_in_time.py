@@ -1,0 +1,43 @@
+"""Changes in time at one place and at two, and a pump whose law is not in the library."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from fdi_torch.gap.diagnose import Settings, diagnose
+from tests.test_gap import nominal_plant, recorded
+
+LIBRARY = ("pump_gain", "pump_saturation", "coefficient_drift", "unmetered_flow", "leak", "flow_exponent")
+
+
+def test_a_pump_whose_supply_runs_low_is_no_drift_of_the_outlet() -> None:
+    """It delivers less the more it has pumped: the drift of a pipe beside a gain comes near, but neither is there."""
+    told = recorded({}, 34, samples=1500)
+    assert told.inputs is not None
+    pumped = torch.cumsum(told.inputs[:, 1], dim=0)
+    share = torch.sqrt(1.0 - 0.35 * pumped / pumped[-1])
+    spent = torch.stack([told.inputs[:, 0], told.inputs[:, 1] * share], dim=1)
+    real = recorded({}, 34, samples=1500, std=5e-4, inputs=spent)
+    answer = diagnose(nominal_plant(), replace(real, inputs=told.inputs), settings=Settings(LIBRARY))
+    assert answer.verdict == "unknown" and answer.where[0][0] == "Q2"
+
+
+def test_two_changes_in_time_at_two_places_are_named() -> None:
+    truth = {"T1.unmetered_flow.flow": -8e-6, "T1.unmetered_flow.begin": 300.0, "T1.unmetered_flow.duration": 350.0}
+    truth |= {"P32.coefficient_drift.rate": -1.5e-4}
+    answer = diagnose(nominal_plant(), recorded(truth, 32), settings=Settings(LIBRARY))
+    assert answer.verdict == "named"
+    assert {(c.effect, c.location) for c in answer.causes} == {("unmetered_flow", "T1"), ("coefficient_drift", "P32")}
+
+
+def test_a_leak_that_grows_is_named() -> None:
+    truth = {"T1.leak.size": 0.3, "T1.leak.onset": 250.0, "T1.leak.ramp": 600.0}
+    answer = diagnose(nominal_plant(), recorded(truth, 33), settings=Settings(LIBRARY))
+    assert answer.verdict == "named"
+    (leak,) = answer.causes
+    assert (leak.effect, leak.location) == ("leak", "T1")
+    assert leak.parameters["onset"].value == pytest.approx(250.0, abs=5.0 * leak.parameters["onset"].std)
+    assert leak.parameters["ramp"].value == pytest.approx(600.0, abs=5.0 * leak.parameters["ramp"].std)

@@ -1,0 +1,73 @@
+"""First-order gains of single regressors, against the regression on all of their columns."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from fdi_torch.effects import effect
+from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.diagnose import Settings, recalibrate
+from fdi_torch.gap.localization import single_regressor_gain as promise
+from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.marginal_likelihood import with_estimated_noise
+from fdi_torch.gap.problem import problem_of
+from fdi_torch.plant.effect import Placement
+from tests.test_gap import nominal_plant, recorded
+
+PLACES = ("Q1", "T1", "P13", "OUT2", "T1-T3", "h2")
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["plain", "with a lag of a sensor"])
+def surveyed(request: pytest.FixtureRequest) -> tuple[DiscrepancyRegression, Fitter, Fit]:
+    case = problem_of(nominal_plant(), (recorded({"Q1.pump_lag.time_constant": 8.0}, seed=3),), (), Settings())
+    fitter, null, _ = recalibrate(case.data)
+    under, _ = with_estimated_noise(fitter, null)
+    if request.param:
+        lag = Candidate((Placement(effect("sensor_lag"), "h2"),), ({"h2.sensor_lag.time_constant": 3.0},))
+        null = under.fit(lag, null)
+    return DiscrepancyRegression(under, null, (), 40), under, null
+
+
+def products(
+    surveyed: tuple[DiscrepancyRegression, Fitter, Fit], place: str, monkeypatch: pytest.MonkeyPatch
+) -> Tensor:
+    """Of the forms with the residual and random signs."""
+    survey, under, null = surveyed
+    found: list[Tensor] = []
+    monkeypatch.setattr(promise, "_best_gain", lambda p: found.append(p) or 0.0)
+    promise.single_regressor_gains(survey, under, null, [place], torch.Generator().manual_seed(5))
+    return found[0]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_products_are_those_of_the_columns(
+    place: str, surveyed: tuple[DiscrepancyRegression, Fitter, Fit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    survey, under, null = surveyed
+    own = survey.of(place)
+    scale, pull, off = under.priors(null.space, null.theta)
+    rows = torch.cat([(under.white(null.linearised)[1][0] * scale).flatten(0, 1), torch.diag(pull + 1e-9)])
+    basis = torch.linalg.qr(rows)[0]
+    residual = torch.cat([under.white(own.linearised)[0][0].flatten(), -off])
+    columns = under.whiten(own.columns).flatten(0, 1)
+    columns = torch.cat([columns, columns.new_zeros(len(pull), columns.shape[1])])
+    columns -= basis @ (basis.T @ columns)
+    found = products(surveyed, place, monkeypatch)
+    size = torch.linalg.vector_norm(columns, dim=0)
+    score = (columns.T @ (residual - basis @ (basis.T @ residual))) / size
+    live = size > 1e-3 * size.max()
+    torch.testing.assert_close((found[:, 0] / size)[live], score[live], rtol=1e-6, atol=1e-6 * float(score.abs().max()))
+    # The root of a mean of squares of N signs has a standard deviation of 1 / sqrt(2 N) of itself.
+    share = found[:, 1:].square().mean(dim=1).sqrt()[live] / size[live]
+    assert float((share - 1.0).abs().max()) < 6.0 / (2.0 * promise.SIGNS) ** 0.5
+    assert float(share.mean()) == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_place_of_the_cause_has_the_largest_first_order_gain(
+    surveyed: tuple[DiscrepancyRegression, Fitter, Fit],
+) -> None:
+    survey, under, null = surveyed
+    found = promise.single_regressor_gains(survey, under, null, PLACES, torch.Generator().manual_seed(5))
+    assert max(found, key=lambda place: found[place]) == "Q1"

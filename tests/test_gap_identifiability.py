@@ -1,0 +1,109 @@
+"""Identifiability: simulated confusions, inseparable effects, and the input that separates two rivals."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from fdi_torch.effects import effect
+from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.experiment_design import HIGH, discriminating_input, planned_recording
+from fdi_torch.gap.identifiability import DRAWS, identifiability, simulated_confusions
+from fdi_torch.gap.problem import checked_data_set
+from fdi_torch.gap.screening import Option, Pairs, ScreeningResult
+from fdi_torch.plant.effect import Placement
+from tests.test_gap import nominal_plant, recorded
+
+
+def made_up(columns: torch.Tensor) -> Pairs:
+    """Pairs of three pump gains, as if they had these columns."""
+    places = ("Q1", "Q2", "Q1")
+    names = ("pump_gain", "pump_gain", "pump_lag")
+    options = []
+    for name, place in zip(names, places, strict=True):
+        kind = effect(name)
+        parameters = kind.parameters(place, nominal_plant())
+        size = parameters[0]
+        start = {f"{place}.{name}.{size.name}": size.nominal + 1e-3 * (size.high - size.nominal)}
+        options.append(Option(Placement(kind, place), start, parameters))
+    return Pairs(tuple(options), torch.zeros(3, dtype=torch.float64), columns.T @ columns)
+
+
+def test_a_collinear_cause_is_confused_half_the_time_and_always_without_the_true_cause() -> None:
+    # The first two columns are one and the same but for a ten-thousandth; the third has nothing to do with them.
+    columns = torch.zeros(4, 3, dtype=torch.float64)
+    columns[0, :2], columns[1, 1], columns[2, 2] = 30.0, 3e-3, 30.0
+    told = simulated_confusions(made_up(columns), ("pump_gain", "Q1"), 900.0, nominal_plant())
+    assert told is not None
+    assert told["rivals"] == 2 and told["draws"] == 2 * DRAWS
+    assert told["passed"] == DRAWS and told["passed_for"] == [{"effect": "pump_gain", "location": "Q2"}]
+    assert 0.2 * DRAWS < told["confused"] < 0.8 * DRAWS
+
+
+def test_effects_with_different_signatures_are_never_confused() -> None:
+    told = simulated_confusions(
+        made_up(30.0 * torch.eye(3, dtype=torch.float64)), ("pump_gain", "Q1"), 900.0, nominal_plant()
+    )
+    assert told is not None and told["passed"] == told["confused"] == 0
+
+
+def test_a_gap_that_no_other_effect_can_cause_is_not_confused() -> None:
+    pairs = made_up(1e-2 * torch.eye(3, dtype=torch.float64))
+    assert simulated_confusions(pairs, ("pump_gain", "Q1"), 1e9, nominal_plant()) is None
+
+
+def test_inseparable_and_hidden_effects_follow_from_the_columns() -> None:
+    columns = torch.zeros(4, 3, dtype=torch.float64)
+    columns[0, :2], columns[1, 1], columns[2, 2] = 30.0, 3.0, 4.0
+    pairs = made_up(columns)
+    strength = torch.diagonal(pairs.gram)
+    found = identifiability(ScreeningResult(pairs.options, pairs.score, strength, pairs), nominal_plant())
+    assert found.hidden == (("pump_lag", "Q1"),)
+    ((first, second, left),) = found.inseparable
+    assert {first, second} == {("pump_gain", "Q1"), ("pump_gain", "Q2")}
+    # What is left of the weaker beside the stronger: |a|^2 sin^2 of the angle between them.
+    assert left == pytest.approx(900.0 * math.sin(math.atan2(3.0, 30.0)) ** 2)
+
+
+@pytest.fixture(scope="module")
+def rivals() -> Fitter:
+    """A recording under steady inputs: lag and delay of a pump are one there."""
+    recording = recorded({"Q1.pump_lag.time_constant": 10.0}, 9, samples=300, steady=True)
+    white = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    return Fitter(checked_data_set(nominal_plant(), (), [recording], None), white)
+
+
+def test_the_designed_input_separates_what_the_recording_cannot(rivals: Fitter) -> None:
+    fits = [
+        rivals.fit(Candidate((Placement(effect(name), "Q1"),), ({f"Q1.{name}.{size}": 10.0},)))
+        for name, size in (("pump_lag", "time_constant"), ("pump_delay", "delay"))
+    ]
+    assert abs(fits[0].cost - fits[1].cost) < 10.0
+    found = discriminating_input(rivals, fits[0], fits[1])
+    assert found is not None and found["separation"] > 20.0
+    assert found["parted_after_samples"] == round(found["parted_after"]) + 1 < 1500
+    wanted = planned_recording(found["input"], nominal_plant())
+    assert wanted.input_names == ("Q1", "Q2") and len(wanted) == 1500
+    full = torch.tensor([p.max_flow for p in nominal_plant().pumps], dtype=torch.float64)
+    assert bool((wanted.inputs > 0.0).all()) and bool((wanted.inputs <= HIGH * full).all())
+    held = torch.diff(wanted.inputs[:, 0]).abs()
+    assert int((held > 0).sum()) == len(found["input"]["Q1"]["at"]) - 1
+
+
+def test_explanations_with_the_same_prediction_are_not_separated(rivals: Fitter) -> None:
+    fit = rivals.fit(Candidate())
+    found = discriminating_input(rivals, fit, fit)
+    assert found is not None
+    assert found["separation"] == pytest.approx(0.0, abs=1e-9)
+    assert found["parted_after"] is None and found["parted_after_samples"] is None
+
+
+def test_an_ambiguous_answer_has_an_input_that_separates_the_rivals() -> None:
+    recording = recorded({"Q1.pump_lag.time_constant": 4.0}, 9, samples=400, std=2e-3)
+    answer = diagnose(nominal_plant(), recording, settings=Settings(("pump_lag", "pump_delay")))
+    assert answer.verdict == "ambiguous"
+    assert answer.next_input is not None and len(answer.next_input["between"]) == 2

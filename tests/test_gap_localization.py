@@ -1,0 +1,131 @@
+"""Localization: regressors, their evidence, the smoothed trajectory, and the place of an unknown cause."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from fdi_torch.gap.dataset import interpolate
+from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
+from fdi_torch.gap.localization.localize import localize
+from fdi_torch.gap.localization.regressors import (
+    backlash,
+    decayed,
+    dominant_period,
+    hinges,
+    lagged,
+    rate_limited,
+    relay,
+    relays,
+    stiction,
+)
+from fdi_torch.gap.localization.sparse_regression import sparse_fit
+from fdi_torch.gap.marginal_likelihood import with_estimated_noise
+from fdi_torch.gap.problem import problem_of
+from tests.test_gap import noise, nominal_plant, recorded
+
+
+def test_values_between_samples_lie_on_the_line_and_stay_beyond_the_ends() -> None:
+    at, times = torch.tensor([-1.0, 0.5, 3.0, 9.0]), torch.tensor([0.0, 1.0, 4.0])
+    assert interpolate(at, times, torch.tensor([0.0, 2.0, 5.0])).tolist() == [0.0, 1.0, 4.0, 5.0]
+
+
+def test_regressors_with_memory_follow_their_equations() -> None:
+    x, step = torch.tensor([0.0, 1.0, 1.0, 1.0], dtype=torch.float64), torch.full((4,), 2.0, dtype=torch.float64)
+    decay = torch.exp(torch.tensor(-0.5, dtype=torch.float64))
+    assert lagged(x, step, 4.0) == pytest.approx(torch.stack([0 * decay, 1 - decay, 1 - decay**2, 1 - decay**3]))
+    assert decayed(torch.diff(x, prepend=x[:1]), step, 4.0) == pytest.approx(
+        torch.stack([0 * decay, decay**0, decay, decay**2])
+    )
+    assert backlash(torch.tensor([0.0, 0.5, 2.0, 1.5, 0.0]), torch.tensor([[1.0], [0.25]])).tolist() == [
+        [0.0, 0.0, 1.0, 1.0, 1.0],
+        [0.0, 0.25, 1.75, 1.75, 0.25],
+    ]
+    assert rate_limited(torch.tensor([0.0, 5.0, 5.0, 1.0]), step, 1.0).tolist() == [0.0, 2.0, 4.0, 2.0]
+
+
+def test_a_relay_keeps_its_state_between_its_thresholds() -> None:
+    x = torch.tensor([0.0, 0.5, 0.9, 0.5, 0.1, 0.5])
+    assert relay(x, 0.2, 0.8).tolist() == [0.0, 0.0, 1.0, 1.0, 0.0, 0.0]
+    assert stiction(x, 0.45).tolist() == pytest.approx([0.0, 0.5, 0.5, 0.5, 0.5, 0.5])
+    assert [low for low, _ in relays(x, (0.0, 1.0), 3)] == pytest.approx([1 / 6, 1 / 6, 0.5])
+
+
+def test_hinges_span_every_piecewise_linear_function_of_their_nodes() -> None:
+    x = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
+    basis = torch.stack(hinges(x, (0.0, 1.0), 5), dim=1)
+    kinked = (x - 0.25).abs() - 2.0 * (x - 0.75).clamp(min=0.0)
+    found = torch.linalg.lstsq(basis, kinked.unsqueeze(1)).solution
+    assert (basis @ found).squeeze(1) == pytest.approx(kinked, abs=1e-10)
+
+
+def test_the_regressors_that_made_a_signal_have_more_evidence_than_others() -> None:
+    generator = torch.Generator().manual_seed(2)
+    true, other = (torch.randn(400, 30, generator=generator, dtype=torch.float64) for _ in range(2))
+    noise = torch.randn(400, generator=generator, dtype=torch.float64)
+    signal = 3.0 * true[:, 4] - 2.0 * true[:, 11] + noise
+    both = torch.stack([true, other])
+    found = sparse_fit(both.mT @ both, (both.mT @ signal.unsqueeze(-1)).squeeze(-1), 40)
+    assert float(found.evidence[0] - found.evidence[1]) > 1000.0
+    least_squares = torch.linalg.lstsq(true[:, [4, 11]], signal.unsqueeze(1)).solution
+    closed = float(signal @ signal - ((signal - (true[:, [4, 11]] @ least_squares).squeeze(1)) ** 2).sum())
+    assert float(found.closes[0]) == pytest.approx(closed, rel=5e-3)
+    assert 1.9 < float(found.needs[0]) < 10.0 < float(found.needs[1]), "two did it, and others need many to come near"
+
+
+def test_a_slow_pump_is_distinguished_from_its_tank() -> None:
+    """Both make one balance; coarse steps in time, at the tank, do nearly as well as the pump's own forms."""
+    case = problem_of(nominal_plant(), (recorded({"Q2.actuator_slew.slowness": 3e6}, 4),), (), Settings())
+    fitter, null, _ = recalibrate(case.data)
+    own, likely = with_estimated_noise(fitter, null)
+    found = localize(own, null, likely.noise, ("Q2", "T2", "OUT2"))
+    assert found[0].location == "Q2"
+    assert sorted(place.location for place in found) == ["OUT2", "Q2", "T2"]
+
+
+def test_a_spectral_line_is_found_despite_a_slow_misfit() -> None:
+    times = torch.arange(3000, dtype=torch.float64)
+    slow = 0.01 * torch.sin(times / 200.0).unsqueeze(1) + noise(3000, 0.0, 0.002, 3)
+    line = slow + 0.002 * torch.sin(2 * torch.pi * times / 47.3).unsqueeze(1)
+    assert dominant_period(line, 1.0) == pytest.approx(47.3, rel=2e-3)
+
+
+@pytest.mark.parametrize("values", [{"Q1.pump_lag.time_constant": 15.0}, {"h2.sensor_hysteresis.play": 0.02}])
+def test_an_effect_with_memory_that_the_library_lacks_is_unknown_at_its_place(values: dict[str, float]) -> None:
+    answer = diagnose(nominal_plant(), recorded(values, 5), settings=Settings(leave_out=("pump_lag", "pump_delay")))
+    place = next(iter(values)).partition(".")[0]
+    assert answer.verdict in ("unknown", "ambiguous")  # play looks much like a lag of the sensor
+    assert answer.where[0][0] == place
+    assert ("unknown", place) in [causes[0] for causes in answer.ambiguity_set] or answer.posterior[
+        0
+    ].unknown_at == place
+    assert sum(e.probability for e in answer.posterior) + answer.unexamined == pytest.approx(1.0, abs=1e-3)
+
+
+def test_an_indefinite_curvature_does_not_change_its_neighbours() -> None:
+    columns = torch.randn(3, 20, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    gram, score = columns.mT @ columns, torch.full((3, 6), 100.0, dtype=torch.float64)
+    spoilt = gram.clone()
+    spoilt[1, 0, 1] = spoilt[1, 1, 0] = 1.01 * torch.sqrt(gram[1, 0, 0] * gram[1, 1, 1])
+    found, expected = sparse_fit(spoilt, score, 20), sparse_fit(gram, score, 20)
+    assert bool(torch.isfinite(found.evidence).all())
+    assert torch.equal(found.evidence[[0, 2]], expected.evidence[[0, 2]])
+
+
+def test_a_rounding_error_is_no_unknown_cause() -> None:
+    """It changes as slowly as the level does, but by no more than half a step."""
+    run = recorded({}, 7, samples=1500)
+    run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
+    fitter, fit, steps = recalibrate(problem_of(nominal_plant(), (run,), (), Settings()).data)
+    assert [step > 0.0 for step in steps] == [False, False, True]
+    under, likely = with_estimated_noise(fitter, fit)
+    assert all(place.gain < 0.0 for place in localize(under, fit, likely.noise, ["h3"]))
+
+
+def test_a_sensor_that_drifts_by_more_than_its_rounding_is_unknown() -> None:
+    run = recorded({}, 7, samples=1500)
+    run.outputs[:, 2] += noise(1500, 0.95, 0.02, 3)[:, 0]
+    run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
+    fitter, fit, _ = recalibrate(problem_of(nominal_plant(), (run,), (), Settings()).data)
+    under, likely = with_estimated_noise(fitter, fit)
+    assert localize(under, fit, likely.noise, ["h3"])[0].gain > 10.0
