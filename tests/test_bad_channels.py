@@ -197,6 +197,7 @@ def test_a_sensor_that_is_stuck_for_a_while_is_unknown() -> None:
     assert answer.verdict == "unknown" and answer.where[0] == ("h2", 1.0)
 
 
+@pytest.mark.slow
 def test_a_recording_without_a_sensor_that_reads_is_refused() -> None:
     run = replace(sound(), outputs=torch.full((2000, 3), 0.3, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"expected a sensor that reads its level"):

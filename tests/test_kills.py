@@ -203,7 +203,8 @@ def test_what_is_said_of_an_interrupted_job_is_true(
     folder, ended, complaints = struck_before_its_end(job, tmp_path, number)
     assert (ended, complaints.count("\n")) == (code, 1)
     log = log_of(folder)
-    going_on = "--resume goes on from there" if job.name in RESUMED else "starts again from the beginning; it cannot be resumed"
+    again = "starts again from the beginning; it cannot be resumed"
+    going_on = "--resume goes on from there" if job.name in RESUMED else again
     word = "interrupted" if number == signal.SIGINT else "terminated"
     kept = f"what was computed until now is in {log}"
     assert (
