@@ -29,7 +29,7 @@ class Term:
     """Contribution of one recording to the cost.
 
     engine: simulates the plant under the recording's inputs. data: readings and weights. columns: the columns of theta
-    that the engine takes; None: all. noise_std (C,) or (problems, C): standard deviation of the noise, in each reading's
+    that the engine takes; None: all. noise_std (C,) or (problems, C): standard deviation of the noise, in the reading's
     unit; None if unknown.
     """
 
@@ -163,7 +163,7 @@ def deviance(squares: Tensor, data: Readings, noise_std: Tensor | None) -> Tenso
 
 
 def likelihood_expansion(gram: Tensor, data: Readings, noise_std: Tensor | None) -> Linearisation:
-    """Gauss-Newton model of the negative log-likelihood, from the sums of products (L, C, P+3, P+3), see `Engine.gram`."""
+    """Gauss-Newton model of the negative log-likelihood, from the sums of products `Engine.gram` (L, C, P+3, P+3)."""
     squares = gram[..., -3, -3]
     cost = deviance(squares.unsqueeze(1), data, noise_std).squeeze(1).sum(-1)
     profiled = squares / data.weight.sum(-2).clamp(min=1.0) + _rounding_variance(data)

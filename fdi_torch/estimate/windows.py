@@ -38,8 +38,8 @@ class WindowFault:
     """Estimate of one fault in one window.
 
     size, std: size and standard error, inflated by the misfit, in `unit`. std is infinite if the size is at its upper
-    bound or its tank is empty. flow: change of flow at the window's mean levels, m^3/s; None if the fault is not one of a
-    flow.
+    bound or its tank is empty. flow: change of flow at the window's mean levels, m^3/s; None if the fault
+    does not change a flow.
     """
 
     name: str
