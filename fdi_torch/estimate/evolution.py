@@ -133,8 +133,8 @@ def stop_reason(state: State, settings: EvolutionSettings) -> Tensor:
     if state.evaluations + size > settings.evaluations:
         reason = torch.where(torch.isfinite(best), _BUDGET, _FAILED)
     reason = torch.where((state.waited >= settings.patience) & torch.isfinite(best), _STALLED, reason)
-    spread = state.population.amax(-2) - state.population.amin(-2)
-    contracted = (spread <= settings.parameter_tolerance * (state.high - state.low)).all(-1)
+    ranges = state.population.amax(-2) - state.population.amin(-2)
+    contracted = (ranges <= settings.parameter_tolerance * (state.high - state.low)).all(-1)
     costs_agree = worst - best <= settings.cost_tolerance * state.scale
     reason = torch.where(contracted & costs_agree, _CONVERGED, reason)
     return torch.where(best <= settings.target, _TARGET, reason)

@@ -62,13 +62,13 @@ class EvolutionSettings:
         """Population size of the next generation: constant, or linear in the evaluations (L-SHADE, equation 10)."""
         if self.strategy != "l-shade" or first <= self.smallest:
             return first
-        share = min(1.0, evaluations / self.evaluations)
-        return round(first + (self.smallest - first) * share)
+        fraction = min(1.0, evaluations / self.evaluations)
+        return round(first + (self.smallest - first) * fraction)
 
     def archive_size(self, population: int) -> int:
         return round(self.archive_share * population) if self.strategy == "l-shade" else 0
 
 
-def _expect(condition: bool, wanted: str, got: object) -> None:
+def _expect(condition: bool, expected: str, actual: object) -> None:
     if not condition:
-        raise ValueError(f"expected {wanted}, got {got}; change the search settings")
+        raise ValueError(f"expected {expected}, got {actual}; change the search settings")

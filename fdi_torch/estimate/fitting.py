@@ -91,7 +91,7 @@ class Fitting:
         return engines
 
     def takes_own_steps(self, step: float) -> bool:
-        """Whether each lane controls its own step length in any recording.
+        """Whether the step length is controlled separately for each lane in at least one recording.
 
         The cost is then exact only up to the tolerance of the step control.
         """
@@ -160,10 +160,14 @@ def set_up(
 
 
 def start_levels(
-    plant: PlantDescription, network: TankNetwork, recording: Recording, wanted: StartLevels
+    plant: PlantDescription, network: TankNetwork, recording: Recording, start: StartLevels
 ) -> tuple[Tensor, list[Parameter]]:
-    """Initial levels (tanks,) in m, and parameters with search ranges for those that are estimated."""
-    by_tank = wanted if isinstance(wanted, Mapping) else {tank.name: wanted for tank in plant.tanks}
+    """Initial levels (tanks,) in m, and parameters with search ranges for those that are estimated.
+
+    start: 'equilibrium', 'free' or a level in m, see `set_up`. A tank that a mapping omits is 'free'. Raises ValueError
+    for an unknown tank.
+    """
+    by_tank = start if isinstance(start, Mapping) else {tank.name: start for tank in plant.tanks}
     unknown = set(by_tank) - {tank.name for tank in plant.tanks}
     if unknown:
         raise ValueError(f"start levels: expected tanks of plant {plant.name}, got {', '.join(sorted(unknown))}")

@@ -280,8 +280,8 @@ def _sorted_and_reduced(state: State, settings: EvolutionSettings) -> State:
 
 def _with_progress_counters(state: State, settings: EvolutionSettings) -> State:
     best, median = state.cost[..., 0], state.cost[..., state.cost.shape[-1] // 2]
-    spread = torch.where(torch.isfinite(median), median - best, 0.0)
-    scale = torch.maximum(state.scale, spread)
+    difference = torch.where(torch.isfinite(median), median - best, 0.0)
+    scale = torch.maximum(state.scale, difference)
     improved = best < state.anchor - settings.cost_tolerance * scale
     return replace(
         state,

@@ -135,8 +135,8 @@ def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
     Raises ValueError for an infinite or empty range.
     """
     space = fitting.space
-    nominal, reach = space.nominal(), 4.0 * space.std()
-    low, high = torch.maximum(space.low(), nominal - reach), torch.minimum(space.high(), nominal + reach)
+    nominal, half_range = space.nominal(), 4.0 * space.std()
+    low, high = torch.maximum(space.low(), nominal - half_range), torch.minimum(space.high(), nominal + half_range)
     for p, a, b in zip(space, low.tolist(), high.tolist(), strict=True):
         if not (torch.isfinite(torch.tensor([a, b])).all() and a < b):
             raise ValueError(
@@ -164,12 +164,12 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
     recording_points = points[:, columns]
     coarse = settings.search_step
     readings = engine_at(min(longest, FIRST_STEP * scale)).readings(recording_points)
-    spread = readings.flatten(0, 1).std(dim=0).clamp(min=1e-12)
+    std = readings.flatten(0, 1).std(dim=0).clamp(min=1e-12)
     if coarse is None:
-        coarse = choose_step(engine_at, recording_points, settings.search_tolerance * spread, longest, scale, 0.9)
+        coarse = choose_step(engine_at, recording_points, settings.search_tolerance * std, longest, scale, 0.9)
     fine = ADAPTIVE_STEPS[-1] * scale if settings.adaptive else settings.refine_step
     if fine is None:
-        fine = choose_step(engine_at, recording_points, settings.refine_tolerance * spread, coarse, scale, 0.9)
+        fine = choose_step(engine_at, recording_points, settings.refine_tolerance * std, coarse, scale, 0.9)
     return coarse, fine
 
 
@@ -216,8 +216,8 @@ def refine_to_convergence(
 ) -> tuple[Refined, float]:
     """Refine from every start (K, P), take the best optimum, and halve the integration step (s) until it converges.
 
-    The step has converged when halving it changes every standard error by less than `std_tolerance` and every value by
-    at most 5 % of its standard error. Returns the optimum and the last step.
+    The step has converged when halving it changes every standard error by at most the fraction `std_tolerance` and every
+    value by at most 5 % of its standard error. Returns the optimum and the last step.
     """
 
     def run(theta: Tensor, at: float) -> Refined:
@@ -323,13 +323,13 @@ def conclude(
     lanes = torch.zeros(1, dtype=torch.int64)
     problem = fitting.problem(steps[1], "likelihood", settings.adaptive)
     noise = problem.noise(theta, lanes)
-    predicted, ratios, slow_noise = [], [], []
-    for term, level in zip(problem.terms, noise, strict=True):
+    predicted, noise_ratios, inflated_noise = [], [], []
+    for term, noise_level in zip(problem.terms, noise, strict=True):
         predicted.append(term.engine.readings(term.theta(theta))[0])
         sensor_noise = sample_noise(term.data.known, term.data.weight)
-        ratios.append(float((level[0] / sensor_noise.clamp(min=1e-12)).max()))
-        slow_noise.append(level[0] * torch.sqrt(lasting(term.data.known - predicted[-1], term.data.weight)))
-    curvature = problem.at_noise(slow_noise).linearise(theta, lanes).curvature[0]
+        noise_ratios.append(float((noise_level[0] / sensor_noise.clamp(min=1e-12)).max()))
+        inflated_noise.append(noise_level[0] * torch.sqrt(lasting(term.data.known - predicted[-1], term.data.weight)))
+    curvature = problem.at_noise(inflated_noise).linearise(theta, lanes).curvature[0]
     estimate = make_estimate(
         fitting.space,
         theta[0],
@@ -343,7 +343,14 @@ def conclude(
     channels = [fitting.recordings[0].input_names.index(c) for c in fitting.plant.channels()]
     means = fitting.recordings[0].inputs[:, channels].mean(dim=0)
     diagnosis = diagnose(
-        fitting.networks[0], fitting.space, theta[0], estimate.std, levels, means, max(ratios), settings.confidence
+        fitting.networks[0],
+        fitting.space,
+        theta[0],
+        estimate.std,
+        levels,
+        means,
+        max(noise_ratios),
+        settings.confidence,
     )
     return HybridResult(
         estimate=estimate,

@@ -62,8 +62,8 @@ def certainty(information: Tensor, held: Tensor | None = None, threshold: float 
     scaled = 0.5 * (scaled + scaled.mT)
     if held is not None:
         # Decouple held parameters from the others, with unit information; `_certainty_from` sets their covariance to 0.
-        apart = held[..., :, None] | held[..., None, :]
-        scaled = torch.where(apart, torch.eye(scaled.shape[-1]).to(scaled), scaled)
+        involves_held = held[..., :, None] | held[..., None, :]
+        scaled = torch.where(involves_held, torch.eye(scaled.shape[-1]).to(scaled), scaled)
     not_finite = ~torch.isfinite(scaled).all(-1).all(-1)[..., None, None]
     values, vectors = _eigen(torch.where(not_finite, torch.zeros_like(scaled), scaled))
     undetermined = (values <= threshold * values[..., -1:].clamp(min=0.0)) | (values <= 0)

@@ -111,18 +111,18 @@ class Filtered:
     def __init__(self, kalman_filter: KalmanFilter, noise: StateNoise) -> None:
         self.own, self.wanders = kalman_filter, noise.wander is not None
         of_sensors, zeros = (noise.scale * kalman_filter.sensors.std) ** 2, torch.zeros_like(noise.scale)
-        decays = [(torch.full_like(noise.intensity, kalman_filter.kept(noise.correlation_time)), noise.intensity**2)]
-        decays += [(kalman_filter.sensors.correlation, of_sensors)] if kalman_filter.correlated else []
+        processes = [(torch.full_like(noise.intensity, kalman_filter.kept(noise.correlation_time)), noise.intensity**2)]
+        processes += [(kalman_filter.sensors.correlation, of_sensors)] if kalman_filter.correlated else []
         self.r = zeros if kalman_filter.correlated else of_sensors
         if (wander := noise.wander) is not None:
             of_wander = zeros.index_fill(0, torch.tensor(wander.channel), wander.std**2)
-            decays.append((torch.full_like(zeros, kalman_filter.kept(wander.correlation_time)), of_wander))
-        keep, variance = (torch.cat(parts) for parts in zip(*decays, strict=True))
-        self.keep, self.q = keep, (1.0 - keep**2) * variance
+            processes.append((torch.full_like(zeros, kalman_filter.kept(wander.correlation_time)), of_wander))
+        decay, variance = (torch.cat(parts) for parts in zip(*processes, strict=True))
+        self.keep, self.q = decay, (1.0 - decay**2) * variance
         self.p0 = torch.cat([variance.new_zeros(kalman_filter.tanks), variance])
         tensors = (*kalman_filter.matrices, self.keep, self.q, self.r, self.p0, *kalman_filter.flags)
         self._model = _Model(*(t.data_ptr() for t in tensors))
-        self._library = _library(kalman_filter.tanks, kalman_filter.channels, len(decays) - 1)
+        self._library = _library(kalman_filter.tanks, kalman_filter.channels, len(processes) - 1)
         self.gain = variance.new_empty(kalman_filter.samples, len(self.p0), kalman_filter.channels)
         self.white = variance.new_empty(kalman_filter.samples, kalman_filter.channels, kalman_filter.channels)
         self.log_det = float(self._run("kalman_gains", self.gain, self.white))

@@ -53,7 +53,7 @@ _DAMPING_REDUCTION, _GOOD_GAIN_RATIO = 0.2, 0.25
 class Linearisation:
     """Quadratic model of the cost at a point: cost (L,), gradient (L, P), Gauss-Newton curvature (L, P, P).
 
-    state: data of the problem's own that belong to this point, handed back with it; None if there are none.
+    state: data that the problem attaches to this point and receives back with it; None if there are none.
     """
 
     cost: Tensor
@@ -162,10 +162,10 @@ class _Lanes:
     model: Linearisation
     damping: Tensor
     growth: Tensor  # Nielsen's nu: factor on the damping after an unsatisfactory step
-    gained: Tensor  # actual decrease of the cost by the last step
-    missed: Tensor  # predicted decrease of the last step if it was refused, else infinite
-    settled: Tensor  # bool: the last step was accepted and below the step tolerance
-    strained: Tensor  # bool: the last step was accepted after refusals
+    actual_decrease: Tensor  # actual decrease of the cost by the last step
+    refused_decrease: Tensor  # predicted decrease of the last step if it was refused, else infinite
+    negligible_step: Tensor  # bool: the last step was accepted and below the step tolerance
+    after_refusals: Tensor  # bool: the last step was accepted after refusals
 
     def __getitem__(self, keep: Tensor) -> _Lanes:
         if keep.dtype == torch.bool and bool(keep.all()):
@@ -234,9 +234,9 @@ def _begin(linearise: Linearise, theta: Tensor, low: Tensor, high: Tensor, setti
             f"got {shapes}; make `linearise` return one of each for every lane"
         )
     damping = torch.full_like(model.cost, settings.damping)
-    growth, infinite = torch.full_like(model.cost, 2.0), torch.full_like(model.cost, math.inf)
+    nu, infinite = torch.full_like(model.cost, 2.0), torch.full_like(model.cost, math.inf)
     false = torch.zeros_like(lanes, dtype=torch.bool)
-    return _Lanes(lanes, theta, low, high, model, damping, growth, infinite, infinite, false, false)
+    return _Lanes(lanes, theta, low, high, model, damping, nu, infinite, infinite, false, false)
 
 
 def _filed(result: Refined, finished: _Lanes, status: Tensor, decrement: Tensor, iteration: int) -> Refined:
@@ -269,13 +269,15 @@ def _status(
     status = torch.full_like(lanes.lanes, MAX_ITERATIONS if iteration >= settings.iterations else RUNNING)
     if settings.competition is not None and iteration > 1:
         excess = lanes.model.cost - lowest_cost
-        hopeless = (excess > settings.competition.behind) & (lanes.gained < settings.competition.share * excess)
+        hopeless = (excess > settings.competition.behind) & (
+            lanes.actual_decrease < settings.competition.share * excess
+        )
         status = torch.where(hopeless, ABANDONED, status)
     # With less damping, a negligible prediction may also be due to a bound that shortened the step.
-    no_gain = (lanes.missed <= tolerance) & (lanes.damping > 1.0)
-    negligible_gain = lanes.strained & (lanes.gained <= tolerance)
+    no_gain = (lanes.refused_decrease <= tolerance) & (lanes.damping > 1.0)
+    negligible_gain = lanes.after_refusals & (lanes.actual_decrease <= tolerance)
     status = torch.where(no_gain | negligible_gain | (lanes.damping > _MOST_DAMPING), STALLED, status)
-    status = torch.where(converged | lanes.settled, CONVERGED, status)
+    status = torch.where(converged | lanes.negligible_step, CONVERGED, status)
     return torch.where(lanes.model.finite(), status, FAILED)
 
 
@@ -315,16 +317,16 @@ def _advance(lanes: _Lanes, step: Step, model: Linearisation, settings: RefineSe
     well_predicted = decrease > _GOOD_GAIN_RATIO * step.predicted
     factor = torch.where(accepted & well_predicted, _DAMPING_REDUCTION, lanes.growth)
     change = (step.trial - lanes.theta).abs()
-    tiny = (change <= settings.step_tolerance * typical_size(lanes.theta, lanes.low, lanes.high)).all(-1)
+    below_tolerance = (change <= settings.step_tolerance * typical_size(lanes.theta, lanes.low, lanes.high)).all(-1)
     advanced = replace(
         lanes,
         theta=torch.where(accepted[:, None], step.trial, lanes.theta),
         model=lanes.model.replaced(accepted.nonzero().flatten(), model[accepted]),
         damping=(lanes.damping * factor).clamp(min=_LEAST_DAMPING),
         growth=torch.where(accepted, 2.0, 2.0 * lanes.growth),
-        gained=decrease,
-        missed=torch.where(accepted, math.inf, step.predicted),
-        settled=accepted & tiny & (lanes.damping <= 1.0),
-        strained=accepted & (lanes.growth > 2.0),
+        actual_decrease=decrease,
+        refused_decrease=torch.where(accepted, math.inf, step.predicted),
+        negligible_step=accepted & below_tolerance & (lanes.damping <= 1.0),
+        after_refusals=accepted & (lanes.growth > 2.0),
     )
     return advanced, accepted

@@ -180,12 +180,12 @@ def correlation_loss(sums: Tensor, data: Readings) -> Tensor:
     """
     r, rr, ry = sums.unbind(-1)
     yy = _per_lane(spread_of(data), r)
-    spread = rr - r * r / _per_lane(data.weight.sum(-2), r)
-    ff = yy - 2.0 * ry + spread
+    residual_squares = rr - r * r / _per_lane(data.weight.sum(-2), r)
+    ff = yy - 2.0 * ry + residual_squares
     varies = ff > 1e-24 * yy
     safe = torch.where(varies, ff, torch.ones_like(ff))
     rho = (yy - ry) / torch.sqrt(yy * safe)
-    near_one = (yy * spread - ry * ry) / (yy * safe) / (1.0 + rho.clamp(min=0.0))
+    near_one = (yy * residual_squares - ry * ry) / (yy * safe) / (1.0 + rho.clamp(min=0.0))
     loss = torch.where(rho > 0, near_one, 1.0 - rho)
     return torch.where(varies | ~torch.isfinite(ff), loss, torch.ones_like(loss))
 
@@ -221,9 +221,9 @@ def _rounding_variance(data: Readings) -> Tensor:
 
 
 def _expect_variation(data: Readings) -> None:
-    spread = spread_of(data)
-    if not bool((spread > 0).all()):
-        channel = int((spread <= 0).nonzero()[0, -1])
+    squares = spread_of(data)
+    if not bool((squares > 0).all()):
+        channel = int((squares <= 0).nonzero()[0, -1])
         raise ValueError(
             f"expected channels that vary, got a constant one (number {channel + 1}), whose correlation is undefined; "
             "use the objective 'likelihood' or leave the channel out"

@@ -10,7 +10,7 @@ def wilson(count: int, trials: int, confidence: float = 0.95) -> tuple[float, fl
     if not trials:
         return 0.0, 1.0
     z = NormalDist().inv_cdf(0.5 + 0.5 * confidence)
-    share, z2_over_n = count / trials, z * z / trials
-    middle = (share + 0.5 * z2_over_n) / (1.0 + z2_over_n)
-    half_width = z * (share * (1.0 - share) / trials + 0.25 * z * z / trials**2) ** 0.5 / (1.0 + z2_over_n)
+    proportion, z2_over_n = count / trials, z * z / trials
+    middle = (proportion + 0.5 * z2_over_n) / (1.0 + z2_over_n)
+    half_width = z * (proportion * (1.0 - proportion) / trials + 0.25 * z * z / trials**2) ** 0.5 / (1.0 + z2_over_n)
     return middle - half_width, middle + half_width

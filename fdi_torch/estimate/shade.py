@@ -30,8 +30,8 @@ def draw_factor(memory: Tensor, u: Tensor) -> Tensor:
     The paper redraws until F > 0. The inverse distribution function of the truncated distribution needs no loop.
     """
     below_zero = 0.5 - torch.atan(memory / _SPREAD) / math.pi
-    share = below_zero + u * (1.0 - below_zero)
-    return (memory + _SPREAD * torch.tan(math.pi * (share - 0.5))).clamp(1e-12, 1.0)
+    probability = below_zero + u * (1.0 - below_zero)
+    return (memory + _SPREAD * torch.tan(math.pi * (probability - 0.5))).clamp(1e-12, 1.0)
 
 
 def lehmer_mean(values: Tensor, weights: Tensor) -> Tensor:

@@ -97,6 +97,8 @@ def _with_wander_correlation_time(noise: StateNoise, time: float) -> StateNoise:
 
 @dataclass(frozen=True)
 class _Problem:
+    """The likelihood of one residual as a function of the noise model; fields as in `estimate_state_noise`."""
+
     propagation: Propagation
     sensors: SensorNoise
     residual: Tensor

@@ -68,7 +68,7 @@ def noise_of(recording: Recording, plant: PlantDescription) -> Tensor:
 
 
 def cut_up(recording: Recording, length: float) -> list[Recording]:
-    """Divide a recording into consecutive windows of `length` s; neighbours share a sample.
+    """Divide a recording into consecutive windows of `length` s; neighbours have one sample in common.
 
     An incomplete last window is dropped. Raises ValueError if a window is not longer than the sampling interval.
     """
