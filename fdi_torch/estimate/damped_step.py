@@ -15,7 +15,7 @@ from fdi_torch.estimate.batch_algebra import apply, dot, solve_positive
 from fdi_torch.estimate.refined import held_back
 
 _RIDGE = 1e-10  # relative to the unit diagonal: regularises combinations of parameters without curvature
-_MOST_BENT = 0.75  # largest 2 |correction| / |step| (Transtrum and Sethna 2012, section 3.2)
+_MAX_CORRECTION_RATIO = 0.75  # largest 2 |correction| / |step| (Transtrum and Sethna 2012, section 3.2)
 
 
 @dataclass(frozen=True)
@@ -104,10 +104,10 @@ def bent_step(model: Quadratic, damping: Tensor, trial: Tensor, bend: Tensor) ->
     """
     unit = model.unit
     free = (trial > model.low) & (trial < model.high)
-    right = torch.where(free, -bend * unit, 0.0)
-    correction, positive = solve_positive(_reduced(model.damped(damping), free), right)
+    rhs = torch.where(free, -bend * unit, 0.0)
+    correction, positive = solve_positive(_reduced(model.damped(damping), free), rhs)
     step = (trial - model.theta) / unit
-    short_enough = 4.0 * dot(correction, correction) < _MOST_BENT**2 * dot(step, step)
+    short_enough = 4.0 * dot(correction, correction) < _MAX_CORRECTION_RATIO**2 * dot(step, step)
     corrected = (trial + correction * unit).clamp(model.low, model.high)
     return corrected, positive & short_enough & torch.isfinite(corrected).all(-1)
 

@@ -103,10 +103,10 @@ class Fitting:
     def _takes_own_steps(self, recording: Recording, network: TankNetwork, step: float) -> bool:
         """True if step control per lane is cheaper than fixed steps, and the inputs are constant between samples."""
         steps = float(recording.time[-1] - recording.time[0]) / step
-        constant = recording.hold == "zero_order" and all(
+        inputs_constant = recording.hold == "zero_order" and all(
             p.effect.stage is not Stage.COMMAND for p in network.placements
         )
-        return constant and not self.is_slow and steps > OWN_STEP_COST * len(recording)
+        return inputs_constant and not self.is_slow and steps > OWN_STEP_COST * len(recording)
 
     def problem(self, step: float, objective: Objective = "likelihood", adaptive: bool = False) -> Problem:
         """The estimation problem with integration steps of at most `step` s.
@@ -121,6 +121,7 @@ class Fitting:
 
 
 def _step_control(step: float, recording: Recording, plant: PlantDescription) -> StepControl:
+    """Step control about as accurate as fixed steps of `step` s. Raises ValueError if that accuracy is out of range."""
     try:
         return StepControl.for_fixed_step(step, plant)
     except ValueError as error:
@@ -220,6 +221,7 @@ def levels_shown_first(plant: PlantDescription, network: TankNetwork, recording:
 
 
 def _expect_variation(recording: Recording, plant: PlantDescription) -> None:
+    """Raise ValueError if the valid readings of a sensor are constant: their correlation is undefined."""
     for sensor in (s for s in plant.sensors if s.column in recording.output_names):
         column = recording.output_names.index(sensor.column)
         readings = recording.outputs[recording.mask[:, column], column]

@@ -212,7 +212,7 @@ def _ascending(values: list[Tensor]) -> list[Tensor]:
 
 
 def pick(rows: Tensor, index: Tensor) -> Tensor:
-    """rows (*problems, M, P) at index (*problems, K) -> (*problems, K, P), a new tensor."""
+    """Copy the rows `index` (*problems, K) of `rows` (*problems, M, P) into a new tensor (*problems, K, P)."""
     problem = torch.arange(index[..., 0].numel(), device=index.device).reshape(*index.shape[:-1], 1)
     flat = (index + problem * rows.shape[-2]).reshape(-1)
     return rows.reshape(-1, rows.shape[-1]).index_select(0, flat).reshape(*index.shape, rows.shape[-1])

@@ -216,8 +216,8 @@ def refine_to_convergence(
 ) -> tuple[Refined, float]:
     """Refine from every start (K, P), take the best optimum, and halve the integration step (s) until it converges.
 
-    The step has converged when halving it changes every standard error by at most the fraction `std_tolerance` and every
-    value by at most 5 % of its standard error. Returns the optimum and the last step.
+    The step has converged when halving it changes every standard error by at most the fraction `std_tolerance` and
+    every value by at most 5 % of its standard error. Returns the optimum and the last step.
     """
 
     def run(theta: Tensor, at: float) -> Refined:

@@ -44,8 +44,8 @@ from fdi_torch.estimate.refined import (
 )
 
 _MOST_DAMPING, _LEAST_DAMPING = 1e14, 1e-12
-# The damping multiplies by the first number if the actual decrease exceeds the second times the predicted decrease. It
-# falls fast and rises slowly at first ("delayed gratification", Transtrum and Sethna 2012, section 4.1).
+# The damping is multiplied by the first number if actual decrease / predicted decrease exceeds the second. It falls
+# fast and rises slowly at first ("delayed gratification", Transtrum and Sethna 2012, section 4.1).
 _DAMPING_REDUCTION, _GOOD_GAIN_RATIO = 0.2, 0.25
 
 

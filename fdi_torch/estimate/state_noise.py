@@ -20,10 +20,10 @@ from torch import Tensor
 from fdi_torch.estimate.kalman import KalmanFilter, Propagation, Score, SensorNoise, StateNoise
 
 CORRELATION_TIMES = (0.0, 5.0, 20.0, 80.0, 320.0)  # grid of candidates, in sampling intervals; 0: white
-SETTLED = 0.1  # nats; the optimisation ends when an iteration gains less
+LIKELIHOOD_TOLERANCE = 0.1  # nats; the optimisation ends when an iteration gains less
 RIDGE = 1e-12  # relative to a unit curvature: keeps parameters without information in the data in place
-LEAST = 1e-2  # lower limit on the effective number of readings per parameter, for its scaling
-WIDEST = 10.0  # bound on |log(intensity / unit)| and |log(scale)| in the optimisation
+MIN_DETERMINED = 1e-2  # lower limit on the effective number of readings per parameter, for its scaling
+LOG_BOUND = 10.0  # bound on |log(intensity / unit)| and |log(scale)| in the optimisation
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class _Problem:
         # The variables are scaled to a curvature of about one per sample. The tolerance of L-BFGS-B is relative to
         # max(|cost|, 1), so the cost is taken relative to its initial value.
         samples, (start_value, score) = len(self.residual), self.likelihood(start)
-        unit = torch.sqrt(2.0 * score.determined.clamp(min=LEAST) / samples).numpy()
+        unit = torch.sqrt(2.0 * score.determined.clamp(min=MIN_DETERMINED) / samples).numpy()
 
         def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
             value, score = self.likelihood(noise_at(x / unit))
@@ -161,11 +161,11 @@ class _Problem:
         log_start = torch.cat([log_start, log_start.new_zeros(1)]) if start_wander else log_start
         optimum = minimize(
             cost,
-            log_start.clamp(-WIDEST, WIDEST).numpy() * unit,
+            log_start.clamp(-LOG_BOUND, LOG_BOUND).numpy() * unit,
             jac=True,
             method="L-BFGS-B",
-            bounds=[(-WIDEST * u, WIDEST * u) for u in unit],
-            options={"ftol": SETTLED / samples, "gtol": SETTLED / samples},
+            bounds=[(-LOG_BOUND * u, LOG_BOUND * u) for u in unit],
+            options={"ftol": LIKELIHOOD_TOLERANCE / samples, "gtol": LIKELIHOOD_TOLERANCE / samples},
         )
         return Likelihood(noise_at(optimum.x / unit), start_value - float(optimum.fun) * samples, bool(optimum.success))
 
