@@ -1,1 +1,1 @@
-"""Estimation: global search, refinement, and how sure one may be of the result."""
+"""Parameter estimation: global search, local refinement, and uncertainty of the result."""

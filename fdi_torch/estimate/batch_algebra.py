@@ -1,6 +1,7 @@
-"""Linear algebra of small vectors whose last bit does not depend on the batch: elementwise operations in a fixed order.
+"""Linear algebra of small vectors and matrices with results that are bit-for-bit independent of the batch size.
 
-Library products and factorisations choose their order of summation by the shape of the whole batch.
+All functions use elementwise operations in a fixed order, because library products and factorisations choose their
+order of summation by the shape of the whole batch. Leading dimensions (...) are batch dimensions.
 """
 
 from __future__ import annotations
@@ -10,18 +11,18 @@ from torch import Tensor
 
 
 def row_sum(values: Tensor) -> Tensor:
-    """Sum over the last dimension in an order that depends on its length alone: (..., N) -> (...)."""
+    """Pairwise sum over the last dimension, (..., N) -> (...), in an order that depends only on N."""
     if values.shape[-1] == 0:
         return values.new_zeros(values.shape[:-1])
     while values.shape[-1] > 1:
         half = (values.shape[-1] + 1) // 2
-        rest = torch.nn.functional.pad(values[..., half:], (0, 2 * half - values.shape[-1]))
-        values = values[..., :half] + rest
+        second_half = torch.nn.functional.pad(values[..., half:], (0, 2 * half - values.shape[-1]))
+        values = values[..., :half] + second_half
     return values[..., 0]
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """(..., P), (..., P) -> (...)."""
+    """Inner product of vectors, (..., P), (..., P) -> (...)."""
     return row_sum(a * b)
 
 
@@ -31,17 +32,17 @@ def apply(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def solve_positive(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """x of matrix x = right, (..., P, P), (..., P) -> (..., P), for positive definite matrices, by Gauss-Jordan.
+    """Solve matrix x = right, (..., P, P), (..., P) -> (..., P), for positive definite matrices, by Gauss-Jordan.
 
-    Without pivoting, which positive definite matrices of unit diagonal do not need. Also returns (...), whether the
-    matrix turned out to be positive definite; where it did not, x means nothing.
+    There is no pivoting, which positive definite matrices of unit diagonal do not need. Also returns whether each
+    matrix is positive definite, (...) bool; if it is not, x is meaningless.
     """
     rows = torch.cat((matrix, right[..., None]), -1)
-    positive = torch.ones(rows.shape[:-2], dtype=torch.bool, device=rows.device)
+    is_positive = torch.ones(rows.shape[:-2], dtype=torch.bool, device=rows.device)
     for j in range(right.shape[-1]):
         pivot = rows[..., j, j]
-        positive = positive & (pivot > 0)
+        is_positive = is_positive & (pivot > 0)
         row = rows[..., j, :] / torch.where(pivot > 0, pivot, 1.0)[..., None]
         rows = rows - rows[..., :, j, None] * row[..., None, :]
         rows[..., j, :] = row
-    return rows[..., -1], positive
+    return rows[..., -1], is_positive

@@ -1,6 +1,7 @@
-"""Newton steps of a batch of quadratic models in their boxes, and what the models promise.
+"""Damped Newton steps of a batch of quadratic models within bounds, and the decrease that the models predict.
 
-All work in Marquardt's units (1963), 1 / sqrt(diagonal of the curvature), in which the curvature's diagonal is one.
+All equations are scaled by 1 / sqrt(diagonal of the curvature) (Marquardt 1963): the scaled curvature has a unit
+diagonal.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ from torch import Tensor
 from fdi_torch.estimate.batch_algebra import apply, dot, solve_positive
 from fdi_torch.estimate.refined import held_back
 
-_RIDGE = 1e-10  # of the unit diagonal: a combination of parameters that is known less well than so promises nothing
-_MOST_BENT = 0.75  # twice a correction's length over the step's (Transtrum and Sethna 2012, section 3.2)
+_RIDGE = 1e-10  # relative to the unit diagonal: regularises combinations of parameters without curvature
+_MAX_CORRECTION_RATIO = 0.75  # largest 2 |correction| / |step| (Transtrum and Sethna 2012, section 3.2)
 
 
 @dataclass(frozen=True)
 class Quadratic:
-    """The models of L lanes: gradient (L, P) and curvature (L, P, P) at theta (L, P) within [low, high]."""
+    """Quadratic models of L lanes: gradient (L, P) and curvature (L, P, P) at theta (L, P) within [low, high]."""
 
     theta: Tensor
     gradient: Tensor
@@ -29,25 +30,27 @@ class Quadratic:
 
     @property
     def unit(self) -> Tensor:
-        """Marquardt's units of the parameters, (L, P); one where nothing depends on a parameter."""
+        """Scale of each parameter, 1 / sqrt(H_ii), (L, P); one where the cost has no curvature."""
         diagonal = self.curvature.diagonal(dim1=-2, dim2=-1)
         return torch.where(diagonal > 0, 1.0 / torch.where(diagonal > 0, diagonal, 1.0).sqrt(), 1.0)
 
     def damped(self, damping: Tensor) -> Tensor:
-        """The curvature in Marquardt's units plus `damping` (L,) on its diagonal, (L, P, P)."""
+        """The scaled curvature with `damping` (L,) added to its diagonal, (L, P, P)."""
         unit = self.unit
         eye = torch.eye(unit.shape[-1], dtype=unit.dtype, device=unit.device)
         return self.curvature * unit[..., :, None] * unit[..., None, :] + damping[..., None, None] * eye
 
     def held(self) -> Tensor:
-        """Parameters that a bound stops, (L, P) bool."""
+        """Parameters at an active bound, (L, P) bool."""
         return held_back(self.theta, self.gradient, self.low, self.high)
 
 
 @dataclass(frozen=True)
 class Step:
-    """trial (L, P); predicted (L,): decrease of the cost by the model; solvable (L,): whether the damped model has a
-    minimum.
+    """Steps of L lanes.
+
+    trial (L, P): the point reached. predicted (L,): decrease of the cost according to the undamped model.
+    solvable (L,): whether the damped model has a minimum.
     """
 
     trial: Tensor
@@ -59,53 +62,57 @@ class Step:
 
 
 def newton_decrement(model: Quadratic) -> tuple[Tensor, Tensor]:
-    """g'H^-1 g / 2 over the parameters that no bound stops, (L,), and whether H is positive there, (L,) bool."""
+    """g'H^-1 g / 2 over the free parameters, (L,), and whether H is positive definite there, (L,) bool."""
     free = ~model.held()
-    slope = torch.where(free, model.gradient * model.unit, 0.0)
-    ridge = torch.full_like(slope[..., 0], _RIDGE)
-    newton, positive = solve_positive(_reduced(model.damped(ridge), free), slope)
-    return 0.5 * dot(slope, newton), positive
+    scaled_gradient = torch.where(free, model.gradient * model.unit, 0.0)
+    ridge = torch.full_like(scaled_gradient[..., 0], _RIDGE)
+    newton, positive = solve_positive(_reduced(model.damped(ridge), free), scaled_gradient)
+    return 0.5 * dot(scaled_gradient, newton), positive
 
 
 def damped_step(model: Quadratic, damping: Tensor) -> Step:
-    """The damped Newton step on the free parameters; those that meet a bound stop there and the others solve again."""
+    """The damped Newton step within the bounds, damping (L,).
+
+    A parameter that would leave its range is fixed at the bound, and the step of the others is solved again until all
+    lie within the bounds (active-set method).
+    """
     theta, unit = model.theta, model.unit
-    slope, curvature = model.gradient * unit, model.damped(damping)
-    fixed, goal = model.held(), theta  # goal: where the fixed parameters go
+    scaled_gradient, curvature = model.gradient * unit, model.damped(damping)
+    fixed, fixed_at = model.held(), theta  # fixed_at: values of the fixed parameters
     solvable = torch.ones_like(damping, dtype=torch.bool)
     while True:
-        move = torch.where(fixed, (goal - theta) / unit, 0.0)
-        right = torch.where(fixed, 0.0, -(slope + apply(curvature, move)))
+        move = torch.where(fixed, (fixed_at - theta) / unit, 0.0)
+        right = torch.where(fixed, 0.0, -(scaled_gradient + apply(curvature, move)))
         newton, positive = solve_positive(_reduced(curvature, ~fixed), right)
         solvable = solvable & positive
-        trial = torch.where(fixed, goal, theta + newton * unit)
-        beyond = ~fixed & ((trial < model.low) | (trial > model.high))
-        if not bool(beyond.any()):
+        trial = torch.where(fixed, fixed_at, theta + newton * unit)
+        outside = ~fixed & ((trial < model.low) | (trial > model.high))
+        if not bool(outside.any()):
             break
-        goal = torch.where(beyond, trial.clamp(model.low, model.high), goal)
-        fixed = fixed | beyond
+        fixed_at = torch.where(outside, trial.clamp(model.low, model.high), fixed_at)
+        fixed = fixed | outside
     change = trial - theta
     predicted = -(dot(model.gradient, change) + 0.5 * dot(change, apply(model.curvature, change)))
     return Step(trial, predicted, solvable)
 
 
 def bent_step(model: Quadratic, damping: Tensor, trial: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
-    """Where a step to `trial` (L, P) leads with its second-order correction, (L, P), and whether that is a correction.
+    """The step to `trial` (L, P) with its second-order correction, (L, P), and whether it is valid, (L,) bool.
 
-    bend: J'c (L, P) for the residuals' bend c along the step. It is none where it is too long for its step, or no
-    number.
+    bend (L, P): J'c, with c = r(theta + step) - r(theta) - J step the nonlinearity of the residuals along the step. The
+    correction -(H + damping diag H)^-1 J'c is invalid if it is not finite or too long relative to the step.
     """
     unit = model.unit
     free = (trial > model.low) & (trial < model.high)
-    right = torch.where(free, -bend * unit, 0.0)
-    correction, positive = solve_positive(_reduced(model.damped(damping), free), right)
+    rhs = torch.where(free, -bend * unit, 0.0)
+    correction, positive = solve_positive(_reduced(model.damped(damping), free), rhs)
     step = (trial - model.theta) / unit
-    short = 4.0 * dot(correction, correction) < _MOST_BENT**2 * dot(step, step)
-    bent = (trial + correction * unit).clamp(model.low, model.high)
-    return bent, positive & short & torch.isfinite(bent).all(-1)
+    short_enough = 4.0 * dot(correction, correction) < _MAX_CORRECTION_RATIO**2 * dot(step, step)
+    corrected = (trial + correction * unit).clamp(model.low, model.high)
+    return corrected, positive & short_enough & torch.isfinite(corrected).all(-1)
 
 
 def _reduced(curvature: Tensor, free: Tensor) -> Tensor:
-    """The curvature of the free parameters, the identity for the others."""
+    """The curvature with the rows and columns of fixed parameters replaced by those of the identity."""
     eye = torch.eye(free.shape[-1], dtype=curvature.dtype, device=curvature.device)
     return torch.where(free[..., :, None] & free[..., None, :], curvature, eye)

@@ -1,4 +1,4 @@
-"""From an estimate to words: which faults are present, how large, and whether the model explains the recording."""
+"""Diagnosis from an estimate: which faults are present, how large they are, and whether the model fits."""
 
 from __future__ import annotations
 
@@ -16,16 +16,20 @@ from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.equilibrium import RESOLUTION
 
-# A round hole with a sharp edge; only used to say a flow as a hole (Idelchik 1986).
+# Discharge coefficient of a sharp-edged round hole (Idelchik 1986), for converting a flow into an equivalent hole.
 HOLE_COEFFICIENT = 0.6
-# Residuals this much above the sample-to-sample noise are more than noise, in standard deviations.
+# The model is rejected if the standard deviation of the residuals exceeds the sensor noise by more than this factor.
 UNEXPLAINED_RATIO = 1.2
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One suspected fault. value, std, nominal in `unit` (SI); flow m^3/s it changes at the mean levels (None where it
-    moves no water); hole: diameter in m of the sharp-edged hole that passes that flow."""
+    """Test result for one suspected fault.
+
+    value, std, nominal: in `unit` (SI). probability: confidence level at which the value differs from nominal.
+    flow: change of flow at the mean levels, m^3/s; None if the fault does not change a flow. hole: diameter of the
+    sharp-edged hole that passes this flow, m.
+    """
 
     name: str
     unit: str
@@ -43,11 +47,12 @@ UNRELIABLE = "Unreliable: the model does not explain the recording"
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """faults: every suspected one, present or not. kind: 'no fault', 'single fault' or 'multiple faults'.
+    """Test results for all suspected faults, and whether the model explains the recording.
 
-    confidence: that of the whole statement, shared out over the faults (Bonferroni).
-    explained: whether the residuals are no larger than the readings' own sample-to-sample noise; unexplained_ratio: by
-    what factor they are larger, worst channel.
+    faults: all suspected faults, present or not. kind: 'no fault', 'single fault' or 'multiple faults'.
+    confidence: joint confidence of all statements (Bonferroni correction).
+    unexplained_ratio: standard deviation of the residuals over the sample-to-sample noise of the readings, largest of
+    all channels. explained: whether this ratio is at most UNEXPLAINED_RATIO.
     """
 
     faults: tuple[Fault, ...]
@@ -65,7 +70,7 @@ class Diagnosis:
 
     @property
     def warning(self) -> str:
-        """One sentence if the model does not explain the recording, so that no size can be trusted."""
+        """A warning if the model does not explain the recording, so that no estimate can be trusted; else empty."""
         if self.explained:
             return ""
         return f"{UNRELIABLE} (residuals {self.unexplained_ratio:.2g} times the sensors' noise)"
@@ -81,15 +86,16 @@ def diagnose(
     unexplained_ratio: float,
     confidence: float = 0.95,
 ) -> Diagnosis:
-    """value, std (P,); mean_levels (tanks,) m; mean_channels (channels,).
+    """Test each fault size for a significant deviation from nominal.
 
-    A fault is present where its size differs from nominal by more than its standard error explains at the given
-    confidence. A size whose standard error is infinite is never called present.
+    A fault is present if |value - nominal| / std is significant at `confidence`, two-sided and Bonferroni-corrected for
+    the number of faults. A fault with an infinite standard error is never present.
+    value, std (P,): estimates and standard errors. mean_levels (tanks,), m; mean_channels (channels,): actuator inputs.
     """
-    suspects = [i for i, p in enumerate(space) if is_fault_size(network, p)]
-    level = 1.0 - (1.0 - confidence) / max(len(suspects), 1)
+    fault_sizes = [i for i, p in enumerate(space) if is_fault_size(network, p)]
+    level = 1.0 - (1.0 - confidence) / max(len(fault_sizes), 1)
     faults = []
-    for i in suspects:
+    for i in fault_sizes:
         p = space.parameters[i]
         score = abs(float(value[i]) - p.nominal) / float(std[i]) if float(std[i]) > 0 else math.inf
         probability = 2.0 * NormalDist().cdf(score) - 1.0 if math.isfinite(score) else float(value[i] != p.nominal)
@@ -103,7 +109,7 @@ def diagnose(
 
 
 def is_fault_size(network: TankNetwork, parameter: Parameter) -> bool:
-    """Whether the parameter is the size of an effect, not one of its shapes or a constant of the plant."""
+    """Whether the parameter is the size of an effect, as opposed to a shape parameter or a constant of the plant."""
     name = parameter.name.split("@")[0]
     for placement in network.placements:
         if name.startswith(placement.prefix + "."):
@@ -115,21 +121,28 @@ def is_fault_size(network: TankNetwork, parameter: Parameter) -> bool:
 def fault_flow(
     network: TankNetwork, space: ParameterSpace, value: Tensor, which: int, levels: Tensor, channels: Tensor
 ) -> tuple[float | None, float | None]:
-    """How much flow (m^3/s) the fault changes at these levels, and the diameter (m) of a sharp-edged hole as large."""
+    """Change of flow (m^3/s) that a fault causes, and the diameter (m) of the sharp-edged hole with the same flow.
+
+    The change is the largest difference of any tank's net inflow between the value and the nominal value of the fault.
+    From Torricelli's law, flow = HOLE_COEFFICIENT * area * sqrt(2 g level). None where undefined.
+    which: index of the fault in `space`. levels (tanks,), m; channels (channels,): actuator inputs.
+    """
     name = space.names[which].split("@")[0]
     placement = next(p for p in network.placements if name.startswith(p.prefix + "."))
     if placement.effect.stage not in (Stage.FLOW, Stage.BALANCE):
         return None, None
-    # Start levels of further recordings (T1.start_level@1) are no constants of the plant, and change no flow at these.
-    own = [i for i, n in enumerate(space.names) if n in network.constants]
-    part = ParameterSpace([network.constants[space.names[i]] for i in own])
-    theta = value[own]
+    # Initial levels of further recordings (T1.start_level@1) are not plant constants and do not affect these flows.
+    plant_columns = [i for i, n in enumerate(space.names) if n in network.constants]
+    plant_space = ParameterSpace([network.constants[space.names[i]] for i in plant_columns])
+    theta = value[plant_columns]
     without = theta.clone()
-    without[own.index(which)] = space.parameters[which].nominal
-    volumes = [torch.stack(_inflows(network, part, candidate, levels, channels)) for candidate in (theta, without)]
-    change = (volumes[0] - volumes[1]).abs()
+    without[plant_columns.index(which)] = space.parameters[which].nominal
+    inflows = [
+        torch.stack(_inflows(network, plant_space, parameters, levels, channels)) for parameters in (theta, without)
+    ]
+    change = (inflows[0] - inflows[1]).abs()
     flow = float(change.max())
-    # Both ends of a pipe change alike but for the last bit: the hole is then one in the tank that comes first.
+    # For a pipe, both ends change equally up to rounding; the hole is then placed in the first of the two tanks.
     head = float(levels[int((change > (1.0 - 1e-6) * flow).nonzero()[0])]) if flow > 0.0 else 0.0
     if flow <= 0.0 or head <= 0.0:
         return flow, None
@@ -140,22 +153,24 @@ def fault_flow(
 def _inflows(
     network: TankNetwork, space: ParameterSpace, theta: Tensor, levels: Tensor, channels: Tensor
 ) -> list[Tensor]:
-    """Net inflow of each tank long after every onset, m^3/s."""
+    """Net inflow of each tank, m^3/s, at a time long after every fault onset."""
     values = network.bind(space, theta)
     late = levels.new_tensor(1e9)
-    pace = time_scale(network.description)
-    clock = Clock(late, levels.new_tensor(pace), levels.new_tensor(RESOLUTION * pace))
-    wanted = [channels[channel] for _, channel in network.actuators()]
-    commands, _ = network.commands(wanted, network.steady_command_memory(wanted, clock, values), clock, values)
-    now = network.operating_point(levels.unbind(), commands, clock, values)
-    return network.less_overflow(now, network.net_inflows(now, network.pump_flows(now), network.pipe_flows(now)))
+    time_constant = time_scale(network.description)
+    clock = Clock(late, levels.new_tensor(time_constant), levels.new_tensor(RESOLUTION * time_constant))
+    inputs = [channels[channel] for _, channel in network.actuators()]
+    commands, _ = network.commands(inputs, network.steady_command_memory(inputs, clock, values), clock, values)
+    point = network.operating_point(levels.unbind(), commands, clock, values)
+    return network.less_overflow(
+        point, network.net_inflows(point, network.pump_flows(point), network.pipe_flows(point))
+    )
 
 
 def sample_noise(values: Tensor, weight: Tensor) -> Tensor:
-    """The readings' noise (C,) from second differences of neighbouring samples (S, C), whatever the model.
+    """Model-free estimate of the readings' noise (C,) from second differences of neighbouring samples (S, C).
 
-    Differences of the second order take a smooth signal away; the median of their size is not moved by a few switches
-    (Hall, Kay & Titterington 1990).
+    sigma = median |y_{s+1} - 2 y_s + y_{s-1}| / (0.6745 sqrt 6). Second differences remove a smooth signal, and the
+    median is robust against a few switching events (Hall, Kay & Titterington 1990). weight (S, C): 0 masks a reading.
     """
     valid = (weight[2:] > 0) & (weight[1:-1] > 0) & (weight[:-2] > 0)
     second = (values[2:] - 2.0 * values[1:-1] + values[:-2]).abs() / math.sqrt(6.0)
@@ -167,10 +182,10 @@ def sample_noise(values: Tensor, weight: Tensor) -> Tensor:
 
 
 def lasting(residual: Tensor, weight: Tensor) -> Tensor:
-    """For how many samples a residual lasts, (C,): (1 + a) / (1 - a), a its lag-1 correlation; 1 where it is white.
+    """Variance inflation of each channel due to correlated residuals, (C,): (1 + a) / (1 - a), a: lag-1 correlation.
 
-    Slow parameters see noise of that many times the variance (AR(1) spectrum at frequency zero; Box & Jenkins 1970).
-    residual, weight: (S, C). A correlation within three standard errors of zero counts as none.
+    This is the ratio of an AR(1) spectrum at frequency zero to white noise of the same variance (Box & Jenkins 1970). A
+    correlation that is negative or within three standard errors of zero counts as zero. residual, weight: (S, C).
     """
     pairs = weight[1:] * weight[:-1]
     square = (weight * residual**2).sum(0) / weight.sum(0).clamp(min=1.0)

@@ -1,8 +1,8 @@
-"""Random numbers by counting: a draw is a hash of (seed, counters, position), with no state to carry.
+"""Counter-based random numbers: each draw is a hash of (seed, counters, position), without generator state.
 
-So a problem's draws are the same alone, in a batch, on either device, and after its neighbours left. The hash is
+The draws of a problem therefore do not depend on the batch that it is part of, nor on the device. The hash is
 splitmix64 (Steele, Lea & Flood 2014, "Fast splittable pseudorandom number generators"; Stafford's finaliser 13) in
-wrapping int64 arithmetic.
+int64 arithmetic modulo 2^64.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def _signed(word: int) -> int:
-    """The int64 with the same 64 bits."""
+    """The int64 with the same 64 bits as an unsigned word."""
     word &= 2**64 - 1
     return word - 2**64 if word >= 2**63 else word
 
@@ -22,7 +22,7 @@ _ROUNDS = ((30, _signed(0xBF58476D1CE4E5B9)), (27, _signed(0x94D049BB133111EB)),
 
 
 def mix(words: Tensor) -> Tensor:
-    """splitmix64's finaliser (Steele, Lea & Flood 2014) on int64 of any shape; a new tensor."""
+    """Finaliser of splitmix64 (Steele, Lea & Flood 2014), elementwise on int64 of any shape."""
     words = words.clone()
     shifted = torch.empty_like(words)
     for shift, factor in _ROUNDS:
@@ -35,7 +35,7 @@ def mix(words: Tensor) -> Tensor:
 
 
 def stream(seed: Tensor, *counters: int) -> Tensor:
-    """The key (*problems) of an independent stream for each seed (*problems), int64, and tuple of counters."""
+    """Keys (*problems) int64 of independent random streams, one for each seed (*problems) and tuple of counters."""
     key = mix(seed)
     for counter in counters:
         key = mix(key + _signed(_GOLDEN * (counter + 1)))
@@ -45,16 +45,16 @@ def stream(seed: Tensor, *counters: int) -> Tensor:
 def uniform(key: Tensor, count: int) -> Tensor:
     """The first `count` draws of each stream, uniform on the open interval (0, 1).
 
-    key (*problems) int64 -> (*problems, count) float64. Each is the middle of one of 2^32 equal cells.
+    key (*problems) int64 -> (*problems, count) float64. Each draw is the midpoint of one of 2^32 equal cells.
     """
-    # One word of 64 bits gives two draws.
+    # Each 64-bit word yields two draws.
     position = torch.arange(1, count // 2 + count % 2 + 1, device=key.device) * _GOLDEN
     halves = mix(key[..., None] + position).view(torch.int32)[..., :count]
     return halves.to(torch.float64).add_(2.0**31 + 0.5).mul_(2.0**-32)
 
 
 def problem_seeds(seed: int, shape: tuple[int, ...] = (), device: torch.device | str = "cpu") -> Tensor:
-    """A seed for each problem of a batch `shape`, int64, from one number."""
+    """Seeds int64 for a batch of problems of this shape, derived from one number."""
     count = int(torch.Size(shape).numel())
     one = torch.full((), _signed(seed), dtype=torch.int64, device=device)
     return mix(stream(one) + torch.arange(1, count + 1, device=device) * _GOLDEN).reshape(shape)

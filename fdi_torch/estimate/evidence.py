@@ -1,8 +1,9 @@
-"""Laplace's evidence: what an explanation's parameters cost, what is believed before the data, and the posterior.
+"""Bayesian evidence of a model by Laplace's approximation, prior odds of sets of effects, and posterior probabilities.
 
-    log E = -cost + log of the volume of the posterior over that of the prior + log prior odds
+    log E = -cost + log(posterior volume / prior volume) + log prior odds
 
-(MacKay, 2003, "Information theory, inference and learning algorithms", chapter 28.)
+The cost is the negative log-likelihood at its minimum. The volume ratio is the Occam factor, which penalises parameters
+(MacKay, 2003, "Information theory, inference and learning algorithms", chapter 28).
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Odds:
-    """What is believed before the data.
+    """Prior odds of deviations from the nominal model.
 
-    effect: odds that one more thing of the library is wrong, shared by all effects at all places. same_place: odds that
-    two effects sit at one place and are not one of another equation. unknown: odds that a place has a law which the
-    library lacks, shared by all places. discrepancy: how far the true law of an effect may differ from the library's,
-    as a share of what the effect does to the readings.
+    effect: odds of one more effect of the library, divided equally among all effects at all places.
+    same_place: factor for a second effect at the same place, as opposed to one effect with a different law.
+    unknown: odds that some place follows a law that is not in the library, divided equally among all places.
+    discrepancy: relative error of an effect's law in the library, as a fraction of the effect on the readings.
     """
 
     effect: float = 0.1
@@ -32,29 +33,38 @@ class Odds:
 
 
 ODDS = Odds()
-RARE = 0.02  # odds against the best explanation at which what was not looked at is left alone
+RARE = 0.02  # odds relative to the best model below which candidates that were not yet fitted are ignored
 
 
 def log_prior(count: int, places: int, choices: int) -> float:
-    """Of a set of `count` effects at so many different places, out of so many choices of an effect at a place."""
+    """Log prior odds of a set of `count` effects at `places` distinct places.
+
+    log p = count log(effect / choices) + (count - places) log(same_place) + log count!, where `choices` is the number
+    of possible pairs of effect and place, and count! counts the orders in which the same set can be drawn.
+    """
     each = count * (math.log(ODDS.effect) - math.log(choices)) + (count - places) * math.log(ODDS.same_place)
     return each + math.lgamma(count + 1)
 
 
 def log_det(curvature: Tensor) -> float:
-    """Of a curvature in units of each parameter's range; what the data do not show counts as known to 1 range."""
+    """Log determinant of a curvature (P, P) that is scaled by each parameter's prior width.
+
+    Eigenvalues below one are set to one: a direction without information in the data keeps its prior.
+    """
     return float(torch.log(torch.clamp(torch.linalg.eigvalsh(curvature), min=1.0)).sum())
 
 
 def log_volume(curvature: Tensor, width: Tensor) -> float:
-    """Log of the volume of the posterior over that of a uniform prior of these widths (P,); never above 0.
+    """Log of the Occam factor, the ratio of posterior volume to uniform prior volume: -log det(W H W / 2 pi) / 2 <= 0.
 
-    curvature (P, P): of the cost, half a chi-square. What the data do not show keeps its prior.
+    curvature (P, P): Hessian H of the cost, half a chi-square. width (P,): widths of the prior, the diagonal of W. A
+    direction without information in the data contributes 0.
     """
     scaled = curvature * width[:, None] * width[None, :] / (2.0 * math.pi)
     return -0.5 * log_det(0.5 * (scaled + scaled.mT))
 
 
 def posterior(log_weights: Sequence[float]) -> list[float]:
+    """Posterior probabilities of models from their log evidences, normalised to a sum of one."""
     weights = torch.softmax(torch.tensor(log_weights, dtype=torch.float64), dim=0)
     return [float(w) for w in weights]

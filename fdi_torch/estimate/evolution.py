@@ -1,7 +1,7 @@
-"""Differential evolution, from a box to a result: generations until every problem has a reason to stop.
+"""Differential evolution of a batch of independent problems, run until each meets a stopping criterion.
 
-The cost is `cost(candidates (L, N, P), lanes (L,)) -> (L, N)`: L problems still run, `lanes` are their places in the
-flattened batch. Problems that have finished leave, which changes nothing for those that stay.
+The cost function is `cost(candidates (L, N, P), lanes (L,)) -> (L, N)` for the L problems that are still running, whose
+indices in the flattened batch are `lanes`. A stopped problem drops out without affecting the results of the others.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ _RUNNING, _TARGET, _CONVERGED, _STALLED, _BUDGET, _FAILED = range(len(REASONS))
 
 @dataclass(frozen=True)
 class EvolutionResult:
-    """What was found. Populations are best first, and NaN where L-SHADE has taken members away.
+    """Result of the search. Populations are sorted, best first, and padded with NaN where L-SHADE removed members.
 
-    A problem none of whose candidates had a finite cost is "failed": best is then any vector of the box, cost infinite.
+    A problem is "failed" if no candidate had a finite cost; `best` is then an arbitrary vector of the box and
+    `best_cost` is infinite.
     """
 
     best: Tensor  # (*problems, P)
@@ -39,23 +40,23 @@ class EvolutionResult:
     cost: Tensor  # (*problems, N)
     generations: Tensor  # (*problems) int64
     evaluations: Tensor  # (*problems) int64
-    reason: Tensor  # (*problems) int64, place in REASONS
+    reason: Tensor  # (*problems) int64, index into REASONS
 
     @property
     def converged(self) -> Tensor:
-        """(*problems) bool: the population has contracted to a point, or the target was reached."""
+        """Whether the population contracted to a point or reached the target, (*problems) bool."""
         return (self.reason == _CONVERGED) | (self.reason == _TARGET)
 
     def reasons(self) -> list[str]:
-        """The reason of each problem in words, flattened."""
+        """Stopping reason of each problem by name, flattened."""
         return [REASONS[code] for code in self.reason.flatten().tolist()]
 
 
 @dataclass(frozen=True)
 class Search:
-    """A whole search between two generations: the running problems, which they are, and what has finished.
+    """Snapshot of a search between two generations: the running problems and the results of the finished ones.
 
-    It holds all that is needed to go on, bit for bit, with `evolve(..., resume=search)`.
+    `evolve(..., resume=search)` continues from it bit for bit.
     """
 
     state: State  # of the running problems, one flat leading dimension L
@@ -64,7 +65,7 @@ class Search:
     shape: tuple[int, ...]  # of the batch of problems
 
     def to_dict(self) -> dict[str, Tensor]:
-        """Plain tensors; `from_dict` makes the same search of them."""
+        """The search as plain tensors; `from_dict` restores it."""
         tensors = {f"state.{name}": value for name, value in self.state.to_dict().items()}
         tensors |= {f"finished.{name}": value for name, value in vars(self.finished).items()}
         return tensors | {"lanes": self.lanes, "shape": torch.tensor(self.shape, dtype=torch.int64)}
@@ -89,38 +90,40 @@ def evolve(
     on_generation: Callable[[Search], None] | None = None,
     resume: Search | None = None,
 ) -> EvolutionResult:
-    """Minimises the cost of every problem within its box.
+    """Minimise the cost of every problem within its box.
 
-    low, high (*problems, P); seeds (*problems) int64, or one number from which they are made; first_guess
-    (*problems, K, P) or (K, P). `on_generation` is called after each generation; what it raises ends the search and is
-    passed on, and the `Search` it was last given can be resumed. Raises ValueError where shapes or box do not fit.
+    low, high (*problems, P). seeds: (*problems) int64, or one number from which they are derived. first_guess
+    (*problems, K, P) or (K, P): replaces the first K members. on_generation: called after each generation; an exception
+    that it raises ends the search and propagates, and the last `Search` that it received can be resumed.
+    Raises ValueError for mismatched shapes or an invalid box.
     """
     settings = settings or EvolutionSettings()
-    search = _retired(resume or _begin(low, high, settings, seeds, first_guess), settings)
+    search = _without_stopped(resume or _begin(low, high, settings, seeds, first_guess), settings)
     while len(search.lanes):
         trial = ask(search.state, settings)
         costs = cost(trial.candidates, search.lanes)
         search = replace(search, state=tell(search.state, trial, costs, settings))
         if on_generation is not None:
             on_generation(search)
-        search = _retired(search, settings)
+        search = _without_stopped(search, settings)
     return snapshot(search)
 
 
 def snapshot(search: Search) -> EvolutionResult:
-    """The result so far, of the shape of the batch; problems still running have that as their reason."""
+    """The result so far, in the shape of the batch; problems that are not finished have the reason "running"."""
     running = torch.zeros_like(search.lanes)
-    flat = _filed(search, torch.ones_like(search.lanes, dtype=torch.bool), running).finished
+    flat = _with_results(search, torch.ones_like(search.lanes, dtype=torch.bool), running).finished
     return EvolutionResult(
         **{name: value.unflatten(0, search.shape) if search.shape else value[0] for name, value in vars(flat).items()}
     )
 
 
 def stop_reason(state: State, settings: EvolutionSettings) -> Tensor:
-    """(*problems) int64, place in REASONS; 0 while the problem is to go on.
+    """Stopping reason of each problem, (*problems) int64, an index into REASONS; 0 while it runs.
 
-    converged: members lie within `parameter_tolerance` of the box and costs within `cost_tolerance` of their scale. The
-    cost itself is compared with nothing, so an offset of the cost changes no decision.
+    converged: the range of the members is at most `parameter_tolerance` times the box's width in every parameter, and
+    the range of their costs at most `cost_tolerance` times `State.scale`. Only cost differences enter this criterion,
+    so a constant offset of the cost has no effect on it.
     """
     reason = torch.zeros_like(state.waited)
     if state.generation == 0:
@@ -130,10 +133,10 @@ def stop_reason(state: State, settings: EvolutionSettings) -> Tensor:
     if state.evaluations + size > settings.evaluations:
         reason = torch.where(torch.isfinite(best), _BUDGET, _FAILED)
     reason = torch.where((state.waited >= settings.patience) & torch.isfinite(best), _STALLED, reason)
-    spread = state.population.amax(-2) - state.population.amin(-2)
-    together = (spread <= settings.parameter_tolerance * (state.high - state.low)).all(-1)
-    level = worst - best <= settings.cost_tolerance * state.scale
-    reason = torch.where(together & level, _CONVERGED, reason)
+    ranges = state.population.amax(-2) - state.population.amin(-2)
+    contracted = (ranges <= settings.parameter_tolerance * (state.high - state.low)).all(-1)
+    costs_agree = worst - best <= settings.cost_tolerance * state.scale
+    reason = torch.where(contracted & costs_agree, _CONVERGED, reason)
     return torch.where(best <= settings.target, _TARGET, reason)
 
 
@@ -164,7 +167,7 @@ def _begin(
 
 
 def _expect_room(problems: int, parameters: int, settings: EvolutionSettings) -> None:
-    """Members, those that have finished, the archive and the memory of what succeeded."""
+    """Check that populations (running and finished), archives and success-history memories fit into the memory."""
     size = settings.first_population(parameters)
     archive = settings.archive_share * size if settings.strategy == "l-shade" else 0.0
     numbers = (2.0 * size + archive) * (parameters + 1) + 2.0 * settings.memory
@@ -172,19 +175,19 @@ def _expect_room(problems: int, parameters: int, settings: EvolutionSettings) ->
     expect_room(problems * numbers, f"{what}{settings.memory:.3g}", "make them smaller")
 
 
-def _retired(search: Search, settings: EvolutionSettings) -> Search:
-    """The search without the problems that have a reason to stop, which are filed."""
+def _without_stopped(search: Search, settings: EvolutionSettings) -> Search:
+    """Move the problems that meet a stopping criterion from the running ones to the results."""
     reason = stop_reason(search.state, settings)
-    done = reason != _RUNNING
-    if not bool(done.any()):
+    stopped = reason != _RUNNING
+    if not bool(stopped.any()):
         return search
-    filed = _filed(search, done, reason)
-    return replace(filed, state=search.state.select(~done), lanes=search.lanes[~done])
+    updated = _with_results(search, stopped, reason)
+    return replace(updated, state=search.state.select(~stopped), lanes=search.lanes[~stopped])
 
 
-def _filed(search: Search, done: Tensor, reason: Tensor) -> Search:
-    """The search with the problems of the mask (L,) copied into `finished`."""
-    state, lanes = search.state.select(done), search.lanes[done]
+def _with_results(search: Search, selected: Tensor, reason: Tensor) -> Search:
+    """Copy the running problems of the mask (L,) into `finished`."""
+    state, lanes = search.state.select(selected), search.lanes[selected]
     missing = search.finished.cost.shape[-1] - state.cost.shape[-1]
     values = {
         "best": state.population[:, 0],
@@ -193,7 +196,7 @@ def _filed(search: Search, done: Tensor, reason: Tensor) -> Search:
         "cost": torch.nn.functional.pad(state.cost, (0, missing), value=math.nan),
         "generations": torch.full_like(lanes, state.generation),
         "evaluations": torch.full_like(lanes, state.evaluations),
-        "reason": reason[done],
+        "reason": reason[selected],
     }
     finished = {name: old.index_copy(0, lanes, values[name]) for name, old in vars(search.finished).items()}
     return replace(search, finished=EvolutionResult(**finished))

@@ -1,4 +1,4 @@
-"""How a differential evolution is to search; every number of the method that is a choice."""
+"""Settings of the differential evolution."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ STRATEGIES = ("rand/1/bin", "l-shade")
 
 @dataclass(frozen=True)
 class EvolutionSettings:
-    """How to search. The first block is for both strategies, then each has its own.
+    """Settings of the differential evolution: first those of both strategies, then those of each one.
 
-    population: members N; None for 10 P (rand/1/bin) or 18 P (l-shade). evaluations: budget of each problem.
-    parameter_tolerance: share of the box; cost_tolerance: share of the scale of the costs (see `State.scale`).
-    patience: generations without progress until a problem counts as stalled. target: a cost that is good enough.
-    factor, rate: F and CR. memory, best_share, archive_share, smallest: H, p, r_arc and N_min.
+    population: number of members N; None: 10 P (rand/1/bin) or 18 P (l-shade), with P parameters.
+    evaluations: budget of cost evaluations per problem. bounds: rule that returns mutants to the box (bounds.RULES).
+    parameter_tolerance: relative to the box's width; cost_tolerance: relative to the scale of the costs, `State.scale`.
+    patience: number of generations without improvement after which a problem has stalled.
+    target: cost at which the search stops. factor, rate: F and CR.
+    memory, best_share, archive_share, smallest: H, p, r_arc and N_min of Tanabe & Fukunaga (2014).
     """
 
     strategy: str = "l-shade"
@@ -57,16 +59,16 @@ class EvolutionSettings:
         return self.population or (18 if self.strategy == "l-shade" else 10) * max(parameters, 1)
 
     def population_after(self, first: int, evaluations: int) -> int:
-        """Members of the next generation: constant, or falling linearly to `smallest` over the budget (L-SHADE, 10)."""
+        """Population size of the next generation: constant, or linear in the evaluations (L-SHADE, equation 10)."""
         if self.strategy != "l-shade" or first <= self.smallest:
             return first
-        share = min(1.0, evaluations / self.evaluations)
-        return round(first + (self.smallest - first) * share)
+        fraction = min(1.0, evaluations / self.evaluations)
+        return round(first + (self.smallest - first) * fraction)
 
     def archive_size(self, population: int) -> int:
         return round(self.archive_share * population) if self.strategy == "l-shade" else 0
 
 
-def _expect(condition: bool, wanted: str, got: object) -> None:
+def _expect(condition: bool, expected: str, actual: object) -> None:
     if not condition:
-        raise ValueError(f"expected {wanted}, got {got}; change the search settings")
+        raise ValueError(f"expected {expected}, got {actual}; change the search settings")

@@ -1,4 +1,4 @@
-"""What is to be fitted: a plant, its recordings and the parameters in question, as problems at any step."""
+"""A fitting problem: a plant, its recordings and the parameters to estimate, for any integration step."""
 
 from __future__ import annotations
 
@@ -28,22 +28,25 @@ StartLevel = Literal["equilibrium", "free"] | float
 StartLevels = StartLevel | Mapping[str, StartLevel]
 EngineKind = Literal["auto", "reference", "compiled"]
 
-# A start level that is estimated is searched this share of its tank's height about the first readings.
+# An estimated initial level is searched within this fraction of the tank's height on either side of the level that the
+# first readings show (their median).
 START_SEARCH_SHARE = 0.05
 FIRST_READINGS = 5
-# An adaptive solver sees inputs that run linearly as their means over so long; in units of the plant's time scale.
+# An adaptive solver receives linearly interpolated inputs as means over intervals of at most this length, in units of
+# the plant's time scale.
 LONGEST_STEP = 1.0
-# One of a lane's own steps costs about as much as so many of RK4 that all lanes take alike.
+# Cost of one step with individual step control per lane, in units of a fixed RK4 step common to all lanes.
 OWN_STEP_COST = 16
 
 
 @dataclass(frozen=True)
 class Fitting:
-    """One set of parameters common to several recordings, beside the start levels of each.
+    """Parameters common to several recordings, together with the initial levels of each recording.
 
-    space: all that is estimated, common ones first; the start levels of recording k > 0 bear a suffix '@k'.
-    networks, own_spaces: the plant of each recording with its nominal start levels, and what is estimated there.
-    columns: which columns of theta each recording takes.
+    space: all estimated parameters, the common ones first; initial levels of recording k > 0 have the suffix '@k'.
+    networks: the plant with the nominal initial levels of each recording.
+    own_spaces: the parameters of each recording, i.e. the common ones and its own initial levels.
+    columns: the columns of theta that hold these, for each recording.
     """
 
     space: ParameterSpace
@@ -59,46 +62,57 @@ class Fitting:
 
     @property
     def is_slow(self) -> bool:
-        """Whether each operation of each step costs a call from Python, so that steps have to be saved."""
+        """Whether the engine evaluates every integration step in Python, so that steps are expensive."""
         return self.engine == "reference"
 
     def beginning(self, samples: int) -> Fitting:
-        """The same with the first samples of each recording only."""
-        cut = [r.stretch(0, samples) for r in self.recordings]
-        return replace(self, recordings=tuple(cut))
+        """A copy that uses only the first `samples` samples of each recording."""
+        shortened = [r.stretch(0, samples) for r in self.recordings]
+        return replace(self, recordings=tuple(shortened))
 
     def engines(self, step: float, adaptive: bool = False) -> list[Engine]:
-        """An engine for each recording, in steps no longer than `step` s, or by an adaptive solver about as exact."""
+        """A simulation engine for each recording.
+
+        It takes steps of at most `step` s, or adaptive ones of about the same accuracy. Raises ValueError if step <= 0.
+        """
         if not step > 0.0:
             raise ValueError(f"expected a positive integration step, got {step:g} s")
         engines = []
-        for network, own, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True):
-            divides = not adaptive and self._takes_own_steps(recording, network, step)
-            longest = LONGEST_STEP * time_scale(self.plant) if adaptive or divides else step
-            own_steps = _own_steps(step, recording, self.plant) if divides else None
-            experiment = lay_out(recording, self.plant.channels(), longest, own_steps)
+        for network, space, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True):
+            uses_own_steps = not adaptive and self._takes_own_steps(recording, network, step)
+            longest = LONGEST_STEP * time_scale(self.plant) if adaptive or uses_own_steps else step
+            step_control = _step_control(step, recording, self.plant) if uses_own_steps else None
+            experiment = lay_out(recording, self.plant.channels(), longest, step_control)
             if adaptive:
-                engines.append(adaptive_engine(network, own, experiment, step))
+                engines.append(adaptive_engine(network, space, experiment, step))
             else:
                 device = recording.time.device.type
-                engines.append(make_engine(network, own, experiment, self.engine, device=device))
+                engines.append(make_engine(network, space, experiment, self.engine, device=device))
         return engines
 
     def takes_own_steps(self, step: float) -> bool:
-        """Whether lanes divide the time between samples by themselves: costs are exact to their tolerance only."""
+        """Whether the step length is controlled separately for each lane in at least one recording.
+
+        The cost is then exact only up to the tolerance of the step control.
+        """
         return any(
             self._takes_own_steps(recording, network, step)
             for recording, network in zip(self.recordings, self.networks, strict=True)
         )
 
     def _takes_own_steps(self, recording: Recording, network: TankNetwork, step: float) -> bool:
-        """Where they cost less than fixed ones, and inputs are held between samples, so that nothing is lost."""
+        """True if step control per lane is cheaper than fixed steps, and the inputs are constant between samples."""
         steps = float(recording.time[-1] - recording.time[0]) / step
-        held = recording.hold == "zero_order" and all(p.effect.stage is not Stage.COMMAND for p in network.placements)
-        return held and not self.is_slow and steps > OWN_STEP_COST * len(recording)
+        inputs_constant = recording.hold == "zero_order" and all(
+            p.effect.stage is not Stage.COMMAND for p in network.placements
+        )
+        return inputs_constant and not self.is_slow and steps > OWN_STEP_COST * len(recording)
 
     def problem(self, step: float, objective: Objective = "likelihood", adaptive: bool = False) -> Problem:
-        """Raises ValueError where the objective is correlation and readings that count stand still."""
+        """The estimation problem with integration steps of at most `step` s.
+
+        Raises ValueError if the objective is 'correlation' and a channel's readings are constant.
+        """
         for recording in self.recordings if objective == "correlation" else ():
             _expect_variation(recording, self.plant)
         parts = zip(self.engines(step, adaptive), self.recordings, self.columns, strict=True)
@@ -106,7 +120,8 @@ class Fitting:
         return Problem(self.space, terms, objective)
 
 
-def _own_steps(step: float, recording: Recording, plant: PlantDescription) -> StepControl:
+def _step_control(step: float, recording: Recording, plant: PlantDescription) -> StepControl:
+    """Step control about as accurate as fixed steps of `step` s. Raises ValueError if that accuracy is out of range."""
     try:
         return StepControl.for_fixed_step(step, plant)
     except ValueError as error:
@@ -121,21 +136,22 @@ def set_up(
     start: StartLevels | Sequence[StartLevels] = "free",
     engine: EngineKind = "auto",
 ) -> Fitting:
-    """The fitting of `parameters` ('T1.leak.size', or a Parameter with its own range) to recordings.
+    """Set up the fit of `parameters` ('T1.leak.size', or a Parameter with its own range) to recordings.
 
-    start: 'equilibrium' (the plant file's level, or rest under the first inputs), 'free' (estimated) or a level in m,
-    for all tanks or by tank, and for all recordings or one for each.
-    Raises ValueError for an unknown parameter or a channel that is not recorded.
+    start: initial levels, one choice for all tanks or a mapping by tank, for all recordings or a sequence with one
+    entry per recording. A choice is 'equilibrium' (the level of the plant file, else the equilibrium under the first
+    inputs), 'free' (estimated) or a level in m.
+    Raises ValueError for an unknown parameter and for a channel that is not recorded.
     """
-    wanted = list(parameters)
-    names = [p if isinstance(p, str) else p.name for p in wanted]
+    requested = list(parameters)
+    names = [p if isinstance(p, str) else p.name for p in requested]
     placements = placements_for(names)
     reference = build_network(plant, placements)
-    common = [reference.constants[p] if isinstance(p, str) else p for p in wanted]
+    common = [reference.constants[p] if isinstance(p, str) else p for p in requested]
     networks, own_spaces, columns, joint = [], [], [], list(common)
     starts = start if isinstance(start, Sequence) and not isinstance(start, str) else [start] * len(recordings)
-    for k, (recording, chosen) in enumerate(zip(recordings, starts, strict=True)):
-        levels, free = start_levels(plant, reference, recording, chosen)
+    for k, (recording, recording_start) in enumerate(zip(recordings, starts, strict=True)):
+        levels, free = start_levels(plant, reference, recording, recording_start)
         tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(plant.tanks, levels, strict=True))
         networks.append(build_network(replace(plant, tanks=tanks), placements))
         own_spaces.append(ParameterSpace([*common, *free]))
@@ -145,26 +161,30 @@ def set_up(
 
 
 def start_levels(
-    plant: PlantDescription, network: TankNetwork, recording: Recording, wanted: StartLevels
+    plant: PlantDescription, network: TankNetwork, recording: Recording, start: StartLevels
 ) -> tuple[Tensor, list[Parameter]]:
-    """Start levels (tanks,) in m, and those of them that are to be estimated, with the range to search."""
-    by_tank = wanted if isinstance(wanted, Mapping) else {tank.name: wanted for tank in plant.tanks}
+    """Initial levels (tanks,) in m, and parameters with search ranges for those that are estimated.
+
+    start: 'equilibrium', 'free' or a level in m, see `set_up`. A tank that a mapping omits is 'free'. Raises ValueError
+    for an unknown tank.
+    """
+    by_tank = start if isinstance(start, Mapping) else {tank.name: start for tank in plant.tanks}
     unknown = set(by_tank) - {tank.name for tank in plant.tanks}
     if unknown:
         raise ValueError(f"start levels: expected tanks of plant {plant.name}, got {', '.join(sorted(unknown))}")
-    rest = shown = None
+    rest_levels = first_levels = None
     levels, free = [], []
     for i, tank in enumerate(plant.tanks):
         choice = by_tank.get(tank.name, "free")
         if choice == "free":
-            shown = shown or levels_shown_first(plant, network, recording)
-            parameter = _free_start(tank, shown[i])
+            first_levels = first_levels or levels_shown_first(plant, network, recording)
+            parameter = _free_start(tank, first_levels[i])
             levels.append(parameter.nominal)
             free.append(parameter)
         elif choice == "equilibrium" and tank.start_level is None:
-            if rest is None:
-                rest = equilibrium(network, _first_inputs(plant, recording))
-            levels.append(float(rest[i]))
+            if rest_levels is None:
+                rest_levels = equilibrium(network, _first_inputs(plant, recording))
+            levels.append(float(rest_levels[i]))
         else:
             levels.append(float(tank.start_level or 0.0) if isinstance(choice, str) else choice)
     return torch.tensor(levels, dtype=torch.float64), free
@@ -175,38 +195,39 @@ def _first_inputs(plant: PlantDescription, recording: Recording) -> Tensor:
     return recording.inputs[0, columns]
 
 
-def _free_start(tank: Tank, shown: float | None) -> Parameter:
-    """shown: the level (m) that the first readings show; None where no sensor sees the tank."""
-    level = min(max(0.5 * tank.height if shown is None else shown, 0.0), tank.height)
-    reach = tank.height if shown is None else START_SEARCH_SHARE * tank.height
-    low, high = max(0.0, level - reach), min(tank.height, level + reach)
+def _free_start(tank: Tank, observed: float | None) -> Parameter:
+    """Parameter of an initial level. observed: level (m) in the first readings; None for a tank without readings."""
+    level = min(max(0.5 * tank.height if observed is None else observed, 0.0), tank.height)
+    half_range = tank.height if observed is None else START_SEARCH_SHARE * tank.height
+    low, high = max(0.0, level - half_range), min(tank.height, level + half_range)
     return Parameter(f"{tank.name}.start_level", "m", level, low, high, meaning=f"level of {tank.name} at t = 0")
 
 
 def levels_shown_first(plant: PlantDescription, network: TankNetwork, recording: Recording) -> list[float | None]:
-    """The level of each tank that the first few readings of its sensor show, m; None where no sensor sees it."""
-    readings, seen = [], set()
+    """Level of each tank, m, from the median of its sensor's first readings; None for a tank without readings."""
+    readings, observed_tanks = [], set()
     for sensor in plant.sensors:
         valid = recording.outputs[:0, 0]
         if sensor.column in recording.output_names:
             column = recording.output_names.index(sensor.column)
             valid = recording.outputs[:, column][recording.mask[:, column]][:FIRST_READINGS]
-        seen |= {sensor.tank} if len(valid) else set()
+        observed_tanks |= {sensor.tank} if len(valid) else set()
         readings.append(valid.median() if len(valid) else network.nominal.new_tensor(torch.nan))
     values = network.bind(ParameterSpace(), network.nominal.new_zeros(0))
     levels = levels_from_readings(
         network, readings, network.start_levels(values), network.nominal.new_zeros(()), values
     )
-    return [float(h) if tank.name in seen else None for tank, h in zip(plant.tanks, levels, strict=True)]
+    return [float(h) if tank.name in observed_tanks else None for tank, h in zip(plant.tanks, levels, strict=True)]
 
 
 def _expect_variation(recording: Recording, plant: PlantDescription) -> None:
+    """Raise ValueError if the valid readings of a sensor are constant: their correlation is undefined."""
     for sensor in (s for s in plant.sensors if s.column in recording.output_names):
         column = recording.output_names.index(sensor.column)
-        seen = recording.outputs[recording.mask[:, column], column]
-        if len(seen) and bool((seen == seen[0]).all()):
+        readings = recording.outputs[recording.mask[:, column], column]
+        if len(readings) and bool((readings == readings[0]).all()):
             unit, scale = display_unit(sensor.unit)
-            value = f"{scale * float(seen[0]):g} {unit}"
+            value = f"{scale * float(readings[0]):g} {unit}"
             raise ValueError(
                 f"{recording.source}: {sensor.column}: expected readings that vary, got {value} "
                 "throughout, whose correlation is undefined; set estimate.objective.search to likelihood, or leave "
@@ -215,12 +236,15 @@ def _expect_variation(recording: Recording, plant: PlantDescription) -> None:
 
 
 def readings_of(recording: Recording, plant: PlantDescription) -> Readings:
-    """The recording's outputs in the order of the plant's sensors, with weight 0 where masked."""
+    """The recording's outputs in the order of the plant's sensors, with weight 0 where masked.
+
+    Raises ValueError if a sensor's column is missing.
+    """
     columns = []
     for sensor in plant.sensors:
         if sensor.column not in recording.output_names:
-            known = ", ".join(recording.output_names) or "none"
-            raise ValueError(f"{recording.source}: expected readings of sensor '{sensor.column}', got {known}")
+            recorded = ", ".join(recording.output_names) or "none"
+            raise ValueError(f"{recording.source}: expected readings of sensor '{sensor.column}', got {recorded}")
         columns.append(recording.output_names.index(sensor.column))
     mask = recording.mask[:, columns]
     values = torch.where(mask, recording.outputs[:, columns], torch.zeros_like(recording.outputs[:, columns]))

@@ -1,8 +1,10 @@
-"""One generation of differential evolution as init, ask and tell: state in, state out.
+"""One generation of differential evolution as three pure functions: `init`, `ask` and `tell`.
 
-Strategies: "rand/1/bin" is equations (20)-(23) of the paper this project implements (Storn & Price 1997); "l-shade" is
-Tanabe & Fukunaga (2014): current-to-pbest/1/bin with success-history memory, archive and linear population reduction.
-Leading dimensions are problems that share nothing: a problem's numbers are bit for bit those it has alone.
+`init` draws the first population, `ask` proposes candidates, and `tell` takes their costs and returns the next state.
+Strategies: "rand/1/bin" (Storn & Price 1997) is equations (20)-(23) of the paper that this project implements;
+"l-shade" (Tanabe & Fukunaga 2014) is current-to-pbest/1/bin with a success-history memory of F and CR, an archive of
+replaced parents and linear population size reduction. N: population size, P: parameters, H: memory size, A: archive
+size. Leading dimensions are independent problems; the results of each are bit-for-bit those of running it alone.
 """
 
 from __future__ import annotations
@@ -19,15 +21,18 @@ from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.shade import draw_factor, draw_rate, update_archive, update_memory
 
-_VARIATION, _REPAIR, _ARCHIVE = range(3)  # the streams of one generation
+_VARIATION, _REPAIR, _ARCHIVE = range(3)  # indices of the random streams of one generation
 
 
 @dataclass(frozen=True)
 class State:
-    """Where the search stands. Members are sorted, best first; an infinite cost is a member without a valid cost.
+    """State of the search. Members are sorted, best first; a member without a valid cost has an infinite one.
 
-    scale: the largest distance seen between the median and the best cost of a generation: the yardstick for costs,
-    which an offset of the cost does not touch. anchor: best cost at the last progress, waited: generations since.
+    memory_f, memory_cr: success-history memories; memory_cell: the cell to be overwritten next.
+    archive: replaced parents, of which the first `archived` rows are in use.
+    scale: largest difference between median and best cost of any generation so far. Cost tolerances are relative to it,
+    which makes them independent of a constant offset of the cost.
+    anchor: best cost at the last significant improvement; waited: generations since then.
     """
 
     population: Tensor  # (*problems, N, P)
@@ -48,12 +53,12 @@ class State:
     evaluations: int = 0
 
     def select(self, keep: Tensor) -> State:
-        """The problems that the mask (*problems) keeps, as one flat leading dimension."""
-        kept: dict[str, Any] = {name: value[keep] for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **kept)
+        """The problems selected by the mask `keep` (*problems), with one flat leading dimension."""
+        chosen: dict[str, Any] = {name: value[keep] for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **chosen)
 
     def to_dict(self) -> dict[str, Tensor]:
-        """Plain tensors, from which `from_dict` makes the same state bit for bit."""
+        """The state as plain tensors; `from_dict` restores it bit for bit."""
         return {name: torch.as_tensor(value) for name, value in vars(self).items()}
 
     @classmethod
@@ -65,7 +70,7 @@ class State:
 
 @dataclass(frozen=True)
 class Trial:
-    """Candidates to be evaluated and the F and CR that made them."""
+    """Candidates to be evaluated, with the factor F and the crossover rate CR that each was made with."""
 
     candidates: Tensor  # (*problems, N, P)
     factor: Tensor  # (*problems, N)
@@ -75,9 +80,10 @@ class Trial:
 def init(
     low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor, first_guess: Tensor | None = None
 ) -> State:
-    """A uniform population in the box, low + rand(0, 1) (high - low), not yet evaluated. (20)
+    """Draw the first population uniformly in the box, low + rand(0, 1) (high - low), not yet evaluated. (20)
 
-    low, high (*problems, P); seed (*problems) int64; first_guess (*problems, K, P), K <= N: replaces the first members.
+    low, high (*problems, P); seed (*problems) int64; first_guess (*problems, K, P), K <= N: replaces the first K.
+    Raises ValueError for an empty or infinite box, mismatched shapes and a budget below the population size.
     """
     problems, parameters = low.shape[:-1], low.shape[-1]
     _check_box(low, high, seed)
@@ -90,7 +96,7 @@ def init(
     low_, high_ = low[..., None, :], high[..., None, :]
     population = (low_ + draws * (high_ - low_)).clamp(low_, high_)
     if first_guess is not None:
-        population = _seeded(population, first_guess.to(low).clamp(low_, high_))
+        population = _with_first_guess(population, first_guess.to(low).clamp(low_, high_))
     cells = settings.memory if settings.strategy == "l-shade" else 0
     return State(
         population=population,
@@ -122,7 +128,7 @@ def _check_box(low: Tensor, high: Tensor, seed: Tensor) -> None:
         )
 
 
-def _seeded(population: Tensor, guess: Tensor) -> Tensor:
+def _with_first_guess(population: Tensor, guess: Tensor) -> Tensor:
     if guess.shape[-2] > population.shape[-2]:
         raise ValueError(
             f"expected at most {population.shape[-2]} first guesses (the population), got {guess.shape[-2]}; give fewer"
@@ -131,10 +137,13 @@ def _seeded(population: Tensor, guess: Tensor) -> Tensor:
 
 
 def ask(state: State, settings: EvolutionSettings) -> Trial:
-    """The next candidates (*problems, N, P): the first population itself, then mutants crossed with their parents."""
+    """Propose the next candidates (*problems, N, P): the first population itself, later on mutation and crossover.
+
+    Binomial crossover: a component comes from the mutant with probability CR, and at least one always does. (22)
+    """
     if state.generation == 0:
-        nothing = torch.zeros_like(state.cost)
-        return Trial(state.population, nothing, nothing)
+        zeros = torch.zeros_like(state.cost)
+        return Trial(state.population, zeros, zeros)
     size, parameters = state.population.shape[-2:]
     rows = 4 if settings.strategy == "rand/1/bin" else 7
     u = uniform(stream(state.seed, state.generation, _VARIATION), size * (rows + parameters))
@@ -148,7 +157,7 @@ def ask(state: State, settings: EvolutionSettings) -> Trial:
 
 
 def _rand_1(state: State, settings: EvolutionSettings, u: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """theta_j + F (theta_k - theta_l), with i, j, k, l mutually different. (21)"""
+    """Mutants theta_j + F (theta_k - theta_l), with i, j, k, l mutually different. (21)"""
     size = state.population.shape[-2]
     i = torch.arange(size, device=u[0].device)
     j = draw_other(u[0], size, i)
@@ -160,7 +169,7 @@ def _rand_1(state: State, settings: EvolutionSettings, u: list[Tensor]) -> tuple
 
 
 def _to_p_best_1(state: State, settings: EvolutionSettings, u: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """x_i + F (x_pbest - x_i) + F (x_r1 - x_r2), x_r2 from population and archive. (L-SHADE, 3)"""
+    """Mutants x_i + F (x_pbest - x_i) + F (x_r1 - x_r2), with x_r2 from population or archive. (L-SHADE, 3)"""
     population, size = state.population, state.population.shape[-2]
     u_cell, u_factor, u_rate, u_best, u_1, u_2 = u
     cell = (u_cell * settings.memory).long()
@@ -175,7 +184,10 @@ def _to_p_best_1(state: State, settings: EvolutionSettings, u: list[Tensor]) -> 
 
 
 def _pick_of_two(state: State, index: Tensor) -> Tensor:
-    """Rows of the population followed by the archive; not joined first, the copy would cost more than all else."""
+    """Rows `index` (*problems, N) of the population followed by the archive.
+
+    The two are not concatenated, because that copy would dominate the cost of a generation.
+    """
     size, room = state.population.shape[-2], state.archive.shape[-2]
     member = pick(state.population, index.clamp(max=size - 1))
     if not room:
@@ -184,7 +196,7 @@ def _pick_of_two(state: State, index: Tensor) -> Tensor:
 
 
 def draw_other(u: Tensor, size: int | Tensor, *taken: Tensor) -> Tensor:
-    """Integers uniform on 0..size-1 without those in `taken`, which differ from one another; all (*problems, N)."""
+    """Integers uniform on 0..size-1, excluding those in `taken`, which are mutually different; all (*problems, N)."""
     index = (u * (size - len(taken))).long()
     for value in _ascending(list(taken)):
         index = index + (index >= value)
@@ -192,7 +204,7 @@ def draw_other(u: Tensor, size: int | Tensor, *taken: Tensor) -> Tensor:
 
 
 def _ascending(values: list[Tensor]) -> list[Tensor]:
-    """Elementwise sorted; bubble sort, for there are at most three."""
+    """Sort elementwise across the list, by bubble sort: there are at most three tensors."""
     for end in range(len(values) - 1, 0, -1):
         for a in range(end):
             values[a], values[a + 1] = torch.minimum(values[a], values[a + 1]), torch.maximum(values[a], values[a + 1])
@@ -200,7 +212,7 @@ def _ascending(values: list[Tensor]) -> list[Tensor]:
 
 
 def pick(rows: Tensor, index: Tensor) -> Tensor:
-    """rows (*problems, M, P) at index (*problems, K) -> (*problems, K, P), a new tensor."""
+    """Copy the rows `index` (*problems, K) of `rows` (*problems, M, P) into a new tensor (*problems, K, P)."""
     problem = torch.arange(index[..., 0].numel(), device=index.device).reshape(*index.shape[:-1], 1)
     flat = (index + problem * rows.shape[-2]).reshape(-1)
     return rows.reshape(-1, rows.shape[-1]).index_select(0, flat).reshape(*index.shape, rows.shape[-1])
@@ -218,27 +230,30 @@ def _repaired(mutant: Tensor, state: State, settings: EvolutionSettings) -> Tens
 
 
 def tell(state: State, trial: Trial, cost: Tensor, settings: EvolutionSettings) -> State:
-    """Selection, learning, sorting. cost (*problems, N); a cost that is not finite never wins. (23)"""
+    """Select between parents and candidates, update the memories and sort the population. (23)
+
+    cost (*problems, N): costs of the candidates; one that is not finite never replaces its parent.
+    """
     if cost.shape != state.cost.shape:
         raise ValueError(f"expected costs {tuple(state.cost.shape)}, got {tuple(cost.shape)}; one for each candidate")
     cost = torch.where(torch.isfinite(cost), cost, math.inf).to(state.cost.dtype)
     better = cost < state.cost
-    # L-SHADE lets an equal candidate replace its parent too, so that the population can cross plateaus.
-    wins = better if settings.strategy == "rand/1/bin" else (cost <= state.cost) & torch.isfinite(cost)
-    learned = state
+    # In L-SHADE a candidate of equal cost replaces its parent too, so that the population can cross plateaus.
+    replaces = better if settings.strategy == "rand/1/bin" else (cost <= state.cost) & torch.isfinite(cost)
+    updated = state
     if settings.strategy == "l-shade" and state.generation > 0:
-        learned = _learned(state, trial, state.cost - cost, better)
-    chosen = replace(
-        learned,
-        population=torch.where(wins[..., None], trial.candidates, state.population),
-        cost=torch.where(wins, cost, state.cost),
+        updated = _with_updated_memory(state, trial, state.cost - cost, better)
+    selected = replace(
+        updated,
+        population=torch.where(replaces[..., None], trial.candidates, state.population),
+        cost=torch.where(replaces, cost, state.cost),
         generation=state.generation + 1,
         evaluations=state.evaluations + state.cost.shape[-1],
     )
-    return _progressed(_sorted(chosen, settings), settings)
+    return _with_progress_counters(_sorted_and_reduced(selected, settings), settings)
 
 
-def _learned(state: State, trial: Trial, gain: Tensor, success: Tensor) -> State:
+def _with_updated_memory(state: State, trial: Trial, gain: Tensor, success: Tensor) -> State:
     memory_f, memory_cr, cell = update_memory(
         state.memory_f, state.memory_cr, state.memory_cell, trial.factor, trial.rate, gain, success
     )
@@ -249,28 +264,28 @@ def _learned(state: State, trial: Trial, gain: Tensor, success: Tensor) -> State
     return replace(state, memory_f=memory_f, memory_cr=memory_cr, memory_cell=cell, archive=archive, archived=archived)
 
 
-def _sorted(state: State, settings: EvolutionSettings) -> State:
-    """Best first, without the worst when the population shrinks."""
+def _sorted_and_reduced(state: State, settings: EvolutionSettings) -> State:
+    """Sort the members, best first, and drop the worst ones as the population size shrinks."""
     size = min(state.cost.shape[-1], settings.population_after(state.first_population, state.evaluations))
     cost, order = torch.sort(state.cost, stable=True)
-    room = min(state.archive.shape[-2], settings.archive_size(size))
+    archive_size = min(state.archive.shape[-2], settings.archive_size(size))
     return replace(
         state,
         population=pick(state.population, order[..., :size]),
         cost=cost[..., :size].contiguous(),
-        archive=state.archive[..., :room, :].contiguous(),
-        archived=state.archived.clamp(max=room),
+        archive=state.archive[..., :archive_size, :].contiguous(),
+        archived=state.archived.clamp(max=archive_size),
     )
 
 
-def _progressed(state: State, settings: EvolutionSettings) -> State:
+def _with_progress_counters(state: State, settings: EvolutionSettings) -> State:
     best, median = state.cost[..., 0], state.cost[..., state.cost.shape[-1] // 2]
-    spread = torch.where(torch.isfinite(median), median - best, 0.0)
-    scale = torch.maximum(state.scale, spread)
-    moved = best < state.anchor - settings.cost_tolerance * scale
+    difference = torch.where(torch.isfinite(median), median - best, 0.0)
+    scale = torch.maximum(state.scale, difference)
+    improved = best < state.anchor - settings.cost_tolerance * scale
     return replace(
         state,
         scale=scale,
-        anchor=torch.where(moved, best, state.anchor),
-        waited=torch.where(moved, 0, state.waited + 1),
+        anchor=torch.where(improved, best, state.anchor),
+        waited=torch.where(improved, 0, state.waited + 1),
     )

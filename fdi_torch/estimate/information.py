@@ -1,7 +1,7 @@
-"""How sure an estimate can be: Fisher information, covariance, the directions that nothing determines, and ellipses.
+"""Fisher information, covariance (Cramer-Rao bound) and undetermined directions of an estimate.
 
-Everything is done in units in which each parameter's information is one, so that parameters of very different size and
-unit neither hide nor fake a direction that is not determined.
+The information matrix is scaled to a unit diagonal first, so that the rank decision does not depend on the units and
+magnitudes of the parameters.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import row_sum
 
-# Below this share of the largest eigenvalue of the scaled information, a direction counts as undetermined.
+# A direction is undetermined if its eigenvalue of the scaled information is below this fraction of the largest one.
 RELATIVE_EIGENVALUE = 1e-10
-# A parameter belongs to an undetermined direction if its share of it, squared, exceeds this.
+# A parameter belongs to the undetermined subspace if its diagonal element of the projector exceeds this.
 _SHARE = 1e-6
 
 
 def fisher_information(jacobian: Tensor, noise_std: Tensor, weight: Tensor | None = None) -> Tensor:
-    """sum over samples and channels of J J' / sigma^2 for independent Gaussian noise, (*batch, P, P).
+    """Fisher information (*batch, P, P) for independent Gaussian noise: sum of J J' / sigma^2 over all readings.
 
-    jacobian (*batch, S, C, P) of the readings; noise_std (*batch, C), in their unit; weight (*batch, S, C), 0 masks.
+    jacobian (*batch, S, C, P): derivatives of the readings. noise_std (*batch, C): in each reading's unit.
+    weight (*batch, S, C): 0 masks a reading.
     """
     scaled = jacobian / noise_std[..., None, :, None]
     if weight is not None:
@@ -34,11 +35,11 @@ def fisher_information(jacobian: Tensor, noise_std: Tensor, weight: Tensor | Non
 
 @dataclass(frozen=True)
 class Certainty:
-    """What an information matrix says.
+    """Covariance and undetermined directions that follow from an information matrix.
 
-    std (*batch, P): standard errors, infinite for a parameter that is part of an undetermined direction.
-    covariance (*batch, P, P): of such a parameter infinite on the diagonal and NaN beside it.
-    null (*batch, P, P): projector on the undetermined directions, in the scaled parameters; 0 where there is none.
+    std (*batch, P): standard errors; infinite for a parameter that belongs to an undetermined direction.
+    covariance (*batch, P, P): for such a parameter infinite on the diagonal and NaN elsewhere in its row and column.
+    null (*batch, P, P): projector onto the undetermined subspace, for scaled parameters; zero if there is none.
     scale (*batch, P): parameter = scale * scaled parameter.
     """
 
@@ -51,30 +52,31 @@ class Certainty:
 def certainty(information: Tensor, held: Tensor | None = None, threshold: float = RELATIVE_EIGENVALUE) -> Certainty:
     """Covariance from the Fisher information (*batch, P, P), priors included: the Cramer-Rao bound at the estimate.
 
-    held (*batch, P) bool: parameters known exactly, such as those that a bound keeps in place; their standard error is
-    0 and they add nothing to that of the others.
+    held (*batch, P) bool: parameters taken as exactly known, such as those at an active bound. Their standard error is
+    0 and they do not contribute to that of the others.
+    threshold: relative eigenvalue below which a direction is undetermined.
     """
     diagonal = information.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(diagonal > 0, 1.0 / torch.where(diagonal > 0, diagonal, 1.0).sqrt(), 1.0)
     scaled = information * scale[..., :, None] * scale[..., None, :]
     scaled = 0.5 * (scaled + scaled.mT)
     if held is not None:
-        # Information of their own, unconnected with the others; what it leads to is replaced by zeros below.
-        apart = held[..., :, None] | held[..., None, :]
-        scaled = torch.where(apart, torch.eye(scaled.shape[-1]).to(scaled), scaled)
-    broken = ~torch.isfinite(scaled).all(-1).all(-1)[..., None, None]
-    values, vectors = _eigen(torch.where(broken, torch.zeros_like(scaled), scaled))
-    lost = (values <= threshold * values[..., -1:].clamp(min=0.0)) | (values <= 0)
-    inverse = torch.where(lost, 0.0, 1.0 / torch.where(lost, 1.0, values))
-    null = _composed(vectors, lost.to(vectors))
-    covariance = _composed(vectors, inverse) * scale[..., :, None] * scale[..., None, :]
-    return _marked(covariance, null, scale, held)
+        # Decouple held parameters from the others, with unit information; `_certainty_from` sets their covariance to 0.
+        involves_held = held[..., :, None] | held[..., None, :]
+        scaled = torch.where(involves_held, torch.eye(scaled.shape[-1]).to(scaled), scaled)
+    not_finite = ~torch.isfinite(scaled).all(-1).all(-1)[..., None, None]
+    values, vectors = _eigen(torch.where(not_finite, torch.zeros_like(scaled), scaled))
+    undetermined = (values <= threshold * values[..., -1:].clamp(min=0.0)) | (values <= 0)
+    inverse = torch.where(undetermined, 0.0, 1.0 / torch.where(undetermined, 1.0, values))
+    null = _recompose(vectors, undetermined.to(vectors))
+    covariance = _recompose(vectors, inverse) * scale[..., :, None] * scale[..., None, :]
+    return _certainty_from(covariance, null, scale, held)
 
 
 def _eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Eigenvalues (*batch, P) in ascending order and eigenvectors (*batch, P, P) of symmetric matrices.
 
-    One at a time, each in memory of its own: the library's last bit depends on where in memory a matrix begins.
+    Decomposed one by one, each in its own memory, because the rounding of the library depends on memory alignment.
     """
     parameters = matrix.shape[-1]
     pairs = [torch.linalg.eigh(one.clone()) for one in matrix.reshape(-1, parameters, parameters)]
@@ -82,51 +84,52 @@ def _eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return values.reshape(matrix.shape[:-1]), vectors.reshape(matrix.shape)
 
 
-def _composed(vectors: Tensor, values: Tensor) -> Tensor:
+def _recompose(vectors: Tensor, values: Tensor) -> Tensor:
     """V diag(values) V', (*batch, P, P), summed in an order that does not depend on the batch."""
     return row_sum(vectors[..., :, None, :] * vectors[..., None, :, :] * values[..., None, None, :])
 
 
-def _marked(covariance: Tensor, null: Tensor, scale: Tensor, held: Tensor | None) -> Certainty:
-    """Infinite where undetermined, zero where held."""
-    open_ = null.diagonal(dim1=-2, dim2=-1) > _SHARE
-    beside = open_[..., :, None] | open_[..., None, :]
-    covariance = torch.where(beside, math.nan, covariance)
-    covariance = torch.where(torch.diag_embed(open_), math.inf, covariance)
+def _certainty_from(covariance: Tensor, null: Tensor, scale: Tensor, held: Tensor | None) -> Certainty:
+    """Set the covariance of undetermined parameters to infinity or NaN, and that of held ones to zero."""
+    undetermined = null.diagonal(dim1=-2, dim2=-1) > _SHARE
+    involved = undetermined[..., :, None] | undetermined[..., None, :]
+    covariance = torch.where(involved, math.nan, covariance)
+    covariance = torch.where(torch.diag_embed(undetermined), math.inf, covariance)
     if held is not None:
         covariance = torch.where(held[..., :, None] | held[..., None, :], 0.0, covariance)
     return Certainty(covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt(), covariance, null, scale)
 
 
 def cramer_rao(information: Tensor, threshold: float = RELATIVE_EIGENVALUE) -> Tensor:
-    """The smallest standard deviation (*batch, P) that an unbiased estimator can have; infinite where undetermined."""
+    """Cramer-Rao bound: smallest standard deviation (*batch, P) of any unbiased estimator; infinite if undetermined."""
     return certainty(information, threshold=threshold).std
 
 
 def determined_combinations(null: Tensor, scale: Tensor) -> list[tuple[list[int], Tensor]]:
-    """Groups of parameters that are undetermined together, with the combinations of them that are determined.
+    """Groups of parameters that are jointly undetermined, with the linear combinations of them that are determined.
 
-    null, scale (P, P), (P,) of one `Certainty`. For each group: its m parameters and coefficients (m - k, m) of the
-    combinations, k being the undetermined directions among them, reduced so that each begins with a 1 of its own.
+    null (P, P), scale (P,): from one `Certainty`. Returns for each group the indices of its m parameters and the
+    coefficients (m - k, m) of the determined combinations in reduced row echelon form; k is the number of undetermined
+    directions in the group.
     """
     groups = []
     for members in _groups(null):
         block = null[members][:, members]
         values, vectors = torch.linalg.eigh(block)
-        kept = vectors[:, values < 0.5].mT / scale[members]
-        groups.append((members, _reduced(kept)))
+        determined = vectors[:, values < 0.5].mT / scale[members]
+        groups.append((members, _reduced(determined)))
     return groups
 
 
 def _groups(null: Tensor) -> list[list[int]]:
-    """Parameters linked by a common undetermined direction."""
-    left = [i for i in range(len(null)) if null[i, i] > _SHARE]
+    """Groups of parameters that share an undetermined direction: connected components of the projector `null`."""
+    remaining = [i for i in range(len(null)) if null[i, i] > _SHARE]
     groups = []
-    while left:
-        group = [left.pop(0)]
+    while remaining:
+        group = [remaining.pop(0)]
         for member in group:
-            linked = [j for j in left if abs(float(null[member, j])) > math.sqrt(_SHARE) * 0.1]
-            left = [j for j in left if j not in linked]
+            linked = [j for j in remaining if abs(float(null[member, j])) > math.sqrt(_SHARE) * 0.1]
+            remaining = [j for j in remaining if j not in linked]
             group += linked
         groups.append(sorted(group))
     return groups
@@ -136,8 +139,8 @@ def _reduced(rows: Tensor) -> Tensor:
     """Reduced row echelon form of independent rows (r, m)."""
     rows = rows.clone()
     for i in range(len(rows)):
-        free = rows[i:].abs() / rows[i:].abs().amax(-1, keepdim=True)
-        column = int((free.amax(0) > 1e-6).nonzero()[0])
+        relative = rows[i:].abs() / rows[i:].abs().amax(-1, keepdim=True)
+        column = int((relative.amax(0) > 1e-6).nonzero()[0])
         best = i + int(rows[i:, column].abs().argmax())
         rows[[i, best]] = rows[[best, i]]
         rows[i] = rows[i] / rows[i, column].clone()

@@ -1,10 +1,12 @@
-// Kalman filter of levels x, of the random flows w that move them, and of correlated noise v of the sensors:
+// Kalman filter and smoother for deviations x of the levels, flow disturbances w and correlated sensor noise v:
 //
 //     x_{s+1} = A_s x_s + B_s w_s,   y_s = H_s x_s + v_s + e_s,   e ~ N(0, diag R)
 //
-// where w and v decay by factors `keep` and take shocks of variance q; wherever a sample is marked fresh, the whole
-// state z = (x, w, v) begins anew with variance diag P0. Compiled for TANKS (of x and w), CHANNELS (of y) and LAYERS of
-// noise on each channel, none to several: v has LAYERS * CHANNELS. Matrices are dense, row by row.
+// w and v are first-order processes: decay factors `keep`, white shocks of variance q. The state is z = (x, w, v), with
+// dimension d and transition F. At each sample marked `fresh` (the start of a recording) it restarts at zero mean with
+// covariance diag P0. Compile-time sizes: TANKS (dimension of x and w), CHANNELS (of y), and LAYERS, the number of
+// correlated noise terms on each channel, possibly none: v has LAYERS * CHANNELS components. S: samples, W: columns
+// that are processed side by side. Matrices are dense and row-major.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -55,7 +57,7 @@ inline void transpose(const double* __restrict x, double* __restrict to) {
         for (int j = 0; j < B; ++j) to[j * A + i] = x[i * B + j];
 }
 
-// to = F z, of z (d, W)
+// to (d, W) = F z, for z (d, W)
 template <int W>
 inline void forward(const Model& m, int64_t t, const double* __restrict z, double* __restrict to) {
     std::fill(to, to + n * W, 0.0);
@@ -65,7 +67,7 @@ inline void forward(const Model& m, int64_t t, const double* __restrict z, doubl
         for (int k = 0; k < W; ++k) to[(n + i) * W + k] = m.keep[i] * z[(n + i) * W + k];
 }
 
-// to = F' z, of z (d, W)
+// to (d, W) = F' z, for z (d, W)
 template <int W>
 inline void backward(const Model& m, int64_t t, const double* __restrict z, double* __restrict to) {
     std::fill(to, to + n * W, 0.0);
@@ -75,7 +77,7 @@ inline void backward(const Model& m, int64_t t, const double* __restrict z, doub
     add_product_of_transposed<n, n, W>(m.b + t * n * n, z, to + n * W);
 }
 
-// to (C, W) = H z, of z (d, W); nothing of what is not seen
+// to (C, W) = H z, for z (d, W); H covers x and v, and rows of masked channels are zero
 template <int W>
 inline void look(const Model& m, int64_t t, const double* __restrict z, double* __restrict to) {
     std::fill(to, to + C * W, 0.0);
@@ -86,7 +88,7 @@ inline void look(const Model& m, int64_t t, const double* __restrict z, double* 
         if (!m.seen[t * C + c]) std::fill(to + c * W, to + (c + 1) * W, 0.0);
 }
 
-// to (d, W) = H' x, of x (C, W), which is zero where nothing is seen
+// to (d, W) = H' x, for x (C, W), which must be zero for masked channels
 template <int W>
 inline void look_back(const Model& m, int64_t t, const double* __restrict x, double* __restrict to) {
     std::fill(to, to + 2 * n * W, 0.0);
@@ -94,7 +96,7 @@ inline void look_back(const Model& m, int64_t t, const double* __restrict x, dou
     for (int i = 0; i < LAYERS * C; ++i) std::copy(x + i % C * W, x + (i % C + 1) * W, to + (2 * n + i) * W);
 }
 
-// Inverse of the lower Cholesky factor of s (C, C); false where s is not positive definite.
+// Inverse of the lower Cholesky factor of s (C, C); adds log det s to log_det. False if s is not positive definite.
 inline bool inverse_factor(const double* s, double* inverse, double* log_det) {
     double l[C * C] = {};
     for (int i = 0; i < C; ++i)
@@ -121,7 +123,7 @@ inline bool inverse_factor(const double* s, double* inverse, double* log_det) {
     return true;
 }
 
-// W columns of y from `first` on, of which the last may not be there.
+// Innovations of unit variance for W columns of y, starting at column `first`; columns beyond the last are padding.
 template <int W>
 void whiten(const Model& m, int64_t samples, int64_t columns, int64_t first, const double* gain, const double* white,
             const double* y, double* out) {
@@ -149,7 +151,7 @@ void whiten(const Model& m, int64_t samples, int64_t columns, int64_t first, con
     }
 }
 
-// The transpose of `whiten`: W columns of v -> what each reading adds to the products of v with its innovations.
+// Adjoint of `whiten`, by recursion backwards in time: out = G' v for W columns of v, if `whiten` is out = G y.
 template <int W>
 void whiten_back(const Model& m, int64_t samples, int64_t columns, int64_t first, const double* gain,
                  const double* white, const double* v, double* out) {
@@ -177,7 +179,7 @@ void whiten_back(const Model& m, int64_t samples, int64_t columns, int64_t first
 
 using Walk = void (*)(const Model&, int64_t, int64_t, int64_t, const double*, const double*, const double*, double*);
 
-// Columns side by side, as many at a time as there are left.
+// Process all columns in tiles of 32, 8 or 1 columns, according to the number of remaining columns.
 void in_tiles(Walk wide, Walk narrow, Walk single, const Model& m, int64_t samples, int64_t columns,
               const double* gain, const double* white, const double* x, double* out) {
     for (int64_t first = 0; first < columns;) {
@@ -189,8 +191,9 @@ void in_tiles(Walk wide, Walk narrow, Walk single, const Model& m, int64_t sampl
 }  // namespace
 
 extern "C" {
-// -> gain (S, d, C), white (S, C, C): the inverse factor of the innovation's variance. Returns its log determinant,
-// summed over what was seen, or not a number where a variance is not positive.
+// Riccati recursion. Writes the Kalman gains `gain` (S, d, C) and `white` (S, C, C), the inverse Cholesky factors of
+// the innovations' covariances. Returns the log determinant of these, summed over the valid readings, or NaN if one of them
+// is not positive definite.
 double kalman_gains(int64_t samples, const Model* model, double* gain, double* white) {
     const Model& m = *model;
     std::vector<double> space(3 * d * d + 2 * d * C);
@@ -221,7 +224,7 @@ double kalman_gains(int64_t samples, const Model* model, double* gain, double* w
         for (int i = 0; i < d * d; ++i) p[i] -= next[i];
         forward<d>(m, t, p, half);
         transpose<d, d>(half, p);
-        forward<d>(m, t, p, next);  // F (F P)', as P is symmetric
+        forward<d>(m, t, p, next);  // F (F P)' = F P F', because P is symmetric
         for (int i = 0; i < d; ++i)
             for (int j = 0; j < d; ++j) p[i * d + j] = 0.5 * (next[i * d + j] + next[j * d + i]);
         for (int i = 0; i < decaying; ++i) p[(n + i) * (d + 1)] += m.q[i];
@@ -235,16 +238,18 @@ void kalman_innovations(int64_t samples, const Model* model, int64_t columns, co
     in_tiles(whiten<32>, whiten<8>, whiten<1>, *model, samples, columns, gain, white, y, out);
 }
 
-// The transpose of the same.
+// Adjoint of kalman_innovations: v (S, C, M) -> out (S, C, M).
 void kalman_transposed(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
                        const double* v, double* out) {
     in_tiles(whiten_back<32>, whiten_back<8>, whiten_back<1>, *model, samples, columns, gain, white, v, out);
 }
 
-// Slopes of the log-likelihood of innovations nu (S, C), of unit variance, by the variances: by_q (decaying), by_r (C),
-// by_p0 (d), and the same without the innovations, with the sign turned: n_q, n_r, n_p0, so that a variance times twice
-// its n is how many readings determine it; shocks (S, d): the smoothed state where a recording begins, and the smoothed shock that leads to every
-// other sample (the disturbance smoother: Durbin and Koopman, 2012, sections 4.5 and 7.3.3).
+// Disturbance smoother (Durbin and Koopman, 2012, sections 4.5 and 7.3.3). Input: innovations nu (S, C) of unit
+// variance. Output:
+//   by_q (decaying), by_r (C), by_p0 (d): derivatives of the log-likelihood by the variances q, R and P0;
+//   n_q, n_r, n_p0: minus the parts of these that do not depend on nu; a variance times twice its n is the effective
+//       number of readings that determine it;
+//   shocks (S, d): the smoothed state at the start of a recording, else the smoothed shock that leads to the sample.
 void kalman_score(int64_t samples, const Model* model, const double* gain, const double* white, const double* nu,
                   double* by_q, double* by_r, double* by_p0, double* n_q, double* n_r, double* n_p0,
                   double* shocks) {
@@ -291,7 +296,8 @@ void kalman_score(int64_t samples, const Model* model, const double* gain, const
         }
         look_back<1>(m, t, u, back);
         for (int i = 0; i < d; ++i) r[i] += back[i];
-        // N + Z + Z' with Z = H' (T H / 2 - (F'NF K)'), T the spread: (I - K H)' F'NF (I - K H) + H' S^-1 H.
+        // big = F'NF + Z + Z' with Z = H' (T H / 2 - (F'NF K)') and T = spread, which equals
+        // (I - K H)' F'NF (I - K H) + H' S^-1 H.
         for (int c = 0; c < C; ++c)
             for (int e = 0; e < C; ++e)
                 if (!m.seen[t * C + c] || !m.seen[t * C + e]) spread[c * C + e] = 0.0;
@@ -315,7 +321,7 @@ void kalman_score(int64_t samples, const Model* model, const double* gain, const
     }
 }
 
-// shocks (S, d) -> smoothed levels x (S, n).
+// Smoothed levels x (S, n) from smoothed shocks (S, d): simulates the state equation.
 void kalman_levels(int64_t samples, const Model* model, const double* shocks, double* levels) {
     double z[d] = {}, moved[d] = {};
     for (int64_t t = 0; t < samples; ++t) {

@@ -1,14 +1,19 @@
-"""Random flows into the tanks beside the noise of the sensors: the Kalman filter and smoother about a trajectory.
+"""Kalman filter and smoother for random flow disturbances and sensor noise, linearised about a simulated trajectory.
 
-About a trajectory the deviation x of the levels, the disturbing flows w and correlated sensor noise v obey
+The deviation x of the levels from the trajectory, the flow disturbances w, the sensor noise v and the residuals y of
+the readings obey, from sample s to the next,
 
-    x_{s+1} = A_s x_s + B_s w_s,   w_{s+1} = exp(-dt/tau) w_s + q_s,   v_{s+1} = a v_s + p_s
-    y_s     = C_s x_s + v_s                                                    (residuals of the readings)
+    x_{s+1} = A_s x_s + B_s w_s
+    w_{s+1} = exp(-dt / tau) w_s + q_s          var(w_i) = intensity_i^2
+    v_{s+1} = a v_s + p_s                       var(v_c) = (scale_c std_c)^2
+    y_s     = C_s x_s + v_s
 
-from sample to sample, with var(w_i) = intensity_i^2 and var(v_c) = (scale_c std_c)^2. One of the sensors may wander
-beside: its reading holds another such term, slow and of any size. The filter turns residuals, and
-whatever else is linear in the levels, into innovations of unit variance (Särkkä, 2013, "Bayesian filtering and
-smoothing", chapter 4). Disturbances are what every real rig has: waves, pulsation, splashing. They are no fault.
+with white shocks q and p. One sensor may have an additional slow random drift in its reading (`Wander`), a first-order
+process like v. The filter turns residuals, and their derivatives by parameters, into innovations of unit variance
+(Särkkä, 2013, "Bayesian filtering and smoothing", chapter 4). The disturbances model waves, pulsation and splashing,
+which occur on every real rig and are not faults.
+
+S: samples, C: sensors (channels), n: tanks, d: states of the filter, M: columns that are filtered together.
 """
 
 from __future__ import annotations
@@ -28,11 +33,12 @@ from fdi_torch.simulate.build import load_library
 
 @dataclass(frozen=True)
 class Propagation:
-    """How flows into the tanks reach the readings along one trajectory, from sample to sample.
+    """Linearised dynamics from flow disturbances to readings along a trajectory.
 
-    transition (S, n, n): A. forcing (S, n, n) s/m^2: B, of flows in m^3/s that last from a sample to the next.
-    output (S, C, n): C, in each reading's unit per m. interval: s, between samples. fresh (S,): where a recording
-    begins, with known levels. mask (S, C): which readings there are.
+    transition (S, n, n): A. forcing (S, n, n), s/m^2: B, for flows in m^3/s that are constant between samples.
+    output (S, C, n): C, in each reading's unit per m. interval: sampling interval, s.
+    fresh (S,): true at the first sample of each recording, where the deviation of the levels is zero.
+    mask (S, C): true for valid readings.
     """
 
     transition: Tensor
@@ -45,7 +51,7 @@ class Propagation:
 
 @dataclass(frozen=True)
 class Wander:
-    """What a sensor's reading is wrong by, slowly and at random. std: in the reading's unit; correlation_time: s."""
+    """Slow random drift of one sensor's reading, a first-order process. std: reading's unit; correlation_time: s."""
 
     channel: int
     std: float
@@ -54,8 +60,11 @@ class Wander:
 
 @dataclass(frozen=True)
 class StateNoise:
-    """intensity (n,): standard deviation of the random flow into each tank, m^3/s. correlation_time: s, 0 for white
-    (a new value each sample). scale (C,): factor on the standard deviation of each sensor's noise.
+    """Parameters of the noise model.
+
+    intensity (n,): standard deviation of the random flow into each tank, m^3/s.
+    correlation_time: of these flows, s; 0: white, with an independent value in each sampling interval.
+    scale (C,): factor on the standard deviation of each sensor's noise. wander: drift of one sensor, if any.
     """
 
     intensity: Tensor
@@ -66,14 +75,14 @@ class StateNoise:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """std (C,) in the reading's unit, and the correlation of neighbouring samples (C,)."""
+    """Sensor noise: standard deviation (C,) in the reading's unit, and correlation of neighbouring samples (C,)."""
 
     std: Tensor
     correlation: Tensor
 
 
 class KalmanFilter:
-    """The filter of one propagation, for any noise."""
+    """Kalman filter of one linearised trajectory, before the noise model is given; `under` supplies that."""
 
     def __init__(self, propagation: Propagation, sensors: SensorNoise) -> None:
         p = propagation
@@ -84,58 +93,63 @@ class KalmanFilter:
         self.flags = tuple(x.to(torch.uint8).contiguous() for x in (p.mask, p.fresh))
 
     def under(self, noise: StateNoise) -> Filtered:
+        """The filter with its gains for this noise model."""
         return Filtered(self, noise)
 
     def kept(self, time: float) -> float:
-        """The share of what decays over a correlation time, s, that is left at the next sample."""
+        """Decay factor exp(-dt / time) over one sampling interval; time: correlation time, s, 0 for white noise."""
         return math.exp(-self.interval / time) if time > 0.0 else 0.0
 
 
 class Filtered:
-    """The filter under one noise. log_det: of the innovations' variances, summed over what was read."""
+    """Kalman filter with the gains of one noise model.
 
-    def __init__(self, own: KalmanFilter, noise: StateNoise) -> None:
-        self.own, self.wanders = own, noise.wander is not None
-        of_sensors, nothing = (noise.scale * own.sensors.std) ** 2, torch.zeros_like(noise.scale)
-        decays = [(torch.full_like(noise.intensity, own.kept(noise.correlation_time)), noise.intensity**2)]
-        decays += [(own.sensors.correlation, of_sensors)] if own.correlated else []
-        self.r = nothing if own.correlated else of_sensors
-        if (slow := noise.wander) is not None:
-            of_wander = nothing.index_fill(0, torch.tensor(slow.channel), slow.std**2)
-            decays.append((torch.full_like(nothing, own.kept(slow.correlation_time)), of_wander))
-        keep, variance = (torch.cat(parts) for parts in zip(*decays, strict=True))
-        self.keep, self.q = keep, (1.0 - keep**2) * variance
-        self.p0 = torch.cat([variance.new_zeros(own.tanks), variance])
-        given = (*own.matrices, self.keep, self.q, self.r, self.p0, *own.flags)
-        self._model = _Model(*(t.data_ptr() for t in given))
-        self._library = _library(own.tanks, own.channels, len(decays) - 1)
-        self.gain = variance.new_empty(own.samples, len(self.p0), own.channels)
-        self.white = variance.new_empty(own.samples, own.channels, own.channels)
+    gain (S, d, C): Kalman gains. white (S, C, C): inverse Cholesky factors of the innovations' covariances.
+    log_det: log determinant of these covariances, summed over all valid readings.
+    """
+
+    def __init__(self, kalman_filter: KalmanFilter, noise: StateNoise) -> None:
+        self.own, self.wanders = kalman_filter, noise.wander is not None
+        of_sensors, zeros = (noise.scale * kalman_filter.sensors.std) ** 2, torch.zeros_like(noise.scale)
+        processes = [(torch.full_like(noise.intensity, kalman_filter.kept(noise.correlation_time)), noise.intensity**2)]
+        processes += [(kalman_filter.sensors.correlation, of_sensors)] if kalman_filter.correlated else []
+        self.r = zeros if kalman_filter.correlated else of_sensors
+        if (wander := noise.wander) is not None:
+            of_wander = zeros.index_fill(0, torch.tensor(wander.channel), wander.std**2)
+            processes.append((torch.full_like(zeros, kalman_filter.kept(wander.correlation_time)), of_wander))
+        decay, variance = (torch.cat(parts) for parts in zip(*processes, strict=True))
+        self.keep, self.q = decay, (1.0 - decay**2) * variance
+        self.p0 = torch.cat([variance.new_zeros(kalman_filter.tanks), variance])
+        tensors = (*kalman_filter.matrices, self.keep, self.q, self.r, self.p0, *kalman_filter.flags)
+        self._model = _Model(*(t.data_ptr() for t in tensors))
+        self._library = _library(kalman_filter.tanks, kalman_filter.channels, len(processes) - 1)
+        self.gain = variance.new_empty(kalman_filter.samples, len(self.p0), kalman_filter.channels)
+        self.white = variance.new_empty(kalman_filter.samples, kalman_filter.channels, kalman_filter.channels)
         self.log_det = float(self._run("kalman_gains", self.gain, self.white))
 
     def innovations(self, y: Tensor) -> Tensor:
-        """y (S, C, M) -> the same, whitened; what is masked is 0."""
+        """Innovations (S, C, M) of unit variance of residuals y (S, C, M); 0 where masked."""
         y = y.contiguous()
         out = torch.empty_like(y)
         self._run("kalman_innovations", y.shape[-1], self.gain, self.white, y, out)
         return out
 
     def transposed(self, v: Tensor) -> Tensor:
-        """v (S, C, M) -> u, with sum(u y) = sum(v w) for all readings y whose innovations are w."""
+        """Adjoint of `innovations`: u (S, C, M) such that sum(u y) = sum(v innovations(y)) for every y."""
         v = v.contiguous()
         out = torch.empty_like(v)
         self._run("kalman_transposed", v.shape[-1], self.gain, self.white, v, out)
         return out
 
     def score(self, nu: Tensor) -> Score:
-        """About innovations (S, C) of unit variance."""
-        slopes, seen = ([torch.empty_like(x) for x in (self.q, self.r, self.p0)] for _ in range(2))
+        """Score of the log-likelihood, given innovations nu (S, C) of unit variance."""
+        slopes, information = ([torch.empty_like(x) for x in (self.q, self.r, self.p0)] for _ in range(2))
         shocks = nu.new_empty(self.gain.shape[:2])
-        self._run("kalman_score", self.gain, self.white, nu.contiguous(), *slopes, *seen, shocks)
-        return Score(self._by_deviation(*slopes), self._by_deviation(*seen), shocks)
+        self._run("kalman_score", self.gain, self.white, nu.contiguous(), *slopes, *information, shocks)
+        return Score(self._by_deviation(*slopes), self._by_deviation(*information), shocks)
 
     def _by_deviation(self, by_q: Tensor, by_r: Tensor, by_p0: Tensor) -> Tensor:
-        """Slopes by variances -> by the logarithm of each standard deviation: twice the variance times the slope."""
+        """Derivatives by log standard deviations from derivatives by variances: df/dlog(s) = 2 s^2 df/d(s^2)."""
         tanks, channels = self.own.tanks, self.own.channels
         decaying = 2.0 * (by_q * self.q + by_p0[tanks:] * self.p0[tanks:])
         of_sensors = decaying[tanks : tanks + channels] if self.own.correlated else 2.0 * by_r * self.r
@@ -143,7 +157,7 @@ class Filtered:
         return torch.cat([decaying[:tanks], of_sensors, wander])
 
     def smoothed(self, residual: Tensor) -> Tensor:
-        """residual (S, C) -> the expected deviation of the levels from the trajectory, (S, n) m, given all readings."""
+        """Smoothed deviation of the levels from the trajectory, (S, n) m, given all residuals (S, C)."""
         shocks = self.score(self.innovations(residual.unsqueeze(-1)).squeeze(-1)).shocks
         levels = residual.new_empty(self.own.samples, self.own.tanks)
         self._run("kalman_levels", shocks, levels)
@@ -152,15 +166,17 @@ class Filtered:
     def _run(self, name: str, *arguments: Tensor | int) -> Any:
         function = getattr(self._library, name)
         function.restype = ctypes.c_double if name == "kalman_gains" else None
-        passed = [ctypes.c_int64(a) if isinstance(a, int) else ctypes.c_void_p(a.data_ptr()) for a in arguments]
-        return function(ctypes.c_int64(self.own.samples), ctypes.byref(self._model), *passed)
+        c_arguments = [ctypes.c_int64(a) if isinstance(a, int) else ctypes.c_void_p(a.data_ptr()) for a in arguments]
+        return function(ctypes.c_int64(self.own.samples), ctypes.byref(self._model), *c_arguments)
 
 
 @dataclass(frozen=True)
 class Score:
-    """slope: of the log-likelihood by the logarithms of the intensities (n,), of the scales (C,) and of a wander.
-    determined: how many readings each of them is determined by, whose expected slope is nothing: that many times two is
-    about how the slope falls. shocks (S, d): smoothed.
+    """Derivatives of the log-likelihood.
+
+    slope: by the logarithms of the intensities (n,), the scales (C,) and the wander's standard deviation (if any).
+    determined: effective number of readings that determine each of these; minus the second derivative is about twice
+    this number. shocks (S, d): smoothed shocks.
     """
 
     slope: Tensor
@@ -169,7 +185,7 @@ class Score:
 
 
 class KalmanWhitening:
-    """Turns residuals into innovations of unit variance. log_det: of the innovations' variances, summed."""
+    """Whitening of residuals by the Kalman filter. log_det: log determinant of the innovations' covariances, summed."""
 
     def __init__(self, propagation: Propagation, sensors: SensorNoise, noise: StateNoise) -> None:
         self._filtered = KalmanFilter(propagation, sensors).under(noise)
@@ -177,26 +193,27 @@ class KalmanWhitening:
         self.smoothed, self.transposed = self._filtered.smoothed, self._filtered.transposed
 
     def __call__(self, x: Tensor) -> Tensor:
-        """x (*lanes, S, C) or (*lanes, S, C, P) -> the same, whitened; what is masked is 0."""
+        """Innovations of unit variance, in the shape of x (*lanes, S, C) or (*lanes, S, C, P); 0 where masked."""
         samples, channels = self._filtered.own.samples, self._filtered.own.channels
-        columns = x.shape[-2:] != (samples, channels)
-        last = x if columns else x.unsqueeze(-1)
-        lanes = last.shape[:-3]
-        flat = last.flatten(0, -4) if lanes else last.unsqueeze(0)
-        wide = flat.permute(1, 2, 0, 3).reshape(samples, channels, -1)
-        white = self._filtered.innovations(wide).reshape(samples, channels, *flat.shape[::3])
-        white = white.permute(2, 0, 1, 3).reshape(last.shape)
-        return white if columns else white.squeeze(-1)
+        has_columns = x.shape[-2:] != (samples, channels)
+        with_columns = x if has_columns else x.unsqueeze(-1)
+        lanes = with_columns.shape[:-3]
+        flat = with_columns.flatten(0, -4) if lanes else with_columns.unsqueeze(0)
+        side_by_side = flat.permute(1, 2, 0, 3).reshape(samples, channels, -1)
+        white = self._filtered.innovations(side_by_side).reshape(samples, channels, *flat.shape[::3])
+        white = white.permute(2, 0, 1, 3).reshape(with_columns.shape)
+        return white if has_columns else white.squeeze(-1)
 
 
 class _Model(ctypes.Structure):
-    """Of kalman.hpp, in its order."""
+    """`Model` of kalman.hpp, with its fields in the same order."""
 
     _fields_ = tuple((name, ctypes.c_void_p) for name in ("a", "b", "h", "keep", "q", "r", "p0", "seen", "fresh"))
 
 
 @lru_cache
 def _library(tanks: int, channels: int, layers: int) -> ctypes.CDLL:
+    """kalman.hpp compiled for these sizes; layers: number of correlated noise terms on each channel."""
     sizes = f"#define TANKS {tanks}\n#define CHANNELS {channels}\n#define LAYERS {layers}\n"
     source = sizes + Path(__file__).with_name("kalman.hpp").read_text(encoding="utf-8")
     names = ("gains", "innovations", "transposed", "score", "levels")

@@ -1,17 +1,21 @@
-"""Levenberg-Marquardt for a batch of bounded least-squares problems ("lanes") that share nothing but the call.
+"""Levenberg-Marquardt for a batch of independent, bounded least-squares problems ("lanes").
 
-A lane's cost f(theta) is half a chi-square, or a negative log-likelihood, priors included; it is given with its
-gradient g and its Gauss-Newton curvature H. Steps solve (H + damping diag H) step = -g (Marquardt 1963); parameters
-that a bound stops are held fast. The damping falls to a fifth with a step that gains what the model predicted, and
-rises by 2, 4, 8 ... with steps in a row that do not (Nielsen 1999, "Damping parameter in Marquardt's method").
+The cost f(theta) of a lane is half a chi-square or a negative log-likelihood, priors included. It comes with its
+gradient g and its Gauss-Newton curvature H. A step solves
 
-A lane has converged where its Newton decrement, the decrease g'H^-1 g / 2 that the undamped model predicts over the
-free parameters, is below a tolerance: a property of the point, however many steps led there.
+    (H + damping diag H) step = -g                                                             (Marquardt 1963)
 
-Curved valleys, such as C_d (1 - b) = constant, refuse the plain step, which leaves their floor. A problem that knows
-how its residuals r bend along a step, c = r(theta + step) - r(theta) - J step, has a refused step tried once more with
-its second-order correction -(H + damping diag H)^-1 J'c: the geodesic acceleration of Transtrum and Sethna (2012,
-arXiv 1201.5885), its second derivative taken over the whole step.
+over the free parameters; a parameter at an active bound is held. A step that achieves more than a quarter of the
+predicted decrease reduces the damping to a fifth. Any other step multiplies it by nu, where nu is 2 initially, doubles
+with each refused step and returns to 2 with an accepted one (Nielsen 1999, "Damping parameter in Marquardt's method").
+
+A lane has converged when its Newton decrement g'H^-1 g / 2, the decrease that the undamped model predicts over the free
+parameters, is below a tolerance. This criterion depends on the point only, not on the steps that led there.
+
+In a curved valley, such as C_d (1 - b) = constant, a plain step leaves the valley floor and is refused. If the problem
+can compute the nonlinearity of its residuals r along a step, c = r(theta + step) - r(theta) - J step, the refused step
+is tried once more with the second-order correction -(H + damping diag H)^-1 J'c. This is the geodesic acceleration of
+Transtrum and Sethna (2012, arXiv 1201.5885) with a finite difference over the whole step as second derivative.
 """
 
 from __future__ import annotations
@@ -40,15 +44,16 @@ from fdi_torch.estimate.refined import (
 )
 
 _MOST_DAMPING, _LEAST_DAMPING = 1e14, 1e-12
-# Damping falls fast and rises slowly at first ("delayed gratification", Transtrum and Sethna 2012, section 4.1).
-_EASED, _FORESEEN = 0.2, 0.25  # factor on a step that gained this share of what the model predicted
+# The damping is multiplied by the first number if actual decrease / predicted decrease exceeds the second. It falls
+# fast and rises slowly at first ("delayed gratification", Transtrum and Sethna 2012, section 4.1).
+_DAMPING_REDUCTION, _GOOD_GAIN_RATIO = 0.2, 0.25
 
 
 @dataclass(frozen=True)
 class Linearisation:
-    """The cost's quadratic model at a point: cost (L,), gradient (L, P), curvature (L, P, P).
+    """Quadratic model of the cost at a point: cost (L,), gradient (L, P), Gauss-Newton curvature (L, P, P).
 
-    state: what else the problem asks to be given back with this point.
+    state: data that the problem attaches to this point and receives back with it; None if there are none.
     """
 
     cost: Tensor
@@ -57,7 +62,7 @@ class Linearisation:
     state: State | None = None
 
     def finite(self) -> Tensor:
-        """(L,) bool."""
+        """Lanes whose cost, gradient and curvature are all finite, (L,) bool."""
         slopes = torch.isfinite(self.gradient).all(-1) & torch.isfinite(self.curvature).all(-1).all(-1)
         return torch.isfinite(self.cost) & slopes
 
@@ -66,7 +71,7 @@ class Linearisation:
         return Linearisation(self.cost[keep], self.gradient[keep], self.curvature[keep], state)
 
     def replaced(self, which: Tensor, new: Linearisation) -> Linearisation:
-        """The same with the lanes at places `which` (int64) as `new` has them, in this order."""
+        """A copy in which the k-th lane of `new` replaces lane `which[k]` (int64)."""
         if len(which) == len(self.cost):
             return new
         state = self.state
@@ -84,19 +89,23 @@ Linearise = Callable[[Tensor, Tensor], Linearisation]
 
 
 class Neighbourhood(Protocol):
-    """A problem that reaches a point from a neighbouring one."""
+    """A problem that computes the model at a point from the model at a nearby point."""
 
     def follow(self, theta: Tensor, known: Linearisation, step: Tensor) -> Linearisation:
-        """The model at theta (L, P), a step (L, P) away from the point whose model is `known`."""
+        """The model at theta (L, P), which lies `step` (L, P) away from the point of the model `known`."""
 
     def bend(self, known: Linearisation, trial: Linearisation, step: Tensor) -> Tensor:
-        """J'c (L, P) for c = r(theta + step) - r(theta) - J step, priors included; J as it is in `known`."""
+        """J'c (L, P) with c = r(theta + step) - r(theta) - J step, priors included; J is the Jacobian of `known`."""
 
 
 @dataclass(frozen=True)
 class Competition:
-    """When a lane is given up: it is more than `behind` above the least cost of all lanes, or above `target`, and a
-    step gained less than a `share` of that. The first step is free."""
+    """Rule that abandons hopeless lanes.
+
+    The reference is the lowest cost of all lanes or `target`, whichever is less. A lane is abandoned if its cost
+    exceeds the reference by more than `behind` and its last step reduced this excess by less than the fraction `share`.
+    The rule applies from the second step on.
+    """
 
     behind: float
     share: float
@@ -105,16 +114,17 @@ class Competition:
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """When to stop, and how bold to begin.
+    """Stopping criteria and initial damping.
 
-    decrease_tolerance: of the Newton decrement, in the cost's unit; cost_share: the same as a share of the cost, where
-    that is more. step_tolerance: of an accepted step, as a share of the box's width (of the value itself where there is
-    no box). iterations: a guard against endless descents.
+    A lane has converged if its Newton decrement is below max(decrease_tolerance, cost_share * |cost|), or if an
+    accepted step is below step_tolerance in every parameter, relative to the box's width (to the value itself without
+    a box). damping: initial damping.
+    iterations: maximum number of iterations. competition: rule for abandoning lanes; None abandons none.
     """
 
     iterations: int = 100
     decrease_tolerance: float = 1e-10
-    cost_share: float = 64.0 * torch.finfo(torch.float64).eps  # the cost's rounding
+    cost_share: float = 64.0 * torch.finfo(torch.float64).eps  # rounding of the cost
     step_tolerance: float = 1e-11
     damping: float = 1e-3
     competition: Competition | None = None
@@ -130,10 +140,10 @@ class RefineSettings:
 
 @dataclass(frozen=True)
 class Progress:
-    """One iteration, for whoever looks on; all have one leading dimension: the lanes still at work."""
+    """State after one iteration, for a callback. The leading dimension L counts the lanes that are still iterating."""
 
     iteration: int
-    lanes: Tensor  # (L,) place in the flattened batch
+    lanes: Tensor  # (L,) index in the flattened batch
     theta: Tensor  # (L, P)
     cost: Tensor  # (L,)
     promised: Tensor  # (L,) Newton decrement before the step
@@ -143,7 +153,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class _Lanes:
-    """The lanes still at work, one flat leading dimension L."""
+    """The lanes that are still iterating, one flat leading dimension L."""
 
     lanes: Tensor
     theta: Tensor
@@ -151,11 +161,11 @@ class _Lanes:
     high: Tensor
     model: Linearisation
     damping: Tensor
-    growth: Tensor  # Nielsen's nu
-    gained: Tensor  # decrease of the cost by the last step
-    missed: Tensor  # decrease that the model predicted of it in vain; infinite where it was accepted
-    settled: Tensor  # bool: the last step was below the tolerance
-    strained: Tensor  # bool: it was accepted after others had been refused
+    growth: Tensor  # Nielsen's nu: factor on the damping after an unsatisfactory step
+    actual_decrease: Tensor  # actual decrease of the cost by the last step
+    refused_decrease: Tensor  # predicted decrease of the last step if it was refused, else infinite
+    negligible_step: Tensor  # bool: the last step was accepted and below the step tolerance
+    after_refusals: Tensor  # bool: the last step was accepted after refusals
 
     def __getitem__(self, keep: Tensor) -> _Lanes:
         if keep.dtype == torch.bool and bool(keep.all()):
@@ -176,23 +186,24 @@ def levenberg_marquardt(
     on_iteration: Callable[[Progress], None] | None = None,
     neighbourhood: Neighbourhood | None = None,
 ) -> Refined:
-    """Minimises the cost of every lane from `start` (*batch, P) within [low, high], which broadcast.
+    """Minimise the cost of every lane from `start` (*batch, P) within [low, high], which broadcast against it.
 
-    `linearise(theta (L, P), lanes (L,))` gives the model at theta for the members `lanes` of the flattened batch; those
-    that finish leave. With a neighbourhood only the start is asked of `linearise`. A trial whose model is not finite is
-    refused; a start whose model is not finite is "failed".
+    `linearise(theta (L, P), lanes (L,))` returns the model at theta; `lanes` are indices into the flattened batch.
+    Finished lanes drop out of later calls. With a neighbourhood, `linearise` computes the starting point only and
+    `neighbourhood.follow` all further ones. A trial whose model is not finite is refused; a lane whose start is not
+    finite has the status "failed". Raises ValueError for an empty box and for models of the wrong shape.
     """
     settings = settings or RefineSettings()
     theta, low, high = flat_box(start, low, high)
     lanes = _begin(linearise, theta, low, high, settings)
     result = unfinished(theta, lanes.model.state)
-    least = math.inf if settings.competition is None else settings.competition.target
+    lowest_cost = math.inf if settings.competition is None else settings.competition.target
     iteration = 0
     while len(lanes.lanes):
         decrement, positive = newton_decrement(lanes.quadratic)
         if settings.competition is not None:
-            least = min([least, *lanes.model.cost[lanes.model.finite()].tolist()])
-        status = _status(lanes, decrement, positive, iteration, least, settings)
+            lowest_cost = min([lowest_cost, *lanes.model.cost[lanes.model.finite()].tolist()])
+        status = _status(lanes, decrement, positive, iteration, lowest_cost, settings)
         running = status == RUNNING
         if not bool(running.all()):
             result = _filed(result, lanes[~running], status[~running], decrement[~running], iteration)
@@ -203,7 +214,7 @@ def levenberg_marquardt(
         if neighbourhood is None:
             model = linearise(step.trial, lanes.lanes)
         else:
-            step, model = _along_the_valley(neighbourhood, lanes, step)
+            step, model = _follow_with_correction(neighbourhood, lanes, step)
         lanes, accepted = _advance(lanes, step, model, settings)
         iteration += 1
         if on_iteration is not None:
@@ -223,88 +234,99 @@ def _begin(linearise: Linearise, theta: Tensor, low: Tensor, high: Tensor, setti
             f"got {shapes}; make `linearise` return one of each for every lane"
         )
     damping = torch.full_like(model.cost, settings.damping)
-    growth, endless = torch.full_like(model.cost, 2.0), torch.full_like(model.cost, math.inf)
-    no = torch.zeros_like(lanes, dtype=torch.bool)
-    return _Lanes(lanes, theta, low, high, model, damping, growth, endless, endless, no, no)
+    nu, infinite = torch.full_like(model.cost, 2.0), torch.full_like(model.cost, math.inf)
+    false = torch.zeros_like(lanes, dtype=torch.bool)
+    return _Lanes(lanes, theta, low, high, model, damping, nu, infinite, infinite, false, false)
 
 
-def _filed(result: Refined, done: _Lanes, status: Tensor, decrement: Tensor, iteration: int) -> Refined:
-    """The result with lanes that are done."""
-    model = done.model
+def _filed(result: Refined, finished: _Lanes, status: Tensor, decrement: Tensor, iteration: int) -> Refined:
+    """Copy finished lanes into the result."""
+    model = finished.model
     return result.file(
-        done.lanes,
+        finished.lanes,
         model.state,
-        theta=done.theta,
+        theta=finished.theta,
         cost=model.cost,
         gradient=model.gradient,
         curvature=model.curvature,
         promised=decrement,
-        held=done.quadratic.held(),
+        held=finished.quadratic.held(),
         status=status,
-        iterations=torch.full_like(done.lanes, iteration),
+        iterations=torch.full_like(finished.lanes, iteration),
     )
 
 
 def _status(
-    lanes: _Lanes, decrement: Tensor, positive: Tensor, iteration: int, least: float, settings: RefineSettings
+    lanes: _Lanes, decrement: Tensor, positive: Tensor, iteration: int, lowest_cost: float, settings: RefineSettings
 ) -> Tensor:
-    """(L,) place in STATUSES.
+    """Status code of each lane, (L,), an index into STATUSES.
 
-    A lane has stalled where even a step that was to gain next to nothing failed, or where what was accepted at last
-    after refusals gained next to nothing: at a kink, or for a wrong gradient.
+    A lane has stalled if a step with a negligible predicted decrease was refused, or if a step that was accepted after
+    refusals achieved a negligible decrease. This happens at a kink of the cost or with a wrong gradient.
     """
-    little = (settings.cost_share * lanes.model.cost.abs()).clamp(min=settings.decrease_tolerance)
-    converged = positive & (decrement <= little)
+    tolerance = (settings.cost_share * lanes.model.cost.abs()).clamp(min=settings.decrease_tolerance)
+    converged = positive & (decrement <= tolerance)
     status = torch.full_like(lanes.lanes, MAX_ITERATIONS if iteration >= settings.iterations else RUNNING)
     if settings.competition is not None and iteration > 1:
-        behind = lanes.model.cost - least
-        hopeless = (behind > settings.competition.behind) & (lanes.gained < settings.competition.share * behind)
+        excess = lanes.model.cost - lowest_cost
+        hopeless = (excess > settings.competition.behind) & (
+            lanes.actual_decrease < settings.competition.share * excess
+        )
         status = torch.where(hopeless, ABANDONED, status)
-    in_vain = (lanes.missed <= little) & (lanes.damping > 1.0)  # with less damping the box may be what was in the way
-    creeps = lanes.strained & (lanes.gained <= little)
-    status = torch.where(in_vain | creeps | (lanes.damping > _MOST_DAMPING), STALLED, status)
-    status = torch.where(converged | lanes.settled, CONVERGED, status)
+    # With less damping, a negligible prediction may also be due to a bound that shortened the step.
+    no_gain = (lanes.refused_decrease <= tolerance) & (lanes.damping > 1.0)
+    negligible_gain = lanes.after_refusals & (lanes.actual_decrease <= tolerance)
+    status = torch.where(no_gain | negligible_gain | (lanes.damping > _MOST_DAMPING), STALLED, status)
+    status = torch.where(converged | lanes.negligible_step, CONVERGED, status)
     return torch.where(lanes.model.finite(), status, FAILED)
 
 
-def _along_the_valley(neighbourhood: Neighbourhood, lanes: _Lanes, step: Step) -> tuple[Step, Linearisation]:
-    """The trial of each lane and its model; a refused one is tried once more with its second-order correction."""
+def _follow_with_correction(neighbourhood: Neighbourhood, lanes: _Lanes, step: Step) -> tuple[Step, Linearisation]:
+    """Trials of all lanes with their models, computed by the neighbourhood.
+
+    A trial that would be refused is replaced by its second-order correction, if that is valid (see `bent_step`).
+    """
     model = neighbourhood.follow(step.trial, lanes.model, step.trial - lanes.theta)
     refused = (step.solvable & (step.predicted > 0) & ~_better(lanes, step, model)).nonzero().flatten()
     if not len(refused):
         return step, model
-    some, trial, tried = lanes[refused], step.trial[refused], model[refused]
-    bend = neighbourhood.bend(some.model, tried, trial - some.theta)
-    bent, is_correction = bent_step(some.quadratic, some.damping, trial, bend)
-    is_correction = is_correction & tried.finite()
+    refused_lanes, trial, refused_model = lanes[refused], step.trial[refused], model[refused]
+    bend = neighbourhood.bend(refused_lanes.model, refused_model, trial - refused_lanes.theta)
+    corrected_trial, is_correction = bent_step(refused_lanes.quadratic, refused_lanes.damping, trial, bend)
+    is_correction = is_correction & refused_model.finite()
     if not bool(is_correction.any()):
         return step, model
-    bent, refused = bent[is_correction], refused[is_correction]
-    again = neighbourhood.follow(bent, tried[is_correction], bent - trial[is_correction])
-    return replace(step, trial=step.trial.index_copy(0, refused, bent)), model.replaced(refused, again)
+    corrected_trial, refused = corrected_trial[is_correction], refused[is_correction]
+    corrected_model = neighbourhood.follow(
+        corrected_trial, refused_model[is_correction], corrected_trial - trial[is_correction]
+    )
+    return replace(step, trial=step.trial.index_copy(0, refused, corrected_trial)), model.replaced(
+        refused, corrected_model
+    )
 
 
 def _better(lanes: _Lanes, step: Step, model: Linearisation) -> Tensor:
-    """Which trials (L,) are accepted."""
+    """Which trials are accepted, (L,) bool: finite, lower in cost, from a solvable step with a predicted decrease."""
     return step.solvable & model.finite() & (model.cost < lanes.model.cost) & (step.predicted > 0)
 
 
 def _advance(lanes: _Lanes, step: Step, model: Linearisation, settings: RefineSettings) -> tuple[_Lanes, Tensor]:
-    """Accepts or refuses each lane's trial and updates its damping."""
+    """Accept or refuse the trial of each lane and update its damping; also returns which were accepted, (L,) bool."""
     accepted = _better(lanes, step, model)
     decrease = torch.where(accepted, lanes.model.cost - model.cost, 0.0)
-    foreseen = decrease > _FORESEEN * step.predicted
+    well_predicted = decrease > _GOOD_GAIN_RATIO * step.predicted
+    factor = torch.where(accepted & well_predicted, _DAMPING_REDUCTION, lanes.growth)
     change = (step.trial - lanes.theta).abs()
-    tiny = (change <= settings.step_tolerance * typical_size(lanes.theta, lanes.low, lanes.high)).all(-1)
-    kept = replace(
+    below_tolerance = (change <= settings.step_tolerance * typical_size(lanes.theta, lanes.low, lanes.high)).all(-1)
+    advanced = replace(
         lanes,
         theta=torch.where(accepted[:, None], step.trial, lanes.theta),
         model=lanes.model.replaced(accepted.nonzero().flatten(), model[accepted]),
-        damping=(lanes.damping * torch.where(accepted & foreseen, _EASED, lanes.growth)).clamp(min=_LEAST_DAMPING),
+        damping=(lanes.damping * factor).clamp(min=_LEAST_DAMPING),
         growth=torch.where(accepted, 2.0, 2.0 * lanes.growth),
-        gained=decrease,
-        missed=torch.where(accepted, math.inf, step.predicted),
-        settled=accepted & tiny & (lanes.damping <= 1.0),
-        strained=accepted & (lanes.growth > 2.0),
+        actual_decrease=decrease,
+        refused_decrease=torch.where(accepted, math.inf, step.predicted),
+        negligible_step=accepted & below_tolerance & (lanes.damping <= 1.0),
+        after_refusals=accepted & (lanes.growth > 2.0),
     )
-    return kept, accepted
+    return advanced, accepted

@@ -1,6 +1,7 @@
-"""Objectives: the paper's sum of correlations and the Gaussian likelihood, of one or several recordings.
+"""Objective functions: sum of correlations and Gaussian likelihood, for one or several recordings.
 
-Both are taken from the engines' sums over samples, so no trajectory is kept.
+Both are computed from sums over samples that the simulation engine accumulates, so that no trajectory is stored.
+L: problems ("lanes"), N: candidates of each, C: channels, P: parameters, S: samples.
 """
 
 from __future__ import annotations
@@ -19,14 +20,18 @@ from fdi_torch.simulate.engine import Engine, Readings
 Objective = Literal["correlation", "likelihood"]
 OBJECTIVES: tuple[Objective, ...] = ("correlation", "likelihood")
 
-# Residuals below this share of a channel's own spread are rounding, not noise.
+# Residuals below this fraction of a channel's standard deviation are rounding errors, not noise.
 ROUNDING_SHARE = 1e-9
 
 
 @dataclass(frozen=True)
 class Term:
-    """One recording: the engine under its inputs, what was read, which columns of theta the engine takes, and the
-    noise's standard deviation where it is known."""
+    """Contribution of one recording to the cost.
+
+    engine: simulates the plant under the recording's inputs. data: readings and weights. columns: the columns of theta
+    that the engine takes; None: all. noise_std (C,) or (problems, C): standard deviation of the noise, in the reading's
+    unit; None if unknown.
+    """
 
     engine: Engine
     data: Readings
@@ -38,12 +43,12 @@ class Term:
 
 
 class Problem:
-    """The cost of parameter vectors, in the two forms that search and refinement ask for.
+    """Cost of parameter vectors: values for the search, a quadratic model for the refinement.
 
-    objective 'correlation': sum over channels of 1 - rho, which is (13), (18) of the 2020 paper as a minimum.
-    objective 'likelihood': the negative log-likelihood of Gaussian noise. A term's noise_std (C,) or (problems, C), in
-    the readings' units: where it is not given, each channel's noise level is unknown and is profiled out.
-    Finite standard deviations of the space are Gaussian priors about its nominal values.
+    objective 'correlation': sum over channels of 1 - rho, which turns (13), (18) of the 2020 paper into a minimisation.
+    objective 'likelihood': negative log-likelihood of Gaussian noise. If a term has no noise_std, the noise level of
+    each channel is unknown and profiled out.
+    A finite standard deviation of a parameter in `space` is a Gaussian prior about its nominal value.
     """
 
     def __init__(
@@ -62,12 +67,12 @@ class Problem:
                 _expect_variation(term.data)
 
     def at_noise(self, levels: Sequence[Tensor]) -> Problem:
-        """The likelihood of the same recordings at known noise levels, one (C,) for each."""
-        known = [replace(term, noise_std=level) for term, level in zip(self.terms, levels, strict=True)]
-        return Problem(self.space, known, "likelihood")
+        """The likelihood of the same recordings with known noise levels, one tensor (C,) per recording."""
+        terms = [replace(term, noise_std=level) for term, level in zip(self.terms, levels, strict=True)]
+        return Problem(self.space, terms, "likelihood")
 
     def cost(self, theta: Tensor, lanes: Tensor) -> Tensor:
-        """theta (L, N, P) of the problems `lanes` (L,) -> cost (L, N)."""
+        """Cost (L, N) of the candidates theta (L, N, P) of the problems `lanes` (L,)."""
         total = self._prior(theta)
         for term in self.terms:
             data = of_lanes(term.data, lanes)
@@ -79,41 +84,44 @@ class Problem:
         return total
 
     def correlations(self, theta: Tensor, lanes: Tensor) -> Tensor:
-        """rho of each channel of the first recording (18), (L, N, C)."""
+        """Correlation rho (18) of each channel of the first recording, (L, N, C)."""
         data = of_lanes(self.terms[0].data, lanes)
         return 1.0 - correlation_loss(self.terms[0].engine.moments(self.terms[0].theta(theta), data), data)
 
     def linearise(self, theta: Tensor, lanes: Tensor) -> Linearisation:
-        """theta (L, P) -> cost (L), gradient (L, P) and Gauss-Newton curvature (L, P, P), priors included."""
+        """Cost (L,), gradient (L, P) and Gauss-Newton curvature (L, P, P) at theta (L, P), priors included."""
         precision = self._precision(theta)
-        away = torch.where(precision > 0, theta - self.space.nominal(theta), torch.zeros_like(theta))
+        deviation = torch.where(precision > 0, theta - self.space.nominal(theta), torch.zeros_like(theta))
         cost = self._prior(theta)
-        gradient = precision * away
+        gradient = precision * deviation
         curvature = torch.diag_embed(precision.expand_as(theta))
         for term in self.terms:
             data = of_lanes(term.data, lanes)
-            own = term.theta(theta)
-            gram = term.engine.gram(own.unsqueeze(1), data).squeeze(1)
+            term_theta = term.theta(theta)
+            gram = term.engine.gram(term_theta.unsqueeze(1), data).squeeze(1)
             if self.objective == "correlation":
                 parts = correlation_expansion(gram, data)
             else:
                 parts = likelihood_expansion(gram, data, known_noise(term, lanes))
             cost = cost + parts.cost
-            columns = torch.arange(own.shape[-1], device=theta.device) if term.columns is None else term.columns
+            columns = torch.arange(term_theta.shape[-1], device=theta.device) if term.columns is None else term.columns
             gradient = gradient.index_add(1, columns, parts.gradient)
-            rows = curvature.new_zeros(len(theta), theta.shape[-1], own.shape[-1])
+            rows = curvature.new_zeros(len(theta), theta.shape[-1], term_theta.shape[-1])
             rows = rows.index_add(1, columns, parts.curvature)
             curvature = curvature.index_add(2, columns, rows)
         return Linearisation(cost, gradient, curvature)
 
     def noise(self, theta: Tensor, lanes: Tensor) -> list[Tensor]:
-        """For each recording the standard deviation of the residuals, corrected for the parameters spent, (L, C)."""
+        """Standard deviation of the residuals, (L, C) for each recording.
+
+        The P degrees of freedom that the parameters use are divided equally among all channels of all recordings.
+        """
         levels = []
         for term in self.terms:
             data = of_lanes(term.data, lanes)
             squares = term.engine.moments(term.theta(theta.unsqueeze(1)), data)[:, 0, :, 1]
-            spent = theta.shape[-1] / squares.shape[-1] / len(self.terms)
-            levels.append(torch.sqrt(squares / (data.weight.sum(-2) - spent).clamp(min=1.0)))
+            lost_degrees = theta.shape[-1] / squares.shape[-1] / len(self.terms)
+            levels.append(torch.sqrt(squares / (data.weight.sum(-2) - lost_degrees).clamp(min=1.0)))
         return levels
 
     def _precision(self, theta: Tensor) -> Tensor:
@@ -121,42 +129,45 @@ class Problem:
 
     def _prior(self, theta: Tensor) -> Tensor:
         precision = self._precision(theta)
-        away = torch.where(precision > 0, theta - self.space.nominal(theta), torch.zeros_like(theta))
-        return 0.5 * (precision * away * away).sum(-1)
+        deviation = torch.where(precision > 0, theta - self.space.nominal(theta), torch.zeros_like(theta))
+        return 0.5 * (precision * deviation * deviation).sum(-1)
 
 
 def of_lanes(data: Readings, lanes: Tensor) -> Readings:
-    """The readings of the problems `lanes` (L,); readings shared by all are passed on as they are."""
+    """The readings of the problems `lanes` (L,); readings that all problems share are returned unchanged."""
     if data.values.dim() == 2:
         return data
     return Readings(data.values[lanes], data.weight[lanes], None if data.ar is None else data.ar[lanes])
 
 
 def spread_of(data: Readings) -> Tensor:
-    """Weighted sum of squares of each channel about its mean, (C,) or (L, C)."""
+    """Weighted sum of squared deviations of each channel from its mean, (C,) or (L, C)."""
     return (data.weight * (data.known - data.centre.unsqueeze(-2)) ** 2).sum(-2)
 
 
 def known_noise(term: Term, lanes: Tensor) -> Tensor | None:
-    """The noise levels of some problems, (C,) or (L, C); None where they are unknown."""
+    """Noise levels of the problems `lanes` (L,), as (C,) or (L, C); None if unknown."""
     std = term.noise_std
     return std if std is None or std.dim() == 1 else std[lanes]
 
 
 def deviance(squares: Tensor, data: Readings, noise_std: Tensor | None) -> Tensor:
-    """Each channel's negative log-likelihood, (L, N, C), from its sum of squares; constants dropped."""
+    """Negative log-likelihood of each channel, (L, N, C), from its sum of squared residuals; constants are dropped.
+
+    Known noise: SSR / (2 sigma^2). Unknown noise, profiled out: n/2 log(SSR / n), n being the sum of the weights.
+    """
     if noise_std is not None:
         return 0.5 * squares / _per_lane(noise_std, squares) ** 2
     count = _per_lane(data.weight.sum(-2), squares)
-    return 0.5 * count * torch.log(squares / count.clamp(min=1.0) + _per_lane(_floor(data), squares))
+    return 0.5 * count * torch.log(squares / count.clamp(min=1.0) + _per_lane(_rounding_variance(data), squares))
 
 
 def likelihood_expansion(gram: Tensor, data: Readings, noise_std: Tensor | None) -> Linearisation:
-    """Gauss-Newton expansion of the negative log-likelihood, from the sums of products (L, C, P+3, P+3)."""
+    """Gauss-Newton model of the negative log-likelihood, from the sums of products `Engine.gram` (L, C, P+3, P+3)."""
     squares = gram[..., -3, -3]
     cost = deviance(squares.unsqueeze(1), data, noise_std).squeeze(1).sum(-1)
-    unknown = squares / data.weight.sum(-2).clamp(min=1.0) + _floor(data)
-    variance = unknown if noise_std is None else (noise_std**2).expand_as(squares)
+    profiled = squares / data.weight.sum(-2).clamp(min=1.0) + _rounding_variance(data)
+    variance = profiled if noise_std is None else (noise_std**2).expand_as(squares)
     scaled = gram / variance[..., None, None]
     return Linearisation(cost, -scaled[..., :-3, -3].sum(1), scaled[..., :-3, :-3].sum(1))
 
@@ -164,23 +175,23 @@ def likelihood_expansion(gram: Tensor, data: Readings, noise_std: Tensor | None)
 def correlation_loss(sums: Tensor, data: Readings) -> Tensor:
     """1 - rho of each channel (2020 paper, eq. 18) from sums of r, r^2, r y': (L, N, C, 3) -> (L, N, C).
 
-    Through 1 - rho^2 = (Syy Srr' - Sry^2) / (Syy Sff), which keeps its digits as rho nears 1. A prediction that does
-    not vary is uncorrelated: 1.
+    Computed from 1 - rho^2 = (Syy Srr' - Sry^2) / (Syy Sff), which avoids cancellation as rho approaches 1. A constant
+    prediction counts as uncorrelated, with a loss of 1.
     """
     r, rr, ry = sums.unbind(-1)
     yy = _per_lane(spread_of(data), r)
-    spread = rr - r * r / _per_lane(data.weight.sum(-2), r)
-    ff = yy - 2.0 * ry + spread
+    residual_squares = rr - r * r / _per_lane(data.weight.sum(-2), r)
+    ff = yy - 2.0 * ry + residual_squares
     varies = ff > 1e-24 * yy
     safe = torch.where(varies, ff, torch.ones_like(ff))
     rho = (yy - ry) / torch.sqrt(yy * safe)
-    near_one = (yy * spread - ry * ry) / (yy * safe) / (1.0 + rho.clamp(min=0.0))
+    near_one = (yy * residual_squares - ry * ry) / (yy * safe) / (1.0 + rho.clamp(min=0.0))
     loss = torch.where(rho > 0, near_one, 1.0 - rho)
     return torch.where(varies | ~torch.isfinite(ff), loss, torch.ones_like(loss))
 
 
 def correlation_expansion(gram: Tensor, data: Readings) -> Linearisation:
-    """Gauss-Newton expansion of the sum of 1 - rho = |z - f|^2 / 2; z, f: readings and predictions at unit norm.
+    """Gauss-Newton model of the sum of 1 - rho = |z - f|^2 / 2; z, f: centred readings and predictions of unit norm.
 
     gram (L, C, P+3, P+3): sums of products, see `Engine.gram`.
     """
@@ -199,19 +210,20 @@ def correlation_expansion(gram: Tensor, data: Readings) -> Linearisation:
 
 
 def _per_lane(per_channel: Tensor, like: Tensor) -> Tensor:
-    """(C,) or (L, C) beside (L, N, C)."""
+    """Reshape (C,) or (L, C) such that it broadcasts against `like` (L, N, C)."""
     return per_channel if per_channel.dim() == 1 else per_channel.unsqueeze(1) if like.dim() == 3 else per_channel
 
 
-def _floor(data: Readings) -> Tensor:
-    spread = spread_of(data) / data.weight.sum(-2).clamp(min=1.0)
-    return spread * ROUNDING_SHARE**2 + 1e-300
+def _rounding_variance(data: Readings) -> Tensor:
+    """Variance of rounding errors, which keeps the logarithm of a perfect fit finite, (C,) or (L, C)."""
+    variance = spread_of(data) / data.weight.sum(-2).clamp(min=1.0)
+    return variance * ROUNDING_SHARE**2 + 1e-300
 
 
 def _expect_variation(data: Readings) -> None:
-    spread = spread_of(data)
-    if not bool((spread > 0).all()):
-        channel = int((spread <= 0).nonzero()[0, -1])
+    squares = spread_of(data)
+    if not bool((squares > 0).all()):
+        channel = int((squares <= 0).nonzero()[0, -1])
         raise ValueError(
             f"expected channels that vary, got a constant one (number {channel + 1}), whose correlation is undefined; "
             "use the objective 'likelihood' or leave the channel out"

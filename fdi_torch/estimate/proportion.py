@@ -1,4 +1,4 @@
-"""How sure a share is that was counted."""
+"""Confidence interval of a binomial proportion."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from statistics import NormalDist
 
 
 def wilson(count: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """The interval of the share count / trials (Wilson 1927); from 0 to 1 where nothing was tried."""
+    """Score interval of the proportion count / trials (Wilson 1927); (0, 1) without trials."""
     if not trials:
         return 0.0, 1.0
     z = NormalDist().inv_cdf(0.5 + 0.5 * confidence)
-    share, spread = count / trials, z * z / trials
-    middle = (share + 0.5 * spread) / (1.0 + spread)
-    half = z * (share * (1.0 - share) / trials + 0.25 * z * z / trials**2) ** 0.5 / (1.0 + spread)
-    return middle - half, middle + half
+    proportion, z2_over_n = count / trials, z * z / trials
+    middle = (proportion + 0.5 * z2_over_n) / (1.0 + z2_over_n)
+    half_width = z * (proportion * (1.0 - proportion) / trials + 0.25 * z * z / trials**2) ** 0.5 / (1.0 + z2_over_n)
+    return middle - half_width, middle + half_width

@@ -1,4 +1,4 @@
-"""What a refinement returns, and the box it works in."""
+"""Result of a batch of local refinements, and helpers for bounds."""
 
 from __future__ import annotations
 
@@ -15,41 +15,43 @@ RUNNING, CONVERGED, STALLED, MAX_ITERATIONS, FAILED, ABANDONED = range(len(STATU
 
 
 class State(Protocol):
-    """What a problem keeps of a point of each lane, first dimension L throughout."""
+    """Data that a problem attaches to the current point of each lane; the first dimension is L throughout."""
 
     def lanes(self, which: Tensor) -> Self:
-        """Some of the lanes, by place (int64) or by choice (bool)."""
+        """Select lanes by index (int64) or mask (bool)."""
 
     def replaced(self, which: Tensor, new: Self) -> Self:
-        """The same with the lanes at places `which` (int64) as `new` has them, in this order."""
+        """A copy in which the k-th lane of `new` replaces lane `which[k]` (int64)."""
 
 
 @dataclass(frozen=True)
 class Refined:
-    """Where each member ended. `failed`: the cost or its derivatives were not finite at the start, which is returned.
+    """Final point of each member of a batch of refinements.
 
-    curvature is that of the last linearisation, the prior included. promised, the Newton decrement, tells how far from
-    an optimum a member ended that did not converge: for a negative log-likelihood, sqrt(2 promised) standard errors.
-    state: what the problem keeps of the end points, None for most problems.
+    status: 'failed' means that the cost or its derivatives were not finite at the start, which is returned.
+    gradient, curvature: of the last linearisation, priors included.
+    promised: Newton decrement, the decrease of the cost that the model still predicts. For a negative log-likelihood,
+    the distance to the optimum is sqrt(2 promised) standard errors.
+    state: data that the problem attaches to the final points; None for most problems.
     """
 
     theta: Tensor  # (*batch, P)
     cost: Tensor  # (*batch)
     gradient: Tensor  # (*batch, P)
     curvature: Tensor  # (*batch, P, P)
-    promised: Tensor  # (*batch), decrease of the cost that the model still predicted
-    held: Tensor  # (*batch, P) bool: at a bound, against which the cost pushes
-    status: Tensor  # (*batch) int64, place in STATUSES
+    promised: Tensor  # (*batch) Newton decrement
+    held: Tensor  # (*batch, P) bool: parameters at an active bound
+    status: Tensor  # (*batch) int64, index into STATUSES
     iterations: Tensor  # (*batch) int64
     state: State | None = None
 
     @property
     def converged(self) -> Tensor:
-        """(*batch) bool."""
+        """Which members converged, (*batch) bool."""
         return self.status == CONVERGED
 
     def statuses(self) -> list[str]:
-        """The status of each member in words, flattened."""
+        """Status of each member by name, flattened."""
         return [STATUSES[code] for code in self.status.flatten().tolist()]
 
     def member(self, which: int) -> Refined:
@@ -58,29 +60,29 @@ class Refined:
         return self._each(lambda value: value[place], None if self.state is None else self.state.lanes(place))
 
     def unflatten(self, shape: torch.Size) -> Refined:
-        """From one flat leading dimension to that of the batch; the state stays flat."""
+        """Restore the batch shape from one flat leading dimension; `state` remains flat."""
         return self._each(lambda value: value.reshape((*shape, *value.shape[1:])), self.state)
 
     def best(self) -> Refined:
-        """The member of lowest cost in each row of a batch (B, K), as a batch (B)."""
+        """The member of lowest finite cost in each row of a batch (B, K), as a batch (B)."""
         cost = torch.where(torch.isfinite(self.cost), self.cost, torch.inf)
         rows, best = torch.arange(len(cost), device=cost.device), cost.argmin(-1)
         state = None if self.state is None else self.state.lanes(rows * cost.shape[-1] + best)
         return self._each(lambda value: value[rows, best], state)
 
     def file(self, lanes: Tensor, state: State | None = None, **values: Tensor) -> Refined:
-        """The same with the members `lanes` (L,) of the named fields, and of the state, replaced."""
+        """A copy in which members `lanes` (L,) of the named fields, and of the state, are replaced."""
         changed = {name: getattr(self, name).index_copy(0, lanes, value) for name, value in values.items()}
-        kept = self.state if state is None or self.state is None else self.state.replaced(lanes, state)
-        return replace(self, state=kept, **changed)
+        new_state = self.state if state is None or self.state is None else self.state.replaced(lanes, state)
+        return replace(self, state=new_state, **changed)
 
     def _each(self, change: Callable[[Tensor], Tensor], state: State | None) -> Refined:
-        """The same with every tensor changed."""
+        """A copy with `change` applied to every tensor, and the given state."""
         return Refined(**{name: change(value) for name, value in vars(self).items() if name != "state"}, state=state)
 
 
 def unfinished(start: Tensor, state: State | None) -> Refined:
-    """To be filled in: start (B, P) and what the problem keeps there, nothing else known."""
+    """Result before the first iteration: start (B, P) and its state; the other fields are placeholders."""
     count, parameters = start.shape
     zeros = torch.zeros(count, dtype=torch.int64, device=start.device)
     return Refined(
@@ -97,7 +99,7 @@ def unfinished(start: Tensor, state: State | None) -> Refined:
 
 
 def flat_box(start: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """start (*batch, P) brought into its box, low and high, each (B, P). Raises ValueError where a box is empty."""
+    """start (*batch, P) clamped to its box, with low and high, each (B, P). Raises ValueError for an empty box."""
     parameters = start.shape[-1]
     if not bool((low <= high).all()):
         raise ValueError("expected low <= high for every parameter, got an empty box; exchange or widen the bounds")
@@ -106,11 +108,11 @@ def flat_box(start: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def held_back(theta: Tensor, gradient: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Where a bound is active: the cost would fall beyond it. (..., P) bool."""
+    """Active bounds, (..., P) bool: theta is at the bound, and the cost would decrease beyond it."""
     return ((theta <= low) & (gradient >= 0)) | ((theta >= high) & (gradient <= 0))
 
 
 def typical_size(theta: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """What a step is compared with, (..., P): the width of the box, or the value itself where there is no box."""
+    """Scale of each parameter for the step tolerance, (..., P): width of the box, or |theta| without a finite box."""
     width = high - low
     return torch.where(torch.isfinite(width), width, theta.abs())

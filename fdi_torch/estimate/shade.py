@@ -1,8 +1,8 @@
-"""Success-history adaptation: memory of F and CR that worked, and the archive of beaten parents.
+"""Success-history adaptation of F and CR, and the archive of replaced parents, as in L-SHADE.
 
 Tanabe & Fukunaga (2014), "Improving the search performance of SHADE using linear population size reduction",
-section II; numbers in brackets are that paper's. CR's terminal value, of a memory cell that gives 0 from then on, is
-written as -1.
+section II; numbers in square brackets are equations of that paper. A CR memory cell with the terminal value, stored as
+-1, yields CR = 0 from then on.
 """
 
 from __future__ import annotations
@@ -19,32 +19,35 @@ _SPREAD = 0.1
 
 
 def draw_rate(memory: Tensor, u: Tensor) -> Tensor:
-    """CR ~ normal(memory, 0.1), cut to [0, 1]; 0 from a terminal cell. memory, uniform draws u (...). [1]"""
+    """Draw CR ~ normal(memory, 0.1), clamped to [0, 1]; 0 from a terminal cell. memory (...); u (...) uniform. [1]"""
     normal = math.sqrt(2.0) * torch.erfinv(2.0 * u - 1.0)
     return torch.where(memory == TERMINAL, 0.0, (memory + _SPREAD * normal).clamp(0.0, 1.0))
 
 
 def draw_factor(memory: Tensor, u: Tensor) -> Tensor:
-    """F ~ Cauchy(memory, 0.1), drawn again while F <= 0, cut to 1. memory, uniform draws u (...). [2]
+    """Draw F ~ Cauchy(memory, 0.1), conditional on F > 0, limited to 1. memory (...); u (...) uniform. [2]
 
-    Drawing again until F > 0 is drawing from the part of the distribution above 0: no loop is needed.
+    The paper redraws until F > 0. The inverse distribution function of the truncated distribution needs no loop.
     """
     below_zero = 0.5 - torch.atan(memory / _SPREAD) / math.pi
-    share = below_zero + u * (1.0 - below_zero)
-    return (memory + _SPREAD * torch.tan(math.pi * (share - 0.5))).clamp(1e-12, 1.0)
+    probability = below_zero + u * (1.0 - below_zero)
+    return (memory + _SPREAD * torch.tan(math.pi * (probability - 0.5))).clamp(1e-12, 1.0)
 
 
 def lehmer_mean(values: Tensor, weights: Tensor) -> Tensor:
-    """sum w S^2 / sum w S over the last dimension, (..., N) -> (...); 0 where sum w S is 0. [7]"""
+    """Weighted Lehmer mean sum w S^2 / sum w S over the last dimension, (..., N) -> (...); 0 if sum w S is 0. [7]"""
     weighted = weights * values
-    below = row_sum(weighted)
-    return torch.where(below > 0, row_sum(weighted * values) / torch.where(below > 0, below, 1.0), 0.0)
+    denominator = row_sum(weighted)
+    return torch.where(
+        denominator > 0, row_sum(weighted * values) / torch.where(denominator > 0, denominator, 1.0), 0.0
+    )
 
 
 def success_weights(gain: Tensor, success: Tensor) -> Tensor:
-    """Improvement of the cost as a share of the largest: (..., N), 0 where there was no success.
+    """Weights of the successful candidates, (..., N): improvement of the cost relative to the largest finite one.
 
-    The common factor cancels in the mean. A parent of infinite cost counts as the largest finite gain.
+    Candidates without success have weight 0; a parent of infinite cost counts as the largest finite gain. The weights
+    are not normalised to a sum of 1, because a common factor cancels in the Lehmer mean.
     """
     finite = success & torch.isfinite(gain)
     largest = torch.where(finite, gain, 0.0).amax(-1, keepdim=True)
@@ -55,15 +58,16 @@ def success_weights(gain: Tensor, success: Tensor) -> Tensor:
 def update_memory(
     memory_f: Tensor, memory_cr: Tensor, cell: Tensor, factor: Tensor, rate: Tensor, gain: Tensor, success: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One cell of each memory (*problems, H) takes the mean of what worked; `cell` (*problems) moves on. [Algorithm 1]
+    """Store the weighted mean of the successful F and CR in one cell of the memories (*problems, H). [Algorithm 1]
 
-    factor, rate, gain (parent's cost - candidate's), success (*problems, N). A problem without success changes nothing.
+    cell (*problems): index of the cell, which advances cyclically. factor, rate, gain (parent's minus candidate's cost)
+    and success are (*problems, N). A problem without success is not changed. Returns both memories and the next cell.
     """
     weights = success_weights(gain, success)
     any_success = success.any(-1)
     at = cell[..., None]
-    dead = (memory_cr.gather(-1, at)[..., 0] == TERMINAL) | (torch.where(success, rate, 0.0).amax(-1) == 0.0)
-    new_cr = torch.where(dead, TERMINAL, lehmer_mean(rate, weights))
+    terminal = (memory_cr.gather(-1, at)[..., 0] == TERMINAL) | (torch.where(success, rate, 0.0).amax(-1) == 0.0)
+    new_cr = torch.where(terminal, TERMINAL, lehmer_mean(rate, weights))
     new_f = lehmer_mean(factor, weights)
     memory_f = torch.where(any_success[..., None], memory_f.scatter(-1, at, new_f[..., None]), memory_f)
     memory_cr = torch.where(any_success[..., None], memory_cr.scatter(-1, at, new_cr[..., None]), memory_cr)
@@ -73,20 +77,20 @@ def update_memory(
 def update_archive(
     archive: Tensor, filled: Tensor, parents: Tensor, success: Tensor, u: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Beaten parents enter the archive one by one: into the next free place, or over a random one when it is full.
+    """Add replaced parents to the archive, each in the next free row, or in a random row once the archive is full.
 
     archive (*problems, A, P), of which the first `filled` (*problems) rows are in use; parents (*problems, N, P);
-    success, u (*problems, N), uniform draws. Returns the new archive and count.
+    success (*problems, N); u (*problems, N): uniform random numbers. Returns the new archive and count.
     """
     capacity = archive.shape[-2]
     entry = torch.arange(parents.shape[-2], device=u.device).expand(success.shape)
     free = filled[..., None] + success.cumsum(-1) - 1
-    place = torch.where(free < capacity, free, (u * capacity).long())
-    # Where several take the same place, the last one stays: only that one is written, so no write order matters.
+    target_row = torch.where(free < capacity, free, (u * capacity).long())
+    # If several parents have the same target row, only the last one is written, so the result is deterministic.
     last = entry.new_full((*filled.shape, capacity), -1)
-    last = last.scatter_reduce(-1, place.clamp(min=0), torch.where(success, entry, -1), "amax")
-    stays = success & (last.gather(-1, place.clamp(min=0)) == entry)
+    last = last.scatter_reduce(-1, target_row.clamp(min=0), torch.where(success, entry, -1), "amax")
+    is_written = success & (last.gather(-1, target_row.clamp(min=0)) == entry)
     problem = torch.arange(filled.numel(), device=u.device).reshape(*filled.shape, 1)
-    row = (problem * capacity + place)[stays]
-    rows = archive.reshape(-1, archive.shape[-1]).index_copy(0, row, parents[stays])
+    row = (problem * capacity + target_row)[is_written]
+    rows = archive.reshape(-1, archive.shape[-1]).index_copy(0, row, parents[is_written])
     return rows.reshape(archive.shape), (filled + success.sum(-1)).clamp(max=capacity)

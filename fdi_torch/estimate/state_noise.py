@@ -1,8 +1,8 @@
-"""The most likely disturbances of the flows and scales of the sensors' noise, beside parameters of the plant.
+"""Maximum-likelihood estimate of the noise model: flow disturbances, sensor noise and their correlation time.
 
-Intensities and scales maximise the likelihood of the innovations (kalman.py), whose slopes the disturbance smoother
-gives (Durbin and Koopman, 2012, "Time series analysis by state space methods", section 7.3.3); linear parameters are
-profiled out.
+Intensities and scales maximise the likelihood of the innovations (kalman.py). Its gradient comes from the disturbance
+smoother (Durbin and Koopman, 2012, "Time series analysis by state space methods", section 7.3.3). Plant parameters, in
+which the residuals are linear, are profiled out. The correlation time is selected from a grid of candidates.
 """
 
 from __future__ import annotations
@@ -19,17 +19,20 @@ from torch import Tensor
 
 from fdi_torch.estimate.kalman import KalmanFilter, Propagation, Score, SensorNoise, StateNoise
 
-CORRELATION_TIMES = (0.0, 5.0, 20.0, 80.0, 320.0)  # candidates, in sampling intervals; 0: white
-SETTLED = 0.1  # nats; a smaller gain of an iteration ends the optimisation
-RIDGE = 1e-12  # of a unit curvature: parameters that nothing shows stay where they are
-LEAST = 1e-2  # readings that determine a parameter, for the unit in which it is optimised
-WIDEST = 10.0  # |log| of an intensity over its unit, and of a scale: bounds of the optimisation
+CORRELATION_TIMES = (0.0, 5.0, 20.0, 80.0, 320.0)  # grid of candidates, in sampling intervals; 0: white
+LIKELIHOOD_TOLERANCE = 0.1  # nats; the optimisation ends when an iteration gains less
+RIDGE = 1e-12  # relative to a unit curvature: keeps parameters without information in the data in place
+MIN_DETERMINED = 1e-2  # lower limit on the effective number of readings per parameter, for its scaling
+LOG_BOUND = 10.0  # bound on |log(intensity / unit)| and |log(scale)| in the optimisation
 
 
 @dataclass(frozen=True)
 class Likelihood:
-    """log_likelihood: of the residuals, at its maximum over the linear parameters within their priors and over the
-    noise; without the constant of the normal distribution. converged: whether the optimisation of the noise ended.
+    """Maximum of the likelihood.
+
+    noise: the maximising noise model. log_likelihood: of the residuals, maximised over the noise model and the linear
+    parameters, the log density of their priors included; constants of the normal distribution are omitted.
+    converged: whether the optimisation of the noise model converged.
     """
 
     noise: StateNoise
@@ -48,12 +51,14 @@ def estimate_state_noise(
     start: StateNoise | None = None,
     climb: bool = True,
 ) -> Likelihood:
-    """The most likely state noise of a residual (S, C) beside linear parameters.
+    """Estimate the noise model from residuals (S, C), with plant parameters profiled out.
 
-    jacobian (S, C, P): of the readings by the parameters, which have normal priors of precision pull^2 (P,) about -off
-    standard deviations from where they stand. unit (n,) m^3/s: the order of magnitude of a disturbance. start: where to
-    begin. climb: whether the correlation time climbs along CORRELATION_TIMES from there; it stays otherwise. Where a
-    sensor wanders, it is the correlation time of that.
+    jacobian (S, C, P): derivatives of the readings by the P parameters.
+    pull, off (P,): normal priors of the parameters. A parameter change delta has the prior residual off + pull * delta
+    of unit variance: precision pull^2, and `off` prior standard deviations between current value and prior mean.
+    unit (n,), m^3/s: order of magnitude of a flow disturbance. start: initial noise model.
+    climb: whether to search CORRELATION_TIMES for the best correlation time; otherwise that of `start` is retained. The
+    search is over the wander's correlation time if a sensor wanders, else over that of the flow disturbances.
     """
     problem = _Problem(propagation, sensors, residual, jacobian, pull, off, unit)
     interval = propagation.interval
@@ -63,26 +68,37 @@ def estimate_state_noise(
         return problem.solve(start)
     if start.wander is not None:
         return problem.climbed(
-            start, [c * interval for c in CORRELATION_TIMES[1:]], start.wander.correlation_time, _slowed
+            start,
+            [c * interval for c in CORRELATION_TIMES[1:]],
+            start.wander.correlation_time,
+            _with_wander_correlation_time,
         )
     times = [c * interval for c in CORRELATION_TIMES]
-    return problem.climbed(start, times, start.correlation_time, partial(_retimed, interval=interval))
+    return problem.climbed(
+        start, times, start.correlation_time, partial(_with_flow_correlation_time, interval=interval)
+    )
 
 
-def _retimed(noise: StateNoise, time: float, interval: float) -> StateNoise:
-    """The same volumes that come and go slowly, with another correlation time."""
+def _with_flow_correlation_time(noise: StateNoise, time: float, interval: float) -> StateNoise:
+    """The noise model with another correlation time of the flow disturbances.
+
+    The intensity is adjusted such that the variance of the disturbance integrated over a long time, which is
+    proportional to intensity^2 max(2 tau, dt), does not change.
+    """
     before, after = (max(2.0 * t, interval) for t in (noise.correlation_time, time))
     return replace(noise, correlation_time=time, intensity=noise.intensity * math.sqrt(before / after))
 
 
-def _slowed(noise: StateNoise, time: float) -> StateNoise:
-    """The same with another correlation time of what a sensor wanders by."""
+def _with_wander_correlation_time(noise: StateNoise, time: float) -> StateNoise:
+    """The noise model with another correlation time of the wander."""
     assert noise.wander is not None
     return replace(noise, wander=replace(noise.wander, correlation_time=time))
 
 
 @dataclass(frozen=True)
 class _Problem:
+    """The likelihood of one residual as a function of the noise model; fields as in `estimate_state_noise`."""
+
     propagation: Propagation
     sensors: SensorNoise
     residual: Tensor
@@ -97,67 +113,76 @@ class _Problem:
 
     @cached_property
     def columns(self) -> Tensor:
-        """(S, C, 1 + P)."""
+        """Residual and Jacobian side by side, (S, C, 1 + P)."""
         return torch.cat([self.residual.unsqueeze(-1), self.jacobian], dim=-1)
 
     def climbed(
-        self, start: StateNoise, times: Sequence[float], near: float, moved: Callable[[StateNoise, float], StateNoise]
+        self,
+        start: StateNoise,
+        times: Sequence[float],
+        first_time: float,
+        with_time: Callable[[StateNoise, float], StateNoise],
     ) -> Likelihood:
-        """The most likely noise at each of the times, from the one next to `near` on, up and down while that is better.
+        """Hill climbing over the grid of correlation times, s, from the one nearest to `first_time`.
 
-        moved: a noise with another of the times.
+        At each time the other noise parameters are optimised. with_time: sets the correlation time of a noise model.
         """
-        middle = min(range(len(times)), key=lambda i: abs(times[i] - near))
-        best = self.solve(moved(start, times[middle]))
+        middle = min(range(len(times)), key=lambda i: abs(times[i] - first_time))
+        best = self.solve(with_time(start, times[middle]))
         for step in (1, -1):
             i = middle + step
             while 0 <= i < len(times):
-                further = self.solve(moved(best.noise, times[i]))
-                if further.log_likelihood <= best.log_likelihood:
+                candidate = self.solve(with_time(best.noise, times[i]))
+                if candidate.log_likelihood <= best.log_likelihood:
                     break
-                best, i = further, i + step
+                best, i = candidate, i + step
         return best
 
     def solve(self, start: StateNoise) -> Likelihood:
-        tanks, known_as = len(self.unit), start.wander
+        """Maximise the profile likelihood over the logarithms of intensities, scales and wander, by L-BFGS-B."""
+        tanks, start_wander = len(self.unit), start.wander
 
         def noise_at(x: np.ndarray) -> StateNoise:
             log = torch.from_numpy(x)
             scale = torch.exp(log[tanks : tanks + len(start.scale)])
-            wander = known_as and replace(known_as, std=known_as.std * math.exp(float(log[-1])))
+            wander = start_wander and replace(start_wander, std=start_wander.std * math.exp(float(log[-1])))
             return replace(start, intensity=self.unit * torch.exp(log[:tanks]), scale=scale, wander=wander)
 
-        # In units in which the curvature per sample is about one. The tolerance of L-BFGS is a share of the cost, or of
-        # one where that is more, so the cost counts from the start.
-        samples, (known, by) = len(self.residual), self.likelihood(start)
-        unit = torch.sqrt(2.0 * by.determined.clamp(min=LEAST) / samples).numpy()
+        # The variables are scaled to a curvature of about one per sample. The tolerance of L-BFGS-B is relative to
+        # max(|cost|, 1), so the cost is taken relative to its initial value.
+        samples, (start_value, score) = len(self.residual), self.likelihood(start)
+        unit = torch.sqrt(2.0 * score.determined.clamp(min=MIN_DETERMINED) / samples).numpy()
 
         def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-            value, by = self.likelihood(noise_at(x / unit))
-            return (known - value) / samples, -by.slope.numpy() / samples / unit
+            value, score = self.likelihood(noise_at(x / unit))
+            return (start_value - value) / samples, -score.slope.numpy() / samples / unit
 
-        first = torch.cat([torch.log(start.intensity / self.unit), torch.log(start.scale)])
-        first = torch.cat([first, first.new_zeros(1)]) if known_as else first
-        done = minimize(
+        log_start = torch.cat([torch.log(start.intensity / self.unit), torch.log(start.scale)])
+        log_start = torch.cat([log_start, log_start.new_zeros(1)]) if start_wander else log_start
+        optimum = minimize(
             cost,
-            first.clamp(-WIDEST, WIDEST).numpy() * unit,
+            log_start.clamp(-LOG_BOUND, LOG_BOUND).numpy() * unit,
             jac=True,
             method="L-BFGS-B",
-            bounds=[(-WIDEST * u, WIDEST * u) for u in unit],
-            options={"ftol": SETTLED / samples, "gtol": SETTLED / samples},
+            bounds=[(-LOG_BOUND * u, LOG_BOUND * u) for u in unit],
+            options={"ftol": LIKELIHOOD_TOLERANCE / samples, "gtol": LIKELIHOOD_TOLERANCE / samples},
         )
-        return Likelihood(noise_at(done.x / unit), known - float(done.fun) * samples, bool(done.success))
+        return Likelihood(noise_at(optimum.x / unit), start_value - float(optimum.fun) * samples, bool(optimum.success))
 
     def likelihood(self, noise: StateNoise) -> tuple[float, Score]:
-        """The profile log-likelihood, and its score."""
+        """Profile log-likelihood of a noise model, and its score."""
         model = self.filter.under(noise)
-        left, moved = _regressed(model.innovations(self.columns), self.pull, self.off)
-        cost = float(left.square().sum()) + float(moved.square().sum()) + model.log_det
-        return -0.5 * cost, model.score(left)
+        innovations, prior_residual = _profiled(model.innovations(self.columns), self.pull, self.off)
+        cost = float(innovations.square().sum()) + float(prior_residual.square().sum()) + model.log_det
+        return -0.5 * cost, model.score(innovations)
 
 
-def _regressed(white: Tensor, pull: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:
-    """white (S, C, 1 + P): what is left of the first column beside the others, (S, C), and of the priors' rows (P,)."""
+def _profiled(white: Tensor, pull: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:
+    """Regress the whitened residual on the whitened Jacobian and the priors, by linear least squares.
+
+    white (S, C, 1 + P): whitened residual and Jacobian. Returns the regression residuals of the readings, (S, C), and
+    of the priors, (P,).
+    """
     rows = white.flatten(0, 1)
     gram = rows.T @ rows
     curvature, right = gram[1:, 1:] + torch.diag(pull**2), gram[1:, 0] - pull * off

@@ -1,4 +1,4 @@
-"""Windows in which a fault is present one after another are one stretch: its beginning, its end and its size."""
+"""Merge consecutive windows in which a fault is present into one time interval (stretch) with one size."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from fdi_torch.estimate.windows import Window, WindowFault
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive windows in which a fault was present: start, stop in s; size and std, in `unit`, of all together (std
-    infinite where the size is beyond its range in each); flow (m^3/s) at the mean levels.
+    """Time interval in which a fault was present without interruption.
+
+    start, stop: s. size, std: merged estimate and standard error, in `unit`; std is infinite if most windows have no
+    finite one. flow: mean change of flow, m^3/s; None if the fault does not change a flow.
     """
 
     name: str
@@ -27,34 +29,37 @@ class Stretch:
 
 
 def stretches_of(windows: Sequence[Window]) -> list[Stretch]:
-    """Consecutive windows in which a fault is present, as one: by fault, then in time."""
-    found = []
+    """All intervals in which faults are present, ordered by fault, then by time."""
+    intervals = []
     for k, first in enumerate(windows[0].faults if windows else ()):
-        row: list[Window] = []
+        run: list[Window] = []
         for window in [*windows, None]:
-            goes_on = window is not None and (not row or row[-1].start < window.start <= row[-1].stop + 1e-6)
-            if window is not None and goes_on and window.faults[k].state == "present":
-                row.append(window)
+            adjacent = window is not None and (not run or run[-1].start < window.start <= run[-1].stop + 1e-6)
+            if window is not None and adjacent and window.faults[k].state == "present":
+                run.append(window)
                 continue
-            if row:
-                found.append(_joined(first.name, [w.faults[k] for w in row], row[0].start, row[-1].stop))
-            row = [window] if window is not None and window.faults[k].state == "present" else []
-    return found
+            if run:
+                intervals.append(_merged(first.name, [w.faults[k] for w in run], run[0].start, run[-1].stop))
+            run = [window] if window is not None and window.faults[k].state == "present" else []
+    return intervals
 
 
-def _joined(name: str, each: Sequence[WindowFault], start: float, stop: float) -> Stretch:
-    """The size of the windows together, those in which more water flowed counting for more; its error has their own
-    errors and their scatter. Windows whose size is beyond its range have no say in it, unless they are most.
+def _merged(name: str, estimates: Sequence[WindowFault], start: float, stop: float) -> Stretch:
+    """Merge the estimates of one fault in consecutive windows.
+
+    The size is the mean m = sum w_i s_i, weighted by flow, with variance sum w_i^2 (std_i^2 + (s_i - m)^2). Windows
+    with an infinite standard error are excluded; if they are the majority, the result is the largest size, with
+    std = inf.
     """
-    flows = [f.flow for f in each if f.flow is not None]
+    flows = [f.flow for f in estimates if f.flow is not None]
     flow = sum(flows) / len(flows) if flows else None
-    known = [f for f in each if math.isfinite(f.std)]
-    if 2 * len(known) < len(each):
-        return Stretch(name, start, stop, max(f.size for f in each), math.inf, flow, each[0].unit)
-    size = torch.tensor([f.size for f in known], dtype=torch.float64)
-    weight = torch.tensor([1.0 if f.flow is None else max(f.flow, 1e-12) for f in known], dtype=torch.float64)
+    finite = [f for f in estimates if math.isfinite(f.std)]
+    if 2 * len(finite) < len(estimates):
+        return Stretch(name, start, stop, max(f.size for f in estimates), math.inf, flow, estimates[0].unit)
+    size = torch.tensor([f.size for f in finite], dtype=torch.float64)
+    weight = torch.tensor([1.0 if f.flow is None else max(f.flow, 1e-12) for f in finite], dtype=torch.float64)
     weight = weight / weight.sum()
     mean = float((weight * size).sum())
-    own = torch.tensor([f.std for f in known], dtype=torch.float64)
-    std = float(torch.sqrt((weight**2 * (own**2 + (size - mean) ** 2)).sum()))
-    return Stretch(name, start, stop, mean, std, flow, each[0].unit)
+    std_of_window = torch.tensor([f.std for f in finite], dtype=torch.float64)
+    std = float(torch.sqrt((weight**2 * (std_of_window**2 + (size - mean) ** 2)).sum()))
+    return Stretch(name, start, stop, mean, std, flow, estimates[0].unit)

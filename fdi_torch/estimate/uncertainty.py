@@ -1,4 +1,4 @@
-"""An estimate with all that is to be said of it: value, standard error, what is not determined, fit and status."""
+"""Parameter estimate with its uncertainty: standard errors, undetermined combinations, goodness of fit and status."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from torch import Tensor
 from fdi_torch.estimate.information import RELATIVE_EIGENVALUE, Certainty, certainty, determined_combinations
 from fdi_torch.parameters import ParameterSpace
 
-# Closer to a bound than this share of the range counts as at it.
+# A value within this fraction of the range of a bound counts as at the bound.
 _AT_BOUND = 1e-9
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The result for one set of parameters, SI.
+    """Estimate of one set of parameters, SI units.
 
-    std: standard errors, the tolerances of constants included through the priors; infinite for what is not determined.
-    covariance (P, P): free of bounds; infinite and NaN in the rows of what is not determined.
-    at_bounds: 'low' or 'high' by name. undetermined: one sentence for each group of parameters.
-    noise_std (C,): noise level of each channel, known or estimated, in its unit. chi_square: of the residuals against
-    the noise, with its degrees of freedom. reached: how the estimate was found; plain values.
+    std (P,): standard errors, which include the tolerances of plant constants through their priors; infinite for
+    undetermined parameters. covariance (P, P): computed without regard to bounds; infinite or NaN in the rows and
+    columns of undetermined parameters. at_bounds: 'low' or 'high' by name. undetermined: one sentence per group.
+    noise_std (C,): noise level of each channel, known or estimated, in its unit. chi_square: of the residuals relative
+    to the noise, with degrees_of_freedom. reached: how the estimate was computed, as plain values.
     """
 
     names: tuple[str, ...]
@@ -44,26 +44,26 @@ class Estimate:
 
     @property
     def correlation(self) -> Tensor:
-        """(P, P); NaN beside what is not determined."""
+        """Correlation matrix (P, P); NaN in rows and columns of undetermined parameters."""
         return self.covariance / (self.std[:, None] * self.std[None, :])
 
     @property
     def p_value(self) -> float | None:
-        """The probability of residuals at least as large, if the model and the noise level are right."""
+        """p-value of the chi-square test; None without a chi-square or degrees of freedom."""
         if self.chi_square is None or not self.degrees_of_freedom:
             return None
         half = torch.tensor([0.5 * self.degrees_of_freedom, 0.5 * self.chi_square], dtype=torch.float64)
         return float(torch.special.gammaincc(half[0], half[1]))
 
     def interval(self, confidence: float = 0.95) -> tuple[Tensor, Tensor]:
-        """Lower and upper end (P,) of each parameter's confidence interval, by the normal distribution."""
-        reach = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * self.std
-        return self.value - reach, self.value + reach
+        """Lower and upper limits (P,) of each parameter's confidence interval, from the normal distribution."""
+        half_width = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * self.std
+        return self.value - half_width, self.value + half_width
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values that JSON can carry. A number that is not finite becomes None: of `std`, "not determined".
+        """Plain values for JSON. A number that is not finite becomes None; in `std` this means "not determined".
 
-        The covariance is flat, row after row, with its shape beside it.
+        The covariance is flattened row by row; `covariance_shape` holds its shape.
         """
         plain = {name: plain_value(value, name) for name, value in vars(self).items() if name != "covariance"}
         flat = plain_value(self.covariance.flatten(), "covariance")
@@ -83,23 +83,26 @@ def make_estimate(
     reached: Mapping[str, Any] | None = None,
     threshold: float = RELATIVE_EIGENVALUE,
 ) -> Estimate:
-    """The estimate theta (P,) with what the Fisher information (P, P) there, priors included, says of it."""
+    """Make the estimate theta (P,) with uncertainties from the Fisher information (P, P) there, priors included.
+
+    threshold: relative eigenvalue below which a direction is undetermined. Raises ValueError for mismatched shapes.
+    """
     parameters = len(space)
     if theta.shape != (parameters,) or information.shape != (parameters, parameters):
         raise ValueError(
             f"expected theta ({parameters},) and information ({parameters}, {parameters}), got {tuple(theta.shape)} "
             f"and {tuple(information.shape)}; make one estimate for each member of a batch"
         )
-    sure = certainty(information, threshold=threshold)
+    uncertainty = certainty(information, threshold=threshold)
     return Estimate(
         names=space.names,
         units=tuple(p.unit for p in space),
         value=theta,
-        std=sure.std,
-        covariance=sure.covariance,
+        std=uncertainty.std,
+        covariance=uncertainty.covariance,
         status=status,
         at_bounds=parameters_at_bounds(space, theta),
-        undetermined=(*undetermined_in_words(space.names, sure), *wider_than_range(space, sure.std)),
+        undetermined=(*undetermined_in_words(space.names, uncertainty), *wider_than_range(space, uncertainty.std)),
         noise_std=noise_std,
         chi_square=chi_square,
         degrees_of_freedom=degrees_of_freedom,
@@ -108,19 +111,19 @@ def make_estimate(
 
 
 def parameters_at_bounds(space: ParameterSpace, theta: Tensor) -> dict[str, str]:
-    """'low' or 'high' for each parameter whose value lies at an end of its range; theta (P,)."""
-    found = {}
+    """'low' or 'high' by name, for each parameter whose value in theta (P,) is at a bound."""
+    at_bounds = {}
     for p, value in zip(space, theta.tolist(), strict=True):
-        near = _AT_BOUND * (p.high - p.low) if math.isfinite(p.high - p.low) else 0.0
-        if value <= p.low + near:
-            found[p.name] = "low"
-        elif value >= p.high - near:
-            found[p.name] = "high"
-    return found
+        margin = _AT_BOUND * (p.high - p.low) if math.isfinite(p.high - p.low) else 0.0
+        if value <= p.low + margin:
+            at_bounds[p.name] = "low"
+        elif value >= p.high - margin:
+            at_bounds[p.name] = "high"
+    return at_bounds
 
 
 def undetermined_in_words(names: Sequence[str], sure: Certainty) -> tuple[str, ...]:
-    """One sentence for each group of parameters that are undetermined together, of one member's certainty."""
+    """One sentence for each group of jointly undetermined parameters; `sure` is the certainty of one estimate."""
     return tuple(
         _sentence([names[i] for i in members], rows.tolist())
         for members, rows in determined_combinations(sure.null, sure.scale)
@@ -138,7 +141,7 @@ def _sentence(names: list[str], rows: list[list[float]]) -> str:
 
 
 def _combination(names: list[str], row: list[float]) -> str:
-    """'a + 0.8 b - 2 c', coefficients in SI units."""
+    """Linear combination as text, such as 'a + 0.8 b - 2 c', with coefficients in SI units."""
     size = max(abs(c) for c in row)
     text = ""
     for name, c in zip(names, row, strict=True):
@@ -154,7 +157,7 @@ def _listed(items: list[str]) -> str:
 
 
 def wider_than_range(space: ParameterSpace, std: Tensor) -> tuple[str, ...]:
-    """One sentence for each parameter with a standard error (P,) that is finite and yet larger than its whole range."""
+    """One sentence for each parameter whose standard error (P,) is finite but larger than its range."""
     return tuple(
         f"{p.name} is hardly determined: standard error {error:.3g} {p.unit}, more than its range {p.low:g}..{p.high:g}"
         for p, error in zip(space, std.tolist(), strict=True)
@@ -163,9 +166,9 @@ def wider_than_range(space: ParameterSpace, std: Tensor) -> tuple[str, ...]:
 
 
 def plain_value(value: Any, name: str) -> Any:
-    """Numbers, text, lists and dicts only; a number that is not finite becomes None.
+    """Convert to numbers, text, lists and dicts; a number that is not finite becomes None.
 
-    Raises ValueError for anything that has no plain form.
+    Raises ValueError for any other type; `name` is the path of the value for the message.
     """
     if isinstance(value, Tensor):
         value = value.tolist()

@@ -1,4 +1,4 @@
-"""One short window of a recording, fitted on its own: which of the suspects are there, and how large."""
+"""Estimate the suspected faults in each short window of a recording separately."""
 
 from __future__ import annotations
 
@@ -24,19 +24,22 @@ from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.step_length import choose_step, probe_points
 
 REFINE = RefineSettings(iterations=40, decrease_tolerance=1e-6)
-START = 0.3  # of a fault, between nominal and the end of its range
-STEP_ERROR = 0.2  # of the simulation, as a share of the sensors' noise: a window is too short for it to add up
-LEAST_NOISE = 1e-6  # of a sensor that shows none, as a share of what it reads from floor to rim
-NOTICED = 0.05  # a size within this of nominal is none, as a share of the range
-TOLD = 0.15  # a standard error beyond this share of the range tells nothing
-EMPTY = 0.02  # share of its height below which a tank counts as empty: what drains it then, nothing tells
+START_SIZE = 0.3  # initial size of a fault, as a fraction of its range above nominal
+STEP_ERROR = 0.2  # admissible integration error, as a fraction of the sensor noise; it cannot accumulate in a window
+NOISE_FLOOR = 1e-6  # lower limit of the sensor noise, as a fraction of the reading span from floor to rim
+SIGNIFICANT_SIZE = 0.05  # smaller deviations from nominal do not count as a fault, as a fraction of the range
+INFORMATIVE_STD = 0.15  # a fault is undecidable if its standard error exceeds this fraction of the range
+EMPTY_LEVEL = 0.02  # fraction of its height below which a tank counts as empty; a leak is then unobservable
 State = Literal["present", "absent", "cannot tell"]
 
 
 @dataclass(frozen=True)
 class WindowFault:
-    """size with its standard error (misfit included) in `unit`, and the flow (m^3/s) that it changes at the window's
-    mean levels, None where it is no flow's.
+    """Estimate of one fault in one window.
+
+    size, std: size and standard error, inflated by the misfit, in `unit`. std is infinite if the size is at its upper
+    bound or its tank is empty. flow: change of flow at the window's mean levels, m^3/s; None if the fault
+    does not change a flow.
     """
 
     name: str
@@ -49,7 +52,7 @@ class WindowFault:
 
 @dataclass(frozen=True)
 class Window:
-    """start, stop in s; misfit: root mean square residual over the sensors' noise."""
+    """Result for one window. start, stop: s. misfit: root mean square of the residuals divided by the sensor noise."""
 
     start: float
     stop: float
@@ -58,14 +61,17 @@ class Window:
 
 
 def noise_of(recording: Recording, plant: PlantDescription) -> Tensor:
-    """(C,) sample-to-sample noise of each sensor."""
+    """Sample-to-sample noise of each sensor, (C,), in its reading's unit, limited from below."""
     readings = readings_of(recording, plant)
     spans = readings.values.new_tensor([reading_span(plant, sensor) for sensor in plant.sensors])
-    return torch.maximum(sample_noise(readings.values, readings.weight), LEAST_NOISE * spans)
+    return torch.maximum(sample_noise(readings.values, readings.weight), NOISE_FLOOR * spans)
 
 
 def cut_up(recording: Recording, length: float) -> list[Recording]:
-    """Windows of `length` s side by side; each shares its last sample with the next one. A short rest is left out."""
+    """Divide a recording into consecutive windows of `length` s; neighbours have one sample in common.
+
+    An incomplete last window is dropped. Raises ValueError if a window is not longer than the sampling interval.
+    """
     first, last = float(recording.time[0]), float(recording.time[-1])
     if not (last - first) / length < len(recording):
         at_least = f"longer than the sampling interval ({recording.interval:g} s)"
@@ -75,22 +81,26 @@ def cut_up(recording: Recording, length: float) -> list[Recording]:
 
 
 def window_step(fittings: Sequence[Fitting], std: Tensor) -> float:
-    """The longest step (s) that is right to a fifth of the noise `std` (C,) in the window whose inputs move most."""
-    busiest = max(fittings, key=lambda f: float(f.recordings[0].inputs.diff(dim=0).abs().sum()))
-    time = busiest.recordings[0].time
+    """Longest integration step (s) whose error is within STEP_ERROR times the sensor noise `std` (C,).
+
+    It is determined on the window with the largest total variation of the inputs.
+    """
+    most_excited = max(fittings, key=lambda f: float(f.recordings[0].inputs.diff(dim=0).abs().sum()))
+    time = most_excited.recordings[0].time
 
     def engine_at(step: float) -> Engine:
-        return busiest.engines(step)[0]
+        return most_excited.engines(step)[0]
 
-    points = probe_points(*search_box(busiest))
-    longest, scale = float(time[-1] - time[0]) / 20.0, time_scale(busiest.plant)
+    points = probe_points(*search_box(most_excited))
+    longest, scale = float(time[-1] - time[0]) / 20.0, time_scale(most_excited.plant)
     return choose_step(engine_at, points, STEP_ERROR * std, longest, scale, quantile=0.9)
 
 
 def window_of(fitting: Fitting, std: Tensor, suspects: Collection[str], step: float) -> Window:
-    """The fit of one window, from no fault, from all and from each alone of some size. std (C,): the sensors' noise.
+    """Fit one window and decide which faults are present.
 
-    step: of the simulation, s.
+    The fit starts from no fault, from all faults together and from each fault alone, and the best optimum is taken.
+    std (C,): sensor noise. suspects: names of the fault parameters. step: integration step, s.
     """
     recording, space = fitting.recordings[0], fitting.space
     engine = fitting.engines(step)[0]
@@ -99,10 +109,10 @@ def window_of(fitting: Fitting, std: Tensor, suspects: Collection[str], step: fl
     low, high = space.low(), space.high()
     is_fault = torch.tensor([name in suspects for name in space.names])
     nominal = space.nominal()
-    some = nominal + START * (high - nominal)
-    together = torch.stack([nominal, torch.where(is_fault, some, nominal)])
-    alone = torch.where(torch.diag(is_fault)[is_fault], some, nominal)
-    starts = torch.cat([together, alone])
+    start_size = nominal + START_SIZE * (high - nominal)
+    common_starts = torch.stack([nominal, torch.where(is_fault, start_size, nominal)])
+    single_fault_starts = torch.where(torch.diag(is_fault)[is_fault], start_size, nominal)
+    starts = torch.cat([common_starts, single_fault_starts])
     refined = levenberg_marquardt(
         lambda theta, lanes: problem.linearise(theta, torch.zeros_like(lanes)), starts, low, high, REFINE
     )
@@ -119,21 +129,21 @@ def window_of(fitting: Fitting, std: Tensor, suspects: Collection[str], step: fl
     for i, parameter in enumerate(space):
         if parameter.name in suspects:
             size, error = float(theta[i]), float(errors[i])
-            at_end = size >= parameter.high  # the size is larger than that; how large, nothing tells
-            empty = _empty(fitting, parameter.name.partition(".")[0], levels)
+            at_upper_bound = size >= parameter.high  # the true size may be larger; it has no upper limit
+            tank_empty = _is_empty(fitting, parameter.name.partition(".")[0], levels)
             state: State = (
                 "cannot tell"
-                if empty
+                if tank_empty
                 else state_of(size - parameter.nominal, error, parameter.high - parameter.nominal)
             )
-            error = math.inf if at_end or empty else error
+            error = math.inf if at_upper_bound or tank_empty else error
             flow, _ = fault_flow(fitting.networks[0], space, theta, i, levels, channels)
             faults.append(WindowFault(parameter.name, size, error, state, flow, parameter.unit))
     return Window(float(recording.time[0]), float(recording.time[-1]), tuple(faults), misfit)
 
 
 def _mean_level(fitting: Fitting, tank: str, data: Readings) -> Tensor:
-    """Of a window's readings, m; NaN for a tank that no sensor sees, so that it does not pass for an empty one."""
+    """Mean level (m) that the readings show; NaN for a tank without sensor, which must not count as empty."""
     for i, sensor in enumerate(fitting.plant.sensors):
         if sensor.tank == tank:
             mean = (data.values[:, i] * data.weight[:, i]).sum() / data.weight[:, i].sum().clamp(min=1.0)
@@ -141,21 +151,25 @@ def _mean_level(fitting: Fitting, tank: str, data: Readings) -> Tensor:
     return data.values.new_full((), torch.nan)
 
 
-def _empty(fitting: Fitting, place: str, levels: Tensor) -> bool:
-    """Whether the tank at whose level a fault shows (a pipe's: both) holds next to nothing."""
+def _is_empty(fitting: Fitting, place: str, levels: Tensor) -> bool:
+    """Whether all tanks whose levels a fault at `place` affects are empty (for a pipe: both ends)."""
     pumps = {p.name: {p.target} for p in fitting.plant.pumps}
     pipes = {p.name: {p.source, p.target} for p in fitting.plant.pipes}
-    shown = (pumps | pipes).get(place, {place})
-    held = [
-        float(level) >= EMPTY * tank.height
+    tanks = (pumps | pipes).get(place, {place})
+    has_water = [
+        float(level) >= EMPTY_LEVEL * tank.height
         for tank, level in zip(fitting.plant.tanks, levels, strict=True)
-        if tank.name in shown
+        if tank.name in tanks
     ]
-    return bool(held) and not any(held)
+    return bool(has_water) and not any(has_water)
 
 
 def state_of(size: float, std: float, width: float) -> State:
-    """A fault is present where its size stands out of its error at 95 % and is worth noticing."""
-    if not std < TOLD * width:
+    """Decide from size, standard error and range `width` (all in one unit) whether a fault is present.
+
+    Present: size > 1.96 std (95 % confidence, two-sided) and size > SIGNIFICANT_SIZE * width. Undecidable: std >=
+    INFORMATIVE_STD * width.
+    """
+    if not std < INFORMATIVE_STD * width:
         return "cannot tell"
-    return "present" if size > max(NOTICED * width, 1.96 * std) else "absent"
+    return "present" if size > max(SIGNIFICANT_SIZE * width, 1.96 * std) else "absent"
