@@ -43,7 +43,7 @@ def fitting(samples: int = 301):  # type: ignore[no-untyped-def]
 @pytest.mark.slow
 def test_likelihood_estimators_reach_the_bound() -> None:
     runs = draw_runs(fitting(), 12, 30.0, torch.Generator().manual_seed(0))
-    rows = {row.rival: row for row in compare(runs, 30.0, [100, 300])}
+    rows = {row.name: row for row in compare(runs, 30.0, [100, 300])}
     assert set(rows) == set(ESTIMATOR_NAMES)
     for rival in ("hybrid", "multi_start", "least_squares"):
         # Some 18 errors: their root mean square is known to a third. Where a fault is absent the truth lies on the edge
@@ -51,7 +51,7 @@ def test_likelihood_estimators_reach_the_bound() -> None:
         assert rows[rival].over_bound < 1.5 and rows[rival].failures == 0, rows[rival]
     assert rows["evolution"].over_bound > 1.0
     assert all(row.cost < 0.05 for row in rows.values())  # CPU seconds a sample
-    with pytest.raises(ValueError, match="expected a rival of hybrid"):
+    with pytest.raises(ValueError, match="expected an estimator of hybrid"):
         track_estimates("crystal ball", runs, [100])
 
 
