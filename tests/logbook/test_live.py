@@ -34,7 +34,7 @@ class Viewer:
     def __exit__(self, *error: Any) -> None:
         self.connection.__exit__(*error)
 
-    def listen(self, quiet: float = 0.5) -> Received:
+    def listen(self, quiet: float = 1.5) -> Received:
         """All that comes until nothing has come for a while: topic -> (log time in ns, payload)."""
         while True:
             try:
