@@ -51,5 +51,10 @@ def percent(share: float) -> str:
     return f"{100.0 * share:.3g} %" if math.isfinite(share) else "–"
 
 
+def probability_text(probability: float) -> str:
+    """A probability in percent; one below 0.1 % is not resolved further."""
+    return "< 0.1 %" if probability < 1e-3 else percent(probability)
+
+
 def _minus(text: str) -> str:
     return text.replace("-", "−")

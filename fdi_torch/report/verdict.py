@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from fdi_torch.estimate.diagnosis import UNRELIABLE
 from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.report.diagnosed_effects import DiagnosedEffect, diagnosed_effects, fault_at
@@ -65,13 +68,17 @@ def monitor_words(material: Material) -> str:
         return ""
     last = {m["alarm"]: m for m in material.of("/observer/alarm") if m.get("alarm") and m.get("headline")}
     states = {m["alarm"]: str(m.get("state", "")) for m in material.of("/observer/alarm") if m.get("alarm")}
-    still_open = [
-        f"{m['headline']} ({states[n]})" for n, m in last.items() if states[n] not in ("recovered", "retired")
-    ]
+    unfinished = {n: m for n, m in last.items() if states[n] not in ("recovered", "retired")}
+    still_open = [f"{m['headline']}{_since(m)} ({states[n]})" for n, m in unfinished.items()]
     ended = [f"{m['headline']}" for n, m in last.items() if states[n] == "recovered"]
     parts = [_listed(still_open)] if still_open else []
     parts += [f"recovered: {_listed(ended)}"] if ended else []
     return "; ".join(parts)
+
+
+def _since(event: Mapping[str, Any]) -> str:
+    onset = event.get("onset")
+    return f", since {number(float(onset), 4)} s" if isinstance(onset, int | float) else ""
 
 
 def alarm_words(material: Material) -> str:

@@ -7,7 +7,7 @@ import pytest
 
 from fdi_torch.report.downsampling import corner_points, thinned
 from fdi_torch.report.html import MOST_ROWS, short, table, tag
-from fdi_torch.report.numbers import number, percent, raised, shown_unit, with_error
+from fdi_torch.report.numbers import number, percent, probability_text, raised, shown_unit, with_error
 
 
 @pytest.mark.parametrize(
@@ -30,6 +30,7 @@ def test_units_and_odd_numbers() -> None:
     assert raised("m^-2 s^10") == "m⁻² s¹⁰"
     assert [number(v) for v in (float("nan"), float("inf"), -1.5)] == ["–", "∞", "−1.5"]
     assert percent(0.1234) == "12.3 %"
+    assert [probability_text(p) for p in (0.9979, 0.00202, 2.06e-59)] == ["99.8 %", "0.202 %", "< 0.1 %"]
 
 
 def test_a_spike_and_a_hole_survive_thinning() -> None:

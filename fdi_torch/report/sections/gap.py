@@ -12,7 +12,7 @@ from fdi_torch.gap.verdict_words import explanation_words as in_words
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.json_numbers import as_float
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, shown_unit, with_error
+from fdi_torch.report.numbers import number, probability_text, shown_unit, with_error
 from fdi_torch.report.panels import bar_panel
 from fdi_torch.report.section import Picture, Section
 
@@ -29,13 +29,13 @@ def where_section(material: Material) -> Section | None:
     if not ranked:
         return None
     shares = [100.0 * float(place["share"]) for _, place in ranked]
-    texts = [f"{share:.3g} %{_chance(place)}" for share, (_, place) in zip(shares, ranked, strict=True)]
+    texts = [probability_text(float(place["share"])) + _chance(place) for _, place in ranked]
     guilty = {str(cause["location"]) for cause in material.answer.get("causes", [])}
     for item in material.answer.get("posterior", [])[:1]:
         guilty |= {str(cause["location"]) for cause in causes_of(item)}
     names = [name for name, _ in ranked]
     meaning = material.meaning_of_shares
-    figure = bar_panel("Where", f"{meaning}, %", names, shares, texts, [name in guilty for name in names])
+    figure = bar_panel("Where", "%", names, shares, texts, [name in guilty for name in names])
     _up_to_all(figure)
     words = f"{meaning[:1].upper()}{meaning[1:]}. Orange: where the likeliest explanation has its causes."
     return Section("Where the gap lies", [words, [Picture("gap_where", figure)]])
@@ -105,7 +105,7 @@ def _posterior(answer: Mapping[str, Any]) -> list[Any]:
     if not names:
         return []
     percents = [100.0 * chance for chance in chances]
-    texts = [f"{percent:.3g} %" for percent in percents]
+    texts = [probability_text(0.01 * percent) for percent in percents]
     figure = bar_panel("Explanations", "probability, %", names, percents, texts, within)
     _up_to_all(figure)
     return [[Picture("gap_posterior", figure, "Orange: together they have 95 % of the probability.")]]
