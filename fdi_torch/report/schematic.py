@@ -15,6 +15,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.report.html import short
+from fdi_torch.report.numbers import percent
 from fdi_torch.report.rig_layout import tank_places
 from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
 
@@ -91,7 +92,7 @@ class _Drawing:
         """Texts of the diagnosis at a component."""
         share = self.overlay.probabilities.get(name, 0.0)
         marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
-        return [*marks, f"{100 * share:.0f} %"] if share >= 0.005 else marks
+        return [*marks, percent(share)] if share >= 0.005 else marks
 
     def lines(self, name: str, width: int) -> list[tuple[str, str, str]]:
         """Text, colour and weight of each line at a component."""
