@@ -236,13 +236,18 @@ class Valley:
         cost = 0.5 * row_sum(residual * residual)
         return Linearisation(cost, apply(columns, residual), curvature, Point(residual, jacobian))
 
-    def follow(self, theta: Tensor, known: Linearisation, step: Tensor) -> Linearisation:
+    def attempt(
+        self, theta: Tensor, known: Linearisation, step: Tensor, near: Linearisation | None = None
+    ) -> Linearisation:
         return self.linearise(theta, torch.arange(len(theta)))
 
     def bend(self, known: Linearisation, trial: Linearisation, step: Tensor) -> Tensor:
         here, there = known.state, trial.state
         assert isinstance(here, Point) and isinstance(there, Point)
         return apply(here.jacobian.mT, there.residual - here.residual - apply(here.jacobian, step))
+
+    def model(self, theta: Tensor, trial: Linearisation) -> Linearisation:
+        return trial
 
 
 def test_a_curved_valley_is_followed_to_its_lowest_point() -> None:
@@ -264,6 +269,21 @@ def test_a_lane_far_behind_is_given_up_and_has_not_converged() -> None:
     result = levenberg_marquardt(DECAYS.linearise, START, *FREE, beaten)
     assert set(result.statuses()) == {"abandoned"} and not result.converged.any()
     assert (result.iterations < levenberg_marquardt(DECAYS.linearise, START, *FREE).iterations).all()
+
+
+def test_refused_steps_do_not_give_a_lane_up() -> None:
+    """Newton's first steps overshoot 1 - exp(-(x - 10)^2 / 2) and are refused; the lane must not be judged by them."""
+
+    def well(theta: Tensor, lanes: Tensor) -> Linearisation:
+        x = theta[:, 0] - 10.0
+        narrow = torch.exp(-0.5 * x**2)
+        curvature = torch.full_like(narrow, 1e-3)
+        return Linearisation(10.0 * (1.0 - narrow), (10.0 * narrow * x)[:, None], curvature[:, None, None])
+
+    settings = RefineSettings(competition=Competition(behind=1.0, share=0.25, target=0.0))
+    start = torch.tensor([[8.5]], dtype=DOUBLE)
+    found = levenberg_marquardt(well, start, torch.full_like(start, -100.0), torch.full_like(start, 100.0), settings)
+    assert found.statuses() != ["abandoned"] and found.cost.item() < 1e-6
 
 
 def test_status_says_out_of_iterations_or_stalled() -> None:

@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -88,14 +88,32 @@ class Linearisation:
 Linearise = Callable[[Tensor, Tensor], Linearisation]
 
 
-class Neighbourhood(Protocol):
-    """A problem that computes the model at a point from the model at a nearby point."""
+class Trial(Protocol):
+    """Points whose cost (L,) is known, but not their derivatives."""
 
-    def follow(self, theta: Tensor, known: Linearisation, step: Tensor) -> Linearisation:
-        """The model at theta (L, P), which lies `step` (L, P) away from the point of the model `known`."""
+    cost: Tensor
 
-    def bend(self, known: Linearisation, trial: Linearisation, step: Tensor) -> Tensor:
+    def __getitem__(self, keep: Tensor) -> Self:
+        """Select lanes by index (int64)."""
+
+    def replaced(self, which: Tensor, new: Self) -> Self:
+        """A copy in which the k-th lane of `new` replaces lane `which[k]` (int64)."""
+
+
+AnyTrial = TypeVar("AnyTrial", bound=Trial)
+
+
+class Neighbourhood(Protocol[AnyTrial]):
+    """A problem that computes points from the model at a nearby point, and their derivatives only where needed."""
+
+    def attempt(self, theta: Tensor, known: Linearisation, step: Tensor, near: AnyTrial | None = None) -> AnyTrial:
+        """The points theta (L, P). `step` (L, P) leads there from the points of the model `known`, or from `near`."""
+
+    def bend(self, known: Linearisation, trial: AnyTrial, step: Tensor) -> Tensor:
         """J'c (L, P) with c = r(theta + step) - r(theta) - J step, priors included; J is the Jacobian of `known`."""
+
+    def model(self, theta: Tensor, trial: AnyTrial) -> Linearisation:
+        """The model at the points of `trial`, theta (L, P)."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +121,8 @@ class Competition:
     """Rule that abandons hopeless lanes.
 
     The reference is the lowest cost of all lanes or `target`, whichever is less. A lane is abandoned if its cost
-    exceeds the reference by more than `behind` and its last step reduced this excess by less than the fraction `share`.
-    The rule applies from the second step on.
+    exceeds the reference by more than `behind` and its last accepted step reduced this excess by less than the fraction
+    `share`. The rule applies from the second step on. A refused step says nothing about what a lane can gain.
     """
 
     behind: float
@@ -162,7 +180,7 @@ class _Lanes:
     model: Linearisation
     damping: Tensor
     growth: Tensor  # Nielsen's nu: factor on the damping after an unsatisfactory step
-    actual_decrease: Tensor  # actual decrease of the cost by the last step
+    actual_decrease: Tensor  # actual decrease of the cost by the last accepted step, infinite before
     refused_decrease: Tensor  # predicted decrease of the last step if it was refused, else infinite
     negligible_step: Tensor  # bool: the last step was accepted and below the step tolerance
     after_refusals: Tensor  # bool: the last step was accepted after refusals
@@ -184,7 +202,7 @@ def levenberg_marquardt(
     high: Tensor,
     settings: RefineSettings | None = None,
     on_iteration: Callable[[Progress], None] | None = None,
-    neighbourhood: Neighbourhood | None = None,
+    neighbourhood: Neighbourhood[AnyTrial] | None = None,
 ) -> Refined:
     """Minimise the cost of every lane from `start` (*batch, P) within [low, high], which broadcast against it.
 
@@ -212,10 +230,10 @@ def levenberg_marquardt(
             break
         step = damped_step(lanes.quadratic, lanes.damping)
         if neighbourhood is None:
-            model = linearise(step.trial, lanes.lanes)
+            hopeful, model = torch.arange(len(lanes.lanes), device=theta.device), linearise(step.trial, lanes.lanes)
         else:
-            step, model = _follow_with_correction(neighbourhood, lanes, step)
-        lanes, accepted = _advance(lanes, step, model, settings)
+            step, hopeful, model = _try_with_correction(neighbourhood, lanes, step)
+        lanes, accepted = _advance(lanes, step, hopeful, model, settings)
         iteration += 1
         if on_iteration is not None:
             values = (lanes.lanes, lanes.theta, lanes.model.cost, decrement, lanes.damping, accepted)
@@ -281,39 +299,49 @@ def _status(
     return torch.where(lanes.model.finite(), status, FAILED)
 
 
-def _follow_with_correction(neighbourhood: Neighbourhood, lanes: _Lanes, step: Step) -> tuple[Step, Linearisation]:
-    """Trials of all lanes with their models, computed by the neighbourhood.
+def _try_with_correction(
+    neighbourhood: Neighbourhood[AnyTrial], lanes: _Lanes, step: Step
+) -> tuple[Step, Tensor, Linearisation]:
+    """The steps, the lanes whose trial has a lower cost, (N,), and the models there.
 
     A trial that would be refused is replaced by its second-order correction, if that is valid (see `bent_step`).
     """
-    model = neighbourhood.follow(step.trial, lanes.model, step.trial - lanes.theta)
-    refused = (step.solvable & (step.predicted > 0) & ~_better(lanes, step, model)).nonzero().flatten()
-    if not len(refused):
-        return step, model
-    refused_lanes, trial, refused_model = lanes[refused], step.trial[refused], model[refused]
-    bend = neighbourhood.bend(refused_lanes.model, refused_model, trial - refused_lanes.theta)
-    corrected_trial, is_correction = bent_step(refused_lanes.quadratic, refused_lanes.damping, trial, bend)
-    is_correction = is_correction & refused_model.finite()
-    if not bool(is_correction.any()):
-        return step, model
-    corrected_trial, refused = corrected_trial[is_correction], refused[is_correction]
-    corrected_model = neighbourhood.follow(
-        corrected_trial, refused_model[is_correction], corrected_trial - trial[is_correction]
-    )
-    return replace(step, trial=step.trial.index_copy(0, refused, corrected_trial)), model.replaced(
-        refused, corrected_model
-    )
+    trial = neighbourhood.attempt(step.trial, lanes.model, step.trial - lanes.theta)
+    lower = _lower(lanes, step, trial.cost)
+    refused = (step.solvable & (step.predicted > 0) & ~lower).nonzero().flatten()
+    if len(refused):
+        point, known, refused_trial = step.trial[refused], lanes[refused], trial[refused]
+        bend = neighbourhood.bend(known.model, refused_trial, point - known.theta)
+        corrected, valid = bent_step(known.quadratic, known.damping, point, bend)
+        valid = (valid & torch.isfinite(refused_trial.cost)).nonzero().flatten()
+        if len(valid):
+            corrected, refused = corrected[valid], refused[valid]
+            new = neighbourhood.attempt(corrected, known[valid].model, corrected - point[valid], refused_trial[valid])
+            trial = trial.replaced(refused, new)
+            step = replace(step, trial=step.trial.index_copy(0, refused, corrected))
+            lower = _lower(lanes, step, trial.cost)
+    hopeful = lower.nonzero().flatten()
+    if not len(hopeful):
+        return step, hopeful, lanes.model[hopeful]
+    return step, hopeful, neighbourhood.model(step.trial[hopeful], trial[hopeful])
 
 
-def _better(lanes: _Lanes, step: Step, model: Linearisation) -> Tensor:
-    """Which trials are accepted, (L,) bool: finite, lower in cost, from a solvable step with a predicted decrease."""
-    return step.solvable & model.finite() & (model.cost < lanes.model.cost) & (step.predicted > 0)
+def _lower(lanes: _Lanes, step: Step, cost: Tensor) -> Tensor:
+    """Which trials have a finite and lower cost, from a solvable step with a predicted decrease, (L,) bool."""
+    return step.solvable & torch.isfinite(cost) & (cost < lanes.model.cost) & (step.predicted > 0)
 
 
-def _advance(lanes: _Lanes, step: Step, model: Linearisation, settings: RefineSettings) -> tuple[_Lanes, Tensor]:
-    """Accept or refuse the trial of each lane and update its damping; also returns which were accepted, (L,) bool."""
-    accepted = _better(lanes, step, model)
-    decrease = torch.where(accepted, lanes.model.cost - model.cost, 0.0)
+def _advance(
+    lanes: _Lanes, step: Step, hopeful: Tensor, model: Linearisation, settings: RefineSettings
+) -> tuple[_Lanes, Tensor]:
+    """Accept or refuse the trial of each lane and update its damping; also returns which were accepted, (L,) bool.
+
+    model: at the trials of the lanes `hopeful`; the trials of all others are refused.
+    """
+    better = model.finite() & _lower(lanes[hopeful], step[hopeful], model.cost)
+    accepted = torch.zeros_like(step.solvable).index_copy(0, hopeful, better)
+    decrease = torch.zeros_like(lanes.damping).index_copy(0, hopeful, lanes.model.cost[hopeful] - model.cost)
+    decrease = torch.where(accepted, decrease, 0.0)
     well_predicted = decrease > _GOOD_GAIN_RATIO * step.predicted
     factor = torch.where(accepted & well_predicted, _DAMPING_REDUCTION, lanes.growth)
     change = (step.trial - lanes.theta).abs()
@@ -321,10 +349,10 @@ def _advance(lanes: _Lanes, step: Step, model: Linearisation, settings: RefineSe
     advanced = replace(
         lanes,
         theta=torch.where(accepted[:, None], step.trial, lanes.theta),
-        model=lanes.model.replaced(accepted.nonzero().flatten(), model[accepted]),
+        model=lanes.model.replaced(hopeful[better], model[better]),
         damping=(lanes.damping * factor).clamp(min=_LEAST_DAMPING),
         growth=torch.where(accepted, 2.0, 2.0 * lanes.growth),
-        actual_decrease=decrease,
+        actual_decrease=torch.where(accepted, decrease, lanes.actual_decrease),
         refused_decrease=torch.where(accepted, math.inf, step.predicted),
         negligible_step=accepted & below_tolerance & (lanes.damping <= 1.0),
         after_refusals=accepted & (lanes.growth > 2.0),

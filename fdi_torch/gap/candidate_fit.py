@@ -20,7 +20,7 @@ from fdi_torch.estimate.kalman import KalmanWhitening
 from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, levenberg_marquardt
 from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
 from fdi_torch.gap.dataset import DataSet, RecordingPart, interpolate
-from fdi_torch.gap.trajectory_problem import FAR, TrajectoryProblem
+from fdi_torch.gap.trajectory_problem import FAR, FittedTrajectory, TrajectoryProblem
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
@@ -223,14 +223,16 @@ class Fitter:
         settings = RefineSettings(cap, 0.5 * DECREMENT, share, step_tolerance=0.0, competition=competition)
         low, high, _ = problem.box
         minimum = levenberg_marquardt(problem.linearise, theta, low, high, settings, neighbourhood=problem)
-        assert isinstance(minimum.state, Linearised)
-        return DescentResult(minimum.theta, 2.0 * minimum.cost, minimum.state, minimum.converged)
+        assert isinstance(minimum.state, FittedTrajectory)
+        return DescentResult(minimum.theta, 2.0 * minimum.cost, minimum.state.linearised, minimum.converged)
 
     def normal(
-        self, space: ParameterSpace, theta: Tensor, linearised: Linearised, scale: Tensor
+        self, space: ParameterSpace, theta: Tensor, residual: Tensor, jacobian: Tensor, scale: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost (L,), half its gradient (L, P), and curvature (L, P, P), in scaled parameters."""
-        residual, jacobian = self.white(linearised)
+        """Cost (L,), half its gradient (L, P), and curvature (L, P, P), in scaled parameters.
+
+        residual (L, S, C), jacobian (L, S, C, P): whitened.
+        """
         weight = 1.0 / space.std(theta)
         deviation = (theta - space.nominal(theta)) * weight
         j, r = (jacobian * scale).permute(0, 3, 2, 1).flatten(2), residual.transpose(1, 2).flatten(1)  # time last
@@ -239,9 +241,20 @@ class Fitter:
         curvature = j @ j.mT + torch.diag_embed((weight * scale) ** 2)
         return cost, gradient, curvature
 
+    def chi_square(self, space: ParameterSpace, theta: Tensor, readings: Tensor) -> Tensor:
+        """Chi-square (L,) of modelled readings (L, S, C) at theta (L, P), with priors."""
+        residual = self.whiten(self.data.readings - readings)
+        deviation = (theta - space.nominal(theta)) / space.std(theta)
+        return (residual * residual).sum((-1, -2)) + (deviation * deviation).sum(-1)
+
+    def curvature(self, fit: Fit) -> Tensor:
+        """Curvature (P, P) of half of chi-square at a fit, in scaled parameters."""
+        white, scale = self.white(fit.linearised), self.box(fit.space)[2]
+        return self.normal(fit.space, fit.theta.unsqueeze(0), *white, scale)[2][0]
+
     def cost(self, fit: Fit) -> float:
         """Chi-square of a fit under this fitter's noise, with priors."""
-        return float(self.normal(fit.space, fit.theta, fit.linearised, self.box(fit.space)[2])[0])
+        return float(self.chi_square(fit.space, fit.theta, fit.linearised.readings))
 
     def white(self, linearised: Linearised) -> tuple[Tensor, Tensor]:
         """Whitened residual (L, S, C) and Jacobian (L, S, C, P)."""
@@ -286,7 +299,7 @@ def _in_library_order(placements: Sequence[Placement]) -> list[Placement]:
 def covariance(fitter: Fitter, fit: Fit) -> Tensor:
     """Covariance (P, P) of a fit's parameters: the inverse of the curvature, priors included."""
     scale = fitter.box(fit.space)[2]
-    curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.linearised, scale)[2][0]
+    curvature = fitter.curvature(fit)
     return torch.linalg.pinv(curvature, hermitian=True) * scale * scale.unsqueeze(1)
 
 

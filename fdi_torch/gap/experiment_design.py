@@ -107,9 +107,7 @@ def _prior_information(fitter: Fitter, fit: Fit) -> Tensor:
     Initial levels, and constants that vary between recordings, have none.
     """
     scale = fitter.box(fit.space)[2]
-    curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.linearised, scale)[2][0] / (
-        scale * scale.unsqueeze(1)
-    )
+    curvature = fitter.curvature(fit) / (scale * scale.unsqueeze(1))
     indices = [fit.space.index(n) for n in _in_one_run(fit)]
     per_recording = fitter.data.per_recording
     common = torch.tensor([n not in per_recording for n in _in_one_run(fit)])

@@ -13,15 +13,15 @@ wrong equation.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, Key
+from fdi_torch.gap.candidate_fit import BEHIND, SHARE, Candidate, Fit, Fitter, Key
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, screen
 
@@ -105,31 +105,42 @@ class ExplanationPool:
         """Estimate noise and fit alternately until the evidence converges; keep the better explanation.
 
         Effects that were evaluated before are evaluated again only if this fit is better under the noise found then.
+        An explanation that falls too far behind those of its size that will be extended is given up, as a fit is.
         """
         before = self.explanations.get(fit.key)
         if before and before.fitter.cost(fit) > before.fit.cost - CONVERGED:
             return before
+        rivals = self.best_of(len(fit.key))[BEAM - 1 :]
+        rival = rivals[0].log_evidence if rivals else -math.inf
         best: RankedExplanation | None = None
         while True:
             own_fitter, likely = with_estimated_noise(self.fitter, fit, start, climb=best is None)
-            fit = own_fitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
+            fit = replace(fit, cost=own_fitter.cost(fit))
+            lead = log_evidence(own_fitter, fit, self.choices) - rival
+            fit = own_fitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit, fit.cost + 2.0 * lead)
             updated = RankedExplanation(fit, own_fitter, likely.noise, log_evidence(own_fitter, fit, self.choices))
-            if best and not updated.log_evidence > best.log_evidence + CONVERGED:
+            gain = updated.log_evidence - best.log_evidence if best else math.inf
+            if best is None or gain > 0.0:
+                best = updated
+            behind = rival - best.log_evidence
+            if not gain > CONVERGED or (behind > 0.5 * BEHIND and gain < SHARE * behind):
                 break
-            best, start = updated, likely.noise
+            start = likely.noise
         if fit.key not in self.explanations or best.log_evidence > self.explanations[fit.key].log_evidence:
             self.explanations[fit.key] = best
         return best
 
     def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
-        """The explanation without one of its effects, refitted from its present values."""
-        fit, key = explanation.fit, explanation.key - {cause}
-        if key not in self.explanations:
-            placements = tuple(p for p in fit.candidate.placements if (p.effect.name, p.location) != cause)
-            prefixes = {p.prefix for p in placements}
-            start = {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] in prefixes}
-            self.evaluate(explanation.fitter.fit(Candidate(placements, (start,)), fit), explanation.noise)
-        return self.explanations[key]
+        """The explanation without one of its effects, refitted from its present values.
+
+        A start near the optimum may avoid a local minimum in which an earlier fit of the same effects ended.
+        """
+        fit = explanation.fit
+        placements = tuple(p for p in fit.candidate.placements if (p.effect.name, p.location) != cause)
+        prefixes = {p.prefix for p in placements}
+        start = {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] in prefixes}
+        self.evaluate(explanation.fitter.fit(Candidate(placements, (start,)), fit), explanation.noise)
+        return self.explanations[explanation.key - {cause}]
 
     def best_of(self, effects: int) -> list[RankedExplanation]:
         """Explanations with this number of effects, the likeliest first."""
@@ -150,18 +161,28 @@ class ExplanationPool:
         fits = self._fitted(parent, parent.fitter, self._extensions(parent, own_noise, own=True))[:EVALUATED]
         if sensor_noise:
             candidates = [*self._extensions(parent, sensor_noise, own=False), *_pairs(sensor_noise.pairs, PAIRS)]
-            undisturbed = self._fitted(parent, self.fitter, candidates)
+            undisturbed = self._fitted(parent, self.fitter, candidates, (self.fitter.cost(f) for f in fits))
             costs = {parent.key: self.fitter.cost(parent.fit)} | {f.key: f.cost for f in undisturbed}
             fits += [f for f in undisturbed if self._improves(f, costs)][:EVALUATED]
         for fit in sorted(fits, key=lambda f: len(f.key)):
             self.evaluate(fit, parent.noise)
 
-    def _fitted(self, parent: RankedExplanation, fitter: Fitter, candidates: Sequence[Candidate]) -> list[Fit]:
-        """Fits of the candidates, the best first. A fit that is worse than the explanation it contains has failed."""
-        parent_cost, fits = fitter.cost(parent.fit), list[Fit]()
+    def _fitted(
+        self,
+        parent: RankedExplanation,
+        fitter: Fitter,
+        candidates: Sequence[Candidate],
+        rivals: Iterable[float] = (),
+    ) -> list[Fit]:
+        """Fits of the candidates, the best first. A fit that is worse than the explanation it contains has failed.
+
+        rivals: costs of other fits under the same noise.
+        """
+        parent_cost, fits, least = fitter.cost(parent.fit), list[Fit](), min(rivals, default=math.inf)
         for candidate in candidates:
             if candidate.key not in self.explanations:
-                fit = fitter.fit(candidate, parent.fit, min((f.cost for f in fits), default=math.inf))
+                fit = fitter.fit(candidate, parent.fit, least)
+                least = min(least, fit.cost)
                 if fit.cost < parent_cost:
                     fits.append(fit)
                 else:
@@ -207,8 +228,10 @@ class ExplanationPool:
         while True:
             best = max(self.explanations.values(), key=lambda e: e.log_evidence)
             for cause in best.key if len(best.key) > 1 else ():
-                if best.key - {cause} not in self.explanations:
-                    self.extend_by(self.without(best, cause), options)
+                known = self.explanations.get(best.key - {cause})
+                reduced = self.without(best, cause)
+                if reduced is not known:
+                    self.extend_by(reduced, options)
             if max(self.explanations.values(), key=lambda e: e.log_evidence) is best:
                 return
 

@@ -6,7 +6,7 @@ compared only where both trajectories satisfy the model: a step whose trajectory
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from typing import Protocol
 
 import torch
@@ -19,7 +19,7 @@ from fdi_torch.simulate.joint_collocation import JointCollocation
 
 CORRECTIONS = 6  # most Newton steps after the parameters moved a trajectory
 FAR = 1e-3  # largest defect of a converged trajectory, in units of the plant's length scale
-LONG, NEARLY = 4.0, 10.0  # in units of FAR: a shift that needs corrections, a defect that one more correction removes
+NEARLY = 10.0  # in units of FAR: a defect that one correction removes
 LOST, STALLED = 100.0, 0.9  # a defect above LOST * FAR that one correction reduces by less than 10 % has diverged
 
 
@@ -33,11 +33,51 @@ class Objective(Protocol):
 
     def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]: ...
 
+    def chi_square(self, space: ParameterSpace, theta: Tensor, readings: Tensor) -> Tensor: ...
+
     def normal(
-        self, space: ParameterSpace, theta: Tensor, linearised: Linearised, scale: Tensor
+        self, space: ParameterSpace, theta: Tensor, residual: Tensor, jacobian: Tensor, scale: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]: ...
 
     def white(self, linearised: Linearised) -> tuple[Tensor, Tensor]: ...
+
+    def whiten(self, x: Tensor) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class FittedTrajectory:
+    """A linearised trajectory with its whitened Jacobian (L, S, C, P)."""
+
+    linearised: Linearised
+    jacobian: Tensor
+
+    def lanes(self, which: Tensor) -> FittedTrajectory:
+        """Select lanes by index (int64) or mask (bool)."""
+        return FittedTrajectory(self.linearised.lanes(which), self.jacobian[which])
+
+    def replaced(self, which: Tensor, new: FittedTrajectory) -> FittedTrajectory:
+        """A copy in which the k-th lane of `new` replaces lane `which[k]` (int64)."""
+        linearised = self.linearised.replaced(which, new.linearised)
+        return FittedTrajectory(linearised, self.jacobian.index_copy(0, which, new.jacobian))
+
+
+@dataclass(frozen=True)
+class TrialTrajectory:
+    """A trajectory without derivatives: cost (L,), infinite if it did not converge; levels (L, K+1, n), readings
+    (L, S, C); allowed (L,): the largest defect, in m, with which it counts as converged."""
+
+    cost: Tensor
+    levels: Tensor
+    readings: Tensor
+    allowed: Tensor
+
+    def __getitem__(self, keep: Tensor) -> TrialTrajectory:
+        return TrialTrajectory(self.cost[keep], self.levels[keep], self.readings[keep], self.allowed[keep])
+
+    def replaced(self, which: Tensor, new: TrialTrajectory) -> TrialTrajectory:
+        """A copy in which the k-th lane of `new` replaces lane `which[k]` (int64)."""
+        pairs = ((getattr(self, f.name), getattr(new, f.name)) for f in fields(self))
+        return TrialTrajectory(*(mine.index_copy(0, which, other) for mine, other in pairs))
 
 
 class TrajectoryProblem:
@@ -52,58 +92,63 @@ class TrajectoryProblem:
         linearised = self.engine.linearise(theta, self.levels[lanes])
         return self._model(theta, _correct(self.engine, theta, linearised, self.objective.far))
 
-    def follow(self, theta: Tensor, known: Linearisation, step: Tensor) -> Linearisation:
-        """The model at theta, a `step` away from `known`. The cost is infinite if the trajectory does not converge."""
-        linearised, far = _linearised(known), self.objective.far
+    def attempt(
+        self, theta: Tensor, known: Linearisation, step: Tensor, near: TrialTrajectory | None = None
+    ) -> TrialTrajectory:
+        """The trajectories at theta, a `step` away from `known` or from `near`."""
+        linearised, far = _fitted(known).linearised, self.objective.far
         shift = (linearised.slopes * step[:, None, None, :]).sum(-1)
-        moved = follow_trajectories(self.engine, theta, linearised.levels + shift, shift, far)
-        model = self._model(theta, moved)
-        lost = ~(moved.defect <= linearised.defect.clamp(min=far))
-        return replace(model, cost=torch.where(lost, torch.inf, model.cost))
+        guess = (near or linearised).levels + shift
+        levels, lost = corrected_trajectories(self.engine, theta, guess, far)
+        readings = self.engine.read(levels, theta)
+        cost = 0.5 * self.objective.chi_square(self.engine.space, theta, readings)
+        cost = torch.where(lost, torch.inf, cost)
+        return TrialTrajectory(cost, levels, readings, linearised.defect.clamp(min=far))
 
-    def bend(self, known: Linearisation, trial: Linearisation, step: Tensor) -> Tensor:
+    def bend(self, known: Linearisation, trial: TrialTrajectory, step: Tensor) -> Tensor:
         """J'c (L, P) for the second-order change c of the whitened readings along the step; priors are linear."""
-        linearised = _linearised(known)
-        bend = (
-            _linearised(trial).readings - linearised.readings - (linearised.jacobian * step[:, None, None, :]).sum(-1)
-        )
-        columns = torch.cat([linearised.jacobian, bend.unsqueeze(-1)], dim=-1)
-        white = self.objective.white(replace(linearised, jacobian=columns))[1].flatten(1, 2)
-        return (white[..., :-1] * white[..., -1:]).sum(1)
+        here = _fitted(known)
+        linear = here.linearised.readings + (here.linearised.jacobian * step[:, None, None, :]).sum(-1)
+        bend = self.objective.whiten(trial.readings - linear)
+        return (here.jacobian.flatten(1, 2).mT @ bend.flatten(1).unsqueeze(-1)).squeeze(-1)
+
+    def model(self, theta: Tensor, trial: TrialTrajectory) -> Linearisation:
+        """The model at a trial. The cost is infinite if the trajectory has not converged."""
+        moved = self.engine.linearise(theta, trial.levels)
+        model = self._model(theta, moved)
+        return replace(model, cost=torch.where(moved.defect <= trial.allowed, model.cost, torch.inf))
 
     def _model(self, theta: Tensor, linearised: Linearised) -> Linearisation:
         scale = self.box[2]
-        cost, descent, curvature = self.objective.normal(self.engine.space, theta, linearised, scale)
+        residual, jacobian = self.objective.white(linearised)
+        cost, descent, curvature = self.objective.normal(self.engine.space, theta, residual, jacobian, scale)
         # A parameter that nothing determines stays at its value.
         weakest = 1e-9 * torch.diagonal(curvature, dim1=-2, dim2=-1).amax(-1, keepdim=True) + 1e-12
         curvature = curvature + torch.diag_embed(weakest.expand_as(theta))
-        return Linearisation(0.5 * cost, -descent / scale, curvature / (scale * scale.unsqueeze(-1)), linearised)
+        state = FittedTrajectory(linearised, jacobian)
+        return Linearisation(0.5 * cost, -descent / scale, curvature / (scale * scale.unsqueeze(-1)), state)
 
 
-def _linearised(model: Linearisation) -> Linearised:
-    assert isinstance(model.state, Linearised)
+def _fitted(model: Linearisation) -> FittedTrajectory:
+    assert isinstance(model.state, FittedTrajectory)
     return model.state
 
 
-def follow_trajectories(
-    engine: Collocation | JointCollocation, theta: Tensor, guess: Tensor, shift: Tensor, far: float
-) -> Linearised:
-    """Linearised trajectories near a guess that is `shift` away from converged ones.
-
-    Slopes are computed only once the guess has been corrected.
-    """
+def corrected_trajectories(
+    engine: Collocation | JointCollocation, theta: Tensor, guess: Tensor, far: float
+) -> tuple[Tensor, Tensor]:
+    """Trajectories (L, K+1, n) after Newton steps from a guess, and which did not converge (L,) bool."""
     levels, lost = guess, torch.zeros(len(theta), dtype=torch.bool)
-    lanes = (shift.abs().amax(dim=(-1, -2)) > LONG * far).nonzero().flatten()
-    defect = torch.full((len(theta),), torch.inf, dtype=guess.dtype)
-    for _ in range(CORRECTIONS - 1):
-        if not len(lanes):
-            break
+    lanes, defect = torch.arange(len(theta)), torch.full((len(theta),), torch.inf, dtype=guess.dtype)
+    for _ in range(CORRECTIONS):
         before = defect[lanes]
         path, moved = engine.corrected(theta[lanes], levels[lanes])
         levels, defect = levels.index_copy(0, lanes, path), defect.index_copy(0, lanes, moved)
         lost[lanes] = _diverged(moved, before, far)
         lanes = lanes[(moved > NEARLY * far) & ~lost[lanes]]
-    return _correct(engine, theta, engine.linearise(theta, levels), far, lost)
+        if not len(lanes):
+            break
+    return levels, lost
 
 
 def _correct(
@@ -111,10 +156,9 @@ def _correct(
     theta: Tensor,
     linearised: Linearised,
     far: float,
-    lost: Tensor | None = None,
 ) -> Linearised:
     """Correct the lanes whose defect is too large until they converge or diverge."""
-    lost = torch.zeros_like(linearised.defect, dtype=torch.bool) if lost is None else lost
+    lost = torch.zeros_like(linearised.defect, dtype=torch.bool)
     for _ in range(CORRECTIONS):
         lanes = (~lost & (linearised.defect > far)).nonzero().flatten()
         if not len(lanes):

@@ -90,9 +90,7 @@ def estimate_initial_state(segment: DataSet, starts: Sequence[Mapping[str, float
 
 def _negative_log_evidence(fitter: Fitter, fit: Fit) -> float:
     """Twice the negative log evidence, without terms that all fits of the segment share."""
-    scale = fitter.box(fit.space)[2]
-    _, _, curvature = fitter.normal(fit.space, fit.theta.unsqueeze(0), fit.linearised, scale)
-    value = fit.cost + float(torch.logdet(curvature[0]))
+    value = fit.cost + float(torch.logdet(fitter.curvature(fit)))
     return value if math.isfinite(value) else math.inf
 
 
