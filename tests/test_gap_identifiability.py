@@ -14,7 +14,7 @@ from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.experiment_design import HIGH, discriminating_input, planned_recording
 from fdi_torch.gap.identifiability import DRAWS, identifiability, simulated_confusions
 from fdi_torch.gap.problem import checked_data_set
-from fdi_torch.gap.screening import Option, Pairs, ScreeningResult
+from fdi_torch.gap.screening import Option, Pairs
 from fdi_torch.plant.effect import Placement
 from tests.test_gap import nominal_plant, recorded
 
@@ -60,8 +60,7 @@ def test_inseparable_and_hidden_effects_follow_from_the_columns() -> None:
     columns = torch.zeros(4, 3, dtype=torch.float64)
     columns[0, :2], columns[1, 1], columns[2, 2] = 30.0, 3.0, 4.0
     pairs = made_up(columns)
-    strength = torch.diagonal(pairs.gram)
-    found = identifiability(ScreeningResult(pairs.options, pairs.score, strength, pairs), nominal_plant())
+    found = identifiability(pairs, nominal_plant())
     assert found.hidden == (("pump_lag", "Q1"),)
     ((first, second, left),) = found.inseparable
     assert {first, second} == {("pump_gain", "Q1"), ("pump_gain", "Q2")}

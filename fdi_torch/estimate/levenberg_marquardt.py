@@ -89,9 +89,11 @@ Linearise = Callable[[Tensor, Tensor], Linearisation]
 
 
 class Trial(Protocol):
-    """Points whose cost (L,) is known, but not their derivatives."""
+    """Points whose cost is known, but not their derivatives."""
 
-    cost: Tensor
+    @property
+    def cost(self) -> Tensor:
+        """Cost of each point, (L,)."""
 
     def __getitem__(self, keep: Tensor) -> Self:
         """Select lanes by index (int64)."""

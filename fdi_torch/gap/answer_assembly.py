@@ -133,7 +133,7 @@ def _confusability(result: DiagnosisResult) -> dict[str, object]:
         return {}
     (cause,) = result.effects_fit.key
     gap = max(result.gap, 1.0)
-    return {"simulated": simulated_confusions(result.search.shown.pairs, cause, gap, result.fitter.data.plant)}
+    return {"simulated": simulated_confusions(result.search.shown, cause, gap, result.fitter.data.plant)}
 
 
 def _identifiability(result: DiagnosisResult) -> dict[str, Any]:

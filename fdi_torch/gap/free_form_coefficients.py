@@ -48,10 +48,11 @@ def coefficients_of(
     """
     options = options_of(free, fitter, reach)
     names = tuple(next(n for n, v in o.start.items() if v != 0.0) for o in options)
-    columns = effect_columns(fitter, fit, options) / UNIT
+    columns = fitter.whiten(effect_columns(fitter, fit, options)) / UNIT
     residual = fitter.white(fit.linearised)[0][0]
     if returned:
-        residual = residual + effect_columns(fitter, fit, [_as_fitted(fitter, fit, p) for p in returned]).sum(-1)
+        changes = effect_columns(fitter, fit, [_as_fitted(fitter, fit, p) for p in returned])
+        residual = residual + fitter.whiten(changes).sum(-1)
     columns, residual = _without_initial_levels(fitter, fit, columns, residual)
     prior = torch.tensor([o.parameters[0].std for o in options], dtype=columns.dtype)
     spectrum, basis = torch.linalg.eigh((columns * prior).T @ (columns * prior))

@@ -27,7 +27,7 @@ from fdi_torch.gap.candidate_fit import Candidate, Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.library import canonical, library_of
-from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, options_of, screen
+from fdi_torch.gap.screening import Option, Pairs, options_of, pairs_of, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
@@ -47,9 +47,8 @@ class Identifiability:
     shown: Mapping[CauseName, float]
 
 
-def identifiability(screening: ScreeningResult, plant: PlantDescription) -> Identifiability:
-    """Identifiability from the screening of a library."""
-    pairs = screening.pairs
+def identifiability(pairs: Pairs, plant: PlantDescription) -> Identifiability:
+    """Identifiability from the regression on pairs of a library."""
     strength = torch.diagonal(pairs.gram)
     most_visible = _most_visible_starts(pairs.options, strength)
     hidden = tuple(cause for cause, i in most_visible.items() if float(strength[i]) < SHOWN)
@@ -96,7 +95,7 @@ def planned_identifiability(
     predicted = replace(fitter.data.recording, outputs=nominal_fit.linearised.readings[0])
     placements = [p for p in library_of(plant, library) if not p.effect.quantizes]
     options = options_of(placements, fitter, operating_range_of(predicted, plant))
-    return identifiability(screen(fitter, nominal_fit, options), plant)
+    return identifiability(pairs_of(fitter, nominal_fit, screen(fitter, nominal_fit, options)), plant)
 
 
 def _noise_free(

@@ -47,7 +47,7 @@ def one_at_a_time(
     options = options_of(
         [p for p in placements if not p.effect.quantizes], fitter, operating_range_of(recording, plant)
     )
-    fits = [null, *(fitter.fit(c, null) for c in _singles(screen(fitter, null, options, pairs=False)))]
+    fits = [null, *(fitter.fit(c, null) for c in _singles(screen(fitter, null, options)))]
     winner = min(fits, key=lambda fit: _bic(fitter, fit))
     return _named([(p.effect.name, p.location) for p in winner.candidate.placements])
 

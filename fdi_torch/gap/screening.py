@@ -9,7 +9,7 @@ effect.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -73,14 +73,6 @@ class ScreeningResult:
     options: tuple[Option, ...]
     score: Tensor
     strength: Tensor
-    computed_pairs: Pairs | None = None
-
-    @property
-    def pairs(self) -> Pairs:
-        """Raises ValueError if the pairs were not computed."""
-        if self.computed_pairs is None:
-            raise ValueError("expected a screen with pairs, got one without; ask `screen` for them")
-        return self.computed_pairs
 
     @property
     def size(self) -> Tensor:
@@ -105,13 +97,25 @@ def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Operating
     ]
 
 
-def screen(fitter: Fitter, fit: Fit, options: Sequence[Option], pairs: bool = True) -> ScreeningResult:
-    """Screen all options about a fit. pairs: whether to compute the regression on pairs as well."""
-    regression = _ProjectedRegression.of(fitter, fit)
-    batches = [regression.screened(options[k : k + BATCH]) for k in range(0, len(options), BATCH)]
-    score, strength = (torch.cat([f[k] for f in batches]) if batches else torch.zeros(0).double() for k in range(2))
-    whole = ScreeningResult(tuple(options), score, strength)
-    return replace(whole, computed_pairs=regression.pairs(whole)) if pairs else whole
+def screen(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> ScreeningResult:
+    """Screen all options about a fit."""
+    return screen_under_each([fitter], fit, options)[0]
+
+
+def screen_under_each(fitters: Sequence[Fitter], fit: Fit, options: Sequence[Option]) -> list[ScreeningResult]:
+    """Screen all options about a fit under the noise of each fitter."""
+    regressions = [_ProjectedRegression.of(fitter, fit) for fitter in fitters]
+    sums = torch.zeros(len(fitters), 2, len(options), dtype=fit.theta.dtype)
+    for k in range(0, len(options), BATCH):
+        columns = effect_columns(fitters[0], fit, options[k : k + BATCH])
+        for regression, of_all in zip(regressions, sums, strict=True):
+            of_all[:, k : k + BATCH] = torch.stack(regression.screened(columns))
+    return [ScreeningResult(tuple(options), score, strength) for score, strength in sums]
+
+
+def pairs_of(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> Pairs:
+    """The regression on pairs of the most promising options of a screening under the same noise."""
+    return _ProjectedRegression.of(fitter, fit).pairs(screening)
 
 
 @dataclass(frozen=True)
@@ -141,11 +145,11 @@ class _ProjectedRegression:
             fitter, fit, remaining.reshape(residual.shape), q[:count].reshape(*residual.shape, -1)
         )
 
-    def screened(self, options: Sequence[Option]) -> tuple[Tensor, Tensor]:
-        """Score and strength of options, (M,) each."""
-        columns = effect_columns(self.fitter, self.fit, options)
-        score, strength = columns.new_zeros(2, len(options)).unbind()
-        shared = columns.new_zeros(len(options), self.basis.shape[-1])
+    def screened(self, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """Score and strength of options, (M,) each; columns (S, C, M): their changes of the readings."""
+        columns = self.fitter.whiten(columns)
+        score, strength = columns.new_zeros(2, columns.shape[-1]).unbind()
+        shared = columns.new_zeros(columns.shape[-1], self.basis.shape[-1])
         for c in range(columns.shape[1]):
             channel_columns = columns[:, c].T
             score += channel_columns @ self.remaining[:, c]
@@ -163,22 +167,21 @@ class _ProjectedRegression:
             chosen |= set(best.values())
         indices = sorted(chosen)
         options = tuple(screening.options[i] for i in indices)
-        columns = effect_columns(self.fitter, self.fit, options).permute(1, 0, 2)
+        columns = self.fitter.whiten(effect_columns(self.fitter, self.fit, options)).permute(1, 0, 2)
         shared = (columns.mT @ self.basis.permute(1, 0, 2)).sum(dim=0)
         gram = (columns.mT @ columns).sum(dim=0) - shared @ shared.T
         return Pairs(options, screening.score[indices], gram)
 
 
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:
-    """Whitened changes of the readings (S, C, M) for each start."""
+    """Changes of the readings (S, C, M), in their unit, for each start."""
     engine = fitter.engine(fit.candidate, list(fit.effect_values))
     pieces = (
         engine.apart(fit.theta.unsqueeze(0), fit.linearised)
         if isinstance(engine, JointCollocation)
         else [(engine, fit.theta, fit.linearised)]
     )
-    columns = with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
-    return fitter.whiten(columns)
+    return with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
 
 
 def _columns(

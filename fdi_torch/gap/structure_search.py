@@ -23,7 +23,7 @@ from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import BEHIND, SHARE, Candidate, Fit, Fitter, Key
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
-from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, screen
+from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
 
 DEEPEST = 4  # effects in one explanation
 BEAM = 2  # explanations of one size that are extended
@@ -52,14 +52,15 @@ class RankedExplanation:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """explanations: all that were evaluated, the likeliest first. null: the recalibrated plant among them. shown:
-    screening about the recalibrated plant under the noise of the best explanation. alarm: the same under its own noise.
-    unexamined: odds of the candidates that were not fitted, against the best explanation."""
+    """explanations: all that were evaluated, the likeliest first. null: the recalibrated plant among them. alarm:
+    screening about the recalibrated plant under its own noise. shown: regression on pairs about the same under the
+    noise of the best explanation. unexamined: odds of the candidates that were not fitted, against the best
+    explanation."""
 
     null: RankedExplanation
     explanations: tuple[RankedExplanation, ...]
-    shown: ScreeningResult
     alarm: ScreeningResult
+    shown: Pairs
     unexamined: float
 
     @property
@@ -70,8 +71,8 @@ class SearchResult:
 def search(pool: ExplanationPool, null: Fit, options: Sequence[Option], most: int = DEEPEST) -> SearchResult:
     """Search from the recalibrated plant `null`, fitted under sensor noise alone. most: effects in one explanation."""
     base = pool.evaluate(null)
-    alarm = screen(base.fitter, base.fit, options)
-    pool.extend(base, alarm, screen(pool.fitter, base.fit, options))
+    alarm, of_sensors = screen_under_each([base.fitter, pool.fitter], base.fit, options)
+    pool.extend(base, alarm, of_sensors)
     frontier = pool.best_of(1)[:BEAM]
     for depth in range(2, most + 1):
         if not frontier or frontier[0].log_evidence < pool.best_of(depth - 2)[0].log_evidence:
@@ -85,8 +86,10 @@ def search(pool: ExplanationPool, null: Fit, options: Sequence[Option], most: in
             break
         pool.fit_unexamined()
     explanations = sorted(pool.explanations.values(), key=lambda e: -e.log_evidence)
-    shown = alarm if explanations[0] is base else screen(explanations[0].fitter, base.fit, options)
-    return SearchResult(base, tuple(explanations), shown, alarm, pool.unexamined())
+    likeliest = explanations[0].fitter
+    screening = alarm if likeliest is base.fitter else screen(likeliest, base.fit, options)
+    shown = pairs_of(likeliest, base.fit, screening)
+    return SearchResult(base, tuple(explanations), alarm, shown, pool.unexamined())
 
 
 class ExplanationPool:
@@ -149,7 +152,7 @@ class ExplanationPool:
     def extend_by(self, parent: RankedExplanation, options: Sequence[Option]) -> None:
         """Extend an explanation by one effect, screened under its own noise."""
         further = [o for o in options if o.cause not in parent.key]
-        self.extend(parent, screen(parent.fitter, parent.fit, further, pairs=False))
+        self.extend(parent, screen(parent.fitter, parent.fit, further))
 
     def extend(
         self, parent: RankedExplanation, own_noise: ScreeningResult, sensor_noise: ScreeningResult | None = None
@@ -160,7 +163,8 @@ class ExplanationPool:
         """
         fits = self._fitted(parent, parent.fitter, self._extensions(parent, own_noise, own=True))[:EVALUATED]
         if sensor_noise:
-            candidates = [*self._extensions(parent, sensor_noise, own=False), *_pairs(sensor_noise.pairs, PAIRS)]
+            pairs = _pairs(pairs_of(self.fitter, parent.fit, sensor_noise), PAIRS)
+            candidates = [*self._extensions(parent, sensor_noise, own=False), *pairs]
             undisturbed = self._fitted(parent, self.fitter, candidates, (self.fitter.cost(f) for f in fits))
             costs = {parent.key: self.fitter.cost(parent.fit)} | {f.key: f.cost for f in undisturbed}
             fits += [f for f in undisturbed if self._improves(f, costs)][:EVALUATED]

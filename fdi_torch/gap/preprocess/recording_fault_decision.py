@@ -91,7 +91,7 @@ def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str]) -> Iterator[f
         reach = with_simulated_levels(ranges, plant, fit.linearised.levels[0])
         fitter = _fitter(parent)
         further = [p for p in placements if (p.effect.name, p.location) not in fit.key]
-        screening = screen(fitter, fit, options_of(further, fitter, reach), pairs=False)
+        screening = screen(fitter, fit, options_of(further, fitter, reach))
         best: dict[tuple[str, str], Option] = {}
         for k in torch.argsort(screening.gain, descending=True).tolist():
             best.setdefault(screening.options[k].cause, screening.options[k])
