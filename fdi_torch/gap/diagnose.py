@@ -55,8 +55,8 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     progress(0.2, "which effects")
     present = {p.prefix for p in problem.known_effects} | {name.rpartition(".")[0] for name in data.nuisance}
     options = options_of([p for p in library if not p.effect.quantizes and p.prefix not in present], fitter, reach)
-    pool = ExplanationPool(fitter, len(library))
-    result = search(pool, null, options, problem.most)
+    pool = ExplanationPool(fitter, null, len(library))
+    result = search(pool, options, problem.most)
     progress(0.6, "where")
     posterior = posterior_of(pool, result, plant, possible_places(plant), problem.named_only)
     credible_set = posterior.credible_set(CONTENT)

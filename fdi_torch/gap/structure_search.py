@@ -68,9 +68,9 @@ class SearchResult:
         return self.explanations[0]
 
 
-def search(pool: ExplanationPool, null: Fit, options: Sequence[Option], most: int = DEEPEST) -> SearchResult:
-    """Search from the recalibrated plant `null`, fitted under sensor noise alone. most: effects in one explanation."""
-    base = pool.evaluate(null)
+def search(pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST) -> SearchResult:
+    """Search from the recalibrated plant. most: effects in one explanation."""
+    base = pool.evaluate(pool.null)
     alarm, of_sensors = screen_under_each([base.fitter, pool.fitter], base.fit, options)
     pool.extend(base, alarm, of_sensors)
     frontier = pool.best_of(1)[:BEAM]
@@ -95,11 +95,12 @@ def search(pool: ExplanationPool, null: Fit, options: Sequence[Option], most: in
 class ExplanationPool:
     """The explanations evaluated so far, by their effects.
 
-    fitter: with sensor noise alone. choices: number of effects at places in the library.
+    fitter: with sensor noise alone. null: the recalibrated plant, fitted by it. choices: number of effects at places in
+    the library.
     """
 
-    def __init__(self, fitter: Fitter, choices: int) -> None:
-        self.fitter, self.choices = fitter, choices
+    def __init__(self, fitter: Fitter, null: Fit, choices: int) -> None:
+        self.fitter, self.null, self.choices = fitter, null, choices
         self.explanations: dict[Key, RankedExplanation] = {}
         self._expected_gains: dict[Key, dict[Key, _ExpectedGain]] = {}
         self._failed: set[Key] = set()
@@ -116,8 +117,9 @@ class ExplanationPool:
         rivals = self.best_of(len(fit.key))[BEAM - 1 :]
         rival = rivals[0].log_evidence if rivals else -math.inf
         best: RankedExplanation | None = None
+        climb = False
         while True:
-            own_fitter, likely = with_estimated_noise(self.fitter, fit, start, climb=best is None)
+            own_fitter, likely = with_estimated_noise(self.fitter, fit, start, climb)
             fit = replace(fit, cost=own_fitter.cost(fit))
             lead = log_evidence(own_fitter, fit, self.choices) - rival
             fit = own_fitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit, fit.cost + 2.0 * lead)
@@ -126,10 +128,12 @@ class ExplanationPool:
             if best is None or gain > 0.0:
                 best = updated
             behind = rival - best.log_evidence
-            if not gain > CONVERGED or (behind > 0.5 * BEHIND and gain < SHARE * behind):
+            hopeless = behind > 0.5 * BEHIND and gain < SHARE * behind
+            if hopeless or (climb and not gain > CONVERGED):
                 break
-            start = likely.noise
-        if fit.key not in self.explanations or best.log_evidence > self.explanations[fit.key].log_evidence:
+            # The search for the correlation time, which takes longest, begins where the rest has converged.
+            fit, start, climb = best.fit, best.noise, not gain > CONVERGED
+        if before is None or best.log_evidence > before.log_evidence:
             self.explanations[fit.key] = best
         return best
 
@@ -161,33 +165,29 @@ class ExplanationPool:
 
         own_noise: screening under its own noise. sensor_noise: screening under sensor noise alone.
         """
-        fits = self._fitted(parent, parent.fitter, self._extensions(parent, own_noise, own=True))[:EVALUATED]
+        fits = self._fitted(parent.fitter, parent.fit, self._extensions(parent, own_noise, own=True))[:EVALUATED]
         if sensor_noise:
             pairs = _pairs(pairs_of(self.fitter, parent.fit, sensor_noise), PAIRS)
             candidates = [*self._extensions(parent, sensor_noise, own=False), *pairs]
-            undisturbed = self._fitted(parent, self.fitter, candidates, (self.fitter.cost(f) for f in fits))
-            costs = {parent.key: self.fitter.cost(parent.fit)} | {f.key: f.cost for f in undisturbed}
+            undisturbed = self._fitted(self.fitter, self.null, candidates, (self.fitter.cost(f) for f in fits))
+            costs = {parent.key: self.null.cost} | {f.key: f.cost for f in undisturbed}
             fits += [f for f in undisturbed if self._improves(f, costs)][:EVALUATED]
         for fit in sorted(fits, key=lambda f: len(f.key)):
             self.evaluate(fit, parent.noise)
 
     def _fitted(
-        self,
-        parent: RankedExplanation,
-        fitter: Fitter,
-        candidates: Sequence[Candidate],
-        rivals: Iterable[float] = (),
+        self, fitter: Fitter, base: Fit, candidates: Sequence[Candidate], rivals: Iterable[float] = ()
     ) -> list[Fit]:
-        """Fits of the candidates, the best first. A fit that is worse than the explanation it contains has failed.
+        """Fits of the candidates from `base`, the best first. A fit that is worse than `base` has failed.
 
         rivals: costs of other fits under the same noise.
         """
-        parent_cost, fits, least = fitter.cost(parent.fit), list[Fit](), min(rivals, default=math.inf)
+        cost, fits, least = fitter.cost(base), list[Fit](), min(rivals, default=math.inf)
         for candidate in candidates:
             if candidate.key not in self.explanations:
-                fit = fitter.fit(candidate, parent.fit, least)
+                fit = fitter.fit(candidate, base, least)
                 least = min(least, fit.cost)
-                if fit.cost < parent_cost:
+                if fit.cost < cost:
                     fits.append(fit)
                 else:
                     self._failed.add(candidate.key)
@@ -247,7 +247,7 @@ class ExplanationPool:
         """Fit and evaluate the likeliest candidates that were not fitted."""
         candidates = [e for e in self._unfitted() if e[2].candidate.key not in self._failed]
         for _, parent, expected in sorted(candidates, key=lambda e: -e[0])[:FITTED]:
-            for fit in self._fitted(parent, parent.fitter, [expected.candidate]):
+            for fit in self._fitted(parent.fitter, parent.fit, [expected.candidate]):
                 self.evaluate(fit, parent.noise)
 
     def _unfitted(self) -> Iterator[tuple[float, RankedExplanation, _ExpectedGain]]:
