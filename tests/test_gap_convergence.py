@@ -15,7 +15,9 @@ from fdi_torch.effects import effect
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
 from fdi_torch.gap.diagnose import recalibrate
+from fdi_torch.gap.marginal_likelihood import log_evidence
 from fdi_torch.gap.problem import PLAIN, problem_of
+from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
@@ -97,6 +99,39 @@ def test_a_start_that_is_given_up_has_not_converged() -> None:
     target = plugging_fits(fitter, null, [0.1])[0].cost
     assert not fitter.fit(elsewhere, null, target=target).converged
     assert fitter.fit(elsewhere, null).converged
+
+
+@pytest.mark.parametrize("removed", [("leak", "T1"), ("plugging", "P32")])
+def test_an_explanation_that_stopped_elsewhere_is_refitted_from_a_better_one_that_contains_it(
+    removed: tuple[str, str],
+) -> None:
+    truth = {"T1.leak.size": 0.1, SIZE: 0.4}
+    recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), truth, seed=0)
+    fitter, null = recalibrated(THREE_TANK, recording)
+    pool = ExplanationPool(fitter, null, choices=60)
+    placements = {p.prefix: p for p in (Placement(effect("leak"), "T1"), PLUGGING)}
+    starts = {name: 0.1 for name in truth}
+    both = pool.evaluate(fitter.fit(Candidate(tuple(placements.values()), (starts,)), null))
+    left = next(p for p in placements.values() if (p.effect.name, p.location) != removed)
+    elsewhere = fitter.fit(Candidate((left,), ({f"{left.prefix}.size": -0.5},)), null, cap=0)
+    stopped = RankedExplanation(elsewhere, fitter, both.noise, log_evidence(fitter, elsewhere, 60))
+    pool.explanations[stopped.key] = stopped
+    pool.exchange_effects([])
+    assert pool.explanations[stopped.key].log_evidence > stopped.log_evidence + 10.0
+    assert pool.explanations[stopped.key].fit.converged
+
+
+def test_the_recalibrated_plant_is_refitted_from_the_best_explanation() -> None:
+    recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), {SIZE: 0.4}, seed=0)
+    fitter, null = recalibrated(THREE_TANK, recording)
+    pool = ExplanationPool(fitter, null, choices=60)
+    best = pool.evaluate(plugging_fits(fitter, null, [0.1])[0])
+    elsewhere = replace(null, theta=0.9 * null.theta)
+    start = Candidate(starts=({},))
+    stopped = fitter.fit(start, elsewhere, cap=0)
+    pool.explanations[null.key] = RankedExplanation(stopped, fitter, best.noise, log_evidence(fitter, stopped, 60))
+    pool.exchange_effects([])
+    assert pool.explanations[null.key].fit.cost < stopped.cost and pool.explanations[null.key].fit.converged
 
 
 def six_tanks() -> PlantDescription:

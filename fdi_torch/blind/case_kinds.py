@@ -55,6 +55,7 @@ KINDS = {
         Kind("left_out"),
         Kind("dnull", causes=0, inputs="steps", disturbed=True),
         Kind("dsingle", inputs="steps", disturbed=True, shows=True),
+        Kind("dloop", causes=0, inputs="steps", disturbed=True, looped=True),
         Kind("site", perhaps=1, inputs="steps", shows=True),
         Kind("hidden", inputs="steps", unmeasured=1 / 3, shows=True),
         Kind("law", causes=0, unseen=True, inputs="steps", shows=True),
@@ -64,7 +65,7 @@ KINDS = {
 }
 ON_NETWORKS = ("site", "hidden", "law", "mixed", "null", "loop", "dnull", "dsingle")
 """Default kinds for random networks."""
-_EXTRA = {"left_out", "site", "hidden", "law", "mixed", "loop"}
+_EXTRA = {"left_out", "dloop", "site", "hidden", "law", "mixed", "loop"}
 STANDARD = tuple(name for name in KINDS if name not in _EXTRA)
 """Default kinds for all other rigs."""
 

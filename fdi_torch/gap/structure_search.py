@@ -86,6 +86,9 @@ def search(pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST
             break
         pool.fit_unexamined()
     explanations = sorted(pool.explanations.values(), key=lambda e: -e.log_evidence)
+    if pool.explanations[base.key] is not base:
+        base = pool.explanations[base.key]
+        alarm = screen(base.fitter, base.fit, options)
     likeliest = explanations[0].fitter
     screening = alarm if likeliest is base.fitter else screen(likeliest, base.fit, options)
     shown = pairs_of(likeliest, base.fit, screening)
@@ -231,10 +234,10 @@ class ExplanationPool:
         """Remove each effect of the best explanation and try others in its place, while that improves it."""
         while True:
             best = max(self.explanations.values(), key=lambda e: e.log_evidence)
-            for cause in best.key if len(best.key) > 1 else ():
+            for cause in best.key:
                 known = self.explanations.get(best.key - {cause})
                 reduced = self.without(best, cause)
-                if reduced is not known:
+                if reduced is not known and options:
                     self.extend_by(reduced, options)
             if max(self.explanations.values(), key=lambda e: e.log_evidence) is best:
                 return
