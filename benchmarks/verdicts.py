@@ -34,6 +34,7 @@ from fdi_torch.gap.library import STANDARD as LIBRARY
 from fdi_torch.gap.problem import Settings, problem_of
 from fdi_torch.gap.screening import Option, options_of
 from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, search
+from fdi_torch.logbook.provenance import git_state
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import operating_range_of_all, with_simulated_levels
 from fdi_torch.recording import Recording
@@ -61,8 +62,8 @@ def excess_of(plant: PlantDescription, recording: Recording, truth: Mapping[str,
     fitter, null, _ = recalibrate(problem.data)
     reach = with_simulated_levels(operating_range_of_all(problem.recordings, plant), plant, null.linearised.levels[0])
     options = options_of([p for p in problem.library if not p.effect.quantizes], fitter, reach)
-    pool = ExplanationPool(fitter, len(problem.library))
-    search(pool, null, options, most=1)
+    pool = ExplanationPool(fitter, null, len(problem.library))
+    search(pool, options, most=1)
     (cause,) = truth["causes"]
     key = frozenset([(cause["effect"], cause["location"])])
     if key not in pool.explanations:
@@ -110,7 +111,10 @@ def descents(out: Path) -> list[dict[str, Any]]:
         if case in done or len(truth["causes"]) != 1 or truth["causes"][0]["effect"] not in LIBRARY:
             continue
         plant = read_plant(out, line)
-        rows.append({"case": case, **truth["causes"][0]} | excess_of(plant, read_recording(out, line, "recording", plant), truth))
+        rows.append(
+            {"case": case, **truth["causes"][0]}
+            | excess_of(plant, read_recording(out, line, "recording", plant), truth)
+        )
         with path.open("a") as file:
             file.write(json.dumps(rows[-1]) + "\n")
     return rows
@@ -128,6 +132,8 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=float("inf"), help="length of the recordings; all by default")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="start no case after this time")
+    parser.add_argument("--leave-out", default="", help="effects to remove from the library, one per case; or all")
     parser.add_argument("--out", type=Path, help="folder of the cases, answers and rows")
     parser.add_argument("--descents", type=Path, help="folder whose fits are compared with descents from other starts")
     arguments = parser.parse_args()
@@ -145,6 +151,9 @@ def main() -> None:
         rig=RIGS[arguments.rig](),
         kinds=tuple(arguments.kinds.split(",")),
         library=LIBRARY,
+        leave_out=LIBRARY if arguments.leave_out == "all" else tuple(n for n in arguments.leave_out.split(",") if n),
+        minutes=arguments.minutes,
+        code=git_state()["commit"][:12],
     )
     for kind, shares in scores_of([row for row in rows if row["by"] == "fdi"])["strata"].items():
         for name in ("right", "in_set", "named_wrong", "false_alarm"):

@@ -8,8 +8,18 @@ from dataclasses import replace
 import pytest
 import torch
 
+from fdi_torch.effects import effect
+from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import Answer
-from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.candidate_fit import Candidate
+from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
+from fdi_torch.gap.marginal_likelihood import with_disturbances
+from fdi_torch.gap.onsets import with_fine_onsets
+from fdi_torch.gap.problem import problem_of
+from fdi_torch.gap.screening import Option, options_of
+from fdi_torch.gap.structure_search import ExplanationPool, search
+from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
 from tests.rigs import blank_recording
 from tests.test_gap import nominal_plant
@@ -79,3 +89,29 @@ def test_a_plugging_in_mid_record_is_named_despite_random_flows() -> None:
     size, onset = cause.parameters["size"], cause.parameters["onset"]
     assert abs(size.value - 0.4) < 5.0 * size.std < 0.3
     assert abs(onset.value - 350.0) < max(5.0 * onset.std, 2.0)
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_an_onset_is_found_although_slow_random_flows_explain_a_flow_that_changed_long_ago(seed: int) -> None:
+    recording = recorded(3e-6, 100, seed, plugged=0.2, onset=385.0)
+    problem = problem_of(nominal_plant(), [recording], [], Settings(("plugging",)))
+    fitter, null, _ = recalibrate(problem.data)
+    pool = ExplanationPool(fitter, null, len(problem.library))
+    reach = operating_range_of_all(problem.recordings, problem.data.plant)
+    best = search(pool, options_of(problem.library, fitter, reach), most=1).best
+    assert best.key == {("plugging", "P13")}
+    start = Candidate(best.fit.candidate.placements, ({"P13.plugging.size": 0.2, "P13.plugging.onset": 385.0},))
+    assert best.fit.cost < best.fitter.fit(start, best.fit).cost + 0.5
+    assert abs(best.fit.values["P13.plugging.onset"] - 385.0) < 5.0
+
+
+def test_onsets_are_as_dense_as_the_random_flows_require() -> None:
+    fitter, null, _ = recalibrate(problem_of(nominal_plant(), [recorded(0.0, 1, seed=3)], [], Settings(LIBRARY)).data)
+    option = Option(Placement(effect("plugging"), "P13"), {"P13.plugging.size": 0.1, "P13.plugging.onset": 350.0})
+    assert with_fine_onsets([option], fitter) == [option]
+    counts = []
+    for flow, time in ((1e-6, 100.0), (8e-6, 100.0), (8e-6, 0.0)):
+        noise = StateNoise(torch.full((3,), flow, dtype=torch.float64), time, torch.ones(3, dtype=torch.float64))
+        counts.append(len(with_fine_onsets([option], with_disturbances(fitter, null, noise))))
+    slow, fast, white = counts
+    assert white == 1 and fast - 1 == pytest.approx(4 * (slow - 1), rel=0.05)

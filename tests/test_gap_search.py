@@ -75,13 +75,8 @@ def test_an_unknown_verdict_suggests_the_next_step() -> None:
     assert not any("--named-only" in step for step in next_steps(sound, True, ("all",), None, "better.yaml"))
 
 
-ABSORBED = pytest.mark.xfail(
-    reason="what the library lacks is random flows to the rest: of their most likely size, they hide the change as well"
-)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("plugged", [False, pytest.param(True, marks=ABSORBED)])
+@pytest.mark.parametrize("plugged", [False, True])
 def test_a_change_in_time_is_named_where_there_was_one(plugged: bool) -> None:
     """Beside an overflow, with laws that the library lacks: a drift would take up what they miss."""
     truth = {k: v for k, v in (STANDING | MISSING).items() if "curvature" not in k}

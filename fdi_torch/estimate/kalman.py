@@ -188,6 +188,7 @@ class KalmanWhitening:
     """Whitening of residuals by the Kalman filter. log_det: log determinant of the innovations' covariances, summed."""
 
     def __init__(self, propagation: Propagation, sensors: SensorNoise, noise: StateNoise) -> None:
+        self.propagation, self.noise = propagation, noise
         self._filtered = KalmanFilter(propagation, sensors).under(noise)
         self.log_det = self._filtered.log_det
         self.smoothed, self.transposed = self._filtered.smoothed, self._filtered.transposed

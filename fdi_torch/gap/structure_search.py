@@ -23,6 +23,7 @@ from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import BEHIND, SHARE, Candidate, Fit, Fitter, Key
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
+from fdi_torch.gap.onsets import with_fine_onsets
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
 
 DEEPEST = 4  # effects in one explanation
@@ -71,6 +72,7 @@ class SearchResult:
 def search(pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST) -> SearchResult:
     """Search from the recalibrated plant. most: effects in one explanation."""
     base = pool.evaluate(pool.null)
+    options = with_fine_onsets(options, base.fitter)
     alarm, of_sensors = screen_under_each([base.fitter, pool.fitter], base.fit, options)
     pool.extend(base, alarm, of_sensors)
     frontier = pool.best_of(1)[:BEAM]

@@ -1,0 +1,58 @@
+"""Onset times from which fits under random flows start.
+
+Under sensor noise alone the cost has a wide minimum about an onset, and a coarse grid suffices. Random flows with a long
+correlation time make it narrow: a flow that changed longer ago than the readings need to show a random flow is
+explained as one. A random flow of standard deviation q into a tank of area A moves the level by q t / A within t, and
+the mean of the readings until then has the standard error s sqrt(dt / t). Both are equal after
+
+    t = (s A sqrt(dt) / q)^(2/3)
+
+An onset is found from starts within a few t of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.screening import Option
+
+SPACING = 4.0  # times t; no onset is further than 2 t from a start, where most of its gain is left
+MOST = 127  # onset times, a limit on computing time
+
+
+def with_fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
+    """The options with further onset times, as dense as the random flows in the fitter's noise require."""
+    duration = max(float(part.experiment.nodes[-1]) for part in fitter.data.parts)
+    count = min(math.ceil(duration / (SPACING * detection_time(fitter))), MOST)
+    result = list(options)
+    coarse: dict[tuple[object, ...], list[Option]] = {}
+    for option in options:
+        onset = f"{option.placement.prefix}.onset"
+        if onset in option.start:
+            others = tuple((n, v) for n, v in option.start.items() if n != onset)
+            coarse.setdefault((option.cause, others), []).append(option)
+    for group in coarse.values():
+        if count > len(group):
+            onset = f"{group[0].placement.prefix}.onset"
+            times = [duration * (k + 1) / (count + 1) for k in range(count)]
+            result += [replace(group[0], start={**group[0].start, onset: time}) for time in times]
+    return result
+
+
+def detection_time(fitter: Fitter) -> float:
+    """The shortest time t (s) after which the readings show a random flow; infinite if these are forgotten sooner."""
+    if fitter.whitening is None:
+        return math.inf
+    propagation, noise = fitter.whitening.propagation, fitter.whitening.noise
+    areas = torch.tensor([t.area for t in fitter.data.plant.tanks], dtype=torch.float64)
+    sensitivity = propagation.output.abs().amax(dim=0)
+    std = fitter.noise.std * noise.scale
+    level_noise = (std.unsqueeze(1) / sensitivity).amin(dim=0)
+    shortest = float(((level_noise * areas * math.sqrt(propagation.interval) / noise.intensity) ** (2 / 3)).min())
+    shortest = max(shortest, propagation.interval)
+    return shortest if noise.correlation_time > shortest else math.inf
