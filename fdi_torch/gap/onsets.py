@@ -1,13 +1,13 @@
 """Onset times from which fits under random flows start.
 
-Under sensor noise alone the cost has a wide minimum about an onset, and a coarse grid suffices. Random flows with a long
-correlation time make it narrow: a flow that changed longer ago than the readings need to show a random flow is
-explained as one. A random flow of standard deviation q into a tank of area A moves the level by q t / A within t, and
-the mean of the readings until then has the standard error s sqrt(dt / t). Both are equal after
+Under sensor noise alone the cost has a wide minimum about an onset, and a coarse grid of starts suffices. Random flows
+with a long correlation time make it narrow: they explain a flow that changed some time ago. A random flow of standard
+deviation q into a tank of area A moves the level by q t / A within a time t, and the mean of the readings until then
+has the standard error s sqrt(dt / t). Both are equal after
 
     t = (s A sqrt(dt) / q)^(2/3)
 
-An onset is found from starts within a few t of it.
+The readings show a random flow after this time t, so the minimum about an onset is a few t wide.
 """
 
 from __future__ import annotations

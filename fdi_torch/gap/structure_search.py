@@ -26,6 +26,8 @@ from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_esti
 from fdi_torch.gap.onsets import with_fine_onsets
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
 
+# DEEPEST, BEAM, FITTED, STARTS, EVALUATED, TURNS and PAIRS are budgets of computing. An extension that FITTED,
+# EVALUATED and TURNS leave out keeps its share of the posterior, `SearchResult.unexamined`.
 DEEPEST = 4  # effects in one explanation
 BEAM = 2  # explanations of one size that are extended
 FITTED = 8  # effects fitted about each explanation and noise, by first-order gain

@@ -36,9 +36,10 @@ library lacks (`estimate.evidence.Odds`)."""
 SURE = 0.95
 """Posterior probability above which a fault is reported."""
 EVALUATIONS = 30
-"""Evaluations of the fit of a rival effect; its log-likelihood need not be exact."""
+"""Evaluations of the fit of a rival effect, a budget of computing: a fit that is cut short counts for less than it may,
+and a fault is reported more easily."""
 RIVALS, MOST_EFFECTS = 6, 2
-"""Effects that are fitted about the likeliest combination, and effects in one combination."""
+"""Effects that are fitted about the likeliest combination, and effects in one combination; likewise a budget."""
 
 
 def recording_fault(

@@ -40,9 +40,14 @@ DELAY_CORRECTIONS = 4
 DELAY_TOLERANCE = 0.05
 """Share of a sampling interval; a smaller correction of the clock offset ends the iteration."""
 PRELIMINARY_EVALUATIONS = 3
-"""Evaluations of a preliminary fit, which selects the power of ten or the pair of inputs that gets a full fit."""
+"""Evaluations of a preliminary fit, which selects the power of ten or the pair of inputs that gets a full fit. A budget
+of computing."""
 MOST_EXPLAINED = 0.8
-"""If a sensor fault explains this share of the lacking log-likelihood, faults of inputs are not tested."""
+"""If a sensor fault explains this share of the lacking log-likelihood, faults of inputs are not tested. A budget of
+computing: each of them needs a fit of its own, and another fault that explains as much changes the sentence, not the
+refusal."""
+MOST_INPUTS = 8
+"""Inputs of equal flow into one tank, of which one with a wrong unit still shows in the mean level."""
 
 
 @dataclass(frozen=True)
@@ -144,8 +149,9 @@ class FaultHypotheses:
     def _units_of_inputs(self) -> Iterator[tuple[RecordingFault, float]]:
         """Wrong units of inputs.
 
-        Tested only if the mean, or the mean movement, of some level is off by a quarter or more: one of several flows
-        that is wrong by a factor of ten causes more than that.
+        Tested only if the mean, or the mean movement, of some level is off by the factor that the loss of one of
+        MOST_INPUTS equal flows causes at equilibrium, where a level is proportional to the flow squared. A unit that is
+        wrong by a factor of ten causes about that or more.
         """
         r, data = self.recording, self.as_is.blocked.data
         readings = torch.where(data.mask, data.readings, torch.nan)
@@ -153,7 +159,7 @@ class FaultHypotheses:
         levels = [x.nanmean(dim=0) for x in (readings, model)]
         moves = [(x - x.nanmean(dim=0)).abs().nanmean(dim=0) for x in (readings, model)]
         decades_off = [torch.log10((a / b).abs()).abs().nan_to_num(0.0).max() for a, b in (levels, moves)]
-        if max(float(x) for x in decades_off) < math.log10(1.25):
+        if max(float(x) for x in decades_off) < 2.0 * math.log10(MOST_INPUTS / (MOST_INPUTS - 0.9)):
             return
         for channel in self.plant.channels():
             fits: list[tuple[float, int, Recording]] = []
