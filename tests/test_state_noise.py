@@ -86,6 +86,12 @@ def problem(p: Propagation, sensors: SensorNoise, residual: Tensor, columns: int
     return _Problem(p, sensors, residual, jacobian, pull, 0.3 * pull, INTENSITY)
 
 
+def one_order_of_magnitude(noise: StateNoise) -> float:
+    """Log prior of two intensities: their logarithms differ from the mean by half of their difference each."""
+    first, second = torch.log(noise.intensity).tolist()
+    return -((0.5 * (first - second) / math.log(2.0)) ** 2)
+
+
 @pytest.mark.parametrize("time", [0.0, 15.0])
 @pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
 @pytest.mark.parametrize("masked", [0.0, 0.3])
@@ -97,7 +103,7 @@ def test_the_likelihood_is_that_of_a_dense_normal_distribution(time: float, corr
     y = residual.flatten()[seen]
     expected = -0.5 * float(y @ torch.linalg.solve(covariance, y)) - 0.5 * float(torch.logdet(covariance))
     value, _ = problem(p, sensors, residual).likelihood(noise)
-    assert value == pytest.approx(expected, rel=1e-9)
+    assert value == pytest.approx(expected + one_order_of_magnitude(noise), rel=1e-9)
     white = KalmanWhitening(p, sensors, noise)
     assert white.log_det == pytest.approx(float(torch.logdet(covariance)), rel=1e-9)
     squares = float(y @ torch.linalg.solve(covariance, y))
@@ -112,7 +118,8 @@ def test_a_sensor_that_wanders_has_the_likelihood_of_a_dense_normal_distribution
     covariance = dense(p, sensors, noise)[0][seen][:, seen]
     y = residual.flatten()[seen]
     expected = -0.5 * float(y @ torch.linalg.solve(covariance, y)) - 0.5 * float(torch.logdet(covariance))
-    assert problem(p, sensors, residual).likelihood(noise)[0] == pytest.approx(expected, rel=1e-9)
+    value, _ = problem(p, sensors, residual).likelihood(noise)
+    assert value == pytest.approx(expected + one_order_of_magnitude(noise), rel=1e-9)
 
 
 @pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
@@ -165,18 +172,18 @@ def test_parameters_beside_the_noise_are_at_their_most_likely_values() -> None:
         return left @ precision @ left + prior @ prior
 
     x = torch.linalg.solve(j.T @ precision @ j + torch.eye(3, dtype=DOUBLE), j.T @ precision @ y - whole.off)
-    expected = -0.5 * float(cost(x)) + 0.5 * float(torch.logdet(precision))
+    expected = -0.5 * float(cost(x)) + 0.5 * float(torch.logdet(precision)) + one_order_of_magnitude(noise)
     assert whole.likelihood(noise)[0] == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("time", [0.0, 15.0])
 @pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
-@pytest.mark.parametrize(("fresh", "masked"), [((0,), 0.0), ((0,), 0.3), ((0, 35), 0.0)])
+@pytest.mark.parametrize(("fresh", "masked", "apart"), [((0,), 0.0, None), ((0,), 0.3, 1), ((0, 35), 0.0, None)])
 def test_slopes_are_central_differences(
-    time: float, correlation: Tensor, fresh: tuple[int, ...], masked: float
+    time: float, correlation: Tensor, fresh: tuple[int, ...], masked: float, apart: int | None
 ) -> None:
     p, sensors = two_tanks(80, fresh, masked), SensorNoise(STD, correlation)
-    noise = StateNoise(INTENSITY, time, torch.tensor([0.9, 1.2], dtype=DOUBLE))
+    noise = StateNoise(INTENSITY, time, torch.tensor([0.9, 1.2], dtype=DOUBLE), apart=apart)
     whole = problem(p, sensors, simulated(p, sensors, noise, 3), columns=2)
     log = torch.zeros(4, dtype=DOUBLE)
 
@@ -274,6 +281,14 @@ def test_the_correlation_time_is_the_nearest_of_the_candidates(
     found = estimate_state_noise(p, sensors, residual, whole.jacobian, whole.pull, whole.off, INTENSITY)
     assert found.converged and found.noise.correlation_time in chosen
     assert found.log_likelihood > whole.likelihood(truth)[0] - 1.0
+
+
+def test_intensities_are_tied_except_for_one_apart() -> None:
+    together, apart = (
+        StateNoise(INTENSITY * torch.tensor([1.0, 50.0]), 15.0, torch.ones(2), apart=k) for k in (None, 1)
+    )
+    assert together.log_prior() < -10.0 and apart.log_prior() == 0.0
+    assert float(together.scatter().sum()) == pytest.approx(0.0, abs=1e-12)
 
 
 def standard_errors(whole: _Problem, noise: StateNoise) -> Tensor:

@@ -58,6 +58,11 @@ class Wander:
     correlation_time: float
 
 
+# Flow disturbances of one plant have the same causes (pumps, waves, valves, supply) and are of one order of magnitude:
+# standard deviation of the logarithm of an intensity, a factor of two.
+SCATTER = math.log(2.0)
+
+
 @dataclass(frozen=True)
 class StateNoise:
     """Parameters of the noise model.
@@ -65,12 +70,29 @@ class StateNoise:
     intensity (n,): standard deviation of the random flow into each tank, m^3/s.
     correlation_time: of these flows, s; 0: white, with an independent value in each sampling interval.
     scale (C,): factor on the standard deviation of each sensor's noise. wander: drift of one sensor, if any.
+    apart: index of a tank whose random flow is not of the same order as the others', if any.
     """
 
     intensity: Tensor
     correlation_time: float
     scale: Tensor
     wander: Wander | None = None
+    apart: int | None = None
+
+    @property
+    def tied(self) -> Tensor:
+        """Tanks whose random flows are of one order of magnitude, (n,) bool."""
+        return torch.tensor([i != self.apart for i in range(len(self.intensity))])
+
+    def scatter(self) -> Tensor:
+        """Log intensities of the tied flows less their mean, over SCATTER, (n,); 0 for a flow apart."""
+        tied = self.tied
+        logarithm = torch.log(self.intensity)
+        return torch.where(tied, (logarithm - logarithm[tied].mean()) / SCATTER, 0.0)
+
+    def log_prior(self) -> float:
+        """Log prior density of the intensities, against equal ones."""
+        return -0.5 * float(self.scatter().square().sum())
 
 
 @dataclass(frozen=True)

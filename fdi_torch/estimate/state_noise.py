@@ -1,6 +1,8 @@
 """Maximum-likelihood estimate of the noise model: flow disturbances, sensor noise and their correlation time.
 
-Intensities and scales maximise the likelihood of the innovations (kalman.py). Its gradient comes from the disturbance
+Intensities and scales maximise the likelihood of the innovations (kalman.py) times a prior: disturbances of all tanks
+are of one order of magnitude, since a significant diffusion term in one state equation shows where a model is deficient
+(Kristensen, Madsen and Jorgensen, 2004, Automatica 40, 225-237). The gradient comes from the disturbance
 smoother (Durbin and Koopman, 2012, "Time series analysis by state space methods", section 7.3.3). Plant parameters, in
 which the residuals are linear, are profiled out. The correlation time is selected from a grid of candidates.
 """
@@ -17,7 +19,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import KalmanFilter, Propagation, Score, SensorNoise, StateNoise
+from fdi_torch.estimate.kalman import SCATTER, KalmanFilter, Propagation, Score, SensorNoise, StateNoise
 
 CORRELATION_TIMES = (0.0, 5.0, 20.0, 80.0, 320.0)  # grid of candidates, in sampling intervals; 0: white
 LIKELIHOOD_TOLERANCE = 0.1  # nats; the optimisation ends when an iteration gains less
@@ -31,7 +33,7 @@ class Likelihood:
     """Maximum of the likelihood.
 
     noise: the maximising noise model. log_likelihood: of the residuals, maximised over the noise model and the linear
-    parameters, the log density of their priors included; constants of the normal distribution are omitted.
+    parameters, the log density of the priors of both included; constants of the normal distribution are omitted.
     converged: whether the optimisation of the noise model converged.
     """
 
@@ -170,11 +172,15 @@ class _Problem:
         return Likelihood(noise_at(optimum.x / unit), start_value - float(optimum.fun) * samples, bool(optimum.success))
 
     def likelihood(self, noise: StateNoise) -> tuple[float, Score]:
-        """Profile log-likelihood of a noise model, and its score."""
+        """Profile log-likelihood of a noise model with the log prior of its intensities, and its score."""
         model = self.filter.under(noise)
         innovations, prior_residual = _profiled(model.innovations(self.columns), self.pull, self.off)
         cost = float(innovations.square().sum()) + float(prior_residual.square().sum()) + model.log_det
-        return -0.5 * cost, model.score(innovations)
+        score, deviation = model.score(innovations), noise.scatter() / SCATTER
+        slope, determined = score.slope.clone(), score.determined.clone()
+        slope[: len(deviation)] -= deviation
+        determined[: len(deviation)] += torch.where(noise.tied, 0.5 / SCATTER**2, 0.0)
+        return -0.5 * cost + noise.log_prior(), replace(score, slope=slope, determined=determined)
 
 
 def _profiled(white: Tensor, pull: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:

@@ -100,6 +100,17 @@ def possible_places(plant: PlantDescription) -> tuple[str, ...]:
     return tuple(place for place in plant.locations() if place not in pairs)
 
 
+def tanks_of(place: str, plant: PlantDescription) -> tuple[str, ...]:
+    """The tanks whose volumes the flows of a component change; none for a sensor."""
+    for pipe in plant.pipes:
+        if pipe.name == place:
+            return pipe.source, pipe.target
+    for pump in plant.pumps:
+        if pump.name == place:
+            return (pump.target,)
+    return tuple(t.name for t in plant.tanks if t.name in place.split("-"))
+
+
 def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:
     """One name for equivalent causes: plugging of an outlet at its tank's floor is a leak of the tank."""
     name, place = cause

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from fdi_torch.estimate.evidence import ODDS, RARE, posterior
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import Fit, Fitter
-from fdi_torch.gap.library import canonical
+from fdi_torch.gap.library import canonical, tanks_of
 from fdi_torch.gap.localization.localize import LocalizedDiscrepancy, localize
 from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, SearchResult
 from fdi_torch.plant.description import PlantDescription
@@ -118,19 +118,25 @@ def _with_unknown(
 ) -> CauseHypothesis:
     """An explanation with a discrepancy at one place, which is attributed to an effect there if it is small."""
     causes = causes_in_order(explanation.fit)
-    here = [c for c in causes if c[1] == place.location]
+    # A random flow into a tank may stand for the error of any flow there.
+    plant, flow = fitter.data.plant, place.noise.apart is not None
+    here = [c for c in causes if c[1] == place.location or (flow and place.location in tanks_of(c[1], plant))]
     weight = explanation.log_evidence + place.gain
-    if here and _is_small(fitter, result, explanation, place):
+    if here and _is_small(fitter, result, explanation, place, here):
         return CauseHypothesis(explanation, causes, weight)
     weight += math.log(ODDS.unknown / places)
     return CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight, place)
 
 
 def _is_small(
-    fitter: Fitter, result: SearchResult, explanation: RankedExplanation, place: LocalizedDiscrepancy
+    fitter: Fitter,
+    result: SearchResult,
+    explanation: RankedExplanation,
+    place: LocalizedDiscrepancy,
+    here: Sequence[CauseName],
 ) -> bool:
-    """Whether a discrepancy is small compared with the influence of the explanation's effects at its place."""
-    elsewhere = frozenset(c for c in explanation.key if c[1] != place.location)
+    """Whether a discrepancy is small compared with the influence of the explanation's effects `here`, at its place."""
+    elsewhere = explanation.key - set(here)
     without = min((e for e in result.explanations if e.key <= elsewhere), key=lambda e: _cost(fitter, e.fit))
     reduction = _cost(fitter, without.fit) - _cost(fitter, explanation.fit)
     return place.size < ODDS.discrepancy * math.sqrt(max(reduction, 0.0))

@@ -128,9 +128,11 @@ class ExplanationPool:
         while True:
             own_fitter, likely = with_estimated_noise(self.fitter, fit, start, climb)
             fit = replace(fit, cost=own_fitter.cost(fit))
-            lead = log_evidence(own_fitter, fit, self.choices) - rival
+            prior = likely.noise.log_prior()
+            lead = log_evidence(own_fitter, fit, self.choices) + prior - rival
             fit = own_fitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit, fit.cost + 2.0 * lead)
-            updated = RankedExplanation(fit, own_fitter, likely.noise, log_evidence(own_fitter, fit, self.choices))
+            evidence = log_evidence(own_fitter, fit, self.choices) + prior
+            updated = RankedExplanation(fit, own_fitter, likely.noise, evidence)
             gain = updated.log_evidence - best.log_evidence if best else math.inf
             if best is None or gain > 0.0:
                 best = updated

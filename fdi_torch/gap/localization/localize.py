@@ -5,10 +5,11 @@ smoothed trajectory; that of a sensor may also be a slow random drift. The log e
 (`sparse_regression.py`), with each regressor selected among all of the component, under the disturbance noise that is
 most likely with the discrepancy (as for named effects: `marginal_likelihood.py`).
 
-A drift is a random process of a sensor alone, with unknown size and correlation time. Random flows move levels, which
-later readings of other sensors show; a drift shows in one channel only. Its two parameters are estimated together with
-the other noise. Its evidence is the likelihood of the innovations less the cost of the two parameters: the prior of the
-size is log-uniform between a tenth of the sensor noise and the range of the readings.
+The random flow into one tank may be an unknown flow there instead of one of the disturbances, which are of one order of
+magnitude in all tanks. A drift is a random process of a sensor alone, with unknown size and correlation time. Random
+flows move levels, which later readings of other sensors show; a drift shows in one channel only. Its two parameters are
+estimated together with the other noise. Its evidence is the likelihood of the innovations less the cost of the two
+parameters: the prior of the size is log-uniform between a tenth of the sensor noise and the range of the readings.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.evidence import RARE
-from fdi_torch.estimate.kalman import StateNoise, Wander
-from fdi_torch.estimate.state_noise import CORRELATION_TIMES
+from fdi_torch.estimate.kalman import SCATTER, StateNoise, Wander
+from fdi_torch.estimate.state_noise import CORRELATION_TIMES, LOG_BOUND
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression, normal_equations
 from fdi_torch.gap.localization.regressors import dominant_period
@@ -62,7 +63,7 @@ def localize(
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
     the result is empty if no discrepancy can reach it.
     """
-    base = _likelihood(fitter, fit, fit.linearised)
+    base = _likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     period = dominant_period(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
     periods = tuple(period / k for k in range(1, HARMONICS + 1)) if period else ()
     regression = DiscrepancyRegression(fitter, fit, periods, STEPS)
@@ -73,9 +74,8 @@ def localize(
 
     def evaluate(discrepancy: Discrepancy, place: str, noise: StateNoise, under: Fitter) -> _EvaluatedDiscrepancy:
         (evidence,) = _regressions(under, fit, [discrepancy])
-        return _EvaluatedDiscrepancy(
-            place, noise, evidence, _likelihood(under, fit, discrepancy.linearised) + evidence.evidence - base
-        )
+        likelihood = _likelihood(under, fit, discrepancy.linearised) + noise.log_prior()
+        return _EvaluatedDiscrepancy(place, noise, evidence, likelihood + evidence.evidence - base)
 
     localized: list[LocalizedDiscrepancy] = []
     # Largest differences seen so far: gain less its first-order estimate, and gain from re-estimated noise.
@@ -102,11 +102,42 @@ def localize(
                 place, best.gain, _effect_size(fitter, discrepancy, best.evaluated), periods, best.noise
             )
         )
-    for drift in _drifting_sensors(fitter, fit, noise, places, base, needed):
-        localized = [p for p in localized if p.location != drift.location or p.gain > drift.gain]
-        if all(p.location != drift.location for p in localized):
-            localized.append(drift)
+    random = [*_drifting_sensors(fitter, fit, noise, places, base, needed)]
+    random += _random_flows(fitter, fit, noise, places, base)
+    for process in random:
+        localized = [p for p in localized if p.location != process.location or p.gain > process.gain]
+        if all(p.location != process.location for p in localized):
+            localized.append(process)
     return sorted(localized, key=_gain, reverse=True)
+
+
+def _random_flows(
+    fitter: Fitter, fit: Fit, noise: StateNoise, places: Sequence[str], base: float
+) -> list[LocalizedDiscrepancy]:
+    """The tank with the largest disturbance, if more likely an unknown flow than one of the disturbances of the plant.
+
+    The prior of its logarithm is uniform over the range of the estimate instead of normal about the others'.
+    """
+    largest = int(noise.intensity.argmax())
+    tank = fitter.data.plant.tanks[largest].name
+    if tank not in places or len(noise.intensity) < 2:
+        return []
+    start = replace(noise, apart=largest)
+    apart = estimate_disturbances(fitter, fit, fit.linearised, start=start).noise
+    under = with_disturbances(fitter, fit, apart)
+    cost = math.log(2.0 * LOG_BOUND / (SCATTER * math.sqrt(2.0 * math.pi)))
+    gain = _likelihood(under, fit, fit.linearised) + apart.log_prior() - base - cost
+    return [LocalizedDiscrepancy(tank, gain, _moved(under, fit), (), apart)]
+
+
+def _moved(fitter: Fitter, fit: Fit) -> float:
+    """Norm of what the disturbances move the readings by, in units of the sensor noise."""
+    assert fitter.whitening is not None
+    plant = fitter.data.plant
+    moved = fitter.whitening.smoothed(fitter.data.readings - fit.linearised.readings[0])
+    names = [t.name for t in plant.tanks]
+    of_sensors = moved[:, [names.index(s.tank) for s in plant.sensors]]
+    return float(torch.linalg.vector_norm(torch.where(fitter.data.mask, of_sensors, 0.0) / fitter.noise.std))
 
 
 def _drifting_sensors(
@@ -117,11 +148,8 @@ def _drifting_sensors(
 
     def evaluate(noise: StateNoise) -> LocalizedDiscrepancy:
         assert noise.wander is not None
-        gain = (
-            _likelihood(with_disturbances(fitter, fit, noise), fit, fit.linearised)
-            - base
-            - _drift_cost(fitter, noise.wander)
-        )
+        likelihood = _likelihood(with_disturbances(fitter, fit, noise), fit, fit.linearised) + noise.log_prior()
+        gain = likelihood - base - _drift_cost(fitter, noise.wander)
         return LocalizedDiscrepancy(sensors[noise.wander.channel], gain, _drift_size(fitter, noise.wander), (), noise)
 
     starts = [
