@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 
 from fdi_torch.estimate.evidence import ODDS, posterior
+from fdi_torch.gap.diagnose import verdict_of
 from fdi_torch.gap.marginal_likelihood import log_prior
+from fdi_torch.gap.posterior import CauseHypothesis
 
 
 def test_all_sets_of_effects_of_one_size_share_one_prior() -> None:
@@ -26,3 +29,12 @@ def test_two_effects_at_one_place_are_less_likely_than_at_two() -> None:
 def test_probabilities_follow_from_differences_of_logarithms_alone() -> None:
     for shift in (0.0, 1e6, -1e6):
         assert posterior([shift + math.log(3.0), shift]) == pytest.approx([0.75, 0.25], rel=1e-6)
+
+
+def test_no_gap_needs_95_percent_as_any_other_verdict() -> None:
+    evaluated: Any = None
+    nothing, leak = CauseHypothesis(evaluated, (), 0.0), CauseHypothesis(evaluated, (("leak", "T1"),), -2.0)
+    assert verdict_of([nothing], True, False, None) == "no_gap"
+    assert verdict_of([nothing, leak], False, False, None) == "ambiguous"
+    assert verdict_of([nothing, leak], False, False, "h1") == "unknown"
+    assert verdict_of([leak], True, False, None) == "named"

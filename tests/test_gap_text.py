@@ -65,6 +65,15 @@ def test_a_single_explanation_that_does_not_suffice_states_the_unfitted_probabil
     )
 
 
+def test_where_the_plant_as_it_is_remains_plausible_there_may_be_a_gap() -> None:
+    posterior = [ProbableExplanation((), 0.88), ProbableExplanation((), 0.11, "T1")]
+    answer = replace(BOTH, verdict="ambiguous", ambiguity_set=[(), (("unknown", "T1"),)], posterior=posterior)
+    assert verdict_sentence(answer.to_dict()) == (
+        "There may be a gap; 2 explanations are plausible at 95 %, the likeliest is nothing beyond tolerances, "
+        "probability 88.0 %."
+    )
+
+
 def test_an_unknown_is_nothing_to_adopt() -> None:
     alone = replace(BOTH, causes=[Cause(*ODD)])
     assert adopted(nominal_plant(), alone).effects == ()

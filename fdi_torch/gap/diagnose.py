@@ -68,7 +68,7 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     outlier_sensor = None if problem.named_only else sensor_with_outliers(problem.outliers[0])
     free_form_fit = _free_form(posterior, reach)
     sure = posterior.probabilities[0] >= CONTENT
-    verdict = _verdict(credible_set, sure, bool(from_readings), outlier_sensor)
+    verdict = verdict_of(credible_set, sure, bool(from_readings), outlier_sensor)
     progress(0.8, "hold-out")
     diagnosis = DiagnosisResult(
         fitter,
@@ -87,7 +87,7 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     return build_answer(diagnosis, problem.holdouts)
 
 
-def _verdict(
+def verdict_of(
     credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: bool, outlier_sensor: str | None
 ) -> Verdict:
     """The verdict of a credible set of hypotheses.
@@ -97,7 +97,7 @@ def _verdict(
     """
     best = credible_set[0]
     if not best.causes and not best.place and not from_readings:
-        return "unknown" if outlier_sensor else "no_gap"
+        return "unknown" if outlier_sensor else "no_gap" if sure else "ambiguous"
     if all(h.place for h in credible_set):
         return "unknown"
     return "named" if sure else "ambiguous"

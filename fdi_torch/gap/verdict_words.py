@@ -56,12 +56,13 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
     if verdict == "named":
         return f"The gap comes from {best}{chance}."
     if verdict == "ambiguous":
-        count = len(answer.get("ambiguity_set") or [])
+        explanations = answer.get("ambiguity_set") or []
+        count, whether = len(explanations), "is" if all(explanations) else "may be"
         plausible = f"{count} explanations are plausible at 95 %, " if count > 1 else ""
         rest = "" if count > 1 else _unfitted(answer)
         certain = answer.get("certain") or []
         surely = f" Present with at least 95 %: {explanation_words(certain)}." if certain else ""
-        return f"There is a gap; {plausible}the likeliest is {best}{chance}.{rest}{surely}"
+        return f"There {whether} a gap; {plausible}the likeliest is {best}{chance}.{rest}{surely}"
     if verdict != "unknown":
         return ""
     if causes_of(first):
