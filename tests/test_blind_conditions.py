@@ -167,3 +167,10 @@ def test_cases_on_networks_are_as_their_kinds_say() -> None:
         if kind in ("null", "dnull"):
             shares = case.readings[0] / [heights[s.tank] for s in case.rig.plant.sensors]
             assert shares.min() > LOWEST - 0.05 and shares.max() < HIGHEST + 0.05
+
+
+@pytest.mark.slow
+def test_random_flows_may_act_beside_a_level_control() -> None:
+    (case,) = make(plans(1, 3, ("dloop",)), three_tank(), 3)
+    assert case.truth["control"]["law"] and case.truth["disturbance"]["kind"] in KINDS
+    assert case.truth["causes"] == [] and case.truth["disturbance"]["moves_levels_by_noise"] > 0.1

@@ -21,7 +21,7 @@ kinds of cases:
   unknown   a law outside the library: the right answer is `unknown` at its location
   left_out  an effect that the diagnosis is not given (--leave-out)
   dnull     no discrepancy, but random disturbance flows into the tanks
-  dsingle   the same with one effect
+  dsingle   the same with one effect              dloop     the same without one, a level controlled
 on random networks of tanks (--plant network):
   site      one or two effects                    law       a law outside the library
   hidden    a third of the levels is unmeasured   mixed     one effect, and such a law elsewhere
