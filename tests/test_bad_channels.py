@@ -12,6 +12,13 @@ from torch import Tensor
 
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.preprocess.acquisition import examined, usable
+from fdi_torch.gap.preprocess.blockwise_likelihood import (
+    blocked_recording,
+    blockwise_fit,
+    first_order_log_likelihood,
+    noise_of,
+    thinned,
+)
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 from tests.test_gap import SMALL, noise, nominal_plant, recorded
@@ -116,6 +123,18 @@ def test_swapped_commands_are_refused() -> None:
     run = sound()
     with pytest.raises(ValueError, match="Q1 and Q2 seem to be swapped"):
         usable(nominal_plant(), replace(run, inputs=run.inputs.flip(1)))
+
+
+def test_a_swap_is_compared_to_first_order() -> None:
+    plant, run = nominal_plant(), sound()
+    swapped = replace(run, inputs=run.inputs.flip(1))
+    right, wrong = (blocked_recording(plant, thinned(r), noise_of(plant, r)) for r in (run, swapped))
+    fit, fit_to_swapped = blockwise_fit(right), blockwise_fit(wrong)
+    # Where the constants are already the best, a further step changes nothing.
+    assert first_order_log_likelihood(right, fit) == pytest.approx(fit.log_likelihood, abs=0.1)
+    gain = fit.log_likelihood - fit_to_swapped.log_likelihood
+    assert first_order_log_likelihood(right, fit_to_swapped) - fit_to_swapped.log_likelihood > 0.5 * gain
+    assert first_order_log_likelihood(wrong, fit) - fit.log_likelihood < -0.5 * gain
 
 
 def late(run: Recording, seconds: int) -> Recording:

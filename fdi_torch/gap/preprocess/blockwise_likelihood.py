@@ -24,6 +24,7 @@ from fdi_torch.effects import effect
 from fdi_torch.gap.candidate_fit import CAP, Candidate, Fit, Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, data_set_of
+from fdi_torch.gap.trajectory_problem import corrected_trajectories
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -133,22 +134,58 @@ def blockwise_fit(
     rounds: int = ROUNDS,
 ) -> BlockwiseFit:
     """Fit the plant, with the effects of a candidate, within its tolerances. cap: most evaluations of one fit."""
-    data, channels = blocked.data, len(blocked.plant.sensors)
+    data = blocked.data
     spans = torch.tensor([reading_span(blocked.plant, s) for s in blocked.plant.sensors], dtype=torch.float64)
     variance = (BROAD * spans) ** 2 if base is None else base.variance
     fit = base.fit if base else None
     _, samples = blocked.means(data.readings, data.mask)
     means = (samples > 0).sum(dim=0).to(torch.float64) * blocked.blocks / (int(blocked.block[-1]) + 1)
-    count = data.mask.sum(dim=0)
     for _ in range(rounds):
-        each = torch.sqrt(variance * count.clamp(min=1) / means.clamp(min=1.0))
-        fitter = Fitter(data, Noise(each, torch.zeros(channels, dtype=torch.float64)))
+        fitter = _fitter(data, variance, means)
         start = Candidate(candidate.placements, (fit.effect_values,)) if fit and fit.key == candidate.key else candidate
         fit = fitter.fit(start, fit, cap=cap)
-        residual, samples = blocked.means(data.readings - fit.linearised.readings[0], data.mask)
-        mean_square = (samples * residual**2).sum(dim=0) / samples.sum(dim=0).clamp(min=1.0)
-        variance = torch.maximum(mean_square, blocked.noise)
+        variance = _variance(blocked, data.readings - fit.linearised.readings[0])
     assert fit is not None
-    deviation = ((fit.theta - fit.space.nominal(fit.theta)) / fit.space.std(fit.theta)).nan_to_num(0.0)
+    return BlockwiseFit(blocked, fit, variance, means, _prior_chi_square(fit, fit.theta))
+
+
+def first_order_log_likelihood(blocked: BlockedRecording, base: BlockwiseFit) -> float:
+    """The log-likelihood of a recording to first order in the change of the constants from `base`, without effects.
+
+    The trajectory is that of the recording's inputs with the constants of `base`; the sensitivities are those of
+    `base`. One such estimate costs a fraction of an evaluation of a fit.
+    """
+    data, fit, variance = blocked.data, base.fit, base.variance
+    fitter, theta = _fitter(data, variance, base.means), fit.theta.unsqueeze(0)
+    engine, scale = fitter.engine(fit.candidate, ()), fitter.box(fit.space)[2]
+    levels, _ = corrected_trajectories(engine, theta, fit.linearised.levels, fitter.far)
+    residual, jacobian = data.readings - engine.read(levels, theta), fit.linearised.jacobian
+    step = torch.zeros_like(theta)
+    for _ in range(ROUNDS):
+        fitter = _fitter(data, variance, base.means)
+        white = fitter.whiten(residual), fitter.whiten(jacobian)
+        _, descent, curvature = fitter.normal(fit.space, theta, *white, scale)
+        step = torch.linalg.lstsq(curvature, descent.unsqueeze(-1), driver="gelsd").solution.squeeze(-1) * scale
+        variance = _variance(blocked, (residual - (jacobian * step[:, None, None, :]).sum(-1))[0])
+    chi_square = _prior_chi_square(fit, (theta + step)[0])
+    return BlockwiseFit(blocked, fit, variance, base.means, chi_square).log_likelihood
+
+
+def _fitter(data: DataSet, variance: Tensor, means: Tensor) -> Fitter:
+    """A fitter that gives each channel the weight of its v_c."""
+    std = torch.sqrt(variance * data.mask.sum(dim=0).clamp(min=1) / means.clamp(min=1.0))
+    return Fitter(data, Noise(std, torch.zeros_like(std)))
+
+
+def _variance(blocked: BlockedRecording, residual: Tensor) -> Tensor:
+    """v_c (C,) of residuals (S, C)."""
+    block_means, samples = blocked.means(residual, blocked.data.mask)
+    mean_square = (samples * block_means**2).sum(dim=0) / samples.sum(dim=0).clamp(min=1.0)
+    return torch.maximum(mean_square, blocked.noise)
+
+
+def _prior_chi_square(fit: Fit, theta: Tensor) -> float:
+    """Chi-square of the constants theta (P,) against their tolerances."""
+    deviation = ((theta - fit.space.nominal(theta)) / fit.space.std(theta)).nan_to_num(0.0)
     constants = torch.tensor([n.count(".") == 1 for n in fit.space.names])
-    return BlockwiseFit(blocked, fit, variance, means, float((deviation[constants] ** 2).sum()))
+    return float((deviation[constants] ** 2).sum())

@@ -25,6 +25,7 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     BlockwiseFit,
     blocked_recording,
     blockwise_fit,
+    first_order_log_likelihood,
     noise_of,
     thinned,
 )
@@ -40,8 +41,8 @@ DELAY_CORRECTIONS = 4
 DELAY_TOLERANCE = 0.05
 """Share of a sampling interval; a smaller correction of the clock offset ends the iteration."""
 PRELIMINARY_EVALUATIONS = 3
-"""Evaluations of a preliminary fit, which selects the power of ten or the pair of inputs that gets a full fit. A budget
-of computing."""
+"""Evaluations of a preliminary fit, which selects the power of ten of an input that gets a full fit. A budget of
+computing."""
 MOST_EXPLAINED = 0.8
 """If a sensor fault explains this share of the lacking log-likelihood, faults of inputs are not tested. A budget of
 computing: each of them needs a fit of its own, and another fault that explains as much changes the sentence, not the
@@ -185,17 +186,19 @@ class FaultHypotheses:
     def _swapped_inputs(self) -> Iterator[tuple[RecordingFault, float]]:
         """The likeliest pair of swapped inputs of one unit."""
         units, r = self.plant.channel_units(), self.recording
-        fits: list[tuple[float, tuple[str, str], Recording]] = []
+        swaps: list[tuple[float, tuple[str, str], Recording]] = []
         for first, second in combinations(self.plant.channels(), 2):
             i, j = r.input_names.index(first), r.input_names.index(second)
             if units[first] == units[second] and not torch.equal(r.inputs[:, i], r.inputs[:, j]):
                 names = list(r.input_names)
                 names[i], names[j] = names[j], names[i]
                 corrected = replace(r, input_names=tuple(names))
-                fits.append((self._fit(corrected, preliminary=True).log_likelihood, (first, second), corrected))
-        if fits:
-            _, pair, corrected = max(fits, key=lambda fit: fit[0])
-            yield _swap(*pair), self._weight(corrected)
+                blocked = blocked_recording(self.plant, thinned(corrected), noise_of(self.plant, r))
+                swaps.append((first_order_log_likelihood(blocked, self.as_is), (first, second), corrected))
+        if swaps:
+            expected, pair, corrected = max(swaps, key=lambda swap: swap[0])
+            if self._worth_fitting(expected - self.as_is.log_likelihood):
+                yield _swap(*pair), self._weight(corrected)
 
     def _clocks(self) -> Iterator[tuple[RecordingFault, float]]:
         """Clock offsets of all sensors together and of each sensor alone; the delay by Gauss-Newton."""
