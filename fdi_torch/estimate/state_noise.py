@@ -32,12 +32,14 @@ class Likelihood:
 
     noise: the maximising noise model. log_likelihood: of the residuals, maximised over the noise model and the linear
     parameters, the log density of their priors included; constants of the normal distribution are omitted.
-    converged: whether the optimisation of the noise model converged.
+    converged: whether the optimisation of the noise model converged. determined: effective number of readings that
+    determine each of its parameters, in the order of `Score.slope`.
     """
 
     noise: StateNoise
     log_likelihood: float
     converged: bool
+    determined: Tensor
 
 
 def estimate_state_noise(
@@ -167,7 +169,8 @@ class _Problem:
             bounds=[(-LOG_BOUND * u, LOG_BOUND * u) for u in unit],
             options={"ftol": LIKELIHOOD_TOLERANCE / samples, "gtol": LIKELIHOOD_TOLERANCE / samples},
         )
-        return Likelihood(noise_at(optimum.x / unit), start_value - float(optimum.fun) * samples, bool(optimum.success))
+        noise, value = noise_at(optimum.x / unit), start_value - float(optimum.fun) * samples
+        return Likelihood(noise, value, bool(optimum.success), self.likelihood(noise)[1].determined)
 
     def likelihood(self, noise: StateNoise) -> tuple[float, Score]:
         """Profile log-likelihood of a noise model, and its score."""
