@@ -57,7 +57,7 @@ class Case:
         return SIZES[self.fault] * self.share if self.fault else 0.0
 
 
-def recordings(cases: Sequence[Case]) -> list[tuple[Recording, Array]]:
+def recordings(cases: Sequence[Case], step: float = STEP) -> list[tuple[Recording, Array]]:
     """Recording and true levels (T, N) m of each case, all simulated together."""
     plant, draws = load_plant("three_tank"), [np.random.default_rng(case.seed) for case in cases]
     rigs = HiddenRigs([plant] * len(cases), [()] * len(cases))
@@ -67,7 +67,7 @@ def recordings(cases: Sequence[Case]) -> list[tuple[Recording, Array]]:
         samples = int(case.lasts) + 1
         errors.append(NOISE * rng.normal(size=(samples, 3)) + _sensor_error(case, samples))
         drives.append(_drive(case, rng, samples, errors[-1]))
-    runs = simulate(rigs, drives, STEP)
+    runs = simulate(rigs, drives, step)
     return [(_recording(run.asked, run.levels + e), run.levels) for run, e in zip(runs, errors, strict=True)]
 
 

@@ -13,7 +13,7 @@ from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, i
 from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, linearised, riccati, start_beside_noise, start_uncertainty
 from fdi_torch.monitor.samples import Samples, usual_interval
 from fdi_torch.monitor.stepper import Stepper
-from fdi_torch.monitor.whitening import Whitening, score_whitenings, with_slow_variance
+from fdi_torch.monitor.whitening import Whitening, score_whitenings
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.build import BuildError
@@ -144,7 +144,7 @@ def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observati
     residual = seen.steady_residual
     flows = _flow_filter(network, linear, gain, seen)
     innovations = residual if flows is None else flows(residual)[0]
-    whitening = with_slow_variance(score_whitenings(innovations)[0][1], innovations)
+    whitening = score_whitenings(innovations)[0][1]
     if flows is None:
         return whitening
     return replace(whitening, flows=flows, slow_error=torch.hypot(whitening.slow_error, flows.error_of_sums))

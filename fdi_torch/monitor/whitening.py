@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,8 +12,6 @@ from fdi_torch.monitor.flow_filter import FlowFilter
 
 HIGHEST_ORDER = 8
 FEWEST_SAMPLES = 40
-BLOCKS = (10, 30, 100, 300)  # samples; a CUSUM sums over some tens, a fit over some hundreds
-FEWEST_BLOCKS, PRIOR_BLOCKS = 6, 5
 
 
 @dataclass(frozen=True)
@@ -21,10 +19,9 @@ class Whitening:
     """e_k = W (nu_k - m - sum_j A_j (nu_(k-j) - m)): innovations as a vector autoregression driven by unit white noise.
 
     nu: innovations of the flow filter `flows`; without one, the residuals themselves. mean m (C,) in the readings'
-    units, zero if not significant; coefficients A (order, C, C); whitener W (C, C), lower triangular. samples: number that it was estimated from. slow_error (C,): standard error of ln of the standard
-    deviation of low-frequency sums of e (1 if the model is exact). slow_variance (C,): variance of low-frequency sums
-    of the autoregression's residual over that of white noise; W compensates for it, so that e has variance
-    1 / slow_variance.
+    units, zero if not significant; coefficients A (order, C, C); whitener W (C, C), lower triangular. samples: number
+    that it was estimated from. slow_error (C,): standard error of ln of the standard
+    deviation of low-frequency sums of e (1 if the model is exact).
     """
 
     mean: Tensor
@@ -32,14 +29,7 @@ class Whitening:
     whitener: Tensor
     samples: int
     slow_error: Tensor
-    slow_variance: Tensor | None = None
     flows: FlowFilter | None = None
-
-    @property
-    def mean_square(self) -> float:
-        """Mean square of e without a fault."""
-
-        return 1.0 if self.slow_variance is None else float((1.0 / self.slow_variance).mean())
 
     @property
     def fast_error(self) -> float:
@@ -91,26 +81,6 @@ def fit_whitening(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> White
     criterion.
     """
     return score_whitenings(residual, highest_order)[0][1]
-
-
-def with_slow_variance(whitening: Whitening, residual: Tensor) -> Whitening:
-    """The whitening with a whitener that allows for slow disturbances in residuals (S, C).
-
-    The variance of block means over m samples, times m, is 1 for white e and larger if e varies slowly, which a
-    low-order autoregression does not capture. The largest value over the block lengths BLOCKS counts; each is shrunk
-    towards 1 by PRIOR_BLOCKS virtual blocks of white noise.
-    """
-    white = whitening(residual)[whitening.order :]
-    slow = torch.ones(white.shape[-1], dtype=white.dtype)
-    for length in BLOCKS:
-        count = len(white) // length
-        if count < FEWEST_BLOCKS:
-            break
-        blocks = white[: count * length].reshape(count, length, -1)
-        present = torch.isfinite(blocks).sum(1).clamp(min=1)
-        square = (torch.nan_to_num(blocks).sum(1).square() / present).sum(0)
-        slow = torch.maximum(slow, (square + PRIOR_BLOCKS) / (count + PRIOR_BLOCKS))
-    return replace(whitening, whitener=whitening.whitener / slow.sqrt().unsqueeze(1), slow_variance=slow)
 
 
 def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> list[tuple[float, Whitening]]:
