@@ -1,7 +1,7 @@
 """False alarms of single calibrations on disturbed tanks without a fault: `python -m benchmarks.monitor_false_alarms`.
 
-Each calibration learns from its own recording and is tested on the rest of it. Its number of alarms is compared with the
-95 % interval that it states for itself: a Poisson number whose rate has the stated standard error of its logarithm.
+Each calibration learns from its own recording and is tested on the rest of it. Its number of alarms is compared with
+the 95 % interval that it states for itself: a Poisson number whose rate has the stated standard error of its logarithm.
 """
 
 from __future__ import annotations

@@ -51,12 +51,7 @@ def scored(case: Case, events: Sequence[Event]) -> Counter[str]:
 
 
 def cases(seed: int, learn: float, faults: Sequence[str], kinds: Sequence[str]) -> list[Case]:
-    drawn = [
-        (fault, ramp, kind)
-        for fault in faults
-        for ramp in (0.0, GROWTH)
-        for kind in kinds
-    ]
+    drawn = [(fault, ramp, kind) for fault in faults for ramp in (0.0, GROWTH) for kind in kinds]
     onset = learn + 300.0
     return [Case(f, r, k, learn, onset, onset + 1600.0, True, 1000 * seed + i) for i, (f, r, k) in enumerate(drawn)]
 

@@ -36,7 +36,10 @@ SIZES = {
 
 @dataclass(frozen=True)
 class Case:
-    """One recording. fault: a key of SIZES, empty for none. ramp: duration of its growth, s; 0 if abrupt. learn: s."""
+    """One recording. fault: a key of SIZES, empty for none. ramp: duration of its growth, s; 0 if abrupt. learn: s.
+
+    share: of the usual size. pumps: flows asked for after the learning part, m^3/s, instead of the usual commands.
+    """
 
     fault: str
     ramp: float
@@ -47,6 +50,7 @@ class Case:
     closed: bool
     seed: int
     share: float = 1.0
+    pumps: tuple[float, float] | None = None
 
     @property
     def name(self) -> str:
@@ -89,6 +93,8 @@ def _drive(case: Case, rng: np.random.Generator, samples: int, error: Array) -> 
             column[first : first + hold] = rng.uniform()
             first += hold
     asked, points = 1e-6 * (40.0 + 20.0 * asked), 0.52 + 0.08 * points
+    if case.pumps is not None:
+        asked[int(case.learn) :] = case.pumps
     start = np.array([0.52, 0.32, 0.42])
     # The variance of the flow integrated over a minute is that of flows held for 15 s.
     scale = {"white": 15.0**0.5, "held": 1.0, "slow": 0.55}[case.kind]

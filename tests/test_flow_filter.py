@@ -48,7 +48,7 @@ def spread_of_sums(white: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("correlation_time", [1.0, 15.0, 150.0])
 def test_sums_of_the_white_residual_spread_like_those_of_white_noise(correlation_time: float) -> None:
-    """After learning, on 9000 further samples: 90 blocks, whose spread is known to 7.5 %; the noise is learnt to 5 %."""
+    """On 9000 samples after learning: 90 blocks, whose spread is known to 7.5 %; the noise is learnt to 5 %."""
     samples = disturbed(correlation_time, 4 * LEARN)
     noise, _ = learn_noise(NETWORK, samples.segment(0, LEARN))
     white = noise.whitening(Observer(NETWORK, noise.gain).run(samples).steady_residual)[LEARN:]
@@ -79,6 +79,17 @@ def test_filtering_in_parts_gives_the_same_innovations_to_the_last_bit() -> None
     assert bool(whole[50].isnan().equal(torch.tensor([False, True, False]))) and bool(path.isfinite().all())
     lanes = flows(residual.expand(3, -1, -1), 0, torch.zeros(3, path.shape[-1], dtype=path.dtype))[0]
     assert torch.equal(lanes[2].nan_to_num(), whole.nan_to_num())
+
+
+def test_shocks_that_add_up_over_samples_have_the_covariance_of_the_recursion() -> None:
+    flows = learn_noise(NETWORK, disturbed(15.0, 400))[0].whitening.flows
+    assert flows is not None
+    transition, total = torch.eye(6, dtype=torch.float64), torch.zeros(6, 6, dtype=torch.float64)
+    for count in range(1, 8):
+        transition = flows.transition @ transition
+        total = flows.transition @ total @ flows.transition.mT + torch.diag(flows.process_std**2)
+        for own, expected in zip(flows.over(count), (transition, total), strict=True):
+            torch.testing.assert_close(own, expected)
 
 
 def test_the_estimate_has_the_flow_that_was_simulated() -> None:

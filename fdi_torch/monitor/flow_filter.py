@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,8 +21,8 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.kalman import Propagation, SensorNoise, StateNoise
-from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
-from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain
+from fdi_torch.estimate.state_noise import estimate_state_noise
+from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, riccati
 from fdi_torch.simulate.build import load_library
 
 FIRST_UNIT = 0.1  # initial flow per sample of the optimisation, in standard deviations of a level's measurement noise
@@ -59,14 +58,38 @@ class FlowFilter:
         """Share of a flow that is left after one sampling interval."""
         return math.exp(-self.interval / self.noise.correlation_time) if self.noise.correlation_time else 0.0
 
+    @property
+    def process_std(self) -> Tensor:
+        """Standard deviation of the shocks of levels and flows in one interval, (2 tanks,) m."""
+        sigma = self.noise.intensity
+        return torch.cat([0.0 * sigma, math.sqrt(1.0 - self.keep**2) * sigma])
+
+    @property
+    def joint(self) -> Linear:
+        """Levels and flows together."""
+        c = self.linear.output
+        return Linear(self.transition, torch.cat([c, torch.zeros_like(c)], 1))
+
     @cached_property
     def gain(self) -> Gain:
         """Kalman gain of levels and flows, with its transient from unknown levels."""
-        c, sigma = self.linear.output, self.noise.intensity
-        joint = Linear(self.transition, torch.cat([c, torch.zeros_like(c)], 1))
-        shocks = math.sqrt(1.0 - self.keep**2) * sigma
-        process, start = torch.cat([0.0 * sigma, shocks]), torch.cat([self.start_std, sigma])
-        return kalman_gain(joint, process, self.reading_std, start)
+        start = torch.cat([self.start_std, self.noise.intensity])
+        return kalman_gain(self.joint, self.process_std, self.reading_std, start)
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """Steady covariance of the predicted levels and flows, (2 tanks, 2 tanks) m^2."""
+        return riccati(self.joint, torch.diag(self.process_std**2), torch.diag(self.reading_std**2))
+
+    def over(self, samples: int) -> tuple[Tensor, Tensor]:
+        """Transition over some samples, and covariance of the shocks that add up meanwhile, by repeated doubling."""
+        step, shocks = self.transition, torch.diag(self.process_std**2)
+        transition, total = torch.eye(len(step), dtype=step.dtype), torch.zeros_like(step)
+        while samples:
+            if samples % 2:
+                transition, total = step @ transition, step @ total @ step.mT + shocks
+            step, shocks, samples = step @ step, step @ shocks @ step.mT + shocks, samples // 2
+        return transition, total
 
     def __call__(self, residual: Tensor, number: int = 0, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Innovations (*batch, S, sensors) in the readings' units, and the filter's state (*batch, S, 2 tanks) after
@@ -120,12 +143,13 @@ def _free_residual(linear: Linear, observer: Gain, residual: Tensor) -> Tensor:
     """What the residual (S, sensors) would be without the observer's corrections: r_k + C xi_k, with
     xi_{k+1} = A (xi_k + L_k r_k).
     """
-    steps = (observer.table(0, len(residual)) @ (residual * observer.spread(0, len(residual))).unsqueeze(-1)).squeeze(-1)
+    raw = residual * observer.spread(0, len(residual))
+    steps = (observer.table(0, len(raw)) @ raw.unsqueeze(-1)).squeeze(-1)
     shift, path = torch.zeros_like(steps[0]), []
     for step in steps:
         path.append(shift)
         shift = linear.transition @ (shift + step)
-    return residual * observer.spread(0, len(residual)) + torch.stack(path) @ linear.output.mT
+    return raw + torch.stack(path) @ linear.output.mT
 
 
 def _by_initial_levels(linear: Linear, count: int) -> Tensor:

@@ -10,7 +10,15 @@ from torch import Tensor
 
 from fdi_torch.monitor.flow_filter import FlowFilter, estimate_flow_filter
 from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, initial_levels
-from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, linearised, riccati, start_beside_noise, start_uncertainty
+from fdi_torch.monitor.observer_gain import (
+    Gain,
+    Linear,
+    kalman_gain,
+    linearised,
+    riccati,
+    start_beside_noise,
+    start_uncertainty,
+)
 from fdi_torch.monitor.samples import Samples, usual_interval
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.whitening import Whitening, score_whitenings

@@ -52,9 +52,7 @@ class Whitening:
         """
         return self.of_innovations(self.innovations(residual)[0])
 
-    def innovations(
-        self, residual: Tensor, number: int = 0, memory: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def innovations(self, residual: Tensor, number: int = 0, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Innovations of the flow filter and its states after each sample; see `FlowFilter.__call__`."""
         if self.flows is None:
             return residual, residual[..., :0]
