@@ -22,7 +22,7 @@ from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.fault_free_checks import residual_warnings
-from fdi_torch.monitor.hypothesis import Fault
+from fdi_torch.monitor.hypothesis import Fault, faults_of
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
@@ -34,7 +34,7 @@ from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
 from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
 from fdi_torch.monitor.stepper import Stepper
-from fdi_torch.monitor.whitening import fit_whitening
+from fdi_torch.monitor.whitening import Whitening, fit_whitening
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.equilibrium import equilibrium
 
@@ -427,3 +427,15 @@ def test_the_forecast_interval_contains_the_time_to_overflow() -> None:
     assert all(time + limit.low < truth < time + limit.high for time, limit in told)
     widths = [limit.high - limit.low for _, limit in told]
     assert widths == sorted(widths, reverse=True)
+
+
+@pytest.mark.parametrize("onset", [203.0, 206.0, 209.0, 213.0])
+def test_a_jump_of_a_reading_is_found_wherever_it_lies_between_the_tried_onsets(onset: float) -> None:
+    """The observer follows a reading within a few samples, so that the jump shows in these only."""
+    samples, believed = recorded(step_to("h3.sensor_bias.bias", 0.03, onset), 500, seed=5), SPACE.nominal()
+    eye, zeros = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    whitening = Whitening(zeros, eye[:0].unsqueeze(1), eye / (1.3 * STD), 500, zeros)
+    observer = ObserverBank(NETWORK, SPACE, hand_gain(0.8 * eye), whitening)
+    fits = isolate(observer, from_rest(samples), believed, faults_of(SPACE.names), incipient=False)
+    assert [SPACE.names[c] for c in fits[0].hypothesis.columns] == ["h3.sensor_bias.bias"]
+    assert abs(fits[0].onset - (onset - 0.5)) < 1.0

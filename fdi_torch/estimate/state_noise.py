@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from operator import itemgetter
 
 import numpy as np
 import torch
@@ -34,12 +35,14 @@ class Likelihood:
 
     noise: the maximising noise model. log_likelihood: of the residuals, maximised over the noise model and the linear
     parameters, the log density of the priors of both included; constants of the normal distribution are omitted.
-    converged: whether the optimisation of the noise model converged.
+    converged: whether the optimisation of the noise model converged. determined: effective number of readings that
+    determine each of its parameters, in the order of `Score.slope`.
     """
 
     noise: StateNoise
     log_likelihood: float
     converged: bool
+    determined: Tensor
 
 
 def estimate_state_noise(
@@ -152,11 +155,14 @@ class _Problem:
 
         # The variables are scaled to a curvature of about one per sample. The tolerance of L-BFGS-B is relative to
         # max(|cost|, 1), so the cost is taken relative to its initial value.
-        samples, (start_value, score) = len(self.residual), self.likelihood(start)
+        samples, likeliest = len(self.residual), self.likelihood(start)
+        start_value, score = likeliest
         unit = torch.sqrt(2.0 * score.determined.clamp(min=MIN_DETERMINED) / samples).numpy()
 
         def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+            nonlocal likeliest
             value, score = self.likelihood(noise_at(x / unit))
+            likeliest = max(likeliest, (value, score), key=itemgetter(0))
             return (start_value - value) / samples, -score.slope.numpy() / samples / unit
 
         log_start = torch.cat([torch.log(start.intensity / self.unit), torch.log(start.scale)])
@@ -169,7 +175,8 @@ class _Problem:
             bounds=[(-LOG_BOUND * u, LOG_BOUND * u) for u in unit],
             options={"ftol": LIKELIHOOD_TOLERANCE / samples, "gtol": LIKELIHOOD_TOLERANCE / samples},
         )
-        return Likelihood(noise_at(optimum.x / unit), start_value - float(optimum.fun) * samples, bool(optimum.success))
+        noise, value = noise_at(optimum.x / unit), start_value - float(optimum.fun) * samples
+        return Likelihood(noise, value, bool(optimum.success), likeliest[1].determined)
 
     def likelihood(self, noise: StateNoise) -> tuple[float, Score]:
         """Profile log-likelihood of a noise model with the log prior of its intensities, and its score."""

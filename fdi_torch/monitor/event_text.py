@@ -22,7 +22,6 @@ from fdi_torch.monitor.hypothesis import HypothesisFit
 from fdi_torch.monitor.level_forecast import forecast_limits
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState
-from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer_bank import ObserverBank
 
 FORECAST_WINDOWS = 4.0  # horizon of the level forecast, in longest windows
@@ -31,8 +30,8 @@ FORECAST_WINDOWS = 4.0  # horizon of the level forecast, in longest windows
 class EventWriter:
     """Writes the events of one monitor."""
 
-    def __init__(self, observer: ObserverBank, noise: NoiseModel, settings: MonitorSettings, watched: int) -> None:
-        self.observer, self.space, self.noise, self.settings = observer, observer.space, noise, settings
+    def __init__(self, observer: ObserverBank, settings: MonitorSettings, watched: int) -> None:
+        self.observer, self.space, self.settings = observer, observer.space, settings
         self.watched, self.matters = watched, {m.fault: m for m in observer.network.description.matters}
 
     def notice(self, state: MonitorState, text: str) -> Event:
@@ -149,7 +148,7 @@ class EventWriter:
         faulty = [f for f in fits if f.hypothesis.columns]
         generator = torch.Generator().manual_seed(change.number)
         horizon, lookback = FORECAST_WINDOWS * self.settings.longest, self.settings.lookback
-        return forecast_limits(self.observer, self.noise, state, change, faulty, horizon, lookback, generator)
+        return forecast_limits(self.observer, state, change, faulty, horizon, lookback, generator)
 
     def _severity(self, explanations: Sequence[Explanation]) -> tuple[str, bool]:
         """The plant file's urgency of the likeliest explanation, and whether one of its faults is large enough to

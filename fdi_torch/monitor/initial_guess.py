@@ -72,7 +72,9 @@ def signature_guesses(
     """Values and onset (H, P+1) at which each hypothesis' signature matches the residual best.
 
     Generalised likelihood ratio over faults and onsets (Willsky & Jones 1976): the signature is the change of the
-    innovations by a small fault, scaled by least squares. base (1, S, sensors): white innovations without a change.
+    innovations by a small fault, scaled by least squares. It is computed for ONSETS onsets and shifted in time for the
+    samples between them, because a jump of a reading shows in a few samples only. base (1, S, sensors): white
+    innovations without a change.
     """
     if not hypotheses:
         return believed.new_zeros(0, len(believed) + 1)
@@ -84,18 +86,36 @@ def signature_guesses(
             theta[i, :, c] += _inward(observer, believed, c, float(move[c]))
     late = torch.tensor([h.incipient for h in hypotheses]).repeat_interleave(ONSETS)
     changes = ChangeHypotheses(theta.flatten(0, 1), onsets.repeat(len(hypotheses)), late)
-    matches, powers = [], []
-    for part in observer.in_blocks(window, changes):
-        shape = base - observer.white_innovations(window, believed, part)
-        matches.append((shape * base).sum((1, 2)))
-        powers.append(shape.square().sum((1, 2)).clamp(min=1e-30))
-    match, power = (torch.cat(rows).reshape(len(hypotheses), ONSETS) for rows in (matches, powers))
+    reach = len(window) // (2 * ONSETS) + 1  # samples to half-way between two onsets
+    parts = [
+        _matches(base - observer.white_innovations(window, believed, part), base, reach)
+        for part in observer.in_blocks(window, changes)
+    ]
+    match, power = (torch.cat(rows).reshape(len(hypotheses), -1) for rows in zip(*parts, strict=True))
     best = (match**2 / power).argmax(dim=1)
-    rows = torch.arange(len(hypotheses))
+    rows, nearest, shift = torch.arange(len(hypotheses)), best // (2 * reach + 1), best % (2 * reach + 1) - reach
     scale = (match / power)[rows, best].unsqueeze(-1)
-    value = believed + (theta[rows, best] - believed) * scale
+    value = believed + (theta[rows, nearest] - believed) * scale
     low, high = observer.space.low(believed), observer.space.high(believed)
-    return torch.cat([value.clamp(low, high), onsets[best].unsqueeze(-1)], dim=-1)
+    interval = (window.samples.time[-1] - window.samples.time[0]) / len(window)
+    onset = (onsets[nearest] + shift * interval).clamp(window.samples.time[0], window.samples.time[-2])
+    return torch.cat([value.clamp(low, high), onset.unsqueeze(-1)], dim=-1)
+
+
+def _matches(shape: Tensor, base: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """Products of shifted signatures with the residual, and their sums of squares, (L, 2 reach + 1) each.
+
+    shape (L, S, sensors), shifted by -reach .. reach samples; base (1, S, sensors). The part of a signature that
+    a shift moves beyond the window is lost, and zeros come in.
+    """
+    count = shape.shape[1]
+    spectrum = torch.fft.rfft(shape, 2 * count, dim=1).conj() * torch.fft.rfft(base, 2 * count, dim=1)
+    product = torch.fft.irfft(spectrum, 2 * count, dim=1).sum(-1)
+    shifts = torch.arange(-reach, reach + 1)
+    total = torch.nn.functional.pad(shape.square().sum(-1).cumsum(1), (1, 0))
+    first, last = (-shifts).clamp(0, count), (count - shifts).clamp(0, count)
+    power, rounding = total[:, last] - total[:, first], torch.finfo(total.dtype).eps ** 0.5
+    return product[:, shifts % (2 * count)], power.maximum(rounding * total[:, -1:]).clamp(min=1e-30)
 
 
 def oscillation_guess(

@@ -117,7 +117,7 @@ class Prior:
 def no_change_fit(observer: ObserverBank, window: ObserverWindow, believed: Tensor, base: Tensor) -> HypothesisFit:
     """The hypothesis of a false alarm. base (1, S, sensors): white innovations without a change."""
     limit, first = _noise_limit(observer, window), float(window.samples.time[0])
-    level = window.readings * observer.whitening.mean_square
+    level = float(window.readings)
     return HypothesisFit(NO_CHANGE, believed, torch.zeros_like(believed), first, 0.0, 0.0, _misfit(base), level, limit)
 
 
@@ -128,7 +128,7 @@ def _noise_limit(observer: ObserverBank, window: ObserverWindow) -> float:
     """
     count, channels = window.readings, len(observer.network.description.sensors)
     learnt = observer.whitening.samples * channels
-    return count * observer.whitening.mean_square * (1.0 + 4.0 * math.sqrt(2.0 / max(count, 1) + 2.0 / learnt))
+    return count * (1.0 + 4.0 * math.sqrt(2.0 / max(count, 1) + 2.0 / learnt))
 
 
 def _best_of_each(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
@@ -185,7 +185,7 @@ def fit(
     std = std_with_phases_at_zero(certainty(final.curvature, held=~free), theta, oscillations, free, middle)
     width = torch.cat([observer.space_width(), (last - first)[None]])
     tolerance, limit = SIZE_STEP * (high - low), _noise_limit(observer, window)
-    level = window.readings * observer.whitening.mean_square
+    level = float(window.readings)
     at_bound = free & ((refined.theta <= low + tolerance) | (refined.theta >= high - tolerance))
     for column, p in enumerate(observer.space):
         for physical in (p.nominal, *p.extremes):  # a physical limit is a valid estimate, not a limit of the search

@@ -1,13 +1,12 @@
 """Forecast of overflow and dry tanks if nothing changes, by Monte Carlo simulation from the monitor's present state.
 
 The draws are spread over the explanations in proportion to their probability, with sizes drawn from their standard
-deviations. The inputs keep their recent average, faults that grow continue to grow, and the levels get the process
-noise of the fault-free recording.
+deviations. The inputs keep their recent average, faults that grow continue to grow, and the random flows of the
+fault-free recording go on from their present estimate.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -16,13 +15,11 @@ import torch
 from torch import Tensor
 
 from fdi_torch.monitor.events import Limit
+from fdi_torch.monitor.flow_filter import FlowFilter
 from fdi_torch.monitor.hypothesis import HypothesisFit
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
-from fdi_torch.monitor.noise_model import NoiseModel
-from fdi_torch.monitor.observer import LEVEL_OFFSET
-from fdi_torch.monitor.observer_bank import NEVER, ChangeHypotheses, ObserverBank, ObserverWindow
+from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.plant.scales import length_scale
 
 DRAWS = 40
 POINTS = 200  # times at which levels are computed
@@ -46,7 +43,6 @@ class _ContinuedRamps(ChangeHypotheses):
 
 def forecast_limits(
     observer: ObserverBank,
-    noise: NoiseModel,
     state: MonitorState,
     change: DetectedChange,
     fits: Sequence[HypothesisFit],
@@ -68,7 +64,7 @@ def forecast_limits(
     before, changes = _drawn_parameters(observer, change, fits, now, horizon, generator)
     paths, start = observer.run(window, before, changes)[0][..., :tanks], state.state[-1, :tanks]
     levels = torch.cat([start.expand(DRAWS, 1, tanks), paths], dim=1)
-    levels[:, 1:] += _process_noise(observer, noise, window, state.believed, generator)
+    levels[:, 1:] += _random_flows(observer.whitening.flows, state, horizon / POINTS, generator)
     limits = []
     for index, tank in enumerate(observer.network.description.tanks):
         path = levels[..., index]
@@ -105,30 +101,27 @@ def _drawn_parameters(
     return torch.stack(values), _ContinuedRamps(torch.stack(after), onset, growing, duration)
 
 
-def _process_noise(
-    observer: ObserverBank, noise: NoiseModel, window: ObserverWindow, believed: Tensor, generator: torch.Generator
-) -> Tensor:
-    """Random deviations of the levels (DRAWS, POINTS, tanks) m: x <- F x + q.
+def _random_flows(flows: FlowFilter | None, state: MonitorState, span: float, generator: torch.Generator) -> Tensor:
+    """Deviations of the levels by random flows (DRAWS, POINTS, tanks) m, from their present estimate and its error.
 
-    F: Jacobian of the levels over the first interval; q: process noise of one interval.
+    span: s between the points.
     """
-    tanks, span = len(noise.process_std), float(window.samples.time[1] - window.samples.time[0])
-    if bool(torch.isnan(noise.process_std).any()):
-        return believed.new_zeros(DRAWS, POINTS, tanks)
-    step = LEVEL_OFFSET * length_scale(observer.network.description)
-    lanes = window.state.repeat(tanks + 1, 1)
-    lanes[1:, :tanks] += step * torch.eye(tanks, dtype=lanes.dtype)
-    first = ObserverWindow(window.samples.segment(0, 2), lanes, window.number)
-    never = torch.full((tanks + 1,), NEVER, dtype=lanes.dtype)
-    constant = ChangeHypotheses(believed.repeat(tanks + 1, 1), never, torch.zeros(tanks + 1, dtype=torch.bool))
-    moved = observer.run(first, believed, constant)[0][:, 0, :tanks]
-    transition = (moved[1:] - moved[0]).mT / step
-    std = noise.process_std * math.sqrt(span / noise.interval)
-    deviation, path = moved.new_zeros(DRAWS, tanks), []
+    if flows is None:
+        return state.healthy.new_zeros(1, 1, 1)
+    transition, shocks = flows.over(max(round(span / flows.interval), 1))
+    root = _root(flows.covariance)
+    now = state.memory[-1] + torch.randn(DRAWS, len(root), generator=generator, dtype=root.dtype) @ root.mT
+    path, step = [], _root(shocks)
     for _ in range(POINTS):
-        deviation = deviation @ transition.mT + std * torch.randn(DRAWS, tanks, generator=generator, dtype=moved.dtype)
-        path.append(deviation)
+        now = now @ transition.mT + torch.randn(DRAWS, len(root), generator=generator, dtype=root.dtype) @ step.mT
+        path.append(now[:, : len(root) // 2])
     return torch.stack(path, dim=1)
+
+
+def _root(covariance: Tensor) -> Tensor:
+    """A matrix R with R R' = covariance, which may be singular."""
+    values, vectors = torch.linalg.eigh(covariance)
+    return vectors * values.clamp(min=0.0).sqrt()
 
 
 def _crossing_time(path: Tensor, height: float, time: Tensor) -> Tensor:

@@ -67,7 +67,7 @@ class Monitor:
         self.watched = len(space) if watched is None else watched
         self.faults = faults_of(space.names[: self.watched])
         self.observer = ObserverBank(network, space, noise.gain, noise.whitening, longest_step)
-        self.writer = EventWriter(self.observer, noise, self.settings, self.watched)
+        self.writer = EventWriter(self.observer, self.settings, self.watched)
         self.alarms = AlarmHandler(self.observer, detector, self.faults, self.watched, self.settings, self.writer)
 
     def start(

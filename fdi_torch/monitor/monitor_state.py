@@ -78,12 +78,14 @@ class MonitorState:
 
     Recent samples, S of them:
       samples; state (S, tanks + M): observer state after each, levels in m, then memory of actuators and sensors;
-      residual, white (S, sensors): residuals and whitened residuals; fault_effects (S, E, sensors): change of the
-      residual if each of the E effects were taken out of the observer's plant. number: samples since the observer's
+      residual, innovations, white (S, sensors): residuals, innovations of the flow filter, and white residuals; memory
+      (S, F): state of the flow filter; fault_effects (S, E, sensors): change of the innovations if each of the E
+      effects were taken out of the observer's plant. number: samples since the observer's
       start. reachable: when it started, s. earliest_start: no later window begins before it, s.
     Parameters:
       believed (P,): values that the observer uses; healthy (P,): the same with every fault at nominal.
-      states_without (E, tanks + M): states of parallel observers, each without one effect.
+      states_without (E, tanks + M), memory_without (E, F): states of parallel observers, each without one effect, and
+      of their flow filters.
       unexplained_rms (sensors,): root mean square of the white residuals that the known faults leave unexplained.
     Bookkeeping:
       clock: time of the last sample. detector_memory: None after a restart of the detector. alarms: all so far.
@@ -94,12 +96,15 @@ class MonitorState:
     samples: Samples
     state: Tensor
     residual: Tensor
+    innovations: Tensor
     white: Tensor
+    memory: Tensor
     fault_effects: Tensor
     number: int
     believed: Tensor
     healthy: Tensor
     states_without: Tensor
+    memory_without: Tensor
     reachable: float
     unexplained_rms: Tensor
     clock: ClockState
@@ -145,4 +150,5 @@ class MonitorState:
         start = max(start, self.earliest_start)
         first = max(min(int((self.samples.time < start).sum()) - 1, len(self.samples) - 3), 0)
         processed = self.number - (len(self.samples) - 1 - first)
-        return ObserverWindow(self.samples.segment(first, len(self.samples)), self.state[first], processed)
+        samples = self.samples.segment(first, len(self.samples))
+        return ObserverWindow(samples, self.state[first], processed, self.memory[first])

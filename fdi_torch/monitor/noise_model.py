@@ -8,13 +8,23 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from fdi_torch.monitor.flow_filter import FlowFilter, estimate_flow_filter
 from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, initial_levels
-from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, linearised, riccati, start_beside_noise
+from fdi_torch.monitor.observer_gain import (
+    Gain,
+    Linear,
+    kalman_gain,
+    linearised,
+    riccati,
+    start_beside_noise,
+    start_uncertainty,
+)
 from fdi_torch.monitor.samples import Samples, usual_interval
 from fdi_torch.monitor.stepper import Stepper
-from fdi_torch.monitor.whitening import Whitening, score_whitenings, with_slow_variance
+from fdi_torch.monitor.whitening import Whitening, score_whitenings
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.simulate.build import BuildError
 
 # log10 of the process noise per sample over the measurement noise, both in m: from negligible to dominant.
 EXPONENTS = tuple(0.5 * i - 4.0 for i in range(11))
@@ -26,7 +36,7 @@ class NoiseModel:
     """Noise model identified from a fault-free recording.
 
     process_std (tanks,) m per sample; reading_std (sensors,) in the readings' units; ratio: process over measurement
-    noise, both as levels. whitening: autocorrelation of the observer's residual. gain: of the observer. interval: usual
+    noise, both as levels. whitening: of the observer's residual. gain: of the observer. interval: usual
     time between samples, s.
     """
 
@@ -77,7 +87,8 @@ def noise_of_gain(
     """Noise model for a given observer gain: only the residual's autocorrelation; process noise is unknown (NaN)."""
     seen = Observer(network, gain, space, theta, longest_step).run(fault_free)
     settled = seen.last(max(len(fault_free) - len(gain.opening), len(fault_free) // 2))
-    whitening = with_slow_variance(score_whitenings(settled.steady_residual)[0][1], settled.steady_residual)
+    linear = operating_point(network, fault_free, space, theta, longest_step)
+    whitening = _whitening(network, linear, gain, seen)
     unknown = network.nominal.new_full((len(network.description.tanks),), torch.nan)
     std = settled.steady_residual.square().nanmean(dim=0).sqrt()
     return NoiseModel(unknown, std, float("nan"), whitening, gain, usual_interval(fault_free.time)), seen
@@ -128,8 +139,32 @@ def _noise(network: TankNetwork, linear: Linear, best: _Candidate) -> NoiseModel
     process_std = ratio * (reading_std / unit).mean().expand(tanks)
     batch = _gain(network, linear, ratio.log10().unsqueeze(0))
     gain = Gain(batch.steady[0], batch.opening[:, 0], batch.inflation[:, 0])
-    whitening = with_slow_variance(best.whitening, best.seen.steady_residual)
+    whitening = _whitening(network, linear, gain, best.seen)
     return NoiseModel(process_std, reading_std, float(ratio), whitening, gain)
+
+
+def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> Whitening:
+    """Whitening of an observer's residuals: random flows by their Kalman filter, what remains by an autoregression.
+
+    The error of the flows' intensity adds to that of slow sums of the white residual. Without a compiler there is no
+    flow filter.
+    """
+    residual = seen.steady_residual
+    flows = _flow_filter(network, linear, gain, seen)
+    innovations = residual if flows is None else flows(residual)[0]
+    whitening = score_whitenings(innovations)[0][1]
+    if flows is None:
+        return whitening
+    return replace(whitening, flows=flows, slow_error=torch.hypot(whitening.slow_error, flows.error_of_sums))
+
+
+def _flow_filter(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> FlowFilter | None:
+    residual, interval = seen.steady_residual, usual_interval(seen.time)
+    std, start = residual.square().nanmean(dim=0).sqrt(), start_uncertainty(network.description, residual)
+    try:
+        return estimate_flow_filter(linear, gain, residual, std, start, interval)
+    except BuildError:
+        return None
 
 
 def operating_point(

@@ -53,13 +53,15 @@ def no_change(believed: Tensor) -> ChangeHypotheses:
 class ObserverWindow:
     """A time window in which a change is searched for.
 
-    samples: the first one only sets the start; `state` (tanks + M,) is the observer's state after its correction and
-    `number` the count of samples that the observer had processed by then. The later samples are compared.
+    samples: the first one only sets the start; `state` (tanks + M,) is the observer's state after its correction,
+    `number` the count of samples that the observer had processed by then, and `memory` the state of the flow filter
+    (None: zero). The later samples are compared. state and memory may have a lane for each hypothesis.
     """
 
     samples: Samples
     state: Tensor
     number: int
+    memory: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.samples) - 1
@@ -109,7 +111,8 @@ class ObserverBank:
 
     def white_innovations(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
         """White innovations (L, S, sensors); zero where a reading, or one that the whitening needs, is missing."""
-        white = self.whitening(self.run(window, believed, changes)[1])
+        residual = self.run(window, believed, changes)[1]
+        white = self.whitening.of_innovations(self.whitening.innovations(residual, window.number, window.memory)[0])
         white[:, : self.whitening.order] = 0.0
         return torch.nan_to_num(white, nan=0.0)
 

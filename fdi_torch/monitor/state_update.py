@@ -22,18 +22,22 @@ def initial_state(
     """The state after the first sample. levels (tanks,) m: taken from the readings if None."""
     first = samples.segment(0, 1)
     state, residual = observer.first_state(samples, believed, levels)
-    white, effects = observer.whitening(residual[None]), len(observer.effects)
+    innovations, memory = observer.whitening.innovations(residual[None])
+    white, effects = observer.whitening.of_innovations(innovations), len(observer.effects)
     zeros, now = torch.zeros_like(residual), float(first.time[0])
     return MonitorState(
         samples=first,
         state=state[None],
         residual=residual[None],
+        innovations=innovations,
         white=white,
+        memory=memory,
         fault_effects=zeros.expand(1, effects, -1),
         number=1,
         believed=believed,
         healthy=healthy,
         states_without=state.expand(effects, -1),
+        memory_without=memory.expand(effects, -1),
         reachable=now,
         unexplained_rms=zeros,
         clock=ClockState(now),
@@ -43,9 +47,15 @@ def initial_state(
 def advance_observer(observer: ObserverBank, state: MonitorState, samples: Samples) -> MonitorState:
     """Run the observer along further samples."""
     last = len(state.samples) - 1
-    window = ObserverWindow(concatenated(state.samples.segment(last, last + 1), samples), state.state[-1], state.number)
+    further = concatenated(state.samples.segment(last, last + 1), samples)
+    starts = ObserverWindow(
+        further,
+        torch.cat([state.state[-1:], state.states_without]),
+        state.number,
+        torch.cat([state.memory[-1:], state.memory_without]),
+    )
     state = replace(state, samples=concatenated(state.samples, samples), number=state.number + len(samples))
-    return _run(observer, state, window, state.states_without, state.believed, NEVER)
+    return _run(observer, state, starts, state.believed, NEVER)
 
 
 def adopt_change(observer: ObserverBank, state: MonitorState, change: DetectedChange, believed: Tensor) -> MonitorState:
@@ -54,7 +64,7 @@ def adopt_change(observer: ObserverBank, state: MonitorState, change: DetectedCh
     window = state.window(fit.onset)
     incipient, active_before = fit.hypothesis.incipient, state.active_effects(observer)
     state = replace(state, believed=believed, change=change, pending=None, detector_memory=None)
-    moved = _run(observer, state, window, _identical_starts(observer, window), change.before, fit.onset, incipient)
+    moved = _run(observer, state, _identical_starts(observer, window), change.before, fit.onset, incipient)
     rms = moved.white[-len(window) :].square().nanmean(dim=0).nan_to_num().sqrt()
     if fit.fits or not moved.active_effects(observer):
         rms = torch.zeros_like(rms)
@@ -67,7 +77,7 @@ def adopt_sizes(observer: ObserverBank, state: MonitorState, fit: HypothesisFit)
     """Run the observer again from the fit's onset with new sizes of the known faults."""
     window, before = state.window(fit.onset), state.believed
     moved = replace(state, believed=fit.value, detector_memory=None)
-    return _run(observer, moved, window, _identical_starts(observer, window), before, fit.onset)
+    return _run(observer, moved, _identical_starts(observer, window), before, fit.onset)
 
 
 def drop_old_samples(state: MonitorState) -> MonitorState:
@@ -80,7 +90,9 @@ def drop_old_samples(state: MonitorState) -> MonitorState:
         samples=state.samples.segment(first, len(state.samples)),
         state=state.state[first:],
         residual=state.residual[first:],
+        innovations=state.innovations[first:],
         white=state.white[first:],
+        memory=state.memory[first:],
         fault_effects=state.fault_effects[first:],
     )
 
@@ -110,44 +122,52 @@ def fault_effect_rms(observer: ObserverBank, state: MonitorState, column: int, s
 def _run(
     observer: ObserverBank,
     state: MonitorState,
-    window: ObserverWindow,
-    states_without: Tensor,
+    starts: ObserverWindow,
     before: Tensor,
     onset: float,
     incipient: bool = False,
 ) -> MonitorState:
     """Run the observer along a window at the end of the samples, and replace the stored results there.
 
-    The parameters change from `before` to `state.believed` at `onset` s. states_without (E, tanks + M): states at the
-    window's start of the parallel observers that each lack one effect; they give the effect of each known fault.
+    The parameters change from `before` to `state.believed` at `onset` s. starts: the window, with the state of the
+    observer in the first row (1 + E, tanks + M), and below it those of the parallel observers that each lack one
+    effect; these give the effect of each known fault. Its memory likewise.
     """
-    first, active = len(state.samples) - len(window), state.active_effects(observer)
+    first, active = len(state.samples) - len(starts), state.active_effects(observer)
     theta = torch.cat([state.believed[None], state.parameters_without_each(observer)])
     onsets = before.new_tensor([onset, *[LONG_AGO] * len(active)])
     changes = ChangeHypotheses(theta, onsets, torch.tensor([incipient, *[False] * len(active)]))
-    starts = torch.cat([window.state[None], states_without[active]])
-    path, residual = observer.run(replace(window, state=starts), before, changes)
-    effects = residual.new_zeros(len(window), len(observer.effects), residual.shape[-1])
-    effects[:, active] = (residual[1:] - residual[0]).movedim(0, 1).nan_to_num()
-    last = path[0, -1].repeat(len(observer.effects), 1)
-    last[active] = path[1:, -1]
+    assert starts.memory is not None
+    rows, effect_count = [0, *(1 + e for e in active)], len(observer.effects)
+    lanes = replace(starts, state=starts.state[rows], memory=starts.memory[rows])
+    path, residual = observer.run(lanes, before, changes)
+    innovations, memory = observer.whitening.innovations(residual, starts.number, lanes.memory)
+    effects = residual.new_zeros(len(starts), effect_count, residual.shape[-1])
+    effects[:, active] = (innovations[1:] - innovations[0]).movedim(0, 1).nan_to_num()
+    states_without, memory_without = (x[0, -1].repeat(effect_count, 1) for x in (path, memory))
+    states_without[active], memory_without[active] = path[1:, -1], memory[1:, -1]
     moved = replace(
         state,
         state=torch.cat([state.state[:first], path[0]]),
         residual=torch.cat([state.residual[:first], residual[0]]),
+        innovations=torch.cat([state.innovations[:first], innovations[0]]),
+        memory=torch.cat([state.memory[:first], memory[0]]),
         fault_effects=torch.cat([state.fault_effects[:first], effects]),
-        states_without=last,
+        states_without=states_without,
+        memory_without=memory_without,
     )
     return _with_white_residuals(observer, moved, first)
 
 
-def _identical_starts(observer: ObserverBank, window: ObserverWindow) -> Tensor:
-    """Start states (E, tanks + M) of the parallel observers, equal to that of the full observer."""
-    return window.state.expand(len(observer.effects), -1)
+def _identical_starts(observer: ObserverBank, window: ObserverWindow) -> ObserverWindow:
+    """The window with the same start states for the full observer and for the parallel ones, (1 + E, ...) each."""
+    assert window.memory is not None
+    rows = 1 + len(observer.effects)
+    return replace(window, state=window.state.expand(rows, -1), memory=window.memory.expand(rows, -1))
 
 
 def _with_white_residuals(observer: ObserverBank, state: MonitorState, first: int) -> MonitorState:
     """Whiten the residuals again from sample `first` on."""
     history = max(first - observer.whitening.order, 0)
-    white = observer.whitening(state.residual[history:])[first - history :]
+    white = observer.whitening.of_innovations(state.innovations[history:])[first - history :]
     return replace(state, white=torch.cat([state.white[:first], white]))

@@ -1,28 +1,27 @@
-"""Mean and autocorrelation of fault-free residuals, and the filter that makes them white with unit variance."""
+"""Filter that makes fault-free residuals white with unit variance: random flows, mean and autocorrelation."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from fdi_torch.monitor.flow_filter import FlowFilter
+
 HIGHEST_ORDER = 8
 FEWEST_SAMPLES = 40
-BLOCKS = (10, 30, 100, 300)  # samples; a CUSUM sums over some tens, a fit over some hundreds
-FEWEST_BLOCKS, PRIOR_BLOCKS = 6, 5
 
 
 @dataclass(frozen=True)
 class Whitening:
-    """e_k = W (r_k - m - sum_j A_j (r_(k-j) - m)): residuals as a vector autoregression driven by unit white noise.
+    """e_k = W (nu_k - m - sum_j A_j (nu_(k-j) - m)): innovations as a vector autoregression driven by unit white noise.
 
-    mean m (C,) in the readings' units, zero if not significant; coefficients A (order, C, C); whitener W (C, C), lower
-    triangular. samples: number that it was estimated from. slow_error (C,): standard error of ln of the standard
-    deviation of low-frequency sums of e (1 if the model is exact). slow_variance (C,): variance of low-frequency sums
-    of the autoregression's residual over that of white noise; W compensates for it, so that e has variance
-    1 / slow_variance.
+    nu: innovations of the flow filter `flows`; without one, the residuals themselves. mean m (C,) in the readings'
+    units, zero if not significant; coefficients A (order, C, C); whitener W (C, C), lower triangular. samples: number
+    that it was estimated from. slow_error (C,): standard error of ln of the standard
+    deviation of low-frequency sums of e (1 if the model is exact).
     """
 
     mean: Tensor
@@ -30,13 +29,7 @@ class Whitening:
     whitener: Tensor
     samples: int
     slow_error: Tensor
-    slow_variance: Tensor | None = None
-
-    @property
-    def mean_square(self) -> float:
-        """Mean square of e without a fault."""
-
-        return 1.0 if self.slow_variance is None else float((1.0 / self.slow_variance).mean())
+    flows: FlowFilter | None = None
 
     @property
     def fast_error(self) -> float:
@@ -54,19 +47,31 @@ class Whitening:
         return self.whitener @ (eye - self.coefficients.sum(0)) @ self.mean
 
     def __call__(self, residual: Tensor) -> Tensor:
-        """residual (*batch, S, C) -> white (*batch, S, C), NaN if a residual that it depends on is missing."""
-        return self.filter(residual - self.mean)
+        """Residuals of a run from its first sample on, scaled to the steady variance (*batch, S, C) -> white
+        (*batch, S, C), NaN if one that it depends on is missing.
+        """
+        return self.of_innovations(self.innovations(residual)[0])
 
-    def filter(self, residual: Tensor) -> Tensor:
-        """Whiten without subtracting the mean, as for the effect of a fault. Residuals before the
+    def innovations(self, residual: Tensor, number: int = 0, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Innovations of the flow filter and its states after each sample; see `FlowFilter.__call__`."""
+        if self.flows is None:
+            return residual, residual[..., :0]
+        return self.flows(residual, number, memory)
+
+    def of_innovations(self, innovations: Tensor) -> Tensor:
+        """White e of innovations (*batch, S, C)."""
+        return self.filter(innovations - self.mean)
+
+    def filter(self, innovations: Tensor) -> Tensor:
+        """Whiten without subtracting the mean, as for the effect of a fault. Innovations before the
         first sample are 0.
         """
-        innovation = residual
+        own = innovations
         for lag, matrix in enumerate(self.coefficients, start=1):
-            before = torch.zeros_like(residual)
-            before[..., lag:, :] = residual[..., :-lag, :]
-            innovation = innovation - _apply(matrix, before)
-        return _apply(self.whitener, innovation)
+            before = torch.zeros_like(innovations)
+            before[..., lag:, :] = innovations[..., :-lag, :]
+            own = own - _apply(matrix, before)
+        return _apply(self.whitener, own)
 
 
 def fit_whitening(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> Whitening:
@@ -74,26 +79,6 @@ def fit_whitening(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> White
     criterion.
     """
     return score_whitenings(residual, highest_order)[0][1]
-
-
-def with_slow_variance(whitening: Whitening, residual: Tensor) -> Whitening:
-    """The whitening with a whitener that allows for slow disturbances in residuals (S, C).
-
-    The variance of block means over m samples, times m, is 1 for white e and larger if e varies slowly, which a
-    low-order autoregression does not capture. The largest value over the block lengths BLOCKS counts; each is shrunk
-    towards 1 by PRIOR_BLOCKS virtual blocks of white noise.
-    """
-    white = whitening(residual)[whitening.order :]
-    slow = torch.ones(white.shape[-1], dtype=white.dtype)
-    for length in BLOCKS:
-        count = len(white) // length
-        if count < FEWEST_BLOCKS:
-            break
-        blocks = white[: count * length].reshape(count, length, -1)
-        present = torch.isfinite(blocks).sum(1).clamp(min=1)
-        square = (torch.nan_to_num(blocks).sum(1).square() / present).sum(0)
-        slow = torch.maximum(slow, (square + PRIOR_BLOCKS) / (count + PRIOR_BLOCKS))
-    return replace(whitening, whitener=whitening.whitener / slow.sqrt().unsqueeze(1), slow_variance=slow)
 
 
 def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> list[tuple[float, Whitening]]:

@@ -1,0 +1,170 @@
+"""Random flows into the tanks in the monitor's residual: their estimate, and the Kalman filter that takes them out.
+
+The noise model is that of the gap diagnosis (estimate/state_noise.py): flows w with a correlation time, white
+measurement noise. About the plant linearised at the operating point, the error x of the observer's prediction obeys
+
+    x_{k+1} = A (x_k - L_k r_k) + B w_k,    w_{k+1} = a w_k + q_k,    r_k = C x_k + v_k,
+
+with the observer's gain L and residual r. The Kalman filter for (x, w) turns r into innovations that are white whatever
+the gain L is. Flows are in metres per sample: what each adds to its tank's level in one sampling interval.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.kalman import Propagation, SensorNoise, StateNoise
+from fdi_torch.estimate.state_noise import estimate_state_noise
+from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, riccati
+from fdi_torch.simulate.build import load_library
+
+FIRST_UNIT = 0.1  # initial flow per sample of the optimisation, in standard deviations of a level's measurement noise
+
+
+@dataclass(frozen=True)
+class FlowFilter:
+    """The Kalman filter for one observer.
+
+    linear: transition A (tanks, tanks) and output C (sensors, tanks). noise: intensities in m per sample. reading_std
+    (sensors,): measurement noise. observer: the observer's gain. start_std (tanks,): of the initial levels, m.
+    interval: s. error_of_sums: standard error of ln of the standard deviation of slow sums of the innovations, which
+    random flows dominate: that of the flows' intensities, root mean square over the tanks.
+    """
+
+    linear: Linear
+    noise: StateNoise
+    reading_std: Tensor
+    observer: Gain
+    start_std: Tensor
+    interval: float
+    error_of_sums: Tensor
+
+    @cached_property
+    def transition(self) -> Tensor:
+        """F (2 tanks, 2 tanks) of levels and flows."""
+        a, keep = self.linear.transition, self.keep
+        flows = keep * torch.eye(len(a), dtype=a.dtype)
+        return torch.cat([torch.cat([a, forcing(a)], 1), torch.cat([torch.zeros_like(a), flows], 1)])
+
+    @property
+    def keep(self) -> float:
+        """Share of a flow that is left after one sampling interval."""
+        return math.exp(-self.interval / self.noise.correlation_time) if self.noise.correlation_time else 0.0
+
+    @property
+    def process_std(self) -> Tensor:
+        """Standard deviation of the shocks of levels and flows in one interval, (2 tanks,) m."""
+        sigma = self.noise.intensity
+        return torch.cat([0.0 * sigma, math.sqrt(1.0 - self.keep**2) * sigma])
+
+    @property
+    def joint(self) -> Linear:
+        """Levels and flows together."""
+        c = self.linear.output
+        return Linear(self.transition, torch.cat([c, torch.zeros_like(c)], 1))
+
+    @cached_property
+    def gain(self) -> Gain:
+        """Kalman gain of levels and flows, with its transient from unknown levels."""
+        start = torch.cat([self.start_std, self.noise.intensity])
+        return kalman_gain(self.joint, self.process_std, self.reading_std, start)
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """Steady covariance of the predicted levels and flows, (2 tanks, 2 tanks) m^2."""
+        return riccati(self.joint, torch.diag(self.process_std**2), torch.diag(self.reading_std**2))
+
+    def over(self, samples: int) -> tuple[Tensor, Tensor]:
+        """Transition over some samples, and covariance of the shocks that add up meanwhile, by repeated doubling."""
+        step, shocks = self.transition, torch.diag(self.process_std**2)
+        transition, total = torch.eye(len(step), dtype=step.dtype), torch.zeros_like(step)
+        while samples:
+            if samples % 2:
+                transition, total = step @ transition, step @ total @ step.mT + shocks
+            step, shocks, samples = step @ step, step @ shocks @ step.mT + shocks, samples // 2
+        return transition, total
+
+    def __call__(self, residual: Tensor, number: int = 0, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Innovations (*batch, S, sensors) in the readings' units, and the filter's state (*batch, S, 2 tanks) after
+        each sample.
+
+        residual (*batch, S, sensors): scaled to the steady variance (`Observation.steady_residual`). number: samples
+        of the run before the first. memory (*batch, 2 tanks): state before the first sample, 0 at the start of a run.
+        """
+        batch, (count, channels) = residual.shape[:-2], residual.shape[-2:]
+        tanks, lanes = len(self.noise.intensity), batch.numel()
+        raw = (residual * self.observer.spread(number, count)).reshape(lanes, count, channels).contiguous()
+        state = raw.new_zeros(2 * tanks) if memory is None else memory
+        state = state.expand(*batch, 2 * tanks).reshape(lanes, -1).contiguous()
+        out, path = torch.empty_like(raw), raw.new_empty(lanes, count, 2 * tanks)
+        tables = [self.gain.table(number, count).contiguous(), self.observer.table(number, count).contiguous()]
+        fixed = [self.transition.contiguous(), self.linear.output.contiguous()]
+        pointers = [ctypes.c_void_p(x.data_ptr()) for x in (*fixed, *tables, raw, state, out, path)]
+        _library(tanks, channels).flow_filter(ctypes.c_int64(lanes), ctypes.c_int64(count), *pointers)
+        out = out.reshape(residual.shape) / self.gain.spread(number, count)
+        return out, path.reshape(*batch, count, 2 * tanks)
+
+
+def forcing(transition: Tensor) -> Tensor:
+    """Levels after one interval by flows held over it, (tanks, tanks): the trapezoidal rule for the mean of A(t)."""
+    return 0.5 * (torch.eye(len(transition), dtype=transition.dtype) + transition)
+
+
+def estimate_flow_filter(
+    linear: Linear, observer: Gain, residual: Tensor, reading_std: Tensor, start_std: Tensor, interval: float
+) -> FlowFilter:
+    """The noise that is most likely with an observer's residuals (S, sensors), and the filter for it.
+
+    reading_std (sensors,): first guess of the measurement noise. Raises BuildError without a compiler.
+    """
+    mask = torch.isfinite(residual)
+    free, count = _free_residual(linear, observer, residual.nan_to_num()), len(residual)
+    repeated = [x.expand(count, *x.shape) for x in (linear.transition, forcing(linear.transition), linear.output)]
+    fresh = torch.arange(count) == 0
+    propagation = Propagation(repeated[0], repeated[1], repeated[2], interval, fresh, mask)
+    sensors = SensorNoise(reading_std, torch.zeros_like(reading_std))
+    metres = reading_std / torch.linalg.vector_norm(linear.output, dim=-1)
+    unit = FIRST_UNIT * metres.median() * torch.ones_like(start_std)
+    ones = torch.ones_like(start_std)
+    by_levels = _by_initial_levels(linear, count) * start_std
+    likely = estimate_state_noise(propagation, sensors, free, by_levels, ones, 0.0 * ones, unit)
+    error = (0.5 / likely.determined[: len(ones)]).mean().sqrt()
+    return FlowFilter(linear, likely.noise, likely.noise.scale * reading_std, observer, start_std, interval, error)
+
+
+def _free_residual(linear: Linear, observer: Gain, residual: Tensor) -> Tensor:
+    """What the residual (S, sensors) would be without the observer's corrections: r_k + C xi_k, with
+    xi_{k+1} = A (xi_k + L_k r_k).
+    """
+    raw = residual * observer.spread(0, len(residual))
+    steps = (observer.table(0, len(raw)) @ raw.unsqueeze(-1)).squeeze(-1)
+    shift, path = torch.zeros_like(steps[0]), []
+    for step in steps:
+        path.append(shift)
+        shift = linear.transition @ (shift + step)
+    return raw + torch.stack(path) @ linear.output.mT
+
+
+def _by_initial_levels(linear: Linear, count: int) -> Tensor:
+    """Derivatives of the readings by the initial levels, C A^k, (S, sensors, tanks)."""
+    power, path = torch.eye(len(linear.transition), dtype=linear.transition.dtype), []
+    for _ in range(count):
+        path.append(linear.output @ power)
+        power = linear.transition @ power
+    return torch.stack(path)
+
+
+@lru_cache
+def _library(tanks: int, channels: int) -> ctypes.CDLL:
+    """flow_filter.hpp compiled for these sizes."""
+    source = Path(__file__).with_name("flow_filter.hpp").read_text(encoding="utf-8")
+    library = load_library(f"#define N {tanks}\n#define C {channels}\n{source}", "flow_filter")
+    library.flow_filter.restype = None
+    return library
