@@ -84,9 +84,9 @@ def model_description(
         canSerializeFMUstate="true",
     )
     definitions = ElementTree.SubElement(root, "UnitDefinitions")
-    for unit in sorted({variable.unit for variable in variables} & _BASE_UNITS.keys()):
-        powers = {base: str(power) for base, power in _BASE_UNITS[unit].items()}
-        ElementTree.SubElement(ElementTree.SubElement(definitions, "Unit", name=unit), "BaseUnit", powers)
+    for symbol in sorted({variable.unit for variable in variables} & _BASE_UNITS.keys()):
+        powers = {base: str(power) for base, power in _BASE_UNITS[symbol].items()}
+        ElementTree.SubElement(ElementTree.SubElement(definitions, "Unit", name=symbol), "BaseUnit", powers)
     ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(step))
     listed = ElementTree.SubElement(root, "ModelVariables")
     for reference, variable in enumerate(variables):
