@@ -20,8 +20,9 @@ from torch import Tensor
 
 from fdi_torch import cli, export_fmu
 from fdi_torch.config.plant_file import load_plant
-from fdi_torch.effects import build_network, place, placements_for
+from fdi_torch.effects import all_placements, build_network, place, placements_for
 from fdi_torch.plant.description import Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.operating_range import operating_range_of
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.simulated_recording import clean_readings
 
@@ -119,6 +120,27 @@ CASES: dict[str, tuple[PlantDescription, dict[str, float]]] = {
 def test_fmpy_simulates_what_we_simulate(case: str, tmp_path: Path) -> None:
     plant, values = CASES[case]
     assert error(plant, tmp_path / "plant.fmu", planned(plant, 1000.0, 5.0), values) < CLOSE
+
+
+def test_every_effect_without_a_dead_time_is_that_of_the_library(tmp_path: Path) -> None:
+    """All at all their places in one FMU, each set to its largest start value in turn."""
+    placements = [p for p in all_placements(VALVE) if not p.prefix.endswith("_delay")]
+    network, recording = build_network(VALVE, placements), planned(VALVE, 400.0, 5.0)
+    export_fmu(VALVE, tmp_path / "plant.fmu", effects=[p.prefix for p in placements])
+    reach, nominal = operating_range_of(recording, VALVE), {p.name: p.nominal for p in network.constants}
+    without = clean_readings(network, recording, nominal)
+    shown, errors = 0, {}
+    for placement in placements:
+        start = placement.effect.starts(placement.location, VALVE, reach)[-1]
+        values = nominal | {f"{placement.prefix}.{name}": value for name, value in start.items()}
+        ours = clean_readings(network, recording, values)
+        theirs = by_fmpy(tmp_path / "plant.fmu", recording, values)
+        columns = torch.tensor(np.stack([theirs[s.column] for s in VALVE.sensors], axis=-1))
+        gains = torch.tensor([s.gain for s in VALVE.sensors], dtype=torch.float64)
+        errors[placement.prefix] = float(((columns - ours) / gains).abs().max())
+        shown += bool(((ours - without) / gains).abs().max() > CLOSE)
+    assert shown > len(placements) / 2  # the others pass a noise-free reading, or these inputs do not reach them
+    assert {prefix: e for prefix, e in errors.items() if not e < CLOSE} == {}
 
 
 def test_the_sensor_is_clipped_and_the_tank_overflows_in_the_case_above(tmp_path: Path) -> None:
