@@ -26,6 +26,7 @@ _HOMES = {
     "fdi_torch.estimate.hybrid": ("HybridResult", "HybridSettings", "estimate_parameters"),
     "fdi_torch.estimate.evolution": ("EvolutionSettings", "evolve"),
     "fdi_torch.estimate.levenberg_marquardt": ("levenberg_marquardt",),
+    "fdi_torch.jobs.fmu_export": ("export_fmu",),
     "fdi_torch.jobs.python_functions": (
         *("FreeRun", "GapResult", "MonitorResult"),
         *("gap", "monitor", "predict", "simulate", "study", "train"),

@@ -30,7 +30,7 @@ RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
 DOORS = {
     "pint": ("units.py",),
     "torchdiffeq": ("simulate/reference_engine.py",),
-    "pyarrow": ("recordings/parquet.py",),
+    "pyarrow": ("recordings/parquet.py", "recordings/feather.py"),
     "openpyxl": ("recordings/excel.py",),
     "h5py": ("recordings/hdf5.py",),
     "pandas": (),

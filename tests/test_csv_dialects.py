@@ -71,7 +71,7 @@ def test_words_for_nothing_read_are_missing_readings(tmp_path: Path, word: str) 
             r"say in which zone this is: columns: \{t: \{zone: Europe/Berlin\}\}",
         ),
         (b"PK\x03\x04\x00\x00", "expected an Excel workbook that is whole, got one that cannot be read"),
-        (b"ARROW1\x00\x00", "got a Feather file; write it as Parquet"),
+        (b"FEA1\x00\x00", "got a Feather file of version 1; write it as version 2"),
         (b"t_s\x00\x00", "got something that is no text"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Recordings in Parquet, Excel, MATLAB and HDF5 files give the same result, or error, as the equivalent CSV file."""
+"""Recordings in Parquet, Feather, Excel, MATLAB and HDF5 files give the result or error of the equivalent CSV file."""
 
 from __future__ import annotations
 
@@ -38,6 +38,11 @@ def as_parquet(path: Path, columns: Columns) -> None:
     parquet.write_table(pyarrow.table(columns), path)
 
 
+def as_feather(path: Path, columns: Columns) -> None:
+    pyarrow, feather = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.feather")
+    feather.write_feather(pyarrow.table(columns), path, compression="zstd")
+
+
 def as_excel(path: Path, columns: Columns) -> None:
     openpyxl = pytest.importorskip("openpyxl")
     pytest.importorskip("defusedxml")
@@ -69,6 +74,7 @@ def as_hdf5(path: Path, columns: Columns) -> None:
 
 FORMATS: dict[str, Callable[[Path, Columns], None]] = {
     "parquet": as_parquet,
+    "feather": as_feather,
     "xlsx": as_excel,
     "mat": as_matlab,
     "h5": as_hdf5,
@@ -106,7 +112,7 @@ def test_what_is_wrong_is_said_as_of_csv(ending: str, tmp_path: Path) -> None:
         assert told[0] == told[1]
 
 
-@pytest.mark.parametrize("ending", ["parquet", "xlsx"])
+@pytest.mark.parametrize("ending", ["parquet", "feather", "xlsx"])
 def test_stamps_and_words_mean_what_they_mean_in_csv(ending: str, tmp_path: Path) -> None:
     first = datetime(2026, 3, 29, 8, 30, tzinfo=UTC)
     times = [first + timedelta(seconds=s) for s in (0, 0.25, 1, 2)]
@@ -222,7 +228,12 @@ def test_from_a_workbook_to_a_check(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize(
     ("ending", "library", "extra"),
-    [("parquet", "pyarrow", "parquet"), ("xlsx", "openpyxl", "excel"), ("h5", "h5py", "hdf5")],
+    [
+        ("parquet", "pyarrow", "parquet"),
+        ("feather", "pyarrow", "parquet"),
+        ("xlsx", "openpyxl", "excel"),
+        ("h5", "h5py", "hdf5"),
+    ],
 )
 def test_a_missing_library_is_named_with_its_extra(
     ending: str, library: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -259,11 +270,12 @@ def test_claims_beyond_the_file_s_size_are_refused_before_they_are_read(tmp_path
     pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     zeros = pyarrow.array(np.zeros(4_000_000))
     parquet.write_table(pyarrow.table({"t_s": zeros, "h1_cm": zeros}), tmp_path / "big.parquet", compression="zstd")
+    as_feather(tmp_path / "big.feather", {"t_s": zeros, "h1_cm": zeros})
     scipy.io.savemat(tmp_path / "big.mat", {"t_s": np.zeros(4_000_000)}, do_compression=True)
     with zipfile.ZipFile(tmp_path / "big.xlsx", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("xl/workbook.xml", "<a/>")
         archive.writestr("xl/worksheets/sheet1.xml", b"0" * 40_000_000)
-    for name in ("big.h5", "big.parquet", "big.mat", "big.xlsx"):
+    for name in ("big.h5", "big.parquet", "big.feather", "big.mat", "big.xlsx"):
         with pytest.raises(ValueError, match=rf"{name}: expected at most .* bytes once unpacked"):
             read_csv(tmp_path / name, *CHANNELS)
 

@@ -33,6 +33,7 @@ COMMANDS = {
     "monitor": "detect, isolate and size faults along a recording or live",
     "diagnosability": "which faults an experiment can detect and distinguish, and from which size",
     "rehearse": "validate a monitor on simulated runs: false alarms, delays, isolation",
+    "export": "export a plant as an FMU for other simulation tools",
     "report": "make one HTML page of one or more logs",
     "inspect": "show what a log contains and whether it is intact, or export its messages",
     "replay": "repeat a logged run and compare, or try another setting",

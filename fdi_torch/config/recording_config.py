@@ -99,7 +99,7 @@ class TagsConfig(Strict):
 
 class FileConfig(Strict):
     file: str = Field(
-        description="CSV (plain or .gz), MCAP, Parquet, Excel, MATLAB or HDF5 file; looked for here and below "
+        description="CSV (plain or .gz), MCAP, Parquet, Feather, Excel, MATLAB or HDF5 file; looked for here and below "
         "FDI_TORCH_DATA"
     )
     header: bool = Field(True, description="false: columns have numbers instead of names, {t: {column: 1, unit: s}}")

@@ -19,7 +19,7 @@ from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, 
 
 _SNIFFED = 1 << 16
 _FOREIGN = {
-    b"ARROW1": "a Feather file; write it as Parquet",
+    b"FEA1": "a Feather file of version 1; write it as version 2",
     b"\x89MCAP": "an MCAP file; let its name end in .mcap",
 }
 
@@ -108,7 +108,7 @@ def _beginning(path: Path) -> bytes:
 def _encoding(path: Path, start: bytes) -> str:
     for magic, what in _FOREIGN.items():
         if start.startswith(magic):
-            raise ValueError(f"{path}: expected a CSV, MCAP, Parquet, Excel, MATLAB or HDF5 file, got {what}")
+            raise ValueError(f"{path}: expected a CSV, MCAP, Parquet, Feather, Excel, MATLAB or HDF5 file, got {what}")
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     if b"\0" in start:

@@ -1,4 +1,4 @@
-"""The rows of a Parquet file. The only importer of pyarrow (extra `parquet`)."""
+"""The rows of a Parquet file (pyarrow, extra `parquet`)."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def rows(path: Path, sheet: str | None) -> Iterator[Row]:
     expect_cells(path, file.metadata.num_rows * len(names))
     yield names
     for batch in file.iter_batches(ROWS_AT_ONCE):
-        yield from zip(*(_values(column) for column in batch.columns), strict=True)
+        yield from zip(*(plain_values(column) for column in batch.columns), strict=True)
 
 
-def _values(column: Any) -> list[Any]:
+def plain_values(column: Any) -> list[Any]:
     """A column as plain values; for nested types the name of the type, which is then rejected as a number."""
     pyarrow = needed("pyarrow", "parquet")
     kind = column.type
@@ -37,5 +37,7 @@ def _values(column: Any) -> list[Any]:
     if pyarrow.types.is_timestamp(kind):
         return list(column.cast(pyarrow.timestamp("us", kind.tz), safe=False).to_pylist())
     known = pyarrow.types
+    if known.is_string(kind) or known.is_large_string(kind):
+        return list(column.to_pylist())
     plain = (known.is_integer, known.is_floating, known.is_decimal, known.is_boolean, known.is_date, known.is_null)
     return list(column.to_pylist()) if any(each(kind) for each in plain) else [f"({kind})"] * len(column)

@@ -36,6 +36,7 @@ class Format:
 
 FORMATS = (
     Format(b"PAR1", "a Parquet file", "parquet"),
+    Format(b"ARROW1", "a Feather file", "feather"),
     Format(b"PK\x03\x04", "an Excel workbook", "excel"),
     Format(b"MATLAB 5.0", "a MATLAB file", "matlab"),
     Format(b"\x89HDF", "an HDF5 file", "hdf5"),

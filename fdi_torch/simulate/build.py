@@ -20,9 +20,10 @@ from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
+_SHARED = ("-std=c++17", "-fPIC", "-shared", "-pthread")
 _FLAGS = (
-    "-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
-    "-fno-strict-aliasing", "-fPIC", "-shared", "-pthread",
+    *_SHARED, "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
+    "-fno-strict-aliasing",
 )  # fmt: skip
 
 
@@ -78,11 +79,7 @@ def is_cached(source: str) -> bool:
 
 def load_library(source: str, *functions: str) -> ctypes.CDLL:
     """The compiled source, from the cache if possible. functions: names that it must export. Raises BuildError."""
-    compiler = find_compiler()
-    if compiler is None:
-        raise BuildError(
-            "expected a C++ compiler, got none on the PATH; install g++, or fdi_torch[compiler], or set CXX"
-        )
+    compiler = _expected_compiler()
     folder, key = _own_folder(), _key(compiler, source)
     cached = _cached(folder, key)
     if cached is not None:
@@ -91,6 +88,23 @@ def load_library(source: str, *functions: str) -> ctypes.CDLL:
         except BuildError:
             cached.unlink(missing_ok=True)
     return _opened(_compile(compiler, source, folder, key), functions)
+
+
+def compile_library(source: str, path: Path, flags: Sequence[str]) -> None:
+    """Compile the source into a shared library at `path`, outside the cache. Raises BuildError."""
+    with tempfile.TemporaryDirectory() as place:
+        code = Path(place) / "library.cpp"
+        code.write_text(source, encoding="utf-8")
+        _run_compiler(_expected_compiler(), [*_SHARED, *flags], code, path)
+
+
+def _expected_compiler() -> Command:
+    compiler = find_compiler()
+    if compiler is None:
+        raise BuildError(
+            "expected a C++ compiler, got none on the PATH; install g++, or fdi_torch[compiler], or set CXX"
+        )
+    return compiler
 
 
 def _key(compiler: Command, source: str) -> str:
@@ -154,17 +168,21 @@ def _compile(compiler: Command, source: str, folder: Path, key: str) -> Path:
         with tempfile.TemporaryDirectory(dir=folder) as place:
             code, built = Path(place) / "kernel.cpp", Path(place) / "kernel.so"
             code.write_text(source, encoding="utf-8")
-            done = subprocess.run(
-                [*compiler, *_FLAGS, str(code), "-o", str(built)], capture_output=True, text=True, check=False
-            )
-            if not done.returncode:
-                built.chmod(0o700)
-                library = folder / f"{key}_{_content_hash(built)}.so"
-                built.replace(library)  # atomic: other processes see all of it or nothing
-                return library
+            _run_compiler(compiler, _FLAGS, code, built)
+            built.chmod(0o700)
+            library = folder / f"{key}_{_content_hash(built)}.so"
+            built.replace(library)  # atomic: other processes see all of it or nothing
+            return library
+    except BuildError:
+        raise
     except OSError as error:
         raise BuildError(f"expected to write to {folder}, got {error}; set XDG_CACHE_HOME") from error
-    raise BuildError(f"expected {' '.join(compiler)} to compile the plant, got: {done.stderr.strip()[:2000]}")
+
+
+def _run_compiler(compiler: Command, flags: Sequence[str], code: Path, built: Path) -> None:
+    done = subprocess.run([*compiler, *flags, str(code), "-o", str(built)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise BuildError(f"expected {' '.join(compiler)} to compile the plant, got: {done.stderr.strip()[:2000]}")
 
 
 @lru_cache(maxsize=8)

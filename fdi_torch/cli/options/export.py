@@ -1,0 +1,27 @@
+"""Export a plant with its effects for other simulation tools: an FMU for co-simulation (FMI 2.0).
+
+The FMU is self-contained and runs on machines of the same kind as this one. Inputs are the plant's recorded inputs,
+outputs its levels and readings, parameters its constants and the parameters of its effects, all in SI.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+EXAMPLES = """
+examples:
+  fdi export rig.yaml --fmu rig.fmu                              the plant with the effects in its file
+  fdi export three_tank --fmu rig.fmu --effect T1.leak           with a leak whose size is 0 until it is set
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("plant", metavar="PLANT", help="a shipped plant, or a plant file")
+    parser.add_argument("--fmu", metavar="FILE", required=True, help="FMU to write")
+    parser.add_argument(
+        "--effect",
+        metavar="PLACE.EFFECT",
+        action="append",
+        default=[],
+        help="a further effect, absent until one of its parameters is set",
+    )

@@ -1,0 +1,94 @@
+"""A plant as an FMU for co-simulation (FMI 2.0): the compiled engine's C++ with the functions of the standard.
+
+The FMU is self-contained: it needs neither Python nor this package where it runs. Its steps are those of
+`clean_readings`: L-stable, with a tolerance of 1e-10 of the plant's length scale.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sys
+import tempfile
+import zipfile
+from importlib.metadata import version
+from pathlib import Path
+
+from fdi_torch.disk import replacing
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.plant.scales import length_scale, time_scale
+from fdi_torch.simulate.build import compile_library
+from fdi_torch.simulate.cpp_source import emit
+from fdi_torch.simulate.fmu_description import Variable, model_description, variables_of
+from fdi_torch.simulate.program import Program, build_program
+from fdi_torch.simulate.simulated_recording import LONGEST_STEP, RESOLUTION, TOLERANCE
+from fdi_torch.simulate.step_control import StepControl
+
+_FUNCTIONS = Path(__file__).with_name("fmu.hpp")
+# Runs on any machine of the same kind, and needs no C++ library there.
+_FLAGS = ("-O2", "-fno-strict-aliasing", "-fvisibility=hidden")
+_STATIC = ("-static-libstdc++", "-static-libgcc") if sys.platform == "linux" else ()
+
+
+def write_fmu(network: TankNetwork, path: Path) -> list[Variable]:
+    """Write the FMU of a plant with its placed effects for this kind of machine, and return its variables.
+
+    The zip file holds modelDescription.xml, the compiled library and, under sources/, the C++ it was compiled from.
+    Raises ValueError if an effect has a dead time, BuildError without a compiler, DiskError.
+    """
+    source = fmu_source(network)
+    variables = variables_of(network)
+    name = network.description.name or "plant"
+    identifier = re.sub(r"\W|^(?=\d)", "_", name, flags=re.ASCII)
+    guid = hashlib.sha256(f"{name}\0{variables}\0{source}".encode()).hexdigest()[:32]
+    step = LONGEST_STEP * time_scale(network.description)
+    tool = f"fdi_torch {version('fdi_torch')}"
+    description = model_description(name, identifier, guid, tool, step, variables)
+    source = f'static const char GUID[] = "{guid}";\n{source}'
+    folder, ending = ("darwin64", "dylib") if sys.platform == "darwin" else ("linux64", "so")
+    with tempfile.TemporaryDirectory() as place, replacing(path) as temporary:
+        built = Path(place) / f"{identifier}.{ending}"
+        compile_library(source, built, [*_FLAGS, *_STATIC])
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("modelDescription.xml", description)
+            archive.write(built, f"binaries/{folder}/{built.name}")
+            archive.writestr(f"sources/{identifier}.cpp", source)
+    return variables
+
+
+def fmu_source(network: TankNetwork) -> str:
+    """The C++ source, in which all constants of the network are parameters; the GUID is not defined yet."""
+    program = build_program(network, network.constants.names, False, adaptive=True)
+    _expect_no_dead_time(network, program)
+    plant = network.description
+    resolution = RESOLUTION * time_scale(plant)
+    control = StepControl.for_tolerance(TOLERANCE * length_scale(plant), plant, resolution)
+    kernel = emit(program, False, "double", "VECTOR")
+    numbers = {
+        "RESOLUTION": resolution,
+        "TOLERANCE": control.tolerance,
+        "SHORTEST_STEP": control.shortest,
+        "LONGEST_STEP": LONGEST_STEP * time_scale(plant),
+    }
+    constants = [f"static const double {name} = {value!r};" for name, value in numbers.items()]
+    arrays = [_array("START", network.nominal.tolist()), _array("LIFTED", program.graph.lifted)]
+    return "\n".join([kernel, *constants, *arrays, _FUNCTIONS.read_text(encoding="utf-8")])
+
+
+def _array(name: str, values: list[float]) -> str:
+    return f"static const real {name}[] = {{{', '.join(_literal(v) for v in values or [0.0])}}};"
+
+
+def _literal(value: float) -> str:
+    number = repr(float(value))
+    return number.replace("inf", "INFINITY").replace("nan", "NAN")
+
+
+def _expect_no_dead_time(network: TankNetwork, program: Program) -> None:
+    late = [network.actuators()[i][0] for i in program.late_actuators]
+    late += [network.description.sensors[i].name for i in program.late_sensors]
+    if late:
+        raise ValueError(
+            f"{network.description.name}: expected effects without a dead time, got a delay at {', '.join(late)}; "
+            "remove it from the plant file, and delay the signal outside the FMU"
+        )
