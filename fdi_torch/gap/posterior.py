@@ -1,7 +1,7 @@
 """Posterior over hypotheses: a set of effects, with or without an unknown discrepancy at one place.
 
-    log weight(S)    = log evidence of S
-    log weight(S, p) = log evidence of S + gain of a free discrepancy at p + log odds of an unknown there
+    log weight(S)    = log evidence of S + log prior of its random flows
+    log weight(S, p) = log weight(S) + gain of a free discrepancy at p + log odds of an unknown there
 
 each under its most likely disturbance noise (`marginal_likelihood.py`, `localization/localize.py`). No library has the
 exact law of a rig (Brynjarsdottir and O'Hagan, 2014). A discrepancy at a place where S has an effect, and small
@@ -77,9 +77,14 @@ def posterior_of(
 
     pool: pool of the evaluated explanations, which may grow. named_only: without unknown discrepancies.
     """
-    hypotheses = [CauseHypothesis(e, causes_in_order(e.fit), e.log_evidence) for e in result.explanations]
+
+    def weight(explanation: RankedExplanation) -> float:
+        return explanation.log_evidence if named_only else explanation.log_weight
+
+    hypotheses = [CauseHypothesis(e, causes_in_order(e.fit), weight(e)) for e in result.explanations]
     if not named_only:
-        for explanation in {e.key: e for e in (result.best, result.null)}.values():
+        likeliest = _likeliest(hypotheses).explanation
+        for explanation in {e.key: e for e in (likeliest, result.best, result.null)}.values():
             hypotheses += _with_unknowns(pool, result, explanation, places, len(places), _likeliest(hypotheses))
         hypotheses += _with_fewer_effects(pool, result, _likeliest(hypotheses), len(places))
     best: dict[tuple[frozenset[CauseName], str | None], CauseHypothesis] = {}
@@ -88,10 +93,8 @@ def posterior_of(
         if key not in best or h.weight > best[key].weight:
             best[key] = h
     ranked = sorted(best.values(), key=lambda h: -h.weight)
-    weights = [h.weight for h in ranked]
-    *probabilities, unexamined = posterior(
-        [*weights, result.best.log_evidence + math.log(max(result.unexamined, 1e-300))]
-    )
+    unfitted = weight(result.best) + math.log(max(result.unexamined, 1e-300))
+    *probabilities, unexamined = posterior([*(h.weight for h in ranked), unfitted])
     return Posterior(tuple(ranked), tuple(probabilities), unexamined, _marginals(ranked, probabilities, places))
 
 
@@ -108,7 +111,7 @@ def _with_unknowns(
     best: CauseHypothesis,
 ) -> list[CauseHypothesis]:
     """An explanation with an unknown discrepancy at each of some places, as far as relevant against the best."""
-    needed = best.weight + math.log(RARE) - explanation.log_evidence - math.log(ODDS.unknown / places)
+    needed = best.weight + math.log(RARE) - explanation.log_weight - math.log(ODDS.unknown / places)
     discrepancies = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed)
     return [_with_unknown(pool.fitter, result, explanation, place, places) for place in discrepancies]
 
@@ -121,7 +124,7 @@ def _with_unknown(
     # A random flow into a tank may stand for the error of any flow there.
     plant, flow = fitter.data.plant, place.noise.apart is not None
     here = [c for c in causes if c[1] == place.location or (flow and place.location in tanks_of(c[1], plant))]
-    weight = explanation.log_evidence + place.gain
+    weight = explanation.log_weight + place.gain
     if here and _is_small(fitter, result, explanation, place, here):
         return CauseHypothesis(explanation, causes, weight)
     weight += math.log(ODDS.unknown / places)

@@ -52,6 +52,11 @@ class RankedExplanation:
     def key(self) -> Key:
         return self.fit.key
 
+    @property
+    def log_weight(self) -> float:
+        """Log posterior weight if nothing is unknown: random flows are then of one order of magnitude in all tanks."""
+        return self.log_evidence + self.noise.log_prior()
+
 
 @dataclass(frozen=True)
 class SearchResult:
@@ -128,11 +133,9 @@ class ExplanationPool:
         while True:
             own_fitter, likely = with_estimated_noise(self.fitter, fit, start, climb)
             fit = replace(fit, cost=own_fitter.cost(fit))
-            prior = likely.noise.log_prior()
-            lead = log_evidence(own_fitter, fit, self.choices) + prior - rival
+            lead = log_evidence(own_fitter, fit, self.choices) - rival
             fit = own_fitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit, fit.cost + 2.0 * lead)
-            evidence = log_evidence(own_fitter, fit, self.choices) + prior
-            updated = RankedExplanation(fit, own_fitter, likely.noise, evidence)
+            updated = RankedExplanation(fit, own_fitter, likely.noise, log_evidence(own_fitter, fit, self.choices))
             gain = updated.log_evidence - best.log_evidence if best else math.inf
             if best is None or gain > 0.0:
                 best = updated
