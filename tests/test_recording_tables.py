@@ -20,6 +20,7 @@ from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.recordings import parquet as parquet_reader
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.recordings.source import ChannelSource
 
@@ -278,6 +279,37 @@ def test_claims_beyond_the_file_s_size_are_refused_before_they_are_read(tmp_path
     for name in ("big.h5", "big.parquet", "big.feather", "big.mat", "big.xlsx"):
         with pytest.raises(ValueError, match=rf"{name}: expected at most .* bytes once unpacked"):
             read_csv(tmp_path / name, *CHANNELS)
+
+
+def test_texts_in_parquet_that_unpack_to_too_much_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    note = pyarrow.array(["a" * 40_000_000, "b"])
+    table = pyarrow.table({"t_s": [0.0, 1.0], "h1_cm": [1.0, 2.0], "note": note})
+    parquet.write_table(table, tmp_path / "text.parquet", compression="zstd", use_dictionary=False)
+    with pytest.raises(ValueError, match=r"text\.parquet: expected at most .* bytes once unpacked"):
+        read_csv(tmp_path / "text.parquet", *CHANNELS)
+
+
+def test_bytes_and_lists_in_parquet_are_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    columns = {"t_s": [0.0, 1.0], "picture": [b"a" * 100] * 2, "parts": [[1.0], [2.0]], "h1_cm": [1.0, 2.0]}
+    parquet.write_table(pyarrow.table(columns), tmp_path / "mixed.parquet")
+    unpacked = set()
+    iterate = parquet.ParquetFile.iter_batches
+
+    def spied(self, *args, **options):
+        for batch in iterate(self, *args, **options):
+            unpacked.update(batch.schema.names)
+            yield batch
+
+    monkeypatch.setattr(parquet.ParquetFile, "iter_batches", spied)
+    rows = list(parquet_reader.rows(tmp_path / "mixed.parquet", None))
+    assert rows[0] == list(columns)
+    assert rows[1:] == [
+        (0.0, "(binary)", "(list<element: double>)", 1.0),
+        (1.0, "(binary)", "(list<element: double>)", 2.0),
+    ]
+    assert unpacked == {"t_s", "h1_cm"}
 
 
 def test_a_sheet_with_a_cell_far_away_is_not_spelled_out(tmp_path: Path) -> None:

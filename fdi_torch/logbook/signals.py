@@ -203,10 +203,12 @@ def _own_table(run: Run, channel: Channel) -> tuple[np.ndarray, np.ndarray, np.n
     """Times (T,), values (T, N) and mask (T, N) of a plant topic."""
     names = _names(channel)
     masked: list[tuple[int, int]] = []
+    may_mask = "masked" in topic_definition(channel.topic).fields  # elsewhere the field is a stranger's, of any kind
 
     def rows() -> Iterable[Sequence[float]]:
         for row, (message, payload) in enumerate(_of(run, channel.topic)):
-            masked.extend((row, names.index(name)) for name in payload.get("masked", ()) if name in names)
+            if may_mask:
+                masked.extend((row, names.index(name)) for name in payload.get("masked", ()) if name in names)
             yield (_time(message, payload), *(number_at(payload, name) for name in names))
 
     table = _table(rows(), len(names) + 1)

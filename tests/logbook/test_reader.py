@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import threading
 import time
 import zlib
@@ -25,9 +26,12 @@ from fdi_torch.logbook import (
     read_run,
     series,
 )
+from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.log_copy import copy_log
 from fdi_torch.logbook.payload import unpack
-from fdi_torch.logbook.sink import Sink
+from fdi_torch.logbook.schemas import json_schema
+from fdi_torch.logbook.sink import EPOCH_NS, Sink
+from fdi_torch.logbook.topic_definitions import topic_definition
 
 
 def test_a_recording_comes_back_bit_for_bit(tmp_path: Path) -> None:
@@ -51,6 +55,20 @@ def test_a_recording_that_starts_with_a_hole_keeps_its_names_in_order(tmp_path: 
     back = own_signals(read_run(tmp_path / "a.mcap"))
     assert back.output_names == ("h1", "h2") and back.inputs.shape == (1, 0)
     np.testing.assert_array_equal(back.outputs, [[np.nan, 1.0]])
+
+
+@pytest.mark.parametrize("masked", [0.0, True, [1], ["Q1"], {"Q1": 1}])
+def test_a_field_of_another_topic_in_a_strangers_log_is_a_signal_at_most(masked: object, tmp_path: Path) -> None:
+    sink = Sink(tmp_path / "a.mcap", "stranger")
+    for topic, name in (("/plant/input", "Q1"), ("/plant/output", "h1")):
+        definition = topic_definition(topic)
+        schema = json_schema(definition, {name: "number"})
+        channel = Channel(topic, "json", definition.schema, "jsonschema", schema, ((f"unit.{name}", "m"),))
+        data = json.dumps({"t": 0.0, name: 1.0} | ({"masked": masked} if name == "Q1" else {})).encode()
+        sink.message(channel, EPOCH_NS, EPOCH_NS, 0, data)
+    sink.finish()
+    back = own_signals(read_run(tmp_path / "a.mcap"))
+    assert back.inputs.tolist() == [[1.0]] and back.mask.tolist() == [[True]]
 
 
 def test_several_recordings_in_one_log(tmp_path: Path) -> None:
