@@ -63,10 +63,12 @@ ul { margin: .3rem 0; padding-left: 1.2rem; }
     text-align: right; white-space: normal; overflow-wrap: anywhere; } .wide td:empty { display: none; }
   .wide td::before { content: attr(data-label); color: var(--soft); text-align: left; }
   .wide td:first-child { font-weight: 600; } .wide td:first-child::before { font-weight: 400; } }
+@page { margin: 15mm 14mm; }
 @media print { :root { color-scheme: light; --ink: #000000; --soft: #444444; --faint: #bbbbbb; --paper: #ffffff;
   --ground: #ffffff; --model: #0b6cab; --mark: #b84a00; --other: #0b7558; }
   body { font-size: 10.5pt; } main { padding: 0; max-width: none; } section { border: 0; padding: 0; margin: 1rem 0; }
-  figure, tr, dl div { break-inside: avoid; } h3 { break-after: avoid; }
+  figure, tr, dl div { break-inside: avoid; } h1, h2, h3 { break-after: avoid; }
+  p, li { orphans: 3; widows: 3; } thead { display: table-header-group; }
   .grid { grid-template-columns: repeat(2, 1fr); } .scroll { overflow: visible; background: none; }
   table { font-size: 8.5pt; } th, td.r { white-space: normal; } th, td { padding-right: .5rem; }
   details::details-content { content-visibility: visible; display: block; } }
