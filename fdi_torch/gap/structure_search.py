@@ -22,6 +22,7 @@ from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import BEHIND, SHARE, Candidate, Fit, Fitter, Key
+from fdi_torch.gap.extensions import ExpectedGain, best_pairs, extended, log_prior_width
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
 from fdi_torch.gap.onsets import with_fine_onsets
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
@@ -114,7 +115,7 @@ class ExplanationPool:
     def __init__(self, fitter: Fitter, null: Fit, choices: int) -> None:
         self.fitter, self.null, self.choices = fitter, null, choices
         self.explanations: dict[Key, RankedExplanation] = {}
-        self._expected_gains: dict[Key, dict[Key, _ExpectedGain]] = {}
+        self._expected_gains: dict[Key, dict[Key, ExpectedGain]] = {}
         self._failed: set[Key] = set()
 
     def evaluate(self, fit: Fit, start: StateNoise | None = None) -> RankedExplanation:
@@ -179,7 +180,7 @@ class ExplanationPool:
         """
         fits = self._fitted(parent.fitter, parent.fit, self._extensions(parent, own_noise, own=True))[:EVALUATED]
         if sensor_noise:
-            pairs = _pairs(pairs_of(self.fitter, parent.fit, sensor_noise), PAIRS)
+            pairs = best_pairs(pairs_of(self.fitter, parent.fit, sensor_noise), PAIRS)
             candidates = [*self._extensions(parent, sensor_noise, own=False), *pairs]
             undisturbed = self._fitted(self.fitter, self.null, candidates, (self.fitter.cost(f) for f in fits))
             costs = {parent.key: self.null.cost} | {f.key: f.cost for f in undisturbed}
@@ -231,9 +232,9 @@ class ExplanationPool:
             key = parent.key | {cause}
             odds = log_prior(key, self.choices) - log_prior(parent.key, self.choices)
             gain = 0.5 * float(screening.gain[group[0]])
-            candidate = _extended(parent.fit, screening, group[:STARTS])
+            candidate = extended(parent.fit, screening, group[:STARTS])
             if own:
-                expected = _ExpectedGain(candidate, gain, odds - _log_prior_width(screening, group[0]))
+                expected = ExpectedGain(candidate, gain, odds - log_prior_width(screening, group[0]))
                 self._expected_gains.setdefault(parent.key, {})[key] = expected
             if gain + odds > 0.0 and len(candidates) < FITTED:
                 candidates.append(candidate)
@@ -262,7 +263,7 @@ class ExplanationPool:
             for fit in self._fitted(parent.fitter, parent.fit, [expected.candidate]):
                 self.evaluate(fit, parent.noise)
 
-    def _unfitted(self) -> Iterator[tuple[float, RankedExplanation, _ExpectedGain]]:
+    def _unfitted(self) -> Iterator[tuple[float, RankedExplanation, ExpectedGain]]:
         """Candidates that were not fitted: expected lead in log evidence over the best explanation, parent, and
         expected gain.
 
@@ -281,63 +282,3 @@ class ExplanationPool:
             for k, expected in expected_gains.items():
                 if k not in self.explanations:
                     yield ratio * expected.gain + expected.prior - behind, parent, expected
-
-
-@dataclass(frozen=True)
-class _ExpectedGain:
-    """A candidate with its expected gain in log-likelihood (nats), and the log prior odds that it costs."""
-
-    candidate: Candidate
-    gain: float
-    prior: float
-
-
-def _log_prior_width(screening: ScreeningResult, i: int) -> float:
-    """Cost of the size of an option with a uniform prior: log of its range in standard errors."""
-    option = screening.options[i]
-    name, start = next(iter(option.start.items()))
-    size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
-    width, unit = size.high - size.low, abs(start - size.nominal)
-    if not math.isfinite(width) or unit == 0.0:
-        return 0.0
-    strength = float(screening.strength[i])
-    return 0.5 * math.log(max(strength * (width / unit) ** 2 / (2.0 * math.pi), 1.0))
-
-
-def _extended(fit: Fit, screening: ScreeningResult, group: Sequence[int]) -> Candidate:
-    """The fit extended by one effect; each start has the size that the screening suggests."""
-    starts = [fit.effect_values | sized(screening.options[i], float(screening.size[i])) for i in group]
-    return Candidate((*fit.candidate.placements, screening.options[group[0]].placement), tuple(starts))
-
-
-def sized(option: Option, factor: float) -> dict[str, float]:
-    """The start with its size multiplied within bounds; that of a threshold stays."""
-    if not option.placement.effect.smooth:
-        return dict(option.start)
-    name = next(iter(option.start))
-    size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
-    factor = min(max(factor, 0.1), 4.0)
-    value = size.nominal + factor * (option.start[name] - size.nominal)
-    return {**option.start, name: min(max(value, size.low), size.high)}
-
-
-def _pairs(pairs: Pairs, count: int) -> list[Candidate]:
-    """The pairs of different effects with the largest joint gain; each alone may gain little."""
-    gain = pairs.gain()
-    best: dict[Key, tuple[int, int]] = {}
-    order = torch.argsort(gain.flatten(), descending=True)[:400].tolist()
-    for flat in order:
-        i, j = divmod(flat, gain.shape[1])
-        a, b = pairs.options[i], pairs.options[j]
-        if a.cause != b.cause:
-            best.setdefault(frozenset((a.cause, b.cause)), (i, j))
-    return [
-        Candidate((pairs.options[i].placement, pairs.options[j].placement), (_joint_start(pairs, i, j),))
-        for i, j in list(best.values())[:count]
-    ]
-
-
-def _joint_start(pairs: Pairs, i: int, j: int) -> dict[str, float]:
-    pick = torch.tensor([i, j])
-    sizes = torch.linalg.lstsq(pairs.gram[pick][:, pick], pairs.score[pick].unsqueeze(1)).solution.flatten().tolist()
-    return sized(pairs.options[i], sizes[0]) | sized(pairs.options[j], sizes[1])
