@@ -25,11 +25,11 @@ SPACING = 4.0  # times t; no onset is further than 2 t from a start, where most 
 MOST = 127  # onset times, a limit on computing time
 
 
-def with_fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
-    """The options with further onset times, as dense as the random flows in the fitter's noise require."""
+def fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
+    """Further onset times of these options, as dense as the random flows in the fitter's noise require."""
     duration = max(float(part.experiment.nodes[-1]) for part in fitter.data.parts)
     count = min(math.ceil(duration / (SPACING * detection_time(fitter))), MOST)
-    result = list(options)
+    further: list[Option] = []
     coarse: dict[tuple[object, ...], list[Option]] = {}
     for option in options:
         onset = f"{option.placement.prefix}.onset"
@@ -40,8 +40,8 @@ def with_fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
         if count > len(group):
             onset = f"{group[0].placement.prefix}.onset"
             times = [duration * (k + 1) / (count + 1) for k in range(count)]
-            result += [replace(group[0], start={**group[0].start, onset: time}) for time in times]
-    return result
+            further += [replace(group[0], start={**group[0].start, onset: time}) for time in times]
+    return further
 
 
 def detection_time(fitter: Fitter) -> float:

@@ -74,6 +74,17 @@ class ScreeningResult:
     score: Tensor
     strength: Tensor
 
+    def __add__(self, other: ScreeningResult) -> ScreeningResult:
+        """The screening of the options of both, made under one noise."""
+        score, strength = (torch.cat([getattr(x, name) for x in (self, other)]) for name in ("score", "strength"))
+        return ScreeningResult(self.options + other.options, score, strength)
+
+    def promising(self, count: int) -> list[Option]:
+        """All options of the `count` effects with the largest gain."""
+        best = dict.fromkeys(self.options[i].cause for i in torch.argsort(self.gain, descending=True).tolist())
+        causes = list(best)[:count]
+        return [o for o in self.options if o.cause in causes]
+
     @property
     def size(self) -> Tensor:
         """The factor (M,) by which each start would be multiplied."""

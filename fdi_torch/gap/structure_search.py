@@ -24,7 +24,7 @@ from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import BEHIND, SHARE, Candidate, Fit, Fitter, Key
 from fdi_torch.gap.extensions import ExpectedGain, best_pairs, extended, log_prior_width
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
-from fdi_torch.gap.onsets import with_fine_onsets
+from fdi_torch.gap.onsets import fine_onsets
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
 
 # DEEPEST, BEAM, FITTED, STARTS, EVALUATED, TURNS and PAIRS are budgets of computing. An extension that FITTED,
@@ -80,7 +80,6 @@ class SearchResult:
 def search(pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST) -> SearchResult:
     """Search from the recalibrated plant. most: effects in one explanation."""
     base = pool.evaluate(pool.null)
-    options = with_fine_onsets(options, base.fitter)
     alarm, of_sensors = screen_under_each([base.fitter, pool.fitter], base.fit, options)
     pool.extend(base, alarm, of_sensors)
     frontier = pool.best_of(1)[:BEAM]
@@ -178,6 +177,8 @@ class ExplanationPool:
 
         own_noise: screening under its own noise. sensor_noise: screening under sensor noise alone.
         """
+        if further := fine_onsets(own_noise.promising(FITTED), parent.fitter):
+            own_noise += screen(parent.fitter, parent.fit, further)
         fits = self._fitted(parent.fitter, parent.fit, self._extensions(parent, own_noise, own=True))[:EVALUATED]
         if sensor_noise:
             pairs = best_pairs(pairs_of(self.fitter, parent.fit, sensor_noise), PAIRS)
