@@ -10,12 +10,16 @@ from torch import Tensor
 
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network
+from fdi_torch.monitor import noise_model
+from fdi_torch.monitor.detection import make_detector
+from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text
 from fdi_torch.monitor.noise_model import learn_noise, noise_of_gain, operating_point
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.simulate.build import BuildError
 from fdi_torch.simulate.equilibrium import equilibrium
 
 PLANT = load_plant("three_tank")
@@ -54,6 +58,23 @@ def test_sums_of_the_white_residual_spread_like_those_of_white_noise(correlation
     white = noise.whitening(Observer(NETWORK, noise.gain).run(samples).steady_residual)[LEARN:]
     assert white.std(dim=0).tolist() == pytest.approx([1.0] * 3, abs=0.1)
     assert spread_of_sums(white).tolist() == pytest.approx([1.0] * 3, abs=4.0 * math.hypot(0.11, 0.06))
+
+
+def test_without_a_compiler_the_start_tells_what_is_not_modelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = disturbed(15.0, 600)
+
+    def told() -> str:
+        noise, _ = learn_noise(NETWORK, samples)
+        generator = torch.Generator().manual_seed(0)
+        detector = make_detector("glr", 20_000.0, 1.0, 3, generator, learnt=noise.whitening)
+        return false_alarm_rate_text(PLANT, noise, detector, 20_000.0, 1.0)
+
+    def missing(*arguments: object) -> None:
+        raise BuildError("no compiler")
+
+    assert "compiler" not in told()
+    monkeypatch.setattr(noise_model, "estimate_flow_filter", missing)
+    assert "if no random flow is slow: to model these, install a C++ compiler" in told()
 
 
 def test_innovations_do_not_depend_on_the_gain_of_the_observer() -> None:

@@ -117,6 +117,8 @@ def false_alarm_rate_text(
     text = (
         f"learnt from {seconds:g} s: one false alarm in {every:g} s, to within a factor of {math.exp(1.96 * error):.2g}"
     )
+    if noise.whitening.flows is None:
+        text += ", if no random flow is slow: to model these, install a C++ compiler or the extra fdi_torch[compiler]"
     if needed <= seconds:
         return text
     return f"{text}; a factor of {RATE_FACTOR:g} takes {needed:.0f} s without a fault: lengthen fault_free"
