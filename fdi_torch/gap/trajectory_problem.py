@@ -99,11 +99,12 @@ class TrajectoryProblem:
         linearised, far = _fitted(known).linearised, self.objective.far
         shift = (linearised.slopes * step[:, None, None, :]).sum(-1)
         guess = (near or linearised).levels + shift
-        levels, lost = corrected_trajectories(self.engine, theta, guess, far)
+        levels, defect = corrected_trajectories(self.engine, theta, guess, far)
         readings = self.engine.read(levels, theta)
         cost = 0.5 * self.objective.chi_square(self.engine.space, theta, readings)
-        cost = torch.where(lost, torch.inf, cost)
-        return TrialTrajectory(cost, levels, readings, linearised.defect.clamp(min=far))
+        allowed = linearised.defect.clamp(min=far)
+        cost = torch.where(defect <= allowed.clamp(min=NEARLY * far), cost, torch.inf)
+        return TrialTrajectory(cost, levels, readings, allowed)
 
     def bend(self, known: Linearisation, trial: TrialTrajectory, step: Tensor) -> Tensor:
         """J'c (L, P) for the second-order change c of the whitened readings along the step; priors are linear."""
@@ -137,18 +138,19 @@ def _fitted(model: Linearisation) -> FittedTrajectory:
 def corrected_trajectories(
     engine: Collocation | JointCollocation, theta: Tensor, guess: Tensor, far: float
 ) -> tuple[Tensor, Tensor]:
-    """Trajectories (L, K+1, n) after Newton steps from a guess, and which did not converge (L,) bool."""
-    levels, lost = guess, torch.zeros(len(theta), dtype=torch.bool)
-    lanes, defect = torch.arange(len(theta)), torch.full((len(theta),), torch.inf, dtype=guess.dtype)
+    """Trajectories (L, K+1, n) after Newton steps from a guess while these converge, and their last defects (L,), m."""
+    levels, lanes = guess, torch.arange(len(theta))
+    defect = torch.full((len(theta),), torch.inf, dtype=guess.dtype)
     for _ in range(CORRECTIONS):
         before = defect[lanes]
         path, moved = engine.corrected(theta[lanes], levels[lanes])
-        levels, defect = levels.index_copy(0, lanes, path), defect.index_copy(0, lanes, moved)
-        lost[lanes] = _diverged(moved, before, far)
-        lanes = lanes[(moved > NEARLY * far) & ~lost[lanes]]
+        better = moved < before
+        levels = levels.index_copy(0, lanes[better], path[better])
+        defect = defect.index_copy(0, lanes[better], moved[better])
+        lanes = lanes[better & (moved > NEARLY * far) & ~_diverged(moved, before, far)]
         if not len(lanes):
             break
-    return levels, lost
+    return levels, defect
 
 
 def _correct(
