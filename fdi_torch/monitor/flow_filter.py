@@ -34,8 +34,7 @@ class FlowFilter:
 
     linear: transition A (tanks, tanks) and output C (sensors, tanks). noise: intensities in m per sample. reading_std
     (sensors,): measurement noise. observer: the observer's gain. start_std (tanks,): of the initial levels, m.
-    interval: s. error_of_sums: standard error of ln of the standard deviation of slow sums of the innovations, which
-    random flows dominate: that of the flows' intensities, root mean square over the tanks.
+    interval: s. intensity_error: standard error of ln of the flows' intensities, root mean square over the tanks.
     """
 
     linear: Linear
@@ -44,7 +43,7 @@ class FlowFilter:
     observer: Gain
     start_std: Tensor
     interval: float
-    error_of_sums: Tensor
+    intensity_error: Tensor
 
     @cached_property
     def transition(self) -> Tensor:
@@ -80,6 +79,19 @@ class FlowFilter:
     def covariance(self) -> Tensor:
         """Steady covariance of the predicted levels and flows, (2 tanks, 2 tanks) m^2."""
         return riccati(self.joint, torch.diag(self.process_std**2), torch.diag(self.reading_std**2))
+
+    @cached_property
+    def error_of_sums(self) -> Tensor:
+        """Standard error of ln of the standard deviation of slow sums of the innovations, (sensors,).
+
+        It is that of the flows' intensities, times the flows' share in the variance of these sums: at frequency 0 the
+        filter's error is e = M (q - F K v) with M = (1 - F (1 - K H))^-1, and the innovation is H e + v.
+        """
+        f, h, k = self.transition, self.joint.output, self.gain.steady
+        m = torch.linalg.inv(torch.eye(len(f), dtype=f.dtype) - f + f @ k @ h)
+        of_flows = ((h @ m) * self.process_std).square().sum(-1)
+        of_readings = ((torch.eye(len(h), dtype=f.dtype) - h @ m @ f @ k) * self.reading_std).square().sum(-1)
+        return self.intensity_error * of_flows / (of_flows + of_readings)
 
     def over(self, samples: int) -> tuple[Tensor, Tensor]:
         """Transition over some samples, and covariance of the shocks that add up meanwhile, by repeated doubling."""
