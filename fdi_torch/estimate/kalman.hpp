@@ -179,13 +179,20 @@ void whiten_back(const Model& m, int64_t samples, int64_t columns, int64_t first
 
 using Walk = void (*)(const Model&, int64_t, int64_t, int64_t, const double*, const double*, const double*, double*);
 
-// Process all columns in tiles of 32, 8 or 1 columns, according to the number of remaining columns.
-void in_tiles(Walk wide, Walk narrow, Walk single, const Model& m, int64_t samples, int64_t columns,
-              const double* gain, const double* white, const double* x, double* out) {
+struct Tile {
+    int64_t width;
+    Walk walk;
+};
+
+// Process all columns in tiles, given from wide to narrow, the last of width 1. The widest tile is taken of which more than
+// half is filled.
+void in_tiles(std::initializer_list<Tile> tiles, const Model& m, int64_t samples, int64_t columns, const double* gain,
+              const double* white, const double* x, double* out) {
     for (int64_t first = 0; first < columns;) {
-        const int64_t left = columns - first;
-        (left > 8 ? wide : left > 1 ? narrow : single)(m, samples, columns, first, gain, white, x, out);
-        first += left > 8 ? 32 : left > 1 ? 8 : 1;
+        const Tile* tile = tiles.begin();
+        while (tile->width > 1 && columns - first <= tile->width / 2) ++tile;
+        tile->walk(m, samples, columns, first, gain, white, x, out);
+        first += tile->width;
     }
 }
 }  // namespace
@@ -235,13 +242,15 @@ double kalman_gains(int64_t samples, const Model* model, double* gain, double* w
 // y (S, C, M) -> innovations of unit variance (S, C, M), column by column.
 void kalman_innovations(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
                         const double* y, double* out) {
-    in_tiles(whiten<32>, whiten<8>, whiten<1>, *model, samples, columns, gain, white, y, out);
+    in_tiles({{32, whiten<32>}, {16, whiten<16>}, {8, whiten<8>}, {1, whiten<1>}}, *model, samples, columns, gain,
+             white, y, out);
 }
 
 // Adjoint of kalman_innovations: v (S, C, M) -> out (S, C, M).
 void kalman_transposed(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
                        const double* v, double* out) {
-    in_tiles(whiten_back<32>, whiten_back<8>, whiten_back<1>, *model, samples, columns, gain, white, v, out);
+    in_tiles({{32, whiten_back<32>}, {16, whiten_back<16>}, {8, whiten_back<8>}, {1, whiten_back<1>}}, *model, samples,
+             columns, gain, white, v, out);
 }
 
 // Disturbance smoother (Durbin and Koopman, 2012, sections 4.5 and 7.3.3). Input: innovations nu (S, C) of unit

@@ -156,20 +156,22 @@ class _Problem:
         # The variables are scaled to a curvature of about one per sample. The tolerance of L-BFGS-B is relative to
         # max(|cost|, 1), so the cost is taken relative to its initial value.
         samples, likeliest = len(self.residual), self.likelihood(start)
-        start_value, score = likeliest
-        unit = torch.sqrt(2.0 * score.determined.clamp(min=MIN_DETERMINED) / samples).numpy()
-
-        def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-            nonlocal likeliest
-            value, score = self.likelihood(noise_at(x / unit))
-            likeliest = max(likeliest, (value, score), key=itemgetter(0))
-            return (start_value - value) / samples, -score.slope.numpy() / samples / unit
+        start_value, first_score = likeliest
+        unit = torch.sqrt(2.0 * first_score.determined.clamp(min=MIN_DETERMINED) / samples).numpy()
 
         log_start = torch.cat([torch.log(start.intensity / self.unit), torch.log(start.scale)])
         log_start = torch.cat([log_start, log_start.new_zeros(1)]) if start_wander else log_start
+        x_start = log_start.numpy() * unit
+
+        def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+            nonlocal likeliest
+            value, score = (start_value, first_score) if (x == x_start).all() else self.likelihood(noise_at(x / unit))
+            likeliest = max(likeliest, (value, score), key=itemgetter(0))
+            return (start_value - value) / samples, -score.slope.numpy() / samples / unit
+
         optimum = minimize(
             cost,
-            log_start.clamp(-LOG_BOUND, LOG_BOUND).numpy() * unit,
+            x_start.clip(-LOG_BOUND * unit, LOG_BOUND * unit),
             jac=True,
             method="L-BFGS-B",
             bounds=[(-LOG_BOUND * u, LOG_BOUND * u) for u in unit],

@@ -179,7 +179,8 @@ class ExplanationPool:
         """
         if further := fine_onsets(own_noise.promising(FITTED), parent.fitter):
             own_noise += screen(parent.fitter, parent.fit, further)
-        fits = self._fitted(parent.fitter, parent.fit, self._extensions(parent, own_noise, own=True))[:EVALUATED]
+        relevant = [c for c in self._extensions(parent, own_noise, own=True) if self._relevant(parent, c.key)]
+        fits = self._fitted(parent.fitter, parent.fit, relevant)[:EVALUATED]
         if sensor_noise:
             pairs = best_pairs(pairs_of(self.fitter, parent.fit, sensor_noise), PAIRS)
             candidates = [*self._extensions(parent, sensor_noise, own=False), *pairs]
@@ -206,6 +207,13 @@ class ExplanationPool:
                 else:
                     self._failed.add(candidate.key)
         return sorted(fits, key=lambda f: f.cost)
+
+    def _relevant(self, parent: RankedExplanation, key: Key) -> bool:
+        """Whether an extension of `parent` is expected to come within RARE of the best explanation."""
+        best = max(e.log_evidence for e in self.explanations.values())
+        expected = self._expected_gains[parent.key][key]
+        lead = self._gain_ratio(parent.key) * expected.gain + expected.prior + parent.log_evidence - best
+        return lead > math.log(RARE)
 
     def _improves(self, fit: Fit, costs: Mapping[Key, float]) -> bool:
         """Whether a fit gains more than its prior odds cost, against every explanation that it contains.
@@ -268,18 +276,37 @@ class ExplanationPool:
         """Candidates that were not fitted: expected lead in log evidence over the best explanation, parent, and
         expected gain.
 
-        Fits gain more than the first-order estimate because the estimated noise shrinks. All candidates of one parent
-        are assumed to gain in the same proportion as those that were fitted, which is estimated by least squares.
+        Fits gain more than the first-order estimate because the estimated noise shrinks (`_gain_ratio`).
         """
         best = max(self.explanations.values(), key=lambda e: e.log_evidence)
         for key, expected_gains in self._expected_gains.items():
-            parent = self.explanations[key]
-            fitted_keys = [k for k in expected_gains if k in self.explanations and not k - key <= best.key]
-            fitted = [(self.explanations[k].log_evidence - parent.log_evidence, expected_gains[k]) for k in fitted_keys]
-            # Least squares of actual on expected gains; the prior observation gained PRIOR_GAIN nats as expected.
-            covariance = PRIOR_GAIN**2 + sum((more - expected.prior) * expected.gain for more, expected in fitted)
-            ratio = max(1.0, covariance / (PRIOR_GAIN**2 + sum(expected.gain**2 for _, expected in fitted)))
+            parent, ratio = self.explanations[key], self._gain_ratio(key)
             behind = best.log_evidence - parent.log_evidence
             for k, expected in expected_gains.items():
                 if k not in self.explanations:
                     yield ratio * expected.gain + expected.prior - behind, parent, expected
+
+    def _gain_ratio(self, key: Key) -> float:
+        """Actual over first-order gain of the extensions of an explanation, at least one.
+
+        Least squares over the extensions that were fitted. An explanation with few of them takes over the ratio of all
+        explanations, as one prior observation of PRIOR_GAIN nats.
+        """
+        of_all = _least_squares_ratio(1.0, [pair for k in self._expected_gains for pair in self._gains(k)])
+        return _least_squares_ratio(of_all, self._gains(key))
+
+    def _gains(self, key: Key) -> list[tuple[float, float]]:
+        """Actual and first-order gains of the fitted extensions of an explanation, without those that only add to the
+        effects of the best explanation."""
+        best = max(self.explanations.values(), key=lambda e: e.log_evidence)
+        evidence = self.explanations[key].log_evidence
+        return [
+            (self.explanations[k].log_evidence - evidence - expected.prior, expected.gain)
+            for k, expected in self._expected_gains[key].items()
+            if k in self.explanations and not k - key <= best.key
+        ]
+
+
+def _least_squares_ratio(prior: float, gains: Sequence[tuple[float, float]]) -> float:
+    covariance = PRIOR_GAIN**2 * prior + sum(actual * expected for actual, expected in gains)
+    return max(1.0, covariance / (PRIOR_GAIN**2 + sum(expected**2 for _, expected in gains)))

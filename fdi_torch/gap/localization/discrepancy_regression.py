@@ -109,6 +109,7 @@ class DiscrepancyRegression:
         self.theta, self.levels = fit.theta.unsqueeze(0), smoothed_levels(fitter, fit)
         self.linearised = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.linearised, levels=self.levels))
+        self._regressors: dict[str, list[Regressors]] = {}
         parts, samples = len(self.pieces), len(fitter.data.readings)
         self.steps = max(min(steps, samples // SAMPLES_A_STEP) // parts, 2)
 
@@ -117,7 +118,7 @@ class DiscrepancyRegression:
         sensors = [s.name for s in plant.sensors]
         if place in sensors:
             return self._sensor_discrepancy(sensors.index(place), plant.sensors[sensors.index(place)])
-        return Discrepancy(self._columns(discrepancy_model_at(place, plant)), self.linearised)
+        return Discrepancy(self._columns(place), self.linearised)
 
     def _pieces(self, linearised: Linearised) -> list[RecordingLinearisation]:
         whole = self.engine
@@ -135,8 +136,13 @@ class DiscrepancyRegression:
             pieces.append(RecordingLinearisation(engine, theta, linearised_part, forcing, rows))
         return pieces
 
-    def regressors(self, component: DiscrepancyModel) -> list[Regressors]:
-        """Regressors of a component along each recording."""
+    def regressors(self, place: str) -> list[Regressors]:
+        """Regressors of the component at a place along each recording."""
+        if place not in self._regressors:
+            self._regressors[place] = self._along_recordings(discrepancy_model_at(place, self.fitter.data.plant))
+        return self._regressors[place]
+
+    def _along_recordings(self, component: DiscrepancyModel) -> list[Regressors]:
         signals = [
             {n: x.reshape(-1).expand(len(p.middle)) for n, x in component.signals(p.forcing).items()}
             for p in self.pieces
@@ -149,11 +155,12 @@ class DiscrepancyRegression:
             regressors.append(Regressors(torch.stack(component.flows(s, step, ends)), torch.stack(in_time), areas))
         return regressors
 
-    def _columns(self, component: DiscrepancyModel) -> Tensor:
-        """Influence of a component's regressors (S, C, M), not whitened."""
+    def _columns(self, place: str) -> Tensor:
+        """Influence of the regressors of a component (S, C, M), not whitened."""
+        component = discrepancy_model_at(place, self.fitter.data.plant)
         shared: list[Tensor] = []
         per_recording: list[Tensor] = []
-        for piece, regressors in zip(self.pieces, self.regressors(component), strict=True):
+        for piece, regressors in zip(self.pieces, self.regressors(place), strict=True):
             changes = [self._rate_changes(piece, component, flows) for flows in (regressors.flows, regressors.in_time)]
             if regressors.areas is not None:
                 rates = regressors.areas.new_zeros(len(changes[0]), *regressors.areas.shape)

@@ -123,11 +123,10 @@ def stiction(x: Tensor, band: float) -> Tensor:
 
 def relay(x: Tensor, low: float, high: float) -> Tensor:
     """Relay with hysteresis: 1 after x exceeds `high`, 0 after x falls below `low`."""
-    on, output = float(x[0]) > 0.5 * (low + high), []
-    for value in x.tolist():
-        on = value >= low if on else value > high
-        output.append(float(on))
-    return x.new_tensor(output)
+    switched = (x > high) | (x < low)
+    switched[0] = True
+    last_switch = torch.where(switched, torch.arange(len(x)), 0).cummax(dim=0).values
+    return (x > 0.5 * (low + high))[last_switch].to(x)
 
 
 def rate_limited(x: Tensor, step: Tensor, rate: float) -> Tensor:
