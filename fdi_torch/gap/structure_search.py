@@ -209,11 +209,14 @@ class ExplanationPool:
         return sorted(fits, key=lambda f: f.cost)
 
     def _relevant(self, parent: RankedExplanation, key: Key) -> bool:
-        """Whether an extension of `parent` is expected to come within RARE of the best explanation."""
+        """Whether an extension of `parent` is expected to come within RARE of the best explanation.
+
+        Before any extension of `parent` is fitted, those of all explanations tell by how much more they may gain.
+        """
         best = max(e.log_evidence for e in self.explanations.values())
         expected = self._expected_gains[parent.key][key]
-        lead = self._gain_ratio(parent.key) * expected.gain + expected.prior + parent.log_evidence - best
-        return lead > math.log(RARE)
+        ratio = _gain_ratio([pair for k in self._expected_gains for pair in self._gains(k)])
+        return ratio * expected.gain + expected.prior + parent.log_evidence - best > math.log(RARE)
 
     def _improves(self, fit: Fit, costs: Mapping[Key, float]) -> bool:
         """Whether a fit gains more than its prior odds cost, against every explanation that it contains.
@@ -275,25 +278,14 @@ class ExplanationPool:
     def _unfitted(self) -> Iterator[tuple[float, RankedExplanation, ExpectedGain]]:
         """Candidates that were not fitted: expected lead in log evidence over the best explanation, parent, and
         expected gain.
-
-        Fits gain more than the first-order estimate because the estimated noise shrinks (`_gain_ratio`).
         """
         best = max(self.explanations.values(), key=lambda e: e.log_evidence)
         for key, expected_gains in self._expected_gains.items():
-            parent, ratio = self.explanations[key], self._gain_ratio(key)
+            parent, ratio = self.explanations[key], _gain_ratio(self._gains(key))
             behind = best.log_evidence - parent.log_evidence
             for k, expected in expected_gains.items():
                 if k not in self.explanations:
                     yield ratio * expected.gain + expected.prior - behind, parent, expected
-
-    def _gain_ratio(self, key: Key) -> float:
-        """Actual over first-order gain of the extensions of an explanation, at least one.
-
-        Least squares over the extensions that were fitted. An explanation with few of them takes over the ratio of all
-        explanations, as one prior observation of PRIOR_GAIN nats.
-        """
-        of_all = _least_squares_ratio(1.0, [pair for k in self._expected_gains for pair in self._gains(k)])
-        return _least_squares_ratio(of_all, self._gains(key))
 
     def _gains(self, key: Key) -> list[tuple[float, float]]:
         """Actual and first-order gains of the fitted extensions of an explanation, without those that only add to the
@@ -307,6 +299,11 @@ class ExplanationPool:
         ]
 
 
-def _least_squares_ratio(prior: float, gains: Sequence[tuple[float, float]]) -> float:
-    covariance = PRIOR_GAIN**2 * prior + sum(actual * expected for actual, expected in gains)
+def _gain_ratio(gains: Sequence[tuple[float, float]]) -> float:
+    """Actual over first-order gain by least squares, at least one.
+
+    Fits gain more than the first-order estimate because the estimated noise shrinks. One prior observation gained
+    PRIOR_GAIN nats as expected.
+    """
+    covariance = PRIOR_GAIN**2 + sum(actual * expected for actual, expected in gains)
     return max(1.0, covariance / (PRIOR_GAIN**2 + sum(expected**2 for _, expected in gains)))
