@@ -83,13 +83,14 @@ def test_what_help_says_by_itself_is_what_the_jobs_do() -> None:
     """Help is shown without the jobs' modules, so that it repeats a few of their constants."""
     from fdi_torch.blind.networks import FEWEST, MOST
     from fdi_torch.blind.plants import RIGS
+    from fdi_torch.cli import options
     from fdi_torch.cli.challenge import CASES
-    from fdi_torch.cli.options import challenge, gap, predict
+    from fdi_torch.cli.options import challenge, gap
     from fdi_torch.gap.free_runs.prediction import START_SAMPLES
     from fdi_torch.gap.structure_search import DEEPEST
     from fdi_torch.jobs.blind_results import LOG
 
-    assert (gap.MOST_CAUSES, gap.START_SAMPLES, predict.START_SAMPLES) == (DEEPEST, START_SAMPLES, START_SAMPLES)
+    assert (gap.MOST_CAUSES, options.START_SAMPLES) == (DEEPEST, START_SAMPLES)
     assert sorted(RIGS) == sorted(challenge.RIGS)
     parser = argparse.ArgumentParser()
     challenge.add_arguments(parser)

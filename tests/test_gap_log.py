@@ -131,7 +131,13 @@ def test_an_ambiguous_answer_writes_the_next_input(tmp_path: Path, capsys: pytes
     assert "next_input.csv; it should distinguish the two likeliest explanations" in shown
     planned = (tmp_path / "next_input.csv").read_text().splitlines()
     assert planned[0] == "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm" and len(planned) == 1501
-    assert cli.main([*words[:3], "--recording", str(tmp_path / "next_input.csv"), "--plan"]) == cli.DONE
+    capsys.readouterr()
+    planned_words = ["--plant", "three_tank", "--recording", str(tmp_path / "next_input.csv"), "--json"]
+    assert cli.main(["plan", *planned_words, "--library", "pump_lag,pump_delay"]) == cli.DONE
+    limits = json.loads(capsys.readouterr().out)
+    assert set(limits["shown"]) == {f"{q}.{e}" for q in ("Q1", "Q2") for e in ("pump_lag", "pump_delay")}
+    assert cli.main(["plan", *planned_words, "--noise", "0"]) == cli.MISUSE
+    assert "--noise: expected a positive standard deviation, got 0" in capsys.readouterr().err
 
 
 def test_nothing_to_adopt_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

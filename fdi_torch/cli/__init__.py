@@ -40,13 +40,15 @@ COMMANDS = {
     "compare": "compare runs: settings, data and results",
     "recover": "recover a broken or unfinished log",
     "gap": "find where and by which effect a plant file deviates from a recording",
+    "refit": "fit all effects and constants of a plant file together, without a search",
+    "plan": "tell what planned inputs cannot show before an experiment",
     "predict": "run a plant freely along a recording and report the error",
     "challenge": "blind benchmark of the gap diagnosis on hidden rigs",
     "study": "repeat an experiment many times: errors against their bounds, coverage, failures",
     "paper": "reproduce the tables and figures of the 2020 paper",
 }
 
-LONG = ("train", "study", "gap", "monitor", "challenge", "paper")
+LONG = ("train", "study", "gap", "refit", "monitor", "challenge", "paper")
 """Commands that take more than a moment to start, and announce that."""
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from fdi_torch.cli import DONE
 from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.allocation import keep_memory
-from fdi_torch.cli.gap_refit import run_refit
-from fdi_torch.cli.gap_text import next_steps, show, show_plan
+from fdi_torch.cli.gap_text import next_steps, show
+from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import load_plant
@@ -20,8 +20,7 @@ from fdi_torch.gap.answer import UNKNOWN, Answer, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.experiment_design import planned_recording
 from fdi_torch.gap.free_runs.prediction import predict
-from fdi_torch.gap.identifiability import planned_identifiability
-from fdi_torch.jobs.gap import one_thread, run_gap
+from fdi_torch.jobs.gap import run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -35,18 +34,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
     for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
         screen.note(note)
-    library = _names(arguments.library) or None
-    if arguments.plan:
-        with one_thread():
-            return show_plan(planned_identifiability(plant, recordings[0], arguments.noise, library), screen)
+    library = names(arguments.library) or None
     if arguments.step is not None and not arguments.step > 0.0:
         raise ValueError(f"--step: expected a positive number of seconds, got {arguments.step:g}")
     if arguments.most < 1:
         raise ValueError(f"--most: expected at least one effect, got {arguments.most}")
-    left_out = _names(arguments.leave_out)
-    if arguments.refit:
-        with one_thread():
-            return run_refit(plant, recordings, holdouts, left_out, arguments, screen)
+    left_out = names(arguments.leave_out)
     folder = Path(arguments.out)
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
@@ -60,10 +53,6 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     screen.say(f"log: {log} (fdi report {log} makes the page)")
     screen.result(answer.to_dict())
     return DONE
-
-
-def _names(text: str | None) -> tuple[str, ...]:
-    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
 
 
 def _keep(

@@ -6,10 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.gap.answer import UNKNOWN, Answer, CauseName, names
-from fdi_torch.gap.identifiability import Identifiability
 from fdi_torch.gap.verdict_words import causes_of, explanation_words, probability_words, verdict_sentence
 from fdi_torch.parameters import display_unit
 
@@ -78,21 +76,6 @@ def next_steps(
         many = f"{len(inseparable)} pairs of effects, such as {first}" if len(inseparable) > 1 else first
         steps.append(f"these inputs cannot distinguish {many}")
     return steps
-
-
-def show_plan(limits: Identifiability, screen: Screen) -> int:
-    """Print which effects the planned inputs do not show and which they cannot distinguish."""
-    for name, place in limits.hidden:
-        screen.say(f"does not show at its typical size: {name} at {place}")
-    for (a, at), (b, there), distance in limits.inseparable:
-        screen.say(f"cannot be distinguished: {a} at {at} and {b} at {there} (chi-square distance {distance:.1f})")
-    if not limits.hidden and not limits.inseparable:
-        screen.say("every effect of the library shows at its typical size and is distinguishable from every other")
-    shown = {f"{place}.{name}": residual for (name, place), residual in limits.shown.items()}
-    screen.result(
-        {"format": "fdi_torch.gap_plan/1", "hidden": limits.hidden, "twins": limits.inseparable, "shown": shown}
-    )
-    return DONE
 
 
 def _causes(answer: Answer, screen: Screen) -> None:

@@ -36,7 +36,7 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
     if all(float(torch.diff(column).abs().max()) == 0.0 for column in inputs):
         remarks.append(
             "the inputs never change, so that most effects cannot be distinguished from each other or from a constant "
-            "within its tolerance; test inputs with steps by `fdi gap --plan`, then record again"
+            "within its tolerance; test inputs with steps by `fdi plan`, then record again"
         )
     if not data.plant.tolerances:
         remarks.append(

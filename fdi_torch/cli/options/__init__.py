@@ -70,6 +70,56 @@ def seconds(text: str) -> float:
         raise argparse.ArgumentTypeError(f"expected a time such as 90 or '1.5 h', got '{text}'") from None
 
 
+def add_plant_and_recording(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
+    parser.add_argument(
+        "--recording", metavar="FILE", required=True, help="CSV or MCAP file, or a YAML file with `recordings`"
+    )
+
+
+def add_holdout(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--holdout", metavar="FILE", nargs="+", default=[], help="other recordings of the same rig, for validation only"
+    )
+
+
+def add_library(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--library", metavar="EFFECT,...", help="effects to search (EFFECT@PLACE for one), or all")
+
+
+def add_leave_out(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="effects to leave out of the library")
+
+
+def add_step(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--step", metavar="TIME", type=seconds, help="integration step (default: as sampled, <= 5 s)")
+
+
+def names(text: str | None) -> tuple[str, ...]:
+    """The names in a list with commas."""
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
+
+
+START_SAMPLES = 50
+
+
+def add_start_samples(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--start-samples",
+        metavar="N",
+        type=int,
+        default=START_SAMPLES,
+        help=f"samples of each free run for its initial levels ({START_SAMPLES})",
+    )
+    parser.add_argument(
+        "--settle",
+        metavar="TIME",
+        type=seconds,
+        help="instead, estimate levels and what varies by run from the first part of each free run ('30 s'), and count "
+        "errors after it",
+    )
+
+
 def add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", help="output folder (default: logs)")
     parser.add_argument("--device", metavar="cpu|cuda", help="device for the computation")

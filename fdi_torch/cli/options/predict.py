@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import seconds
-
-START_SAMPLES = 50
+from fdi_torch.cli.options import add_start_samples, seconds
 
 EXAMPLES = """
 examples:
@@ -30,20 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--recording", metavar="FILE", action="append", default=[], help="the same, as an option")
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
-    parser.add_argument(
-        "--start-samples",
-        metavar="N",
-        type=int,
-        default=START_SAMPLES,
-        help=f"for the initial levels ({START_SAMPLES})",
-    )
-    parser.add_argument(
-        "--settle",
-        metavar="TIME",
-        type=seconds,
-        help="estimate levels and what varies by run from the first part of each run ('30 s'), and count errors after "
-        "it",
-    )
+    add_start_samples(parser)
     parser.add_argument(
         "--vary",
         metavar="NAME,...",

@@ -99,9 +99,7 @@ def _whitened_adjoint(under: Fitter, columns: Tensor, basis: Tensor) -> Tensor:
 def _flow_products(regression: DiscrepancyRegression, place: str, adjoints: _Adjoints) -> Tensor:
     component = discrepancy_model_at(place, regression.fitter.data.plant)
     shared, per_recording = list[Tensor](), list[Tensor]()
-    for regressors, inflows, rates in zip(
-        regression.regressors(place), adjoints.inflows, adjoints.rates, strict=True
-    ):
+    for regressors, inflows, rates in zip(regression.regressors(place), adjoints.inflows, adjoints.rates, strict=True):
         net = torch.zeros_like(inflows[0])
         for end, sign in ((component.source, -1.0), (component.target, 1.0)):
             if end != OUTSIDE:

@@ -1,54 +1,58 @@
-"""`fdi gap --refit`: fit a plant's own effects and constants together, without a search, and validate them on other
-runs.
-"""
+"""`fdi refit`: what it does and prints. Its options: `options/refit.py`."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.adoption import write_adopted
+from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
+from fdi_torch.config.loaded_recordings import named_recordings
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import LeftOutRun, leave_one_file_out
 from fdi_torch.gap.free_runs.refit import Refit, refit
+from fdi_torch.jobs.gap import one_thread
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
 
-def run_refit(
-    plant: PlantDescription,
-    recordings: Sequence[Recording],
-    holdouts: Sequence[Recording],
-    leave_out: Collection[str],
-    arguments: argparse.Namespace,
-    screen: Screen,
-) -> int:
-    hold = [name for name in arguments.hold.split(",") if name]
-    vary = [name for name in arguments.vary.split(",") if name]
-    fitted = refit(plant, recordings, leave_out, arguments.step, hold, arguments.white, vary)
-    _show(fitted, screen)
-    _show_run_specific(fitted, screen)
-    if arguments.adopt:
-        write_adopted(arguments.plant, plant, fitted.plant, Path(arguments.adopt), screen)
-        screen.note(f"plant file with the fitted values: {arguments.adopt}")
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    plant = load_plant(arguments.plant)
+    recordings = named_recordings(arguments.recording, plant, Path.cwd())
+    holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
+    for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
+        screen.note(note)
+    hold, vary, leave_out = (names(text) for text in (arguments.hold, arguments.vary, arguments.leave_out))
+
+    def fitted_to(others: Sequence[Recording]) -> Refit:
+        return refit(plant, others, leave_out, arguments.step, hold, arguments.white, vary)
+
     trials: list[LeftOutRun] = []
-    if arguments.in_turn:
-        with screen.progress("leave-one-file-out validation") as advance:
-            trials = leave_one_file_out(
-                plant,
-                recordings,
-                holdouts or recordings,
-                lambda others: refit(plant, others, leave_out, arguments.step, hold, arguments.white, vary).plant,
-                arguments.start_samples,
-                advance,
-                arguments.settle,
-            )
-        _show_trials(trials, plant, screen)
+    with one_thread():
+        fitted = fitted_to(recordings)
+        _show(fitted, screen)
+        _show_run_specific(fitted, screen)
+        if arguments.adopt:
+            write_adopted(arguments.plant, plant, fitted.plant, Path(arguments.adopt), screen)
+            screen.note(f"plant file with the fitted values: {arguments.adopt}")
+        if arguments.leave_one_file_out:
+            with screen.progress("leave-one-file-out validation") as advance:
+                trials = leave_one_file_out(
+                    plant,
+                    recordings,
+                    holdouts or recordings,
+                    lambda others: fitted_to(others).plant,
+                    arguments.start_samples,
+                    advance,
+                    arguments.settle,
+                )
+            _show_trials(trials, plant, screen)
     screen.result(
         {
             "format": "fdi_torch.refit/1",
@@ -57,7 +61,7 @@ def run_refit(
             "parameters": fitted.parameters,
             "fitted": {n: {"value": v, "std": s} for n, (v, s) in fitted.fitted.items()},
             "own": fitted.own,
-            "in_turn": trials,
+            "leave_one_file_out": trials,
         }
     )
     return DONE

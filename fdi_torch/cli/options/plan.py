@@ -1,0 +1,31 @@
+"""What planned inputs cannot show: effects that stay hidden, and pairs of effects that they cannot separate.
+
+The recording needs times and inputs only; readings in it are ignored. `fdi gap` itself writes the input that
+distinguishes its two likeliest explanations (next_input.csv).
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from fdi_torch.cli.options import add_library, add_plant_and_recording
+
+NOISE = 1e-3
+
+EXAMPLES = """
+examples:
+  fdi plan --plant rig.yaml --recording planned.csv
+  fdi plan --plant rig.yaml --recording planned.csv --noise 5e-4 --library leak,plugging
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_plant_and_recording(parser)
+    add_library(parser)
+    parser.add_argument(
+        "--noise",
+        metavar="STD",
+        type=float,
+        default=NOISE,
+        help=f"standard deviation of the readings' noise, SI ({NOISE:g}, which is {1e3 * NOISE:g} mm)",
+    )

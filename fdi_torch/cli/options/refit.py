@@ -1,0 +1,43 @@
+"""Fit all effects and constants of a plant file to recordings together, without searching for causes.
+
+The plant file is one that `fdi gap --adopt` wrote, or one whose effects you chose. Every constant with a tolerance and
+every number of an effect is fitted; values under `varying` belong to each recording. The error of each sensor is
+reported before and after, with each value and its standard error.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from fdi_torch.cli.options import add_holdout, add_leave_out, add_plant_and_recording, add_start_samples, add_step
+
+EXAMPLES = """
+examples:
+  fdi refit --plant second.yaml --recording runs.yaml --adopt final.yaml
+  fdi refit --plant rig.yaml --recording run.csv --hold 'h?.offset,*.sensor_lag.*'
+  fdi refit --plant rig.yaml --recording runs.yaml --leave-one-file-out --settle 30   predict each file without it
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_plant_and_recording(parser)
+    add_holdout(parser)
+    add_leave_out(parser)
+    add_step(parser)
+    parser.add_argument("--hold", metavar="NAME,...", default="", help="do not fit these (* matches any name)")
+    parser.add_argument(
+        "--vary",
+        metavar="NAME,...",
+        default="",
+        help="values that may differ by recording; their variation is reported (* matches any name)",
+    )
+    parser.add_argument(
+        "--white", metavar="STD", type=float, help="treat errors as white, with this standard deviation, SI"
+    )
+    parser.add_argument(
+        "--leave-one-file-out",
+        action="store_true",
+        help="also predict every file (every --holdout, if any) freely by a fit to all others",
+    )
+    add_start_samples(parser)
+    parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the fitted values")

@@ -1,0 +1,40 @@
+"""`fdi plan`: what it does and prints. Its options: `options/plan.py`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from fdi_torch.cli import DONE
+from fdi_torch.cli.options import names
+from fdi_torch.cli.screen import Screen
+from fdi_torch.config.loaded_recordings import named_recordings
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.gap.identifiability import Identifiability, planned_identifiability
+from fdi_torch.jobs.gap import one_thread
+
+
+def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    if not arguments.noise > 0.0:
+        raise ValueError(f"--noise: expected a positive standard deviation, got {arguments.noise:g}")
+    plant = load_plant(arguments.plant)
+    planned = named_recordings(arguments.recording, plant, Path.cwd())[0]
+    for note in planned.notes:
+        screen.note(note)
+    with one_thread():
+        limits = planned_identifiability(plant, planned, arguments.noise, names(arguments.library) or None)
+    _show(limits, screen)
+    shown = {f"{place}.{name}": residual for (name, place), residual in limits.shown.items()}
+    screen.result(
+        {"format": "fdi_torch.plan/1", "hidden": limits.hidden, "inseparable": limits.inseparable, "shown": shown}
+    )
+    return DONE
+
+
+def _show(limits: Identifiability, screen: Screen) -> None:
+    for name, place in limits.hidden:
+        screen.say(f"does not show at its typical size: {name} at {place}")
+    for (a, at), (b, there), distance in limits.inseparable:
+        screen.say(f"cannot be distinguished: {a} at {at} and {b} at {there} (chi-square distance {distance:.1f})")
+    if not limits.hidden and not limits.inseparable:
+        screen.say("every effect of the library shows at its typical size and is distinguishable from every other")

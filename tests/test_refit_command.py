@@ -1,0 +1,56 @@
+"""`fdi refit`: fit a plant's own effects and constants, adopt them, and predict each file without it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fdi_torch import cli
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_writer import dump_plant
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recordings.csv_files import write_csv
+from tests.test_gap import nominal_plant, recorded
+
+GAIN = {"Q2.pump_gain.factor": 0.9}
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> PlantDescription:
+    """A plant file with a pump's gain of 1, and recordings of a rig with another gain."""
+    plant = tmp_path / "rig.yaml"
+    text = dump_plant(replace(nominal_plant(), effects=()))
+    plant.write_text(text + "effects:\n  - {effect: pump_gain, location: Q2, parameters: {factor: 1.0}}\n")
+    for seed in (3, 5):
+        write_csv(recorded(GAIN, seed, samples=200), tmp_path / f"day{seed}.csv")
+    (tmp_path / "runs.yaml").write_text("recordings:\n  - {file: day3.csv}\n  - {file: day5.csv}\n")
+    return load_plant(plant)
+
+
+def test_a_refit_adopts_the_effect_and_predicts_each_file_by_the_other(
+    tmp_path: Path, rig: PlantDescription, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["refit", "--plant", "rig.yaml", "--recording", "runs.yaml", "--adopt", "better.yaml", "--json", "--quiet"]
+    assert cli.main([*words, "--leave-one-file-out"]) == cli.DONE
+    shown = json.loads(capsys.readouterr().out)
+    fitted = shown["fitted"]["Q2.pump_gain.factor"]
+    assert abs(fitted["value"] - GAIN["Q2.pump_gain.factor"]) < 4.0 * fitted["std"]
+    assert load_plant(tmp_path / "better.yaml").effects[0].parameters["factor"] == pytest.approx(fitted["value"])
+    assert [Path(trial["source"]).name for trial in shown["leave_one_file_out"]] == ["day3.csv", "day5.csv"]
+    for trial in shown["leave_one_file_out"]:
+        assert sum(trial["refitted"].values()) < sum(trial["as_is"].values())
+
+
+def test_held_values_stay(
+    tmp_path: Path, rig: PlantDescription, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["refit", "--plant", "rig.yaml", "--recording", "day3.csv", "--hold", "*.pump_gain.*", "--json", "--quiet"]
+    assert cli.main(words) == cli.DONE
+    assert "Q2.pump_gain.factor" not in json.loads(capsys.readouterr().out)["fitted"]
+    assert cli.main([*words[:5], "--hold", "Q9.gain", "--quiet"]) == cli.MISUSE
+    assert "Q9.gain" in capsys.readouterr().err
