@@ -1,4 +1,4 @@
-"""Localization: regressors, their evidence, the smoothed trajectory, and the place of an unknown cause."""
+"""Localization: regressors, their evidence, and the place of an unknown cause."""
 
 from __future__ import annotations
 

@@ -254,6 +254,20 @@ def test_smoothed_levels_are_the_dense_conditional_mean(time: float, correlation
     torch.testing.assert_close(found.flatten(), expected, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.parametrize("time", [0.0, 15.0])
+@pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
+def test_predicted_levels_are_the_dense_conditional_mean_of_earlier_readings(time: float, correlation: Tensor) -> None:
+    p, sensors = two_tanks(12, masked=0.2), SensorNoise(STD, correlation)
+    noise = StateNoise(INTENSITY, time, torch.ones(2, dtype=DOUBLE))
+    residual = simulated(p, sensors, noise, 7)
+    readings, levels = dense(p, sensors, noise)
+    predicted = KalmanWhitening(p, sensors, noise).predicted(residual)
+    for s in range(12):
+        earlier = (p.mask & (torch.arange(12) < s).unsqueeze(1)).flatten()
+        weights = torch.linalg.solve(readings[earlier][:, earlier], residual.flatten()[earlier])
+        torch.testing.assert_close(predicted[s], levels[2 * s : 2 * s + 2, earlier] @ weights, rtol=1e-8, atol=1e-12)
+
+
 @pytest.mark.parametrize(("time", "seed"), [(0.0, 11), (15.0, 12), (60.0, 13)])
 def test_disturbances_are_found_with_their_size(time: float, seed: int) -> None:
     p, sensors = two_tanks(3000), SensorNoise(STD, WHITE)

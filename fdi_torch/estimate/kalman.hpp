@@ -330,6 +330,21 @@ void kalman_score(int64_t samples, const Model* model, const double* gain, const
     }
 }
 
+// Levels x (S, n) predicted for each sample from all earlier ones, from residuals y (S, C).
+void kalman_predictions(int64_t samples, const Model* model, const double* gain, const double* y, double* levels) {
+    const Model& m = *model;
+    double z[d], moved[d], nu[C];
+    for (int64_t t = 0; t < samples; ++t) {
+        if (m.fresh[t]) std::fill(z, z + d, 0.0);
+        std::copy(z, z + n, levels + t * n);
+        look<1>(m, t, z, nu);
+        for (int c = 0; c < C; ++c) nu[c] = m.seen[t * C + c] ? y[t * C + c] - nu[c] : 0.0;
+        add_product<d, C, 1>(gain + t * d * C, nu, z);
+        forward<1>(m, t, z, moved);
+        std::copy(moved, moved + d, z);
+    }
+}
+
 // Smoothed levels x (S, n) from smoothed shocks (S, d): simulates the state equation.
 void kalman_levels(int64_t samples, const Model* model, const double* shocks, double* levels) {
     double z[d] = {}, moved[d] = {};

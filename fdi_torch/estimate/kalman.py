@@ -185,6 +185,13 @@ class Filtered:
         self._run("kalman_levels", shocks, levels)
         return levels
 
+    def predicted(self, residual: Tensor) -> Tensor:
+        """Deviation of the levels from the trajectory, (S, n) m, predicted for each sample from the residuals (S, C) of
+        all earlier ones."""
+        levels = residual.new_empty(self.own.samples, self.own.tanks)
+        self._run("kalman_predictions", self.gain, residual.contiguous(), levels)
+        return levels
+
     def _run(self, name: str, *arguments: Tensor | int) -> Any:
         function = getattr(self._library, name)
         function.restype = ctypes.c_double if name == "kalman_gains" else None
@@ -214,6 +221,7 @@ class KalmanWhitening:
         self._filtered = KalmanFilter(propagation, sensors).under(noise)
         self.log_det = self._filtered.log_det
         self.smoothed, self.transposed = self._filtered.smoothed, self._filtered.transposed
+        self.predicted = self._filtered.predicted
 
     def __call__(self, x: Tensor) -> Tensor:
         """Innovations of unit variance, in the shape of x (*lanes, S, C) or (*lanes, S, C, P); 0 where masked."""
@@ -239,5 +247,5 @@ def _library(tanks: int, channels: int, layers: int) -> ctypes.CDLL:
     """kalman.hpp compiled for these sizes; layers: number of correlated noise terms on each channel."""
     sizes = f"#define TANKS {tanks}\n#define CHANNELS {channels}\n#define LAYERS {layers}\n"
     source = sizes + Path(__file__).with_name("kalman.hpp").read_text(encoding="utf-8")
-    names = ("gains", "innovations", "transposed", "score", "levels")
+    names = ("gains", "innovations", "transposed", "score", "predictions", "levels")
     return load_library(source, *(f"kalman_{name}" for name in names))

@@ -70,13 +70,18 @@ def estimate_disturbances(
     )
 
 
-def smoothed_levels(fitter: Fitter, fit: Fit) -> Tensor:
-    """Smoothed levels (1, K+1, tanks) of all recordings: the fitted trajectory plus the most likely effect of the
-    disturbances."""
+def predicted_levels(fitter: Fitter, fit: Fit) -> Tensor:
+    """Levels (1, K+1, tanks) of all recordings: the fitted trajectory plus the effect of the disturbances, predicted
+    from earlier readings.
+
+    An innovation is independent of all that follows from earlier readings (Ljung, 1999, "System identification",
+    section 3.2). Smoothed levels contain the disturbance of the same step; functions of them, in particular of their
+    rates, would explain random flows.
+    """
     data, levels = fitter.data, fit.linearised.levels.clone()
     if fitter.whitening is None:
         return levels
-    correction = fitter.whitening.smoothed(data.readings - fit.linearised.readings[0])
+    correction = fitter.whitening.predicted(data.readings - fit.linearised.readings[0])
     first = 0
     for part, rows in zip(data.parts, data.rows, strict=True):
         nodes = part.experiment.nodes

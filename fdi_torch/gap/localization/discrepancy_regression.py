@@ -1,4 +1,4 @@
-"""First-order influence of a component's discrepancy on the readings, about the smoothed trajectory.
+"""First-order influence of a component's discrepancy on the readings, about the trajectory predicted from earlier readings.
 
 The linearised plant maps each regressor to readings. The part that constants and initial levels within their tolerances
 can explain is projected out.
@@ -23,7 +23,7 @@ from fdi_torch.gap.localization.component_regressors import (
     reading_regressors,
 )
 from fdi_torch.gap.localization.regressors import time_functions
-from fdi_torch.gap.marginal_likelihood import smoothed_levels
+from fdi_torch.gap.marginal_likelihood import predicted_levels
 from fdi_torch.plant.description import OUTSIDE, Sensor
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
@@ -106,7 +106,7 @@ class DiscrepancyRegression:
     def __init__(self, fitter: Fitter, fit: Fit, periods: Sequence[float], steps: int) -> None:
         self.fitter, self.fit, self.periods = fitter, fit, tuple(periods)
         self.engine = fitter.engine(fit.candidate, list(fit.effect_values))
-        self.theta, self.levels = fit.theta.unsqueeze(0), smoothed_levels(fitter, fit)
+        self.theta, self.levels = fit.theta.unsqueeze(0), predicted_levels(fitter, fit)
         self.linearised = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.linearised, levels=self.levels))
         self._regressors: dict[str, list[Regressors]] = {}
@@ -186,7 +186,7 @@ class DiscrepancyRegression:
         return [t.name for t in self.fitter.data.plant.tanks].index(name)
 
     def _sensor_discrepancy(self, channel: int, sensor: Sensor) -> Discrepancy:
-        """About the model's level of the sensor's tank, with all other tanks at their smoothed levels."""
+        """About the model's level of the sensor's tank, with all other tanks at their predicted levels."""
         levels = self.engine.simulate_tank(self.theta, self.levels, self.tank(sensor.tank))
         signals: list[Signals] = []
         first = 0

@@ -1,7 +1,7 @@
 """Ranking of the places of a discrepancy by evidence, whatever the law of the discrepancy.
 
 A discrepancy is a linear combination of a few regressors of the component's own variables (`regressors.py`), about the
-smoothed trajectory; that of a sensor may also be a slow random drift. The log evidence is that of a sparse regression
+predicted trajectory; that of a sensor may also be a slow random drift. The log evidence is that of a sparse regression
 (`sparse_regression.py`), with each regressor selected among all of the component, under the disturbance noise that is
 most likely with the discrepancy (as for named effects: `marginal_likelihood.py`).
 
