@@ -36,7 +36,7 @@ def products(
     """Of the forms with the residual and random signs."""
     survey, under, null = surveyed
     found: list[Tensor] = []
-    monkeypatch.setattr(promise, "_best_gain", lambda p: found.append(p) or 0.0)
+    monkeypatch.setattr(promise, "gains_of", lambda p: found.append(p) or p[:, 0])
     promise.single_regressor_gains(survey, under, null, [place], torch.Generator().manual_seed(5))
     return found[0]
 

@@ -32,6 +32,7 @@ from fdi_torch.plant.scales import time_scale
 
 Signals = dict[str, Tensor]
 RELAYS = 6  # thresholds of relays
+FINER = 8  # factor by which kinks may be placed more closely than in the first grid
 SLOW = (100.0, 300.0)  # time constants (s) of a side chamber of a tank
 
 
@@ -51,6 +52,9 @@ class SignalRanges:
     def hinges(self, s: Signals, name: str, count: int) -> list[Tensor]:
         return hinges(s[name], self(name), 2 * count)
 
+    def fine_hinges(self, s: Signals, name: str, count: int) -> list[Tensor]:
+        return self.hinges(s, name, FINER * count)
+
     def steps_in_value(self, s: Signals, name: str, count: int) -> list[Tensor]:
         return steps_in_value(s[name], self(name), 3 * count)
 
@@ -67,12 +71,13 @@ class DiscrepancyModel:
     """Regressors of one component's discrepancy.
 
     signals: the local signals along a recording. flows: regressors in m^3/s, or to be scaled to it, of a flow from
-    `source` to `target`. in_time: name of the signal that functions of time multiply. areas: regressors of a relative
-    change of the target's area, as level rates in m/s.
+    `source` to `target`. fine: the kinks among them on a finer grid. in_time: name of the signal that functions of time
+    multiply. areas: regressors of a relative change of the target's area, as level rates in m/s.
     """
 
     signals: Callable[[Forcing], Signals]
     flows: RegressorFunction
+    fine: RegressorFunction
     in_time: str
     source: str
     target: str
@@ -101,6 +106,11 @@ def reading_regressors(s: Signals, step: Tensor, ends: SignalRanges, scale: floa
     return [*regressors, *lags_and_decays(s["reading"], step, scale), *backlashes(s["reading"], ends("reading"))]
 
 
+def fine_reading_regressors(s: Signals, ends: SignalRanges) -> list[Tensor]:
+    """The kinks among `reading_regressors` on a finer grid."""
+    return ends.fine_hinges(s, "reading", 12)
+
+
 def _pump(pump: Pump, plant: PlantDescription) -> DiscrepancyModel:
     index, tank, scale = plant.pumps.index(pump), _index(plant, pump.target), time_scale(plant)
 
@@ -118,7 +128,10 @@ def _pump(pump: Pump, plant: PlantDescription) -> DiscrepancyModel:
         regressors += stictions(s["flow"], ends("flow"))
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
-    return DiscrepancyModel(signals, flows, "flow", OUTSIDE, pump.target)
+    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
+        return [*ends.fine_hinges(s, "command", 9), *(s["flow"] * b for b in ends.fine_hinges(s, "level", 6))]
+
+    return DiscrepancyModel(signals, flows, fine, "flow", OUTSIDE, pump.target)
 
 
 def _pipe(pipe: Pipe, plant: PlantDescription) -> DiscrepancyModel:
@@ -142,7 +155,11 @@ def _pipe(pipe: Pipe, plant: PlantDescription) -> DiscrepancyModel:
             regressors += lags_and_decays(s["root"] * s["opening"], step, scale)
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
-    return DiscrepancyModel(signals, flows, "flow", pipe.source, pipe.target)
+    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
+        of_opening = [s["root"] * b for b in ends.fine_hinges(s, "opening", 9)] if pipe.valve else []
+        return [*ends.fine_hinges(s, "root", 16), *of_opening]
+
+    return DiscrepancyModel(signals, flows, fine, "flow", pipe.source, pipe.target)
 
 
 def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
@@ -155,7 +172,10 @@ def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         return [*ends.hinges(s, "head", 10), *ends.hinges(s, "root", 10)]
 
-    return DiscrepancyModel(signals, flows, "root", first, second)
+    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
+        return [*ends.fine_hinges(s, "head", 10), *ends.fine_hinges(s, "root", 10)]
+
+    return DiscrepancyModel(signals, flows, fine, "root", first, second)
 
 
 def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
@@ -176,7 +196,10 @@ def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
     def areas(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         return [s["rate"] * b for b in ends.hinges(s, "level", 12)]
 
-    return DiscrepancyModel(signals, flows, "one", OUTSIDE, place, areas)
+    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
+        return ends.fine_hinges(s, "level", 12)
+
+    return DiscrepancyModel(signals, flows, fine, "one", OUTSIDE, place, areas)
 
 
 def _index(plant: PlantDescription, tank: str) -> int:

@@ -1,7 +1,7 @@
-"""First-order influence of a component's discrepancy on the readings, about the trajectory predicted from earlier readings.
+"""First-order influence of a component's discrepancy on the readings.
 
-The linearised plant maps each regressor to readings. The part that constants and initial levels within their tolerances
-can explain is projected out.
+The plant, linearised about the trajectory that is predicted from earlier readings, maps each regressor to readings. The
+part that constants and initial levels within their tolerances can explain is projected out.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from fdi_torch.gap.localization.component_regressors import (
     SignalRanges,
     Signals,
     discrepancy_model_at,
+    fine_reading_regressors,
     reading_regressors,
 )
 from fdi_torch.gap.localization.regressors import time_functions
@@ -44,22 +45,35 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """Influence of a component's regressors on the readings, columns (S, C, M), about a linearised trajectory."""
+    """Influence of a component's regressors on the readings, columns (S, C, M), about a linearised trajectory.
+
+    choices (M,): number of regressors among which each was selected.
+    """
 
     columns: Tensor
     linearised: Linearised
+    choices: Tensor
+
+    def with_column(self, column: Tensor, choices: int) -> Discrepancy:
+        """The same with one more column (S, C)."""
+        columns = torch.cat([self.columns, column.unsqueeze(-1)], dim=-1)
+        return Discrepancy(columns, self.linearised, torch.cat([self.choices, self.choices.new_tensor([choices])]))
 
 
 @dataclass(frozen=True)
 class Regressors:
-    """Regressors of one component along one recording.
+    """Regressors of one component along one recording of K steps; of a sensor, along its K samples.
 
-    flows (M, K) m^3/s; functions of time in_time (M', K); for a tank, areas (M'', K): changes of its level rate, m/s.
+    functions (M, K): of local variables, in m^3/s, or in the sensor's unit. fine (F, K): those with kinks, on a finer
+    grid. in_time (T, K): functions of time times `factor` (K,). areas (A, K): of a tank, changes of its level rate,
+    m/s; otherwise None.
     """
 
-    flows: Tensor
+    functions: Tensor
+    fine: Tensor
     in_time: Tensor
-    areas: Tensor | None
+    factor: Tensor
+    areas: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -109,16 +123,48 @@ class DiscrepancyRegression:
         self.theta, self.levels = fit.theta.unsqueeze(0), predicted_levels(fitter, fit)
         self.linearised = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.linearised, levels=self.levels))
-        self._regressors: dict[str, list[Regressors]] = {}
+        self._at: dict[str, tuple[list[Regressors], Linearised]] = {}
         parts, samples = len(self.pieces), len(fitter.data.readings)
         self.steps = max(min(steps, samples // SAMPLES_A_STEP) // parts, 2)
 
     def of(self, place: str) -> Discrepancy:
-        plant = self.fitter.data.plant
-        sensors = [s.name for s in plant.sensors]
-        if place in sensors:
-            return self._sensor_discrepancy(sensors.index(place), plant.sensors[sensors.index(place)])
-        return Discrepancy(self._columns(place), self.linearised)
+        regressors, linearised = self.at(place)
+        shared = [self.influence(place, k, r.functions) for k, r in enumerate(regressors)]
+        for k, r in enumerate(regressors):
+            if r.areas is not None:
+                shared[k] = torch.cat([self._influence_of_areas(place, k, r.areas), shared[k]], dim=-1)
+        columns = _concatenated(shared, [self.influence(place, k, r.in_time) for k, r in enumerate(regressors)])
+        return Discrepancy(columns, linearised, columns.new_full((columns.shape[-1],), columns.shape[-1]))
+
+    def at(self, place: str) -> tuple[list[Regressors], Linearised]:
+        """Regressors of the component at a place along each recording, and the trajectory about which they act."""
+        if place not in self._at:
+            plant, channel = self.fitter.data.plant, self.sensor(place)
+            if channel is None:
+                self._at[place] = self._of_component(discrepancy_model_at(place, plant)), self.linearised
+            else:
+                self._at[place] = self._of_sensor(plant.sensors[channel])
+        return self._at[place]
+
+    def sensor(self, place: str) -> int | None:
+        """The channel of a sensor; None if the place is no sensor."""
+        names = [s.name for s in self.fitter.data.plant.sensors]
+        return names.index(place) if place in names else None
+
+    def influence(self, place: str, recording: int, functions: Tensor) -> Tensor:
+        """Influence (S, C, M) of local functions (M, K) along one recording on its readings, not whitened."""
+        piece, channel = self.pieces[recording], self.sensor(place)
+        if channel is None:
+            component = discrepancy_model_at(place, self.fitter.data.plant)
+            return piece.to_readings(self._rate_changes(piece, component, functions))
+        columns = functions.new_zeros(functions.shape[1], self.fitter.data.readings.shape[1], len(functions))
+        columns[:, channel] = functions.T
+        return columns
+
+    def _influence_of_areas(self, place: str, recording: int, areas: Tensor) -> Tensor:
+        rates = areas.new_zeros(len(self.fitter.data.plant.tanks), *areas.shape)
+        rates[self.tank(place)] = areas
+        return self.pieces[recording].to_readings(rates)
 
     def _pieces(self, linearised: Linearised) -> list[RecordingLinearisation]:
         whole = self.engine
@@ -136,56 +182,21 @@ class DiscrepancyRegression:
             pieces.append(RecordingLinearisation(engine, theta, linearised_part, forcing, rows))
         return pieces
 
-    def regressors(self, place: str) -> list[Regressors]:
-        """Regressors of the component at a place along each recording."""
-        if place not in self._regressors:
-            self._regressors[place] = self._along_recordings(discrepancy_model_at(place, self.fitter.data.plant))
-        return self._regressors[place]
-
-    def _along_recordings(self, component: DiscrepancyModel) -> list[Regressors]:
+    def _of_component(self, component: DiscrepancyModel) -> list[Regressors]:
         signals = [
             {n: x.reshape(-1).expand(len(p.middle)) for n, x in component.signals(p.forcing).items()}
             for p in self.pieces
         ]
         ends, regressors = SignalRanges(signals), []
         for piece, s in zip(self.pieces, signals, strict=True):
-            step = piece.engine.experiment.steps
-            in_time = [s[component.in_time] * c for c in self._time_functions(piece.middle, piece)]
+            step, factor = piece.engine.experiment.steps, s[component.in_time]
+            functions, fine = (torch.stack(each(s, step, ends)) for each in (component.flows, component.fine))
             areas = torch.stack(component.areas(s, step, ends)) if component.areas else None
-            regressors.append(Regressors(torch.stack(component.flows(s, step, ends)), torch.stack(in_time), areas))
+            in_time = factor * self._functions_of_time(piece, piece.middle)
+            regressors.append(Regressors(functions, fine, in_time, factor, areas))
         return regressors
 
-    def _columns(self, place: str) -> Tensor:
-        """Influence of the regressors of a component (S, C, M), not whitened."""
-        component = discrepancy_model_at(place, self.fitter.data.plant)
-        shared: list[Tensor] = []
-        per_recording: list[Tensor] = []
-        for piece, regressors in zip(self.pieces, self.regressors(place), strict=True):
-            changes = [self._rate_changes(piece, component, flows) for flows in (regressors.flows, regressors.in_time)]
-            if regressors.areas is not None:
-                rates = regressors.areas.new_zeros(len(changes[0]), *regressors.areas.shape)
-                rates[self.tank(component.target)] = regressors.areas
-                changes.insert(0, rates)
-            columns = piece.to_readings(torch.cat(changes, dim=1))
-            shared.append(columns[..., : -len(regressors.in_time)])
-            per_recording.append(columns[..., -len(regressors.in_time) :])
-        return _concatenated(shared, per_recording)
-
-    def _rate_changes(self, piece: RecordingLinearisation, component: DiscrepancyModel, flows: Tensor) -> Tensor:
-        """Map flows (M, K) from source to target to changes of the level rates (tanks, M, K)."""
-        inflows: list[Tensor | None] = [None] * len(self.fitter.data.plant.tanks)
-        for end, sign in ((component.source, -1.0), (component.target, 1.0)):
-            if end != OUTSIDE:
-                inflows[self.tank(end)] = sign * flows
-        return piece.forcing.by_inflows(inflows, len(flows))
-
-    def _time_functions(self, time: Tensor, piece: RecordingLinearisation) -> list[Tensor]:
-        return time_functions(time, float(piece.engine.experiment.nodes[-1]), self.periods, self.steps)
-
-    def tank(self, name: str) -> int:
-        return [t.name for t in self.fitter.data.plant.tanks].index(name)
-
-    def _sensor_discrepancy(self, channel: int, sensor: Sensor) -> Discrepancy:
+    def _of_sensor(self, sensor: Sensor) -> tuple[list[Regressors], Linearised]:
         """About the model's level of the sensor's tank, with all other tanks at their predicted levels."""
         levels = self.engine.simulate_tank(self.theta, self.levels, self.tank(sensor.tank))
         signals: list[Signals] = []
@@ -197,18 +208,29 @@ class DiscrepancyRegression:
                 {"reading": sensor.gain * interpolate(times, nodes, tank_levels) + sensor.offset, "time": times}
             )
             first += len(nodes)
-        ends = SignalRanges(signals)
-        shared: list[Tensor] = []
-        per_recording: list[Tensor] = []
-        scale = time_scale(self.fitter.data.plant)
+        ends, scale, regressors = SignalRanges(signals), time_scale(self.fitter.data.plant), []
         for piece, s in zip(self.pieces, signals, strict=True):
-            step = piece.engine.experiment.sample_intervals
-            in_time = self._time_functions(s["time"], piece)
-            for regressors, columns in ((reading_regressors(s, step, ends, scale), shared), (in_time, per_recording)):
-                column = levels.new_zeros(len(step), self.fitter.data.readings.shape[1], len(regressors))
-                column[:, channel] = torch.stack(regressors, dim=1)
-                columns.append(column)
-        return Discrepancy(_concatenated(shared, per_recording), self.engine.linearise(self.theta, levels))
+            functions = reading_regressors(s, piece.engine.experiment.sample_intervals, ends, scale)
+            fine, in_time = fine_reading_regressors(s, ends), self._functions_of_time(piece, s["time"])
+            one = torch.ones_like(s["time"])
+            regressors.append(Regressors(torch.stack(functions), torch.stack(fine), in_time, one))
+        return regressors, self.engine.linearise(self.theta, levels)
+
+    def _rate_changes(self, piece: RecordingLinearisation, component: DiscrepancyModel, flows: Tensor) -> Tensor:
+        """Map flows (M, K) from source to target to changes of the level rates (tanks, M, K)."""
+        inflows: list[Tensor | None] = [None] * len(self.fitter.data.plant.tanks)
+        for end, sign in ((component.source, -1.0), (component.target, 1.0)):
+            if end != OUTSIDE:
+                inflows[self.tank(end)] = sign * flows
+        return piece.forcing.by_inflows(inflows, len(flows))
+
+    def _functions_of_time(self, piece: RecordingLinearisation, time: Tensor) -> Tensor:
+        """Steps, ramps and sinusoids, (M, K)."""
+        duration = float(piece.engine.experiment.nodes[-1])
+        return torch.stack(time_functions(time, duration, self.periods, self.steps))
+
+    def tank(self, name: str) -> int:
+        return [t.name for t in self.fitter.data.plant.tanks].index(name)
 
 
 def normal_equations(fitter: Fitter, fit: Fit, discrepancy: Discrepancy) -> NormalEquations:

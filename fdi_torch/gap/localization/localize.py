@@ -26,16 +26,16 @@ from fdi_torch.estimate.kalman import SCATTER, StateNoise, Wander
 from fdi_torch.estimate.state_noise import CORRELATION_TIMES, LOG_BOUND
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression, normal_equations
+from fdi_torch.gap.localization.fine_positions import with_best_position
 from fdi_torch.gap.localization.regressors import dominant_period
-from fdi_torch.gap.localization.single_regressor_gain import single_regressor_gains
-from fdi_torch.gap.localization.sparse_regression import sparse_fit
+from fdi_torch.gap.localization.single_regressor_gain import largest_influence, single_regressor_gains
+from fdi_torch.gap.localization.sparse_regression import SparseFit, column_costs, sparse_fit
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, occam, with_disturbances
 from fdi_torch.simulate.collocation import Linearised
 
 HARMONICS = 3  # of a dominant period of the residual
 STEPS = 120  # step functions of time
-ROUNDS = 40  # iterations of the sparse regression
-MOST_TURNS = 4  # alternations between the disturbance noise and the discrepancy
+MOST_TURNS = 12  # alternations between the disturbance noise and one more regressor
 CONVERGED = 0.1  # nats; a smaller gain ends the alternation
 CALIBRATION_PLACES = 3  # places always evaluated; they show by how much first-order gains are too low
 
@@ -69,39 +69,46 @@ def localize(
     regression = DiscrepancyRegression(fitter, fit, periods, STEPS)
     if _evidence_bound(fitter, fit, noise, regression.steps) - base < needed:
         return []
+    generator, largest = torch.Generator().manual_seed(0), largest_influence(fitter)
     starts = [(n, with_disturbances(fitter, fit, n)) for n in (noise, _nearly_without_disturbances(noise))]
     first_order = _first_order_gains(regression, starts, fit, places, base)
 
     def evaluate(discrepancy: Discrepancy, place: str, noise: StateNoise, under: Fitter) -> _EvaluatedDiscrepancy:
-        (evidence,) = _regressions(under, fit, [discrepancy])
+        equations = normal_equations(under, fit, discrepancy)
+        regressed = sparse_fit(equations.gram, equations.score, column_costs(discrepancy.choices, largest))
         likelihood = _likelihood(under, fit, discrepancy.linearised) + noise.log_prior()
-        return _EvaluatedDiscrepancy(place, noise, evidence, likelihood + evidence.evidence - base)
+        gain = likelihood + regressed.evidence - base
+        return _EvaluatedDiscrepancy(place, noise, under, discrepancy, regressed, gain)
+
+    def with_likely_noise(known: _EvaluatedDiscrepancy, climb: bool) -> _EvaluatedDiscrepancy:
+        at = known.discrepancy
+        likely = estimate_disturbances(fitter, fit, at.linearised, known.explained, known.noise, climb=climb).noise
+        return evaluate(at, known.location, likely, with_disturbances(fitter, fit, likely))
+
+    def with_finer_position(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
+        used = known.regressed.used
+        finer = with_best_position(regression, known.location, known.under, fit, known.discrepancy, used, generator)
+        return evaluate(finer, known.location, known.noise, known.under) if finer else known
 
     localized: list[LocalizedDiscrepancy] = []
-    # Largest differences seen so far: gain less its first-order estimate, and gain from re-estimated noise.
-    excess, noise_gain = -math.inf, 0.0
+    # Largest differences seen so far: gain less its first-order estimate, and gain from further noise and positions.
+    excess, further_gain = -math.inf, 0.0
     for place in sorted(places, key=lambda p: -first_order[p]):
         if len(localized) >= CALIBRATION_PLACES and first_order[place] + excess < needed:
             break
-        discrepancy, iteration = regression.of(place), 0
-        best = first = max((evaluate(discrepancy, place, *start) for start in starts), key=_gain)
-        while (len(localized) < CALIBRATION_PLACES or best.gain + noise_gain >= needed) and iteration < MOST_TURNS:
-            explained = discrepancy.columns @ best.evaluated.mean
-            likely_noise = estimate_disturbances(
-                fitter, fit, discrepancy.linearised, explained, best.noise, climb=iteration == 0
-            ).noise
-            updated = evaluate(discrepancy, place, likely_noise, with_disturbances(fitter, fit, likely_noise))
-            iteration, converged = iteration + 1, updated.gain < best.gain + CONVERGED
-            best = max(best, updated, key=_gain)
-            if converged:
+        start = regression.of(place)
+        best = first = max((evaluate(start, place, *each) for each in starts), key=_gain)
+        for turn in range(MOST_TURNS):
+            if len(localized) >= CALIBRATION_PLACES and best.gain + further_gain < needed:
                 break
-        excess, noise_gain = max(excess, best.gain - first_order[place]), max(noise_gain, best.gain - first.gain)
-        needed = max(needed, best.gain + math.log(RARE))
-        localized.append(
-            LocalizedDiscrepancy(
-                place, best.gain, _effect_size(fitter, discrepancy, best.evaluated), periods, best.noise
-            )
-        )
+            before, best = best, max(best, with_likely_noise(best, turn == 0), key=_gain)
+            best = max(best, with_finer_position(best), key=_gain)
+            if best.gain < before.gain + CONVERGED:
+                break
+        excess, further_gain = max(excess, best.gain - first_order[place]), max(further_gain, best.gain - first.gain)
+        if not _is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
+            needed = max(needed, best.gain + math.log(RARE))
+            localized.append(LocalizedDiscrepancy(place, best.gain, _effect_size(fitter, best), periods, best.noise))
     random = [*_drifting_sensors(fitter, fit, noise, places, base, needed)]
     random += _random_flows(fitter, fit, noise, places, base)
     for process in random:
@@ -166,7 +173,7 @@ def _drifting_sensors(
         noise_gain = max(noise_gain, best.gain - initial.gain)
         needed = max(needed, best.gain + math.log(RARE))
         assert best.noise.wander is not None
-        if not _is_rounding_error(fitter, best.noise.wander):
+        if not _is_rounding_error(fitter, best.location, best.noise.wander.std):
             drifts.append(best)
     return drifts
 
@@ -207,10 +214,9 @@ def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise, choices: int) -
     )
 
 
-def _effect_size(fitter: Fitter, discrepancy: Discrepancy, evaluated: _RegressionEvidence) -> float:
+def _effect_size(fitter: Fitter, evaluated: _EvaluatedDiscrepancy) -> float:
     """Norm of the discrepancy's influence on the readings, in units of the sensor noise."""
-    influence = discrepancy.columns @ evaluated.mean
-    return float(torch.linalg.vector_norm(fitter.noise.whiten(influence, fitter.data.mask)))
+    return float(torch.linalg.vector_norm(fitter.noise.whiten(evaluated.explained, fitter.data.mask)))
 
 
 def _nearly_without_disturbances(noise: StateNoise) -> StateNoise:
@@ -220,42 +226,23 @@ def _nearly_without_disturbances(noise: StateNoise) -> StateNoise:
 
 @dataclass(frozen=True)
 class _EvaluatedDiscrepancy:
-    """A discrepancy at a place under one disturbance noise."""
+    """A discrepancy at a place under one disturbance noise, that of the fitter `under`."""
 
     location: str
     noise: StateNoise
-    evaluated: _RegressionEvidence
+    under: Fitter
+    discrepancy: Discrepancy
+    regressed: SparseFit
     gain: float
+
+    @property
+    def explained(self) -> Tensor:
+        """The part of the readings (S, C) that the discrepancy explains."""
+        return self.discrepancy.columns @ self.regressed.mean
 
 
 def _gain(discrepancy: _EvaluatedDiscrepancy | LocalizedDiscrepancy) -> float:
     return discrepancy.gain
-
-
-@dataclass(frozen=True)
-class _RegressionEvidence:
-    """Log evidence, reduction of chi-square, and coefficients of a sparse regression."""
-
-    evidence: float
-    closes: float
-    mean: Tensor
-
-
-def _regressions(fitter: Fitter, fit: Fit, each: Sequence[Discrepancy]) -> list[_RegressionEvidence]:
-    """Log evidence of each discrepancy against none, each regressor selected among all of its place."""
-    equations = [normal_equations(fitter, fit, discrepancy) for discrepancy in each]
-    width = max(len(r.score) for r in equations)
-    gram, score = (torch.zeros(len(each), *(width,) * d, dtype=torch.float64) for d in (2, 1))
-    for k, r in enumerate(equations):
-        gram[k, : len(r.score), : len(r.score)], score[k, : len(r.score)] = r.gram, r.score
-    fits = sparse_fit(gram, score, ROUNDS)
-    choice = [math.log(len(r.score)) for r in equations]
-    return [
-        _RegressionEvidence(
-            float(fits.evidence[k] - choice[k] * fits.needs[k]), float(fits.closes[k]), fits.mean[k, : len(r.score)]
-        )
-        for k, r in enumerate(equations)
-    ]
 
 
 def _likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
@@ -296,10 +283,13 @@ def _drift_cost(fitter: Fitter, drift: Wander) -> float:
     return math.log(len(CORRELATION_TIMES) - 1) + max(math.log(width * math.sqrt(values / math.pi)), 0.0)
 
 
-def _is_rounding_error(fitter: Fitter, drift: Wander) -> bool:
-    """Whether the drift is as small as a rounding error, which varies slowly with the level: half a step."""
-    steps = fitter.noise.steps
-    return bool(steps) and drift.std < 0.5 * steps[drift.channel]
+def _is_rounding_error(fitter: Fitter, place: str, std: float) -> bool:
+    """Whether a deviation of a sensor with this standard deviation may be a rounding error: up to half a step.
+
+    It is a function of the level, and varies slowly where the level does.
+    """
+    sensors, steps = [s.name for s in fitter.data.plant.sensors], fitter.noise.steps
+    return bool(steps) and place in sensors and std < 0.5 * steps[sensors.index(place)]
 
 
 def _drift_size(fitter: Fitter, drift: Wander) -> float:

@@ -21,6 +21,7 @@ from torch import Tensor
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.localization.component_regressors import discrepancy_model_at
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
+from fdi_torch.gap.localization.sparse_regression import column_costs
 from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.simulate.collocation import Linearised
 
@@ -28,7 +29,7 @@ SIGNS = 64  # random sign vectors; the diagonal of C'C is then accurate to about
 
 
 @dataclass(frozen=True)
-class _Adjoints:
+class Adjoints:
     """Residual and random signs (1 + SIGNS columns) mapped back to the readings (S, C, .), and per recording to the
     flows into each tank and the rates of its level, (tanks, ., K)."""
 
@@ -41,52 +42,70 @@ def single_regressor_gains(
     regression: DiscrepancyRegression, under: Fitter, fit: Fit, places: Sequence[str], generator: torch.Generator
 ) -> dict[str, float]:
     """Gain in log evidence of the best single regressor of each place. under: fitter with the disturbance noise."""
-    sensors = [s.name for s in regression.fitter.data.plant.sensors]
-    basis, rows = _parameter_basis(under, fit)
-    signs = torch.randint(0, 2, (rows, SIGNS), generator=generator, dtype=torch.float64) * 2.0 - 1.0
-    adjoints = _adjoints(
-        regression, under, torch.cat([_residual(under, fit, regression.linearised), signs], dim=1), basis
-    )
+    basis = parameter_basis(under, fit)
+    residual = whitened_residual(under, fit, regression.linearised)
+    adjoints = adjoints_of(regression, under, torch.cat([residual, random_signs(residual, generator)], dim=1), basis)
     gains = {}
     for place in places:
-        if place in sensors:
-            products = _sensor_products(regression.of(place), under, fit, basis, adjoints, sensors.index(place))
-        else:
+        if (channel := regression.sensor(place)) is None:
             products = _flow_products(regression, place, adjoints)
-        gains[place] = _best_gain(products)
+        else:
+            products = _sensor_products(regression.of(place), under, fit, basis, adjoints, channel)
+        (cost,) = column_costs(torch.tensor([float(len(products))]), largest_influence(under)).tolist()
+        gains[place] = float(gains_of(products).max()) - cost
     return gains
 
 
-def _best_gain(products: Tensor) -> float:
-    """products (M, 1 + SIGNS): of the columns with the residual and with the random signs."""
+def largest_influence(fitter: Fitter) -> float:
+    """Largest conceivable influence on the readings: the range of each, in units of its noise."""
+    readings, total = fitter.data.readings, 1.0
+    for c, std in enumerate(fitter.noise.std.tolist()):
+        valid = readings[fitter.data.mask[:, c], c]
+        if len(valid):
+            total += len(valid) * (float(valid.max() - valid.min()) / std) ** 2
+    return math.sqrt(total)
+
+
+def random_signs(residual: Tensor, generator: torch.Generator) -> Tensor:
+    return torch.randint(0, 2, (len(residual), SIGNS), generator=generator, dtype=torch.float64) * 2.0 - 1.0
+
+
+def gains_of(products: Tensor) -> Tensor:
+    """Gain in log evidence of each regressor (M,), without its cost (`column_costs`).
+
+    products (M, 1 + SIGNS): of the columns with the residual and with the random signs.
+    """
     gain = 0.5 * products[:, 0].square() / products[:, 1:].square().mean(dim=1).clamp(min=1e-12)
     # A regressor that reduces chi-square by G costs (1 + log G) / 2 nats at its most likely precision.
-    best = float(gain.max())
-    return best - 0.5 * (1.0 + math.log(max(2.0 * best, 1.0))) - math.log(len(products))
+    return gain - 0.5 * (1.0 + torch.log((2.0 * gain).clamp(min=1.0)))
 
 
-def _residual(under: Fitter, fit: Fit, linearised: Linearised) -> Tensor:
+def whitened_residual(under: Fitter, fit: Fit, linearised: Linearised) -> Tensor:
     """Whitened residual and prior residual of the parameters, (S C + P, 1)."""
     off = under.priors(fit.space, fit.theta)[2]
     return torch.cat([under.white(linearised)[0][0].flatten(), -off]).unsqueeze(1)
 
 
-def _parameter_basis(under: Fitter, fit: Fit) -> tuple[Tensor, int]:
-    """Orthonormal basis (S C + P, P) of the parameters' influence, and its number of rows."""
+def parameter_basis(under: Fitter, fit: Fit, columns: Tensor | None = None) -> Tensor:
+    """Orthonormal basis (S C + P, .) of the influence of the parameters, and of further columns (S, C, M)."""
     scale, pull, _ = under.priors(fit.space, fit.theta)
     jacobian = (under.white(fit.linearised)[1][0] * scale).flatten(0, 1)
     rows = torch.cat([jacobian, torch.diag(pull + 1e-9)])
-    return torch.linalg.qr(rows)[0], len(rows)
+    if columns is not None:
+        further = under.whiten(columns).flatten(0, 1)
+        rows = torch.cat([rows, torch.cat([further, further.new_zeros(len(pull), further.shape[1])])], dim=1)
+    return torch.linalg.qr(rows)[0]
 
 
-def _adjoints(regression: DiscrepancyRegression, under: Fitter, columns: Tensor, basis: Tensor) -> _Adjoints:
+def adjoints_of(regression: DiscrepancyRegression, under: Fitter, columns: Tensor, basis: Tensor) -> Adjoints:
+    """Columns (S C + P, .) without what the basis explains, mapped back."""
     readings = _whitened_adjoint(under, columns, basis)
     inflows, rates = [], []
     for piece in regression.pieces:
         by_rate = piece.to_rates(readings[piece.rows])
         rates.append(by_rate)
         inflows.append(piece.forcing.by_rates(by_rate))
-    return _Adjoints(readings, inflows, rates)
+    return Adjoints(readings, inflows, rates)
 
 
 def _whitened_adjoint(under: Fitter, columns: Tensor, basis: Tensor) -> Tensor:
@@ -96,26 +115,34 @@ def _whitened_adjoint(under: Fitter, columns: Tensor, basis: Tensor) -> Tensor:
     return under.whitening.transposed(remaining[: shape.numel()].reshape(*shape, -1))
 
 
-def _flow_products(regression: DiscrepancyRegression, place: str, adjoints: _Adjoints) -> Tensor:
-    component = discrepancy_model_at(place, regression.fitter.data.plant)
-    shared, per_recording = list[Tensor](), list[Tensor]()
-    for regressors, inflows, rates in zip(regression.regressors(place), adjoints.inflows, adjoints.rates, strict=True):
+def inflow_weights(regression: DiscrepancyRegression, place: str, adjoints: Adjoints) -> list[Tensor]:
+    """Per recording, the weights (., K) of a flow at a place."""
+    component, weights = discrepancy_model_at(place, regression.fitter.data.plant), []
+    for inflows in adjoints.inflows:
         net = torch.zeros_like(inflows[0])
         for end, sign in ((component.source, -1.0), (component.target, 1.0)):
             if end != OUTSIDE:
                 net += sign * inflows[regression.tank(end)]
-        products = regressors.flows @ net.T
+        weights.append(net)
+    return weights
+
+
+def _flow_products(regression: DiscrepancyRegression, place: str, adjoints: Adjoints) -> Tensor:
+    shared, per_recording = list[Tensor](), list[Tensor]()
+    weights = inflow_weights(regression, place, adjoints)
+    for regressors, net, rates in zip(regression.at(place)[0], weights, adjoints.rates, strict=True):
+        products = regressors.functions @ net.T
         if regressors.areas is not None:
-            products = torch.cat([regressors.areas @ rates[regression.tank(component.target)].T, products])
+            products = torch.cat([regressors.areas @ rates[regression.tank(place)].T, products])
         shared.append(products)
         per_recording.append(regressors.in_time @ net.T)
     return torch.cat([torch.stack(shared).sum(dim=0), *per_recording])
 
 
 def _sensor_products(
-    discrepancy: Discrepancy, under: Fitter, fit: Fit, basis: Tensor, adjoints: _Adjoints, channel: int
+    discrepancy: Discrepancy, under: Fitter, fit: Fit, basis: Tensor, adjoints: Adjoints, channel: int
 ) -> Tensor:
     """Products for a sensor, about the model's level of its tank."""
-    residual = _whitened_adjoint(under, _residual(under, fit, discrepancy.linearised), basis)
+    residual = _whitened_adjoint(under, whitened_residual(under, fit, discrepancy.linearised), basis)
     weights = torch.cat([residual[:, channel], adjoints.readings[:, channel, 1:]], dim=1)
     return discrepancy.columns[:, channel].T @ weights

@@ -1,97 +1,112 @@
 """Sparse Bayesian regression: which few of many columns explain a residual, and the evidence for them.
 
-The coefficients have independent priors c_j ~ N(0, 1/a_j); the precisions a_j maximise the evidence, so that a column
-that is not needed gets an infinite precision and no cost (MacKay, 1992; Tipping, 2001, "Sparse Bayesian learning"). For
-a residual r, columns C, G = C'C, b = C'r and noise of unit variance,
+The coefficients have independent priors c_j ~ N(0, 1/a_j), and a column with infinite precision a_j is not used. For a
+residual r, columns C, G = C'C, b = C'r and noise of unit variance,
 
-    log E = b'S b / 2 + log det(S) / 2 + sum log(a) / 2,   S = (G + diag(a))^-1.
+    log E = b'S b / 2 + log det(S) / 2 + sum log(a) / 2,   S = (G + diag(a))^-1,
+
+over the columns that are used, each of which has a cost (`column_costs`). Their difference is maximised one column at a
+time: the column whose addition, removal or
+re-estimation gains most is changed until nothing gains (Tipping and Faul, 2003, "Fast marginal likelihood maximisation
+for sparse Bayesian models").
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 VISIBLE = 1e-6  # chi-square units; columns with less influence are ignored
-LOW, HIGH = 1e-8, 1e12  # bounds of the precisions
-FIRST_ROUNDS = 12  # iterations with all columns; then vanished columns are removed
-VANISHED = 1e-3  # share of a coefficient that the data determine, below which it has vanished
-RIDGES = tuple(10.0**k for k in range(-8, 2))  # as shares of the diagonal
+COLLINEAR = 1e-9  # share of a column that the columns in use leave over; with less, it cannot be added
+CONVERGED = 1e-2  # nats
+MOST_CHANGES = 500  # a guard against cycles by rounding
 
 
 @dataclass(frozen=True)
 class SparseFit:
-    """Solutions of B problems.
+    """evidence: log evidence against no coefficients, less the costs. mean (M,): posterior means of the coefficients.
+    used (M,) bool."""
 
-    evidence (B,): log evidence against no coefficients. closes (B,): reduction of chi-square. needs (B,): effective
-    number of coefficients. mean (B, M): posterior means of the coefficients.
-    """
-
-    evidence: Tensor
-    closes: Tensor
-    needs: Tensor
+    evidence: float
     mean: Tensor
+    used: Tensor
 
 
-def sparse_fit(gram: Tensor, score: Tensor, rounds: int) -> SparseFit:
-    """Solve B regressions with gram (B, M, M) = C'C and score (B, M) = C'r."""
-    size = torch.diagonal(gram, dim1=-2, dim2=-1).clamp(min=0.0)
-    visible, size = size > VISIBLE, torch.sqrt(size.clamp(min=1e-12))
-    unit, target = gram / size.unsqueeze(-1) / size.unsqueeze(-2), score / size
-    first = score.shape[-1] / target.abs().amax(dim=-1, keepdim=True).clamp(min=1e-9) ** 2
-    precision, kept = torch.where(visible, first.expand_as(target), HIGH), None
-    for turn in range(rounds):
-        if turn == FIRST_ROUNDS:
-            unit, target, visible, precision, kept = _without_vanished_columns(unit, target, visible, precision)
-        mean, determined, _ = _posterior(unit, target, precision)
-        updated = determined / (mean * mean).clamp(min=1e-30)
-        precision = torch.where(visible, updated.clamp(LOW, HIGH), HIGH)
-    mean, determined, half_log_det = _posterior(unit, target, precision)
-    evidence = 0.5 * (target * mean).sum(-1) - half_log_det + 0.5 * torch.log(precision).sum(-1) - determined.sum(-1)
-    fitted = (mean.unsqueeze(-2) @ unit @ mean.unsqueeze(-1)).flatten()
-    whole = mean if kept is None else torch.zeros_like(score).scatter(-1, kept, mean)
-    return SparseFit(evidence, 2.0 * (target * mean).sum(-1) - fitted, determined.sum(-1), whole / size)
+def column_costs(choices: Tensor, largest: float) -> Tensor:
+    """Cost (M,) of using each column, nats.
 
-
-def _without_vanished_columns(unit: Tensor, target: Tensor, visible: Tensor, precision: Tensor) -> tuple[Tensor, ...]:
-    """The same problems without vanished columns, and the indices of those kept.
-
-    All problems keep as many columns as the largest needs.
+    choices (M,): number of columns among which each is selected; it costs log(choices). The prior of a coefficient's
+    size is log-uniform over log(largest) e-folds, from an influence of one (the norm of its column times its size) to
+    `largest`. The evidence as a function of the logarithm of the size has a width of sqrt(pi), so that the
+    integral over it is sqrt(pi) / log(largest) of its maximum.
     """
-    _, determined, _ = _posterior(unit, target, precision)
-    count = max(int((determined > VANISHED).sum(-1).max()), 1)
-    kept = determined.topk(count, dim=-1).indices
-    rows, columns = kept.unsqueeze(-1), kept.unsqueeze(-2)
-    each = torch.arange(len(kept))[:, None, None]
-    return (
-        unit[each, rows, columns],
-        target.gather(-1, kept),
-        visible.gather(-1, kept),
-        precision.gather(-1, kept),
-        kept,
-    )
+    return torch.log(choices) + math.log(max(math.log(largest) / math.sqrt(math.pi), 1.0))
 
 
-def _posterior(unit: Tensor, target: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Posterior means (B, M), share of each coefficient that the data determine (B, M), and half the log determinant of
-    the curvature (B,)."""
-    root = _cholesky(unit + torch.diag_embed(precision + 1e-9))
-    covariance = torch.cholesky_inverse(root)
-    mean = (covariance @ target.unsqueeze(-1)).squeeze(-1)
-    determined = (1.0 - precision * torch.diagonal(covariance, dim1=-2, dim2=-1)).clamp(1e-12, 1.0)
-    return mean, determined, torch.log(torch.diagonal(root, dim1=-2, dim2=-1)).sum(-1)
+def sparse_fit(gram: Tensor, score: Tensor, costs: Tensor) -> SparseFit:
+    """Solve the regression with gram (M, M) = C'C and score (M,) = C'r. costs (M,): of using each column."""
+    size = torch.diagonal(gram).clamp(min=0.0)
+    visible, size = size > VISIBLE, torch.sqrt(size.clamp(min=VISIBLE))
+    unit, target = gram / size.unsqueeze(1) / size, score / size
+    precision = torch.full_like(target, math.inf)
+    for _ in range(MOST_CHANGES):
+        gain, updated = _changes(unit, target, precision, costs)
+        gain = torch.where(visible, gain, -math.inf)
+        best = int(gain.argmax())
+        if not float(gain[best]) > CONVERGED:
+            break
+        precision[best] = updated[best]
+    used = torch.isfinite(precision)
+    posterior = _Posterior.of(unit, target, precision)
+    evidence = 0.5 * float(target @ posterior.mean) - posterior.half_log_det
+    evidence += 0.5 * float(torch.log(precision[used]).sum()) - float(costs[used].sum())
+    return SparseFit(evidence, posterior.mean / size, used)
 
 
-def _cholesky(curvature: Tensor) -> Tensor:
-    """Cholesky factor (B, M, M) of a curvature.
+def _changes(unit: Tensor, target: Tensor, precision: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
+    """Gain in log evidence, costs included, of the best change of each precision (M,), and the precision after it.
 
-    Rounding of products of nearly vanishing columns may make a curvature indefinite; a growing ridge is then added.
+    Equations 16 to 33 of the paper; `sparsity` is S, `quality` is Q.
     """
-    root, failed = torch.linalg.cholesky_ex(curvature)
-    for ridge in RIDGES if bool(failed.any()) else ():
-        wider = ridge * (failed > 0).to(curvature)[:, None] * torch.diagonal(curvature, dim1=-2, dim2=-1).abs()
-        curvature = curvature + torch.diag_embed(wider)
-        root, failed = torch.linalg.cholesky_ex(curvature)
-    return torch.linalg.cholesky(curvature) if bool(failed.any()) else root
+    posterior, used = _Posterior.of(unit, target, precision), torch.isfinite(precision)
+    sparsity, quality = posterior.sparsity, target - unit @ posterior.mean
+    now = torch.where(used, precision, 1.0)
+    # s and q: what S and Q would be without the column itself.
+    factor = torch.where(used, now / (now - sparsity), 1.0)
+    s, q = factor * sparsity, factor * quality
+    excess = q * q - s
+    likeliest = torch.where(excess > 0.0, s * s / excess.clamp(min=1e-300), math.inf)
+    ratio = (quality * quality / sparsity.clamp(min=1e-300)).clamp(min=1e-300)
+    added = 0.5 * (ratio - 1.0 - torch.log(ratio)) - costs
+    change = torch.where(excess > 0.0, 1.0 / likeliest, 0.0) - 1.0 / now
+    left = (1.0 + sparsity * change).clamp(min=1e-300)
+    estimated = 0.5 * (quality * quality * change / left - torch.log(left))
+    share = (1.0 - sparsity / now).clamp(min=1e-300)
+    removed = 0.5 * (quality * quality / (sparsity - now) - torch.log(share)) + costs
+    may_be_added = ~used & (excess > 0.0) & (sparsity > COLLINEAR)
+    keep = used & (excess > 0.0) & (estimated >= removed)
+    gain = torch.where(used, torch.where(keep, estimated, removed), torch.where(may_be_added, added, -math.inf))
+    return gain.nan_to_num(nan=-math.inf), torch.where(keep | may_be_added, likeliest, math.inf)
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """mean (M,): zero for columns that are not used. sparsity (M,): C_j' (I - C S C') C_j of each column. half_log_det:
+    half the log determinant of the curvature of the columns in use."""
+
+    mean: Tensor
+    sparsity: Tensor
+    half_log_det: float
+
+    @staticmethod
+    def of(unit: Tensor, target: Tensor, precision: Tensor) -> _Posterior:
+        used = torch.isfinite(precision).nonzero().flatten()
+        root = torch.linalg.cholesky(unit[used][:, used] + torch.diag(precision[used]))
+        mean = torch.zeros_like(target)
+        mean[used] = torch.cholesky_solve(target[used].unsqueeze(1), root).squeeze(1)
+        explained = torch.linalg.solve_triangular(root, unit[used], upper=False)
+        sparsity = (torch.diagonal(unit) - explained.square().sum(dim=0)).clamp(min=0.0)
+        return _Posterior(mean, sparsity, float(torch.log(torch.diagonal(root)).sum()))
