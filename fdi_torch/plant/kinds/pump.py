@@ -34,7 +34,7 @@ class Pump(MeteredFlow):
 
     @classmethod
     def example(cls, name: str, source: str, target: str) -> Self:
-        return cls(name, source if source != OUTSIDE else target, 1e-4)
+        return cls(name, source if source != OUTSIDE else target, 3e-5)
 
     def sketch(self) -> Sketch:
         return Sketch("from_above", symbol=BLADE, round=0.17)

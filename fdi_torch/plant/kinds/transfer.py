@@ -44,7 +44,7 @@ class Transfer(MeteredFlow):
 
     @classmethod
     def example(cls, name: str, source: str, target: str) -> Self:
-        return cls(name, source, target, 1e-4)
+        return cls(name, source, target, 3e-5)
 
     def limited(self, flow: Tensor, local: Local) -> Tensor:
         return limit_draw(flow, local.level, local.net, local.area, local.clock.resolution)

@@ -78,6 +78,8 @@ class Weir(FlowComponent):
         return weir_law(local.head, local.capacity)[0]
 
     def limited(self, flow: Tensor, local: Local) -> Tensor:
+        if not local.clock.explicit:
+            return flow
         slope = weir_slope(flow, local.head)
         return limit_spill(
             flow, slope, excess=local.head, inflow=local.net, tank_area=local.area, resolution=local.clock.resolution
