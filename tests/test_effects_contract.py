@@ -61,7 +61,8 @@ def placements_of(plant: PlantDescription) -> tuple[Placement, ...]:
     everything = all_placements(plant)
     if plant.name != "every kind":
         return everything
-    return tuple(p for p in everything if p.effect.name in getattr(plant.component(p.location), "accepts", ()))
+    accepted = {c.name: c.accepts for c in plant.flow_components()}
+    return tuple(p for p in everything if p.effect.name in accepted.get(p.location, ()))
 
 
 PLACES = [(name, p.prefix) for name, plant in PLANTS.items() for p in placements_of(plant)]
