@@ -11,10 +11,11 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-_HOMES = {
+_HOMES: dict[str, tuple[str, ...]] = {
     "fdi_torch.config": (
         *("ConfigError", "dump_plant", "load_plant", "load_recordings", "load_run"),
         *("read_frame", "read_recording"),
@@ -37,13 +38,16 @@ _HOMES = {
     "fdi_torch.jobs.train": ("TrainResult",),
     "fdi_torch.logbook": ("RunLog", "read_run"),
     "fdi_torch.parameters": ("Parameter", "ParameterSpace"),
-    "fdi_torch.plant.description": ("Pipe", "PlacedEffect", "PlantDescription", "Pump", "Sensor", "Tank"),
+    "fdi_torch.plant.description": ("PlacedEffect", "PlantDescription", "Sensor", "Tank"),
     "fdi_torch.plant.network": ("TankNetwork",),
     "fdi_torch.recording": ("Recording",),
     "fdi_torch.simulate.engine_choice": ("make_engine",),
     "fdi_torch.simulate.equilibrium": ("equilibrium",),
     "fdi_torch.simulate.experiment": ("Experiment", "lay_out"),
 }
+# A kind of flow component is a class named after its file: plant/kinds/weir.py holds Weir.
+_KINDS = Path(__file__).parent / "plant" / "kinds"
+_HOMES |= {f"fdi_torch.plant.kinds.{f.stem}": (f.stem.title().replace("_", ""),) for f in _KINDS.glob("[a-z]*.py")}
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = sorted(_HOME_OF)

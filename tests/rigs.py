@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -10,7 +12,7 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import FLOW_KINDS, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 
@@ -33,6 +35,41 @@ def three_tank(start: tuple[float, float, float] = REST, tank_height: float = 1.
         ),
         (Pump("Q1", "T1", 90e-6), Pump("Q2", "T2", 90e-6)),
         (Sensor("h1", "T1"), Sensor("h2", "T2"), Sensor("h3", "T3")),
+    )
+
+
+def factor(unit: str, metre: float, second: float) -> float:
+    """How a number in this unit changes when metres and seconds are rescaled; volts stay."""
+    scale, result = {"m": metre, "s": second}, 1.0
+    for sign, part in enumerate(unit.replace("/", "*/").split("*")):
+        base, _, power = part.removeprefix("/").partition("^")
+        result *= scale.get(base, 1.0) ** (float(power or 1) * (-1 if part.startswith("/") else 1))
+        assert sign < 4
+    return result
+
+
+def rescaled(plant: PlantDescription, m: float, s: float) -> PlantDescription:
+    """The same plant in other metres and seconds."""
+
+    def f(unit: str) -> float:
+        return factor(unit, m, s)
+
+    flows: dict[str, Any] = {
+        kind.part(): tuple(
+            replace(c, **{name: getattr(c, name) * f(unit) for name, unit, _ in c.constants()})
+            for c in getattr(plant, kind.part())
+        )
+        for kind in FLOW_KINDS
+    }
+    return replace(
+        plant,
+        tanks=tuple(
+            replace(t, area=t.area * m**2, height=t.height * m, start_level=(t.start_level or 0.0) * m)
+            for t in plant.tanks
+        ),
+        sensors=tuple(replace(y, gain=y.gain * f(y.unit) / m, offset=y.offset * f(y.unit)) for y in plant.sensors),
+        gravity=plant.gravity * f("m/s^2"),
+        **flows,
     )
 
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import pytest
 import torch
-from rigs import blank_recording, three_tank
+from rigs import blank_recording, factor, rescaled, three_tank
 from torch import Tensor
 
 from fdi_torch.effects import EFFECTS, all_placements, build_network, effect
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import FLOW_KINDS, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
@@ -41,15 +42,37 @@ def valve_plant() -> PlantDescription:
     )
 
 
-PLANTS = {"three_tank": three_tank((0.3, 0.25, 0.28)), "valves": valve_plant()}
-PLACES = [(name, p.prefix) for name, plant in PLANTS.items() for p in all_placements(plant)]
+def plant_of_every_kind() -> PlantDescription:
+    """Two tanks joined by every kind of flow component, that starts above the crest of a weir."""
+    tanks = (Tank("A", 0.015, 0.5, 0.28), Tank("B", 0.012, 0.5, 0.25))
+    pairs = (Sensor("a", "A"), Sensor("b", "B"))
+    flows: dict[str, Any] = {
+        kind.part(): (kind.example(kind.__name__, "A", "B"), kind.example(f"{kind.__name__}2", "B", "outside"))
+        for kind in FLOW_KINDS
+    }
+    return PlantDescription("every kind", tanks, sensors=pairs, **flows)
+
+
+PLANTS = {"three_tank": three_tank((0.3, 0.25, 0.28)), "valves": valve_plant(), "every kind": plant_of_every_kind()}
+
+
+def placements_of(plant: PlantDescription) -> tuple[Placement, ...]:
+    """The whole library at all places; of the plant of every kind only what its kinds accept beyond the others."""
+    everything = all_placements(plant)
+    if plant.name != "every kind":
+        return everything
+    accepted = {c.name: c.accepts for c in plant.flow_components()}
+    return tuple(p for p in everything if p.effect.name in accepted.get(p.location, ()))
+
+
+PLACES = [(name, p.prefix) for name, plant in PLANTS.items() for p in placements_of(plant)]
 everywhere = pytest.mark.parametrize(("plant", "place"), PLACES)
 
 
 def random_inputs(plant: PlantDescription) -> Recording:
     """Each channel steps every 20 s between a fifth and nine tenths of its full scale; the pumps begin at rest."""
     generator = torch.Generator().manual_seed(7)
-    full = {pump.channel: pump.max_flow / pump.gain for pump in plant.pumps}
+    full = {c.channel: c.full_command for c in plant.metered_flows()}
     scale = torch.tensor([full.get(c, 1.0) for c in plant.channels()], dtype=torch.float64)
     steps = 0.2 + 0.7 * torch.rand(SAMPLES // 4 + 1, len(scale), generator=generator, dtype=torch.float64)
     time = torch.arange(SAMPLES, dtype=torch.float64) * SAMPLE
@@ -97,7 +120,7 @@ def experiment_on(plant: PlantDescription) -> Tensor:
 @cache
 def rig(plant: str) -> Rig:
     """The plant with the whole library at all its places."""
-    return rig_of(PLANTS[plant], all_placements(PLANTS[plant]))
+    return rig_of(PLANTS[plant], placements_of(PLANTS[plant]))
 
 
 @dataclass(frozen=True)
@@ -258,38 +281,12 @@ def test_the_compiled_engine_gives_the_same_slopes(plant: str) -> None:
     assert torch.allclose(engine.linearise(r.space.nominal())[1], expected, rtol=1e-9, atol=1e-9)
 
 
-def factor(unit: str, metre: float, second: float) -> float:
-    """How a number in this unit changes when metres and seconds are rescaled; volts stay."""
-    scale, result = {"m": metre, "s": second}, 1.0
-    for sign, part in enumerate(unit.replace("/", "*/").split("*")):
-        base, _, power = part.removeprefix("/").partition("^")
-        result *= scale.get(base, 1.0) ** (float(power or 1) * (-1 if part.startswith("/") else 1))
-        assert sign < 4
-    return result
-
-
-def rescaled(plant: PlantDescription, m: float, s: float) -> PlantDescription:
-    """The same plant in other metres and seconds."""
-    f = lambda unit: factor(unit, m, s)  # noqa: E731
-    return replace(
-        plant,
-        tanks=tuple(
-            replace(t, area=t.area * m**2, height=t.height * m, start_level=(t.start_level or 0.0) * m)
-            for t in plant.tanks
-        ),
-        pipes=tuple(replace(p, area=p.area * m**2, elevation=p.elevation * m) for p in plant.pipes),
-        pumps=tuple(replace(p, max_flow=p.max_flow * f("m^3/s"), gain=p.gain * f(p.gain_unit)) for p in plant.pumps),
-        sensors=tuple(replace(y, gain=y.gain * f(y.unit) / m, offset=y.offset * f(y.unit)) for y in plant.sensors),
-        gravity=plant.gravity * f("m/s^2"),
-    )
-
-
 @cache
 def rescaled_readings(plant: str, m: float, s: float) -> dict[str, Tensor]:
     """Readings of every effect's last start on the rescaled plant, brought back to the first units."""
     r = rig(plant)
     other = rescaled(r.plant, m, s)
-    network = build_network(other, all_placements(other))
+    network = build_network(other, placements_of(other))
     space = ParameterSpace(network.constants[name] for name in r.space.names)
     recording = random_inputs(r.plant)
     channels = torch.tensor([factor(u, m, s) for u in other.channel_units().values()], dtype=torch.float64)

@@ -13,7 +13,7 @@ from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.preprocess.acquisition import examined
 from fdi_torch.parameters import display_unit
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.check import ChannelSummary, RecordingCheck, check_recording
@@ -66,8 +66,10 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
 
 
 def _show_plant(plant: PlantDescription, screen: Screen) -> None:
-    counts = ((plant.tanks, "tank"), (plant.pipes, "pipe"), (plant.pumps, "pump"), (plant.sensors, "sensor"))
-    parts = ", ".join(_count(len(components), what) for components, what in counts)
+    flows = [(getattr(plant, kind.part()), kind.__name__.lower()) for kind in FLOW_KINDS]
+    always = (plant.tanks, plant.pipes, plant.pumps, plant.sensors)
+    counts = [(plant.tanks, "tank"), *flows, (plant.sensors, "sensor")]
+    parts = ", ".join(_count(len(c), what) for c, what in counts if c or any(c is a for a in always))
     screen.say(f"plant {plant.name}: {parts}, {_count(len(plant.tolerances), 'constant')} with a tolerance")
 
 

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sized
+from collections.abc import Callable, Sized
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, ValidationError
 
+from fdi_torch.config.flow_sections import flow_sections
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
 from fdi_torch.config.problems import ConfigError, explain
-from fdi_torch.config.strict import Acceleration, Amount, Area, Flow, Length, Share, Strict, quantity
+from fdi_torch.config.strict import Acceleration, Amount, Area, Length, Strict, quantity
 from fdi_torch.config.yaml_files import find_plant, read_yaml
 from fdi_torch.names import unknown
-from fdi_torch.plant.description import (
-    LARGEST_DISCHARGE_COEFFICIENT,
-    OUTSIDE,
-    FaultPriority,
-    Pipe,
-    PlacedEffect,
-    Pump,
-    Sensor,
-    Tank,
-)
+from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, FaultPriority, PlacedEffect, Sensor, Tank
+from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.untrusted_input import MOST_COMPONENTS
 
 
@@ -39,24 +32,6 @@ class TankConfig(Strict):
     )
     overflow_to: str = Field(OUTSIDE, description="the tank that receives the overflow")
     leak_reference: str | None = Field(None, description="the pipe whose capacity is a leak of size 1")
-
-
-class PipeConfig(Strict):
-    source: str = Field(description="the tank it starts from")
-    target: str = Field(OUTSIDE, description="the tank it leads to, or outside")
-    area: Area = Field(description="of the orifice, m^2")
-    discharge_coefficient: Share = Field(le=LARGEST_DISCHARGE_COEFFICIENT, description="of the orifice, without unit")
-    elevation: Length = Field(0.0, description="of the orifice above both floors, m")
-    free_fall: bool = Field(False, description="whether it pours into its target from above")
-    valve: str | None = Field(None, description="the input channel with its measured opening, 0 to 1")
-    unrecorded: Share | None = Field(None, ge=0, le=1, description="its opening in recordings that lack the channel")
-
-
-class PumpConfig(Strict):
-    target: str = Field(description="the tank it fills")
-    max_flow: Flow = Field(description="greatest flow, m^3/s")
-    gain: Amount = Field(1.0, description="flow for a command of 1: none, l/min/V, l/min/mA, l/min/Hz; l/min of a duty")
-    command: str | None = Field(None, description="its input channel, if it differs from its name")
 
 
 class SensorConfig(Strict):
@@ -79,12 +54,13 @@ class MatterConfig(Strict):
     urgency: str = Field("", description="a word that is added to its events, such as high")
 
 
-class PlantConfig(Strict):
+class _NamedPlant(Strict):
     name: str = ""
     gravity: Acceleration = Field(9.81, description="m/s^2")
     tanks: dict[str, TankConfig]
-    pipes: dict[str, PipeConfig] = Field(default_factory=dict)
-    pumps: dict[str, PumpConfig] = Field(default_factory=dict)
+
+
+class PlantConfig(flow_sections(_NamedPlant)):  # type: ignore[misc]
     sensors: dict[str, SensorConfig] = Field(default_factory=dict)
     tolerances: dict[str, Amount] = Field(
         default_factory=dict,
@@ -120,17 +96,21 @@ def build_plant(data: dict[str, Any], source: str) -> Plant:
 
 
 def _plant(config: PlantConfig) -> Plant:
-    kinds: tuple[Sized, ...] = (config.tanks, config.pipes, config.pumps, config.sensors, config.effects)
+    flows = {kind: getattr(config, kind.part()) for kind in FLOW_KINDS}
+    kinds: tuple[Sized, ...] = (config.tanks, *flows.values(), config.sensors, config.effects)
     parts = sum(len(kind) for kind in kinds)
     if parts > MOST_COMPONENTS:
         raise ValueError(f"expected at most {MOST_COMPONENTS} components and effects, got {parts}; split the plant")
+    components: dict[str, Any] = {
+        kind.part(): [_flow_component(kind, name, keys) for name, keys in given.items()]
+        for kind, given in flows.items()
+    }
     plant = Plant(
         tanks=[Tank(name, **dict(tank)) for name, tank in config.tanks.items()],
-        pipes=[Pipe(name, **dict(pipe)) for name, pipe in config.pipes.items()],
-        pumps=[Pump(name, **dict(pump)) for name, pump in config.pumps.items()],
         sensors=[_sensor(name, sensor) for name, sensor in config.sensors.items()],
         gravity=config.gravity,
         name=config.name,
+        **components,
     )
     placed = [PlacedEffect(e.effect, e.location, e.parameters) for e in config.effects]  # type: ignore[arg-type]
     plant = replace(plant, effects=tuple(effect_in_si(i, e, plant, quantity) for i, e in enumerate(placed)))
@@ -154,6 +134,10 @@ def _matter(name: str, matter: MatterConfig, plant: Plant) -> FaultPriority:
     if smallest < 0.0:
         raise ValueError(f"matters.{name}.smallest: expected no negative size, got {matter.smallest}")
     return FaultPriority(f"{location}.{effect}.{size.name}", smallest, matter.urgency)
+
+
+def _flow_component(kind: Callable[..., FlowComponent], name: str, keys: Strict) -> FlowComponent:
+    return kind(name, **dict(keys))
 
 
 def _sensor(name: str, config: SensorConfig) -> Sensor:

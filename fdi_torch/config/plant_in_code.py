@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
 from typing import Any
@@ -14,8 +14,18 @@ from fdi_torch.config.strict import quantity
 from fdi_torch.effects import build_network, effect, placements_for
 from fdi_torch.names import matching, unknown
 from fdi_torch.parameters import Parameter, ParameterSpace
-from fdi_torch.plant.description import FaultPriority, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.plant.effect import Effect, fits, place_kind
+from fdi_torch.plant.description import (
+    FLOW_KINDS,
+    FaultPriority,
+    Pipe,
+    PlacedEffect,
+    PlantDescription,
+    Pump,
+    Sensor,
+    Tank,
+)
+from fdi_torch.plant.effect import Effect, fits, place_kind, place_kinds_of
+from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.simulate.ode import Inputs, PlantOde
 
 Read = Callable[[Any, str], float]
@@ -29,7 +39,8 @@ class Plant(PlantDescription):
     Quantities are text with a unit, as in a plant file ('200 cm^2', '3 %'), or numbers in SI. tolerances: relative
     standard deviations of constants, by patterns such as '*.discharge_coefficient' (* is any name); of an offset, a
     start level or a parameter of an effect in its unit. varying: patterns of the constants that differ between
-    recordings. effects: the plant's known effects. matters: least reported size and urgency of faults for a monitor,
+    recordings. effects: the plant's known effects. further: components of the other kinds of `FLOW_KINDS`, such as
+    weirs=[Weir(...)] and transfers=[Transfer(...)]. matters: least reported size and urgency of faults for a monitor,
     SI.
 
     `dump_plant` writes it as a plant file, which `load_plant` reads as an equal plant. Raises ValueError naming
@@ -58,13 +69,15 @@ class Plant(PlantDescription):
         gravity: float | str = 9.81,
         matters: Iterable[FaultPriority] = (),
         name: str = "plant",
+        **further: Iterable[FlowComponent],
     ) -> None:
         parts = (tuple(tanks), tuple(pipes), tuple(pumps), tuple(sensors))
-        without_effects = PlantDescription(name, *parts, gravity=si_value("gravity", gravity, "m/s^2"))
+        flows = _further_flows(further)
+        without_effects = PlantDescription(name, *parts, gravity=si_value("gravity", gravity, "m/s^2"), **flows)
         if not without_effects.sensors:
             raise ValueError("sensors: expected at least one, got none; add one such as h1: {tank: T1}")
         placed = tuple(effect_in_si(i, each, without_effects) for i, each in enumerate(effects))
-        with_effects = PlantDescription(name, *parts, placed, gravity=without_effects.gravity)
+        with_effects = PlantDescription(name, *parts, placed, gravity=without_effects.gravity, **flows)
         absolute_tolerances = tolerances_in_si(tolerances or {}, with_effects)
         super().__init__(
             name,
@@ -74,6 +87,7 @@ class Plant(PlantDescription):
             _varying(varying, absolute_tolerances),
             tuple(matters),
             without_effects.gravity,
+            **flows,
         )
 
     def __eq__(self, other: object) -> bool:
@@ -152,7 +166,7 @@ def effect_at(name: str, location: str, plant: PlantDescription) -> Effect:
     if not fits(requested, plant, location):
         possible = ", ".join(place for place in plant.locations() if fits(requested, plant, place)) or "none there is"
         raise ValueError(
-            f"{location}.{name}: expected a place of kind {' or '.join(requested.places)} ({possible}), "
+            f"{location}.{name}: expected a place of kind {' or '.join(place_kinds_of(requested))} ({possible}), "
             f"got {place_kind(plant, location)} {location}"
         )
     return requested
@@ -205,10 +219,18 @@ def effect_units(plant: PlantDescription) -> dict[str, str]:
 
 
 def _constants(plant: PlantDescription) -> list[str]:
-    kinds: Sequence[tuple[Sequence[Any], tuple[str, ...]]] = (
-        (plant.tanks, ("area", "height", "start_level")),
-        (plant.pipes, ("area", "discharge_coefficient")),
-        (plant.pumps, ("gain", "max_flow")),
-        (plant.sensors, ("gain", "offset")),
-    )
-    return [f"{each.name}.{field}" for components, names in kinds for each in components for field in names]
+    """Names of the constants that can have a tolerance."""
+    tanks = [f"{tank.name}.{name}" for tank in plant.tanks for name in ("area", "height", "start_level")]
+    flows = [
+        f"{c.name}.{name}" for c in plant.flow_components() for name, _, role in c.constants() if role == "estimated"
+    ]
+    return [*tanks, *flows, *(f"{sensor.name}.{name}" for sensor in plant.sensors for name in ("gain", "offset"))]
+
+
+def _further_flows(given: Mapping[str, Iterable[FlowComponent]]) -> dict[str, Any]:
+    """The components of further kinds by part. Raises TypeError for an unknown part."""
+    parts = [kind.part() for kind in FLOW_KINDS]
+    for part in given:
+        if part not in parts:
+            raise TypeError(unknown("an argument of Plant", part, parts))
+    return {part: tuple(components) for part, components in given.items()}

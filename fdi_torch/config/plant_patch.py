@@ -13,13 +13,13 @@ from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.plant_writer import dump_plant, plant_mapping
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.yaml_files import compose_yaml, parse_yaml
-from fdi_torch.plant.description import PlacedEffect, PlantDescription
+from fdi_torch.plant.description import FLOW_KINDS, PlacedEffect, PlantDescription
 from fdi_torch.units import UnitError, in_unit, number_and_unit
 
 DIGITS = 7
 """Significant digits of written numbers; the rounding error is far below any standard error."""
 _SAME = 1e-6  # relative tolerance of numbers written with `DIGITS` digits
-_PARTS = ("tanks", "pipes", "pumps", "sensors")
+_PARTS = ("tanks", *(kind.part() for kind in FLOW_KINDS), "sensors")
 Path = tuple[str | int, ...]
 
 

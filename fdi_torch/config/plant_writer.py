@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
+from fdi_torch.config.flow_sections import written_fields
 from fdi_torch.config.plant_in_code import absolute_units, effect_at, effect_parameters
 from fdi_torch.config.yaml_files import write_yaml
 from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import (
+    FLOW_KINDS,
     OUTSIDE,
     READING_UNITS,
     FaultPriority,
-    Pipe,
     PlacedEffect,
     PlantDescription,
-    Pump,
     Sensor,
     Tank,
 )
+from fdi_torch.plant.flow_component import FlowComponent
 
 _UNITS = {
     "m": ("cm", "mm", "m", "ft", "in"),
@@ -44,8 +45,8 @@ def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
     """The description as the mapping that `build_plant` reads."""
     data: dict[str, Any] = {"name": plant.name, "gravity": _text(plant.gravity, "m/s^2")}
     data["tanks"] = {t.name: _tank_mapping(t) for t in plant.tanks}
-    data["pipes"] = {p.name: _pipe_mapping(p) for p in plant.pipes}
-    data["pumps"] = {p.name: _pump_mapping(p) for p in plant.pumps}
+    for kind in FLOW_KINDS:
+        data[kind.part()] = {c.name: _flow_mapping(c) for c in getattr(plant, kind.part())}
     data["sensors"] = {s.name: _sensor_mapping(s) for s in plant.sensors}
     units = absolute_units(plant)
     data["tolerances"] = {name: _text(v, units.get(name, "1")) for name, v in plant.tolerances.items()}
@@ -74,27 +75,17 @@ def _tank_mapping(tank: Tank) -> dict[str, Any]:
     )
 
 
-def _pipe_mapping(pipe: Pipe) -> dict[str, Any]:
-    return _given(
-        source=pipe.source,
-        target=pipe.target,
-        area=_text(pipe.area, "m^2"),
-        discharge_coefficient=pipe.discharge_coefficient,
-        elevation=_text(pipe.elevation, "m") if pipe.elevation else None,
-        free_fall=pipe.free_fall or None,
-        valve=pipe.valve,
-        unrecorded=pipe.unrecorded,
-    )
-
-
-def _pump_mapping(pump: Pump) -> dict[str, Any]:
-    plain = pump.gain_unit == "1" and pump.gain == 1.0
-    return _given(
-        target=pump.target,
-        max_flow=_text(pump.max_flow, "m^3/s"),
-        gain=None if plain else _text(pump.gain, pump.gain_unit),
-        command=pump.command,
-    )
+def _flow_mapping(component: FlowComponent) -> dict[str, Any]:
+    """The keys of a flow component whose values differ from their defaults, `target` always."""
+    mapping: dict[str, Any] = {}
+    for f in written_fields(type(component)):
+        value, unit = getattr(component, f.name), f.metadata.get("unit", "")
+        if "unit_field" in f.metadata:
+            unit = getattr(component, f.metadata["unit_field"])
+        is_default = value == f.default and unit in ("", "1", f.metadata.get("unit"))
+        if not is_default:
+            mapping[f.name] = _text(value, unit) if unit else value
+    return mapping
 
 
 def _sensor_mapping(sensor: Sensor) -> dict[str, Any]:

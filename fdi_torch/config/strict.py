@@ -52,20 +52,21 @@ def _each_in_seconds(value: Any) -> Any:
     return [quantity(v, "s") for v in value] if isinstance(value, list) else value
 
 
-def _of(unit: str) -> tuple[BeforeValidator, Any]:
+def quantity_of(unit: str) -> tuple[BeforeValidator, Any]:
+    """The validators of a quantity in that unit, for `Annotated`."""
     return BeforeValidator(lambda value: quantity(value, unit)), Field(json_schema_extra={"unit": unit})
 
 
-Share = Annotated[float, *_of("1")]
-Length = Annotated[float, *_of("m")]
-Area = Annotated[float, *_of("m^2")]
-Flow = Annotated[float, *_of("m^3/s")]
-Seconds = Annotated[float, *_of("s")]
+Share = Annotated[float, *quantity_of("1")]
+Length = Annotated[float, *quantity_of("m")]
+Area = Annotated[float, *quantity_of("m^2")]
+Flow = Annotated[float, *quantity_of("m^3/s")]
+Seconds = Annotated[float, *quantity_of("s")]
 Decibel = Annotated[float, Field(ge=-300, le=300)]
 _ON_A_BENCH = "the default is for a bench-top rig"
 BenchSeconds = Annotated[Seconds, _ON_A_BENCH]
 BenchSteps = Annotated[list[float], BeforeValidator(_each_in_seconds), _ON_A_BENCH]
-Acceleration = Annotated[float, *_of("m/s^2")]
+Acceleration = Annotated[float, *quantity_of("m/s^2")]
 
 Amount = float | str
 """A quantity whose unit depends on its owner; converted to SI once that is known."""

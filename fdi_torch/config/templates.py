@@ -130,8 +130,8 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str) -> 
 
 
 def _inputs(plant: PlantDescription) -> str:
-    """For each pump a step up and a step down about half of its range; valves are open."""
-    full_commands = {pump.channel: (pump.max_flow / pump.gain, pump.command_unit) for pump in plant.pumps}
+    """For each pump and transfer a step up and a step down about half of its range; valves are open."""
+    full_commands = {c.channel: (c.full_command, c.command_unit) for c in plant.metered_flows()}
     lines = []
     for channel in plant.channels():
         if channel not in full_commands:

@@ -138,8 +138,8 @@ def without_startup_effects(plant: PlantDescription, channels: Collection[str]) 
 
     The tolerances and varying constants of those effects are removed too.
     """
-    running = {p.name for p in plant.pumps if p.channel in channels}
-    running |= {p.name for p in plant.pipes if p.valve in channels}
+    given = [(component.name, component.input_channel) for component in plant.flow_components()]
+    running = {name for name, channel in given if channel is not None and channel[0] in channels}
     ended = {
         f"{e.location}.{e.effect}" for e in plant.effects if e.location in running and effect(e.effect).startup_only
     }

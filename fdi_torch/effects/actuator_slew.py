@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription, Pump
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 
@@ -30,8 +31,8 @@ class ActuatorSlew(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         component = plant.component(place)
-        unit = component.command_unit if isinstance(component, Pump) else "1"
-        full = component.max_flow / component.gain if isinstance(component, Pump) else 1.0
+        unit = component.command_unit if isinstance(component, MeteredFlow) else "1"
+        full = component.max_flow / component.gain if isinstance(component, MeteredFlow) else 1.0
         slowest = 120.0 * time_scale(plant) / full
         return (Parameter("slowness", SLOWNESS_UNITS[unit], 0.0, 0.0, slowest, meaning="time to move by one unit"),)
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from fdi_torch.effects import EFFECTS, effect
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.plant.effect import Effect, fits
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank, Transfer, Weir
+from fdi_torch.plant.effect import Effect, fits, place_kinds_of
 from fdi_torch.tables import Shown, Table
 
 # A rig with every kind of place, the default if no plant is given.
@@ -19,6 +19,8 @@ _ANY = PlantDescription(
     (Pipe("P12", "T1", "T2", 1e-4, 0.6, valve="v12"), Pipe("OUT", "T2", OUTSIDE, 1e-4, 0.6, valve="vOUT")),
     (Pump("Q1", "T1", 1e-4),),
     (Sensor("h1", "T1"), Sensor("h2", "T2")),
+    weirs=(Weir.example("W12", "T1", "T2"),),
+    transfers=(Transfer.example("X21", "T2", "T1"),),
 )
 _ONSETS = ("onset", "begin")
 
@@ -77,7 +79,9 @@ class Catalogue(Shown):
         entry = next((e for e in self.entries if e.name == name), None)
         if entry is None:
             requested = effect(name)
-            raise ValueError(f"{name}: expected a plant with a {' or a '.join(requested.places)}, got {self.plant}")
+            raise ValueError(
+                f"{name}: expected a plant with a {' or a '.join(place_kinds_of(requested))}, got {self.plant}"
+            )
         return entry
 
     def __len__(self) -> int:
@@ -116,7 +120,7 @@ def _entry(each: Effect, plant: PlantDescription) -> Entry | None:
         (sys.modules[type(each).__module__].__doc__ or "").split("\n\n")[0].replace("\n", " ").rstrip("."),
         inspect.cleandoc(type(each).__doc__ or ""),
         each.stage.value,
-        each.places,
+        place_kinds_of(each),
         at,
         each.parameters(at[0], plant),
         each.mistaken_for,

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription, Pump
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.plant.signals import Clock
 
@@ -26,13 +27,13 @@ class PumpDeadZone(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         pump = plant.component(place)
-        assert isinstance(pump, Pump)
+        assert isinstance(pump, MeteredFlow)
         full = pump.max_flow / pump.gain
         return (Parameter("dead_zone", pump.command_unit, 0.0, 0.0, full, meaning="command at which the pump starts"),)
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         pump = plant.component(place)
-        assert isinstance(pump, Pump)
+        assert isinstance(pump, MeteredFlow)
         full = pump.max_flow / pump.gain
         return [{"dead_zone": share * full} for share in (0.03, 0.1, 0.25, 0.5, 0.9)]
 

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription, Pump
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.metered_flow import MeteredFlow
 
 
 class PumpOffset(Effect):
@@ -24,7 +25,7 @@ class PumpOffset(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         pump = plant.component(place)
-        assert isinstance(pump, Pump)
+        assert isinstance(pump, MeteredFlow)
         far = 0.5 * pump.max_flow
         return (Parameter("offset", "m^3/s", 0.0, -far, far, meaning="additional flow"),)
 

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription, Pump
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.plant.operating_range import OperatingRange, interior_points
 
 DRY = 1e-12  # m^3/s, or relative: counts as no flow
@@ -29,7 +30,7 @@ class PumpSaturation(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         pump = plant.component(place)
-        assert isinstance(pump, Pump)
+        assert isinstance(pump, MeteredFlow)
         full = pump.max_flow
         return (
             Parameter("limit", "m^3/s", full, 0.0, full, meaning="greatest flow of the pump"),
@@ -38,7 +39,7 @@ class PumpSaturation(Effect):
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         pump = plant.component(place)
-        assert isinstance(pump, Pump)
+        assert isinstance(pump, MeteredFlow)
         commanded = tuple(min(max(pump.gain * u, 0.0), pump.max_flow) for u in operating_range.commands[pump.channel])
         return [{"limit": limit, "knee": 0.1} for limit in interior_points((commanded[0], commanded[1]), 7)]
 

@@ -161,9 +161,7 @@ def _inflows(
     inputs = [channels[channel] for _, channel in network.actuators()]
     commands, _ = network.commands(inputs, network.steady_command_memory(inputs, clock, values), clock, values)
     point = network.operating_point(levels.unbind(), commands, clock, values)
-    return network.less_overflow(
-        point, network.net_inflows(point, network.pump_flows(point), network.pipe_flows(point))
-    )
+    return network.less_overflow(point, network.net_inflows(point, network.flows(point)))
 
 
 def sample_noise(values: Tensor, weight: Tensor) -> Tensor:

@@ -152,10 +152,9 @@ def _mean_level(fitting: Fitting, tank: str, data: Readings) -> Tensor:
 
 
 def _is_empty(fitting: Fitting, place: str, levels: Tensor) -> bool:
-    """Whether all tanks whose levels a fault at `place` affects are empty (for a pipe: both ends)."""
-    pumps = {p.name: {p.target} for p in fitting.plant.pumps}
-    pipes = {p.name: {p.source, p.target} for p in fitting.plant.pipes}
-    tanks = (pumps | pipes).get(place, {place})
+    """Whether all tanks whose levels a fault at `place` affects are empty (for a flow component: both ends)."""
+    flows = {c.name: {c.source, c.target} for c in fitting.plant.flow_components()}
+    tanks = flows.get(place, {place})
     has_water = [
         float(level) >= EMPTY_LEVEL * tank.height
         for tank, level in zip(fitting.plant.tanks, levels, strict=True)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fdi_torch.effects import effect
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
-from fdi_torch.plant.description import PlacedEffect, PlantDescription
+from fdi_torch.plant.description import FLOW_KINDS, PlacedEffect, PlantDescription
 
 FORMAT = "fdi_torch.gap/2"
 UNKNOWN = "unknown"  # name of a cause that is not in the library
@@ -184,13 +184,9 @@ def with_constants(plant: PlantDescription, values: Mapping[str, float]) -> Plan
     def updated(parts: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(replace(part, **changed.get(part.name, {})) for part in parts)
 
-    return replace(
-        plant,
-        tanks=updated(plant.tanks),
-        pipes=updated(plant.pipes),
-        pumps=updated(plant.pumps),
-        sensors=updated(plant.sensors),
-    )
+    parts = ("tanks", *(kind.part() for kind in FLOW_KINDS), "sensors")
+    changes: dict[str, Any] = {part: updated(getattr(plant, part)) for part in parts}
+    return replace(plant, **changes)
 
 
 def finite(value: Any) -> Any:

@@ -18,8 +18,9 @@ from torch import Tensor
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
 from fdi_torch.gap.free_form import UNIT, free_form
 from fdi_torch.gap.free_form_coefficients import coefficients_of, fitted_coefficients
-from fdi_torch.plant.description import Pipe, Pump, Sensor, Tank
+from fdi_torch.plant.description import OUTSIDE, Sensor, Tank
 from fdi_torch.plant.effect import Placement, Stage
+from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.plant.operating_range import OperatingRange
 
 BINS = 24  # points of a curve
@@ -150,10 +151,8 @@ def _names(fitter: Fitter) -> set[str]:
 
 def _tank_and_sign(component: Any, place: str) -> tuple[str, float]:
     """The tank whose balance contains the component's flow, and the sign of the flow there."""
-    if isinstance(component, Pump):
-        return component.target, 1.0
-    if isinstance(component, Pipe):
-        return component.source, -1.0
+    if isinstance(component, FlowComponent):
+        return component.near_tank, 1.0 if component.source == OUTSIDE else -1.0
     if isinstance(component, Tank):
         return component.name, 1.0
     return place.split("-")[0], -1.0
@@ -178,14 +177,14 @@ def _variables(fitter: Fitter, fit: Fit, place: str) -> list[tuple[str, str, Ten
         index = [s.name for s in plant.sensors].index(place)
         read = (f"{component.name} read", component.unit, linearised.readings[0, :, index])
         return [read, ("time", "s", experiment.sample_times)]
-    if isinstance(component, Pump):
-        channel = plant.channels().index(component.channel)
-        command = (f"{component.channel} commanded", component.command_unit, experiment.inputs[:, channel])
-        return [command, (f"level of {component.target}", "m", tanks[component.target]), clock]
-    if isinstance(component, Pipe):
-        far = 0.0 if component.is_outlet else tanks[component.target]
-        name = f"level of {component.source}" if component.is_outlet else f"{component.source} − {component.target}"
-        return [(name, "m", tanks[component.source] - far), clock]
+    if isinstance(component, FlowComponent) and component.commanded and component.input_channel:
+        name, unit = component.input_channel
+        command = (f"{name} commanded", unit, experiment.inputs[:, plant.channels().index(name)])
+        return [command, (f"level of {component.near_tank}", "m", tanks[component.near_tank]), clock]
+    if isinstance(component, FlowComponent):
+        near, *far = component.depends_on
+        name = " − ".join(component.depends_on) if far else f"level of {near}"
+        return [(name, "m", tanks[near] - (tanks[far[0]] if far else 0.0)), clock]
     if isinstance(component, Tank):
         return [(f"level of {component.name}", "m", tanks[component.name]), clock]
     first, second = place.split("-")

@@ -72,8 +72,8 @@ def _limits(fitter: Fitter) -> list[tuple[float, float]]:
     """Lowest and highest value of each input, in its SI unit."""
     plant = fitter.data.plant
     limits = {channel: (0.2, 1.0) for channel in plant.channels()}
-    for pump in plant.pumps:
-        full = HIGH * pump.max_flow / pump.gain
+    for pump in plant.metered_flows():
+        full = HIGH * pump.full_command
         limits[pump.channel] = (0.1 * full, full)
     return [limits[channel] for channel in plant.channels()]
 

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.plant.effect import Placement, Stage
+from fdi_torch.plant.flow_component import FlowOrder
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.operating_point import OperatingPoint
 from fdi_torch.simulate.actuation import Actuation
@@ -29,8 +29,8 @@ class Forcing:
     union: the plant with every effect that may be tried. present: prefixes of the effects that act. values: the plant's
     constants, bound to one lane.
 
-    Attributes at the middle of each step: levels (1, K) m of each tank; commands of each actuator; pumps, pipes: flow
-    through each, m^3/s; still: level rates without the effect that is tried, m/s.
+    Attributes at the middle of each step: levels (1, K) m of each tank; commands of each actuator; flows (m^3/s) and
+    heads (m): of each flow component by its name; still: level rates without the effect that is tried, m/s.
     """
 
     def __init__(
@@ -49,10 +49,12 @@ class Forcing:
         self._clock = actuation.clock
         self.commands = actuation.commands(values, 1)
         now = self._now(network, values, self.commands)
-        self.pumps = network.pump_flows(now)
-        self.pipes = network.pipe_flows(now)
-        gathered = network.net_inflows(now, self.pumps, self.pipes)
+        first = network.flows(now)
+        gathered = network.net_inflows(now, first)
         self._gathered = [net.expand(self.levels[0].shape) for net in gathered]
+        self.flows = first | network.last_flows(now, self._gathered)[0]
+        flows_at = {c.name: now.at_flow(c) for c in union.description.flow_components()}
+        self.heads = {name: local.head for name, local in flows_at.items()}
         self._net = network.less_overflow(now, self._gathered)
         self.still, self._by_inflow = self._inflow_slopes(network)
         self._readings = OutputMap(network, experiment, []).read(self._path, values)[0]
@@ -60,11 +62,10 @@ class Forcing:
     def rates(self, placement: Placement, starts: Starts) -> Tensor:
         """Change of the level rates (tanks, M, K) m/s by an effect. starts: its parameters by short name, (M, 1)."""
         network, values, lanes = self._with(placement, starts)
-        shape = (lanes, self.levels[0].shape[-1])
         if placement.effect.stage is Stage.STORAGE:
             rates = network.level_rates(self._now(network, values, self.commands), self._net)
-            return torch.stack([(a - b).expand(shape) for a, b in zip(rates, self.still, strict=True)])
-        return self.by_inflows(self._inflows(network, placement, values, lanes), lanes)
+            return self._changes(rates, lanes)
+        return self._rates_by_flow(network, placement, values, lanes)
 
     def by_inflows(self, inflows: Sequence[Tensor | None], lanes: int) -> Tensor:
         """Change of the level rates by additional flows into each tank, (M, K) or (1, K) m^3/s; None for no flow."""
@@ -100,26 +101,28 @@ class Forcing:
     def _now(self, network: TankNetwork, values: PlaceValues, commands: Sequence[Tensor]) -> OperatingPoint:
         return network.operating_point(self.levels, commands, self._clock, values)
 
-    def _inflows(self, network: TankNetwork, placement: Placement, values: PlaceValues, lanes: int) -> Sequence[Tensor]:
-        """Additional flow into each tank, (M, K) or (1, K) m^3/s."""
+    def _rates_by_flow(self, network: TankNetwork, placement: Placement, values: PlaceValues, lanes: int) -> Tensor:
+        """Change of the level rates (tanks, M, K) m/s by an effect that changes a flow."""
         plant, place, commands = network.description, placement.location, self.commands
         if placement.effect.stage is Stage.BALANCE:
             net = list(self._gathered)
             network.transfer_by_effect(net, placement, self._now(network, values, commands))
-            return [a - b for a, b in zip(net, self._gathered, strict=True)]
+            return self.by_inflows([a - b for a, b in zip(net, self._gathered, strict=True)], lanes)
         if placement.effect.stage is Stage.COMMAND:
             commands = Actuation(network, self.experiment, []).commands(values, lanes)
         now = self._now(network, values, commands)
+        component = next(c for c in plant.flow_components() if c.name == place)
+        if component.order > FlowOrder.BY_LEVELS:  # its own limits depend on the net inflow, as `still` does
+            rates = network.level_rates(now, network.less_overflow(now, self._gathered))
+            return self._changes(rates, lanes)
         inflows = [torch.zeros_like(net) for net in self._gathered]
-        for i, pump in enumerate(plant.pumps):
-            if pump.name == place:
-                flow = network.pump_flow(now, pump)
-                network.transfer(inflows, OUTSIDE, pump.target, flow - self.pumps[i])
-        for j, pipe in enumerate(plant.pipes):
-            if pipe.name == place:
-                flow = network.pipe_flow(now, pipe)
-                network.transfer(inflows, pipe.source, pipe.target, flow - self.pipes[j])
-        return inflows
+        network.transfer(inflows, component.source, component.target, network.flow(now, component) - self.flows[place])
+        return self.by_inflows(inflows, lanes)
+
+    def _changes(self, rates: Sequence[Tensor], lanes: int) -> Tensor:
+        """Differences of level rates from `still`, (tanks, M, K) m/s."""
+        shape = (lanes, self.levels[0].shape[-1])
+        return torch.stack([(a - b).expand(shape) for a, b in zip(rates, self.still, strict=True)])
 
     def _inflow_slopes(self, network: TankNetwork) -> tuple[list[Tensor], list[Row]]:
         """Level rates, and slope of each tank's rate with the flow into each tank, 1/m^2."""

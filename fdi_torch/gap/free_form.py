@@ -1,7 +1,7 @@
 """Free discrepancy of a component: piecewise linear functions of its local variables and of time, as effects.
 
-A pump has functions of its command and its tank's level, a pipe of its head, a tank of its level, a sensor of its
-reading. Coefficients are shares of a typical flow (or reading) with a normal prior.
+A pump or transfer has functions of its command and its tank's level, a pipe or weir of its head, a tank of its level, a
+sensor of its reading. Coefficients are shares of a typical flow (or reading) with a normal prior.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from torch import Tensor
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import flow_scale, reading_span
-from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor
+from fdi_torch.plant.description import FLOW_KINDS, PlantDescription, Sensor
 from fdi_torch.plant.effect import Effect, Local, Memory, Placement, Stage, Values, place_kind
+from fdi_torch.plant.flow_component import FlowComponent
+from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.plant.operating_range import OperatingRange, Range
 from fdi_torch.plant.scales import area_scale, length_scale, time_scale
 from fdi_torch.plant.signals import Clock
@@ -75,11 +77,11 @@ class _Free(Effect):
 
 
 class FreeFlow(_Free):
-    """A pump or pipe: scale f(head or command) + flow (g(level) + k(t))."""
+    """A flow component: scale f(head or command) + flow (g(level) + k(t))."""
 
     name = "free_flow"
     stage = Stage.FLOW
-    places: ClassVar[tuple[str, ...]] = ("pump", "pipe", "outlet")
+    places: ClassVar[tuple[str, ...]] = tuple(name for kind in FLOW_KINDS for name in kind.place_kinds)
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
         local_part = self.curve("command", local.command, p) + self.curve("head", local.head, p)
@@ -176,19 +178,15 @@ def _free_at(place: str, plant: PlantDescription, reach: OperatingRange, periods
     if isinstance(component, Sensor):
         readings = _grid(reach.readings[place], LOCAL_NODES, length if component.unit == "m" else 1.0)
         return [FreeReading({"reading": readings, "time": time}, 0.2 * reading_span(plant, component), periods)]
-    if isinstance(component, Pump):
+    if isinstance(component, MeteredFlow):
         flows = area_scale(plant) * length / time_scale(plant) if component.gain_unit == "1" else 1.0
         command = _grid(reach.commands[component.channel], LOCAL_NODES, flows)
-        nodes = {"command": command, "level": _grid(reach.levels[component.target], 5, length), "time": time}
+        nodes = {"command": command, "level": _grid(reach.levels[component.near_tank], 5, length), "time": time}
         return [FreeFlow(nodes, component.gain * max(abs(command[0]), abs(command[-1])), periods)]
-    assert isinstance(component, Pipe)
-    source_levels = reach.levels[component.source]
-    target_levels = reach.levels[component.target] if not component.is_outlet else (0.0, 0.0)
-    heads = (
-        source_levels
-        if component.is_outlet
-        else (source_levels[0] - target_levels[1], source_levels[1] - target_levels[0])
-    )
+    assert isinstance(component, FlowComponent)
+    (low, high), *far = (reach.levels[tank] for tank in component.depends_on)
+    far_low, far_high = far[0] if far else (component.datum, component.datum)
+    heads = (low - far_high, high - far_low)
     flow = 0.5 * flow_scale(plant, component.source)
     return [FreeFlow({"head": _root_grid(heads, HEAD_NODES, length), "time": time}, flow, periods)]
 

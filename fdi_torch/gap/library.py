@@ -8,7 +8,7 @@ from fdi_torch.effects import EFFECTS, effect
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
-from fdi_torch.plant.effect import Placement, fits
+from fdi_torch.plant.effect import Placement, fits, place_kinds_of
 
 # Effects searched by default. All others are searched if they are named.
 STANDARD = (
@@ -69,7 +69,7 @@ def library_of(
         )
         for place in places:
             if not fits(effect(name), plant, place):
-                kinds = " or ".join(effect(name).places)
+                kinds = " or ".join(place_kinds_of(effect(name)))
                 raise ValueError(f"library: {entry}: expected a place of kind {kinds}, got {place}")
             placements[f"{place}.{name}"] = Placement(effect(name), place)
     if not placements:
@@ -102,12 +102,9 @@ def possible_places(plant: PlantDescription) -> tuple[str, ...]:
 
 def tanks_of(place: str, plant: PlantDescription) -> tuple[str, ...]:
     """The tanks whose volumes the flows of a component change; none for a sensor."""
-    for pipe in plant.pipes:
-        if pipe.name == place:
-            return pipe.source, pipe.target
-    for pump in plant.pumps:
-        if pump.name == place:
-            return (pump.target,)
+    for component in plant.flow_components():
+        if component.name == place:
+            return tuple(dict.fromkeys((component.near_tank, component.target)))
     return tuple(t.name for t in plant.tanks if t.name in place.split("-"))
 
 

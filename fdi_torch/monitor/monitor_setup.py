@@ -23,7 +23,7 @@ from fdi_torch.monitor.observer_gain import Gain, hand_gain, start_beside_noise,
 from fdi_torch.monitor.samples import Samples, samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 
@@ -159,14 +159,16 @@ def calibration(
 
 
 def usual_faults(plant: PlantDescription) -> list[str]:
-    """A leak of each tank, plugging of each pipe, gain and offset of each pump, and bias, gain and freezing of each
-    sensor.
-    """
+    """A leak of each tank, the usual faults of each flow component, and bias, gain and freezing of each sensor."""
     leaks = [f"{tank.name}.leak.size" for tank in plant.tanks]
-    plugged = [f"{pipe.name}.plugging.size" for pipe in plant.pipes]
-    pumps = [f"{pump.name}.{fault}" for fault in ("pump_gain.factor", "pump_offset.offset") for pump in plant.pumps]
+    flows = [
+        f"{component.name}.{fault}"
+        for kind in FLOW_KINDS
+        for fault in kind.usual_faults
+        for component in getattr(plant, kind.part())
+    ]
     wrong = ("sensor_bias.bias", "sensor_gain.factor", "sensor_stuck.size")
-    return leaks + plugged + pumps + [f"{sensor.name}.{fault}" for fault in wrong for sensor in plant.sensors]
+    return leaks + flows + [f"{sensor.name}.{fault}" for fault in wrong for sensor in plant.sensors]
 
 
 def fault_free_part(recording: Recording, start: float, stop: float) -> Recording:

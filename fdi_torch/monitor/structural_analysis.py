@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.plant.effect import Placement, Stage
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement, Stage, place_kind
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,11 @@ def structure_of(plant: PlantDescription, placements: Iterable[Placement]) -> St
     """Structure of a plant: balances, derivatives, flow laws and sensors, with known inputs and readings."""
     equations: dict[str, frozenset[str]] = {}
     for tank in plant.tanks:
-        through = [f"q {p.name}" for p in plant.pipes if tank.name in (p.source, p.target)]
-        through += [f"q {p.name}" for p in plant.pumps if p.target == tank.name]
+        through = [f"q {c.name}" for c in plant.flow_components() if tank.name in (c.source, c.target)]
         equations[f"balance {tank.name}"] = frozenset([f"dh {tank.name}", *through])
         equations[f"derivative {tank.name}"] = frozenset([f"dh {tank.name}", f"h {tank.name}"])
-    for pipe in plant.pipes:
-        ends = [pipe.source] if pipe.is_outlet else [pipe.source, pipe.target]
-        equations[f"law {pipe.name}"] = frozenset([f"q {pipe.name}", *(f"h {e}" for e in ends if e != OUTSIDE)])
-    for pump in plant.pumps:
-        equations[f"law {pump.name}"] = frozenset([f"q {pump.name}"])
+    for c in plant.flow_components():
+        equations[f"law {c.name}"] = frozenset([f"q {c.name}", *(f"h {tank}" for tank in c.depends_on)])
     for sensor in plant.sensors:
         equations[f"sensor {sensor.name}"] = frozenset([f"h {sensor.tank}"])
     return Structure(equations, {p.prefix: frozenset(_violated(plant, p)) for p in placements})
@@ -57,8 +53,8 @@ def structure_of(plant: PlantDescription, placements: Iterable[Placement]) -> St
 def _violated(plant: PlantDescription, placement: Placement) -> list[str]:
     if placement.effect.stage is Stage.BALANCE and "-" in placement.location:
         return [f"balance {tank}" for tank in placement.location.split("-")]
-    kinds = {Tank: "balance", Pipe: "law", Pump: "law", Sensor: "sensor"}
-    return [f"{kinds[type(plant.component(placement.location))]} {placement.location}"]
+    equation = {"tank": "balance", "sensor": "sensor"}.get(place_kind(plant, placement.location), "law")
+    return [f"{equation} {placement.location}"]
 
 
 def overdetermined(equations: dict[str, frozenset[str]]) -> set[str]:

@@ -1,4 +1,4 @@
-"""Components of a rig: tanks, pipes, outlets, pumps and sensors, as plain data in SI.
+"""Tanks and sensors as plain data in SI, and the base of all components; `plant.kinds` holds the flow components.
 
 A quantity may be given as text with its unit, as in Tank("A", area="200 cm^2", height="60 cm"); a number is SI.
 """
@@ -19,9 +19,25 @@ READING_UNITS = {"1": "m", "Pa/m": "Pa", "V/m": "V", "A/m": "A", "1/m": "1"}
 """Unit of a sensor's gain -> SI unit of its reading."""
 
 
-def _quantity(unit: str, **arguments: Any) -> Any:
-    """A dataclass field that holds a quantity of that unit."""
-    return field(metadata={"unit": unit}, **arguments)
+def quantity_field(
+    unit: str, meaning: str = "", *, role: str = "", least: float | None = None, most: float | None = None, **given: Any
+) -> Any:
+    """A dataclass field that holds a quantity of that unit.
+
+    meaning: of its key in a plant file. role: 'estimated' for a positive constant that can be estimated and have a
+    relative tolerance, 'constant' for one whose value can only be varied. least, most: the values that a file may have.
+    given: further arguments of `dataclasses.field`.
+    """
+    metadata = {"unit": unit, "meaning": meaning, "role": role, "least": least, "most": most}
+    return field(metadata=metadata, **given)
+
+
+def word_field(meaning: str, **given: Any) -> Any:
+    """A dataclass field that holds a name or a flag. written_default: its default in plant files only."""
+    metadata = {"meaning": meaning}
+    if "written_default" in given:
+        metadata["written_default"] = given.pop("written_default")
+    return field(metadata=metadata, **given)
 
 
 class Component:
@@ -31,6 +47,11 @@ class Component:
     """
 
     name: str
+
+    @property
+    def place_kind(self) -> str:
+        """The kind of place that it is for effects, such as 'tank', 'pipe', 'outlet'."""
+        return type(self).__name__.lower()
 
     def __post_init__(self) -> None:
         for each in fields(self):  # type: ignore[arg-type]
@@ -63,9 +84,9 @@ class Tank(Component):
     """
 
     name: str
-    area: float = _quantity("m^2")
-    height: float = _quantity("m")
-    start_level: float | None = _quantity("m", default=None)
+    area: float = quantity_field("m^2")
+    height: float = quantity_field("m")
+    start_level: float | None = quantity_field("m", default=None)
     overflow_to: str = OUTSIDE
     leak_reference: str | None = None
 
@@ -73,59 +94,6 @@ class Tank(Component):
         if self.start_level == "equilibrium":  # the word for None in a plant file
             object.__setattr__(self, "start_level", None)
         super().__post_init__()
-
-
-@dataclass(frozen=True)
-class Pipe(Component):
-    """An orifice from one tank into another tank or to the outside: area m^2; elevation m above both floors.
-
-    free_fall: whether it pours into `target` from above, so that only the source's level drives it (always true of an
-    outlet to the outside). valve: the input channel with the measured opening (0..1) of its valve. unrecorded: the
-    opening in recordings without that channel; None requires the channel in every recording.
-    """
-
-    name: str
-    source: str
-    target: str
-    area: float = _quantity("m^2")
-    discharge_coefficient: float = _quantity("1")
-    elevation: float = _quantity("m", default=0.0)
-    free_fall: bool = False
-    valve: str | None = None
-    unrecorded: float | None = None
-
-    @property
-    def is_outlet(self) -> bool:
-        return self.target == OUTSIDE or self.free_fall
-
-
-@dataclass(frozen=True)
-class Pump(Component):
-    """A pump that delivers gain x command into `target`, limited to 0..max_flow (m^3/s).
-
-    command: the input channel, if its name differs from the pump's. gain: m^3/s per SI unit of the command (1 if the
-    command is a flow); a gain given as text ('2 l/min/V') sets gain_unit, one of `COMMAND_UNITS`.
-    """
-
-    name: str
-    target: str
-    max_flow: float = _quantity("m^3/s")
-    gain: float = 1.0
-    command: str | None = None
-    gain_unit: str = "1"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "gain_unit", self._convert("gain", [*COMMAND_UNITS]) or self.gain_unit)
-
-    @property
-    def channel(self) -> str:
-        return self.command or self.name
-
-    @property
-    def command_unit(self) -> str:
-        """SI unit of the command."""
-        return COMMAND_UNITS[self.gain_unit]
 
 
 @dataclass(frozen=True)
@@ -158,7 +126,6 @@ class Sensor(Component):
         return self.channel or self.name
 
 
-def describe(component: Any) -> str:
+def describe(component: Component) -> str:
     """'tank T1', 'outlet OUT2' ...: kind and name of a component."""
-    kind = "outlet" if isinstance(component, Pipe) and component.is_outlet else type(component).__name__.lower()
-    return f"{kind} {component.name}"
+    return f"{component.place_kind} {component.name}"

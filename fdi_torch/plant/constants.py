@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Sensor
+from fdi_torch.plant.flow_component import FlowComponent
 
 
 def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
@@ -26,13 +27,14 @@ def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
         yield Parameter(name, "m", start, low, high, std, "level at t = 0")
         capacity = nominal_capacity(plant, leak_pipe(plant, tank.name))
         yield Parameter(f"{tank.name}.leak_capacity", "m^2.5/s", capacity, meaning="flow of a leak of size 1 at 1 m")
-    for pipe in plant.pipes:
-        yield _positive(pipe.name, "area", "m^2", pipe.area, tolerances)
-        yield _positive(pipe.name, "discharge_coefficient", "1", pipe.discharge_coefficient, tolerances)
-        yield Parameter(f"{pipe.name}.elevation", "m", pipe.elevation, meaning="height of the pipe above the floor")
-    for pump in plant.pumps:
-        yield _positive(pump.name, "gain", pump.gain_unit, pump.gain, tolerances)
-        yield _positive(pump.name, "max_flow", "m^3/s", pump.max_flow, tolerances)
+    for component in plant.flow_components():
+        for name, unit, role in component.constants():
+            value = getattr(component, name)
+            if role == "estimated":
+                yield _positive(component.name, name, unit, value, tolerances)
+            else:
+                meaning = f"{name} of the {component.place_kind}"
+                yield Parameter(f"{component.name}.{name}", unit, value, meaning=meaning)
     for sensor in plant.sensors:
         gain_unit = "1" if sensor.unit == "m" else f"{sensor.unit}/m"
         name, scale = f"{sensor.name}.gain", abs(sensor.gain)
@@ -70,13 +72,13 @@ def leak_pipe(plant: PlantDescription, tank: str) -> Pipe:
 
 def nominal_capacity(plant: PlantDescription, pipe: Pipe) -> float:
     """Nominal C_d a sqrt(2 g) of a pipe: its flow at 1 m of head, m^2.5/s."""
-    return pipe.discharge_coefficient * pipe.area * math.sqrt(2.0 * plant.gravity)
+    return pipe.nominal_capacity(plant.gravity)
 
 
-def inverse_areas(plant: PlantDescription, pipe: Pipe) -> float:
-    """Sum of 1/A over the tanks at both ends, 1/m^2: d(head)/dt per unit of flow through the pipe."""
+def inverse_areas(plant: PlantDescription, component: FlowComponent) -> float:
+    """Sum of 1/A over the tanks at both ends, 1/m^2: d(head)/dt per unit of the component's flow."""
     areas = {tank.name: tank.area for tank in plant.tanks}
-    return sum(1.0 / areas[end] for end in (pipe.source, pipe.target) if end in areas)
+    return sum(1.0 / areas[end] for end in (component.source, component.target) if end in areas)
 
 
 def source_height(plant: PlantDescription, pipe: str) -> float:

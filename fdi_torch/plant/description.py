@@ -6,21 +6,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
-from fdi_torch.plant.components import (
-    COMMAND_UNITS,
-    OUTSIDE,
-    READING_UNITS,
-    Pipe,
-    Pump,
-    Sensor,
-    Tank,
-    describe,
-)
+from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Sensor, Tank, describe
+from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
+from fdi_torch.plant.kinds.pipe import Pipe
+from fdi_torch.plant.kinds.pump import Pump
+from fdi_torch.plant.kinds.transfer import Transfer
+from fdi_torch.plant.kinds.weir import Weir
+from fdi_torch.plant.metered_flow import MeteredFlow
 
 __all__ = [
     "COMMAND_UNITS",
+    "FLOW_KINDS",
     "OUTSIDE",
     "READING_UNITS",
     "FaultPriority",
@@ -30,13 +29,18 @@ __all__ = [
     "Pump",
     "Sensor",
     "Tank",
+    "Transfer",
+    "Weir",
     "describe",
 ]
 
-LARGEST_DISCHARGE_COEFFICIENT = 10.0
-"""Orifices have about 0.6 and wide pipes somewhat more; a larger number is probably in per cent."""
 SMALLEST, LARGEST = 1e-12, 1e9
 """Range of every plausible area, height and flow of a rig, SI; a number outside has a wrong unit or exponent."""
+
+
+def _flows(kind: type[FlowComponent]) -> Any:
+    """A field with all flow components of a kind."""
+    return field(default=(), metadata={"kind": kind})
 
 
 @dataclass(frozen=True)
@@ -73,27 +77,45 @@ class PlantDescription:
 
     name: str
     tanks: tuple[Tank, ...]
-    pipes: tuple[Pipe, ...] = ()
-    pumps: tuple[Pump, ...] = ()
+    pipes: tuple[Pipe, ...] = _flows(Pipe)
+    pumps: tuple[Pump, ...] = _flows(Pump)
     sensors: tuple[Sensor, ...] = ()
     effects: tuple[PlacedEffect, ...] = ()
     tolerances: dict[str, float] = field(default_factory=dict)
     varying: tuple[str, ...] = ()
     matters: tuple[FaultPriority, ...] = ()
     gravity: float = 9.81
+    weirs: tuple[Weir, ...] = _flows(Weir)
+    transfers: tuple[Transfer, ...] = _flows(Transfer)
 
     def __post_init__(self) -> None:
         _check_names(self)
         _check_references(self)
         _check_numbers(self)
 
-    def components(self) -> Iterator[Tank | Pipe | Pump | Sensor]:
+    def components(self) -> Iterator[Tank | FlowComponent | Sensor]:
         yield from self.tanks
-        yield from self.pipes
-        yield from self.pumps
+        yield from self.flow_components()
         yield from self.sensors
 
-    def component(self, name: str) -> Tank | Pipe | Pump | Sensor:
+    def flow_components(self) -> Iterator[FlowComponent]:
+        """All components that carry a flow, by kind in the order of `FLOW_KINDS`."""
+        for kind in FLOW_KINDS:
+            yield from getattr(self, kind.part())
+
+    def metered_flows(self) -> list[MeteredFlow]:
+        """The pumps and transfers, whose flows are input channels, in the order of their channels."""
+        return [c for c in self.flows_in_order() if isinstance(c, MeteredFlow)]
+
+    def flows_in_order(self) -> list[FlowComponent]:
+        """The flow components in the order in which their flows are computed and their channels are listed.
+
+        Flows that depend on the net inflow of their source follow the water: a flow into a tank precedes one out of it.
+        """
+        depth = _depths(self)
+        return sorted(self.flow_components(), key=lambda c: (c.order, depth[c.name]))
+
+    def component(self, name: str) -> Tank | FlowComponent | Sensor:
         for component in self.components():
             if component.name == name:
                 return component
@@ -108,14 +130,34 @@ class PlantDescription:
         return tuple(c.name for c in self.components()) + tuple(f"{a}-{b}" for a, b in self.tank_pairs())
 
     def channels(self) -> tuple[str, ...]:
-        """The required input channels of a recording: pump commands, then valve openings, without repetition."""
-        channels = [p.channel for p in self.pumps] + [p.valve for p in self.pipes if p.valve]
-        return tuple(dict.fromkeys(channels))
+        """The required input channels of a recording: pump commands, valve openings, transfers, without repetition."""
+        return tuple(self.channel_units())
 
     def channel_units(self) -> dict[str, str]:
-        """SI unit of each input channel: the unit of the pump's command, or 1 for a valve's opening."""
-        units = {p.valve: "1" for p in self.pipes if p.valve} | {p.channel: p.command_unit for p in self.pumps}
-        return {channel: units[channel] for channel in self.channels()}
+        """SI unit of each input channel: of a pump's or transfer's command, or 1 for a valve's opening."""
+        given = [c.input_channel for c in self.flows_in_order()]
+        units: dict[str, str] = {}
+        for channel, unit in (pair for pair in given if pair is not None):
+            units.setdefault(channel, unit)
+        return units
+
+
+FLOW_KINDS: tuple[type[FlowComponent], ...] = tuple(
+    f.metadata["kind"] for f in fields(PlantDescription) if "kind" in f.metadata
+)
+"""The kinds of flow component: one field of `PlantDescription` each."""
+
+
+def _depths(plant: PlantDescription) -> dict[str, int]:
+    """Number of flows of its own order that each flow component is behind along the water, at most; circles are cut."""
+    flows = list(plant.flow_components())
+    depth = {c.name: 0 for c in flows}
+    for _ in range(len(plant.tanks)):
+        for c in flows if any(c.order > FlowOrder.BY_LEVELS for c in flows) else ():
+            ahead = [depth[o.name] + 1 for o in flows if o.order == c.order and o.target == c.source]
+            if c.order > FlowOrder.BY_LEVELS:
+                depth[c.name] = min(max(ahead, default=0), len(plant.tanks))
+    return depth
 
 
 def _check_names(plant: PlantDescription) -> None:
@@ -136,15 +178,13 @@ def _check_references(plant: PlantDescription) -> None:
             known = ", ".join((*tanks, *also))
             raise ValueError(f"plant {plant.name}: {place}: expected one of the tanks {known}, got '{name}'")
 
-    for pipe in plant.pipes:
-        expect_tank(f"pipes.{pipe.name}.source", pipe.source)
-        expect_tank(f"pipes.{pipe.name}.target", pipe.target, (OUTSIDE,))
-        if pipe.source == pipe.target:
-            raise ValueError(
-                f"plant {plant.name}: pipes.{pipe.name}: expected two different ends, got {pipe.source} twice"
-            )
-    for pump in plant.pumps:
-        expect_tank(f"pumps.{pump.name}.target", pump.target)
+    for component in plant.flow_components():
+        place = f"{component.part()}.{component.name}"
+        if component.source != OUTSIDE or component.order != FlowOrder.INFLOW:
+            expect_tank(f"{place}.source", component.source)
+        expect_tank(f"{place}.target", component.target, () if component.source == OUTSIDE else (OUTSIDE,))
+        if component.source == component.target:
+            raise ValueError(f"plant {plant.name}: {place}: expected two different ends, got {component.source} twice")
     for sensor in plant.sensors:
         expect_tank(f"sensors.{sensor.name}.tank", sensor.tank)
     for tank in plant.tanks:
@@ -162,9 +202,9 @@ def _check_numbers(plant: PlantDescription) -> None:
     positive = [
         (f"tanks.{t.name}.{f}", getattr(t, f), u) for t in plant.tanks for f, u in (("area", "m^2"), ("height", "m"))
     ]
-    positive += [(f"pipes.{p.name}.area", p.area, "m^2") for p in plant.pipes]
-    positive += [(f"pipes.{p.name}.discharge_coefficient", p.discharge_coefficient, "") for p in plant.pipes]
-    positive += [(f"pumps.{p.name}.max_flow", p.max_flow, "m^3/s") for p in plant.pumps]
+    for component in plant.flow_components():
+        place = f"{component.part()}.{component.name}"
+        positive += [(f"{place}.{name}", getattr(component, name), unit) for name, unit in component.positive_fields()]
     positive += [("gravity", plant.gravity, "m/s^2")]
     for field_name, value, unit in positive:
         if not value > 0:
@@ -176,20 +216,9 @@ def _check_numbers(plant: PlantDescription) -> None:
                 f"plant {plant.name}: {field_name}: expected {SMALLEST:g} to {LARGEST:g} {unit}, got {value:g}; "
                 "is its unit right?"
             )
-    for pipe in plant.pipes:
-        place = f"plant {plant.name}: pipes.{pipe.name}"
-        if not pipe.discharge_coefficient <= LARGEST_DISCHARGE_COEFFICIENT:
-            raise ValueError(
-                f"{place}.discharge_coefficient: expected at most {LARGEST_DISCHARGE_COEFFICIENT:g}, got "
-                f"{pipe.discharge_coefficient:g}; is it in per cent?"
-            )
-        if pipe.unrecorded is not None and not 0 <= pipe.unrecorded <= 1:
-            raise ValueError(f"{place}.unrecorded: expected an opening from 0 to 1, got {pipe.unrecorded:g}")
-        if not 0 <= pipe.elevation <= LARGEST:
-            raise ValueError(
-                f"plant {plant.name}: pipes.{pipe.name}.elevation: expected at least 0 m above both floors, got "
-                f"{pipe.elevation:g} m; move the zero of the tanks' levels below the pipe"
-            )
+    for component in plant.flow_components():
+        for problem in component.problems():
+            raise ValueError(f"plant {plant.name}: {component.part()}.{component.name}.{problem}")
     for sensor in plant.sensors:
         place = f"plant {plant.name}: sensors.{sensor.name}"
         if sensor.gain == 0:

@@ -11,17 +11,18 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
+from fdi_torch.plant.flow_component import FlowComponent
+from fdi_torch.plant.local_conditions import Local, Values
 from fdi_torch.plant.operating_range import OperatingRange
-from fdi_torch.plant.orifice import signed_root
 from fdi_torch.plant.signals import Clock
 
+__all__ = ["Effect", "Local", "Memory", "Placement", "Stage", "Values", "fits", "place_kind", "place_kinds_of"]
+
 Memory = tuple[Tensor, ...]
-Values = Mapping[str, Tensor]
 
 
 class Stage(Enum):
@@ -34,43 +35,12 @@ class Stage(Enum):
     READING = "reading"
 
 
-@dataclass(frozen=True)
-class Local:
-    """The conditions at one place at one instant. All (*batch), SI.
-
-    level: of the tank (pump: its target; pipe: its source); far_level: at the other end; head: driving head of the
-    flow; capacity: flow at 1 m of head through the place's orifice (tank: through its leak reference), m^2.5/s;
-    command: of the pump, or opening of the valve; net: net inflow of the tank so far, m^3/s (BALANCE; elsewhere 0);
-    width: head below which square roots are smoothed, m; height: of the tank, floor to rim, m; gravity: m/s^2;
-    constants: the component's constants by field name.
-    """
-
-    clock: Clock
-    level: Tensor
-    far_level: Tensor
-    head: Tensor
-    capacity: Tensor
-    command: Tensor
-    net: Tensor
-    width: Tensor
-    height: Tensor
-    gravity: Tensor
-    constants: Values
-
-    def root(self, head: Tensor) -> Tensor:
-        """Regularised signed square root of a head, sgn(x) sqrt(|x|), m^0.5 (see `signed_root`)."""
-        return signed_root(head, self.width)
-
-    def magnitude(self, head: Tensor) -> Tensor:
-        """|head| smoothed at zero to sqrt(x^2 + w^2), so that it can be a divisor, m."""
-        return torch.sqrt(head * head + self.width * self.width)
-
-
 class Effect:
     """Base class of all faults and unmodelled effects.
 
     name: as in configurations and results. stage: the stage whose hook it overrides. places: the kinds of component at
-    which it can be placed, of 'pump', 'pipe', 'outlet', 'valve', 'tank', 'tank_pair', 'sensor'. memory: number of its
+    which it can be placed, of 'pump', 'pipe', 'outlet', 'valve', 'tank', 'tank_pair', 'sensor'; a flow component can
+    accept further effects (`FlowComponent.accepts`). memory: number of its
     memory states. smooth: whether the gradient with respect to its size is non-zero at nominal. mistaken_for: effects
     that explain nearly the same data. delays: whether it adds dead time to its signal. quantizes: whether it rounds
     the reading. startup_only: whether it acts only until its component has run for the first time.
@@ -159,18 +129,23 @@ class Placement:
 
 
 def place_kind(plant: PlantDescription, location: str) -> str:
-    """'pump', 'pipe', 'outlet', 'tank', 'tank_pair' or 'sensor'. Raises ValueError for an unknown place."""
+    """'tank', 'sensor', 'tank_pair' or one of a flow kind's `place_kinds`. Raises ValueError for an unknown place."""
     if location in {f"{a}-{b}" for a, b in plant.tank_pairs()}:
         return "tank_pair"
-    component = plant.component(location)
-    if isinstance(component, Pipe):
-        return "outlet" if component.is_outlet else "pipe"
-    return {Tank: "tank", Pump: "pump", Sensor: "sensor"}[type(component)]
+    return plant.component(location).place_kind
 
 
 def fits(effect: Effect, plant: PlantDescription, location: str) -> bool:
     """Whether the effect can be placed at this location."""
     kind = place_kind(plant, location)
     component = None if kind == "tank_pair" else plant.component(location)
-    with_valve = isinstance(component, Pipe) and component.valve is not None
-    return kind in effect.places or (with_valve and "valve" in effect.places)
+    if kind in effect.places or not isinstance(component, FlowComponent):
+        return kind in effect.places
+    with_valve = component.input_channel is not None and not component.commanded
+    return effect.name in component.accepts or (with_valve and "valve" in effect.places)
+
+
+def place_kinds_of(effect: Effect) -> tuple[str, ...]:
+    """The kinds of place at which the effect can be placed, with those of the flow components that accept it."""
+    accepting = (name for kind in FLOW_KINDS if effect.name in kind.accepts for name in kind.place_kinds)
+    return tuple(dict.fromkeys((*effect.places, *accepting)))

@@ -1,4 +1,4 @@
-"""TankNetwork: any network of tanks, pipes, valves, pumps and sensors as one differentiable module.
+"""TankNetwork: any network of tanks, flow components and sensors as one differentiable module.
 
 The equations are written per component, so that tracing them gives straight-line pointwise code; every engine runs
 this code. All numbers are SI; the leading dimensions of a tensor are batches.
@@ -6,7 +6,7 @@ this code. All numbers are SI; the leading dimensions of a tensor are batches.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -15,8 +15,9 @@ from torch import Tensor, nn
 
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.constants import constant_parameters
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor
-from fdi_torch.plant.effect import Effect, Memory, Placement, Stage, Values, fits
+from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor
+from fdi_torch.plant.effect import Effect, Memory, Placement, Stage, Values, fits, place_kinds_of
+from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
 from fdi_torch.plant.operating_point import Constants, OperatingPoint, PlaceValues
 from fdi_torch.plant.orifice import limit_emptying, weir_flow
 from fdi_torch.plant.signal_chain import SignalChain
@@ -43,6 +44,8 @@ class TankNetwork(nn.Module):
         effect_parameters = [p for placement in self.placements for p in placed_parameters(placement, description)]
         self.constants = ParameterSpace([*constant_parameters(description), *effect_parameters])
         self.register_buffer("nominal", self.constants.nominal())
+        self._first_flows = [c for c in description.flows_in_order() if c.order <= FlowOrder.BY_LEVELS]
+        self._last_flows = [c for c in description.flows_in_order() if c.order > FlowOrder.BY_LEVELS]
         self._tank_index = {tank.name: i for i, tank in enumerate(description.tanks)}
 
     def restricted_to(self, prefixes: Collection[str]) -> TankNetwork:
@@ -89,11 +92,9 @@ class TankNetwork(nn.Module):
     def rates(
         self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> list[Tensor]:
-        """dh/dt of each tank (*batch), m/s: pump flows, pipe flows, balances, overflow, storage."""
+        """dh/dt of each tank (*batch), m/s: flows, balances, transfers, weirs and overflow, storage."""
         point = self.operating_point(levels, commands, clock, values)
-        pumped = self.pump_flows(point)
-        piped = self.pipe_flows(point)
-        net = self.net_inflows(point, pumped, piped)
+        net = self.net_inflows(point, self.flows(point))
         return self.level_rates(point, self.less_overflow(point, net))
 
     def operating_point(
@@ -116,49 +117,46 @@ class TankNetwork(nn.Module):
         """Dead time of each actuator, s, by index into `actuators`; only actuators with a delay effect."""
         return self._command_chain.delays(values)
 
-    def pump_flows(self, point: OperatingPoint) -> list[Tensor]:
-        """FLOW of each pump, m^3/s."""
-        return [self.pump_flow(point, pump) for pump in self.description.pumps]
+    def flows(self, point: OperatingPoint) -> dict[str, Tensor]:
+        """FLOW of each component whose flow does not depend on net inflows, by its name, m^3/s."""
+        return {component.name: self.flow(point, component) for component in self._first_flows}
 
-    def pump_flow(self, point: OperatingPoint, pump: Pump) -> Tensor:
-        """FLOW of one pump: gain x command within [0, max_flow], m^3/s."""
-        constants = point.values[pump.name]
-        demanded = torch.clamp(constants["gain"] * point.commands[pump.name], min=0.0)
-        flow = torch.minimum(demanded, constants["max_flow"])
-        for effect, p in self._effects(pump.name, Stage.FLOW, point):
-            flow = effect.flow(flow, point.at_pump(pump), p)
-        return flow
+    def flow(self, point: OperatingPoint, component: FlowComponent, net: Tensor | None = None) -> Tensor:
+        """FLOW of one component, m^3/s, positive from source to target: its law, changed by its effects, limited.
 
-    def pipe_flows(self, point: OperatingPoint) -> list[Tensor]:
-        """FLOW of each pipe and outlet, m^3/s, positive from source to target."""
-        return [self.pipe_flow(point, pipe) for pipe in self.description.pipes]
-
-    def pipe_flow(self, point: OperatingPoint, pipe: Pipe) -> Tensor:
-        """FLOW of one pipe or outlet by Torricelli's law, m^3/s, positive from source to target."""
-        local = point.at_pipe(pipe)
-        effects = self._effects(pipe.name, Stage.FLOW, point)
+        net: inflow of its source by the flows that are computed before it, m^3/s.
+        """
+        local = point.at_flow(component, net)
+        effects = self._effects(component.name, Stage.FLOW, point)
         for effect, p in effects:
             local = replace(local, head=effect.head(local.head, local, p))
-        head = torch.clamp(local.head, min=0.0) if pipe.is_outlet else local.head
-        flow = local.capacity * local.command * local.root(head)
+        flow = component.law(local)
         for effect, p in effects:
             flow = effect.flow(flow, local, p)
-        return flow
+        return component.limited(flow, local)
 
-    def net_inflows(self, point: OperatingPoint, pumped: Sequence[Tensor], piped: Sequence[Tensor]) -> list[Tensor]:
-        """BALANCE of each tank before overflow: pump flows, pipe flows and BALANCE effects, m^3/s."""
+    def net_inflows(self, point: OperatingPoint, flows: Mapping[str, Tensor]) -> list[Tensor]:
+        """BALANCE of each tank before transfers, weirs and overflow: `flows` and BALANCE effects, m^3/s."""
         net = [torch.zeros_like(level) for level in point.levels.values()]
-        for pump, flow in zip(self.description.pumps, pumped, strict=True):
-            self.transfer(net, OUTSIDE, pump.target, flow)
-        for pipe, flow in zip(self.description.pipes, piped, strict=True):
-            self.transfer(net, pipe.source, pipe.target, flow)
+        for component in self._first_flows:
+            self.transfer(net, component.source, component.target, flows[component.name])
         for placement in self.placements:
             if placement.effect.stage is Stage.BALANCE:
                 self.transfer_by_effect(net, placement, point)
         return net
 
+    def last_flows(self, point: OperatingPoint, net: Sequence[Tensor]) -> tuple[dict[str, Tensor], list[Tensor]]:
+        """FLOW of each component that depends on the net inflow of its source, and the net inflows after it, m^3/s."""
+        inflows, flows = list(net), {}
+        for component in self._last_flows:
+            flow = self.flow(point, component, inflows[self._tank_index[component.source]])
+            self.transfer(inflows, component.source, component.target, flow)
+            flows[component.name] = flow
+        return flows, inflows
+
     def less_overflow(self, point: OperatingPoint, net: Sequence[Tensor]) -> list[Tensor]:
-        """Net inflow of each tank with the overflow over the rims moved to where it goes, m^3/s."""
+        """Net inflow of each tank after transfers, weirs, and overflow over the rims, m^3/s."""
+        net = self.last_flows(point, net)[1]
         inflows = list(net)
         for tank, inflow in zip(self.description.tanks, net, strict=True) if self.may_overflow else ():
             constants, level = point.values[tank.name], point.levels[tank.name]
@@ -195,9 +193,9 @@ class TankNetwork(nn.Module):
         return self._reading_chain.delays(values)
 
     def actuators(self) -> list[tuple[str, int]]:
-        """Name and input channel index of each pump, then of each pipe with a valve."""
-        pumps = [(p.name, self._channel_index[p.channel]) for p in self.description.pumps]
-        return pumps + [(p.name, self._channel_index[p.valve]) for p in self.description.pipes if p.valve]
+        """Name and input channel index of each component that has an input channel, as in `flows_in_order`."""
+        given = [(c.name, c.input_channel) for c in self.description.flows_in_order()]
+        return [(name, self._channel_index[channel[0]]) for name, channel in given if channel is not None]
 
     def sensor_tanks(self) -> list[int]:
         return [self._tank_index[s.tank] for s in self.description.sensors]
@@ -259,5 +257,5 @@ def placed_parameters(placement: Placement, plant: PlantDescription) -> list[Par
 
 def _expect_fit(plant: PlantDescription, placement: Placement) -> None:
     if not fits(placement.effect, plant, placement.location):
-        kinds = " or ".join(placement.effect.places)
+        kinds = " or ".join(place_kinds_of(placement.effect))
         raise ValueError(f"{placement.prefix}: expected a place of kind {kinds}, got {placement.location}")

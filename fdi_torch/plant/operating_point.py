@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.plant.constants import inverse_areas, leak_pipe, nominal_capacity
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Tank
-from fdi_torch.plant.effect import Local, Values
-from fdi_torch.plant.orifice import orifice_capacity, regular_width, rim_strength
+from fdi_torch.plant.constants import inverse_areas, leak_pipe
+from fdi_torch.plant.description import OUTSIDE, PlantDescription, Tank
+from fdi_torch.plant.flow_component import FlowComponent
+from fdi_torch.plant.local_conditions import Local, Values
+from fdi_torch.plant.orifice import rim_strength
 from fdi_torch.plant.signals import Clock
 
 PlaceValues = Mapping[str, Values]
@@ -67,39 +68,28 @@ class OperatingPoint:
     def gravity(self) -> Tensor:
         return self.values[""]["gravity"]
 
-    def at_pump(self, pump: Pump) -> Local:
-        """Conditions at a pump: the level of its target tank, the pump's gain and command."""
-        constants = self.values[pump.name]
-        at_target = self.at_tank(pump.target)
-        return replace(at_target, capacity=constants["gain"], command=self.commands[pump.name], constants=constants)
-
-    def at_pipe(self, pipe: Pipe) -> Local:
-        """Conditions at a pipe or outlet: both levels, the head between them, the valve's opening."""
-        constants = self.values[pipe.name]
-        level = self.levels[pipe.source]
-        head, far = level - constants["elevation"], level
-        if not pipe.is_outlet:
-            far = self.levels[pipe.target]
-            wet_far = torch.clamp(far - constants["elevation"], min=0.0)
-            head = torch.clamp(head, min=0.0) - wet_far if pipe.elevation else level - far
-        elif pipe.target == OUTSIDE:
-            far = torch.zeros_like(level)
-        else:
-            far = self.levels[pipe.target]
-        opening = self.commands.get(pipe.name)
-        return Local(
+    def at_flow(self, component: FlowComponent, net: Tensor | None = None) -> Local:
+        """Conditions at a flow component. net: inflow of its source by the flows that are computed before it, m^3/s."""
+        constants, tank = self.values[component.name], component.near_tank
+        level = self.levels[tank]
+        opening = self.commands.get(component.name)
+        local = Local(
             self.clock,
             level,
-            far,
-            head,
-            capacity=self.capacity(pipe),
-            command=self._number(1.0) if opening is None else torch.clamp(opening, 0.0, 1.0),
-            net=self._number(0.0),
-            width=self.width(pipe),
-            height=self.values[pipe.source]["height"],
+            torch.zeros_like(level) if component.target == OUTSIDE else self.levels[component.target],
+            head=level,
+            capacity=self.values.cached(
+                f"capacity of {component.name}", lambda: component.capacity(constants, self.gravity)
+            ),
+            command=self._number(1.0) if opening is None else component.actuated(opening),
+            net=self._number(0.0) if net is None else net,
+            width=self.width(component),
+            height=self.values[tank]["height"],
+            area=self.values[tank]["area"],
             gravity=self.gravity,
             constants=constants,
         )
+        return replace(local, head=component.head(local))
 
     def at_tank(self, name: str, far: str | None = None, net: Tensor | None = None) -> Local:
         """Conditions at a tank, or between a tank and `far`; net: inflow of the tank so far, m^3/s."""
@@ -114,26 +104,20 @@ class OperatingPoint:
             net=self._number(0.0) if net is None else net,
             width=self.width(leak_pipe(self.plant, name)),
             height=constants["height"],
+            area=constants["area"],
             gravity=self.gravity,
             constants=constants,
         )
 
-    def capacity(self, pipe: Pipe) -> Tensor:
-        """C_d a sqrt(2 g) of a pipe: its flow at 1 m of head, m^2.5/s."""
-        constants = self.values[pipe.name]
-        return self.values.cached(
-            f"capacity of {pipe.name}",
-            lambda: orifice_capacity(constants["discharge_coefficient"], constants["area"], self.gravity),
-        )
-
-    def width(self, pipe: Pipe) -> Tensor:
-        """Head below which the square root of a pipe's law is smoothed, m."""
+    def width(self, component: FlowComponent) -> Tensor:
+        """Head below which the square root of a component's law is smoothed, m."""
 
         def compute() -> Tensor:
-            rate = nominal_capacity(self.plant, pipe) * inverse_areas(self.plant, pipe)
-            return regular_width(rate, self.clock.resolution)
+            areas = inverse_areas(self.plant, component)
+            width = component.smoothing_width(self.plant.gravity, areas, self.clock.resolution)
+            return self.width(leak_pipe(self.plant, component.near_tank)) if width is None else width
 
-        return self.values.cached(f"width of {pipe.name}", compute, self.clock.resolution)
+        return self.values.cached(f"width of {component.name}", compute, self.clock.resolution)
 
     def rim(self, tank: Tank) -> Tensor:
         """Weir coefficient of a tank's whole rim: its overflow at 1 m above the rim, m^1.5/s."""

@@ -38,13 +38,17 @@ def orifice_capacity(discharge_coefficient: Tensor, area: Tensor, gravity: Tenso
     return discharge_coefficient * area * torch.sqrt(2.0 * gravity)
 
 
-def rim_strength(tank_area: Tensor, gravity: Tensor) -> Tensor:
-    """Weir coefficient of a round tank's rim: (2/3) C sqrt(2 g) 2 sqrt(pi A), m^1.5/s.
+def weir_strength(coefficient: Tensor | float, crest: Tensor, gravity: Tensor) -> Tensor:
+    """Weir coefficient (2/3) C sqrt(2 g) b of a sharp crest of length b, m^1.5/s; flow over it at 1 m above the crest.
 
-    The rim is a sharp-crested weir of length 2 sqrt(pi A); its overflow at x m above it is this times x^(3/2), m^3/s.
+    Rectangular weir (Poleni, 1717; Bos, 1989, "Discharge Measurement Structures", ch. 5); C is about 0.6.
     """
-    crest = 2.0 * torch.sqrt(math.pi * tank_area)
-    return (2.0 / 3.0) * WEIR_COEFFICIENT * torch.sqrt(2.0 * gravity) * crest
+    return (2.0 / 3.0) * coefficient * torch.sqrt(2.0 * gravity) * crest
+
+
+def rim_strength(tank_area: Tensor, gravity: Tensor) -> Tensor:
+    """Weir coefficient of a round tank's rim, a crest of length 2 sqrt(pi A), m^1.5/s."""
+    return weir_strength(WEIR_COEFFICIENT, 2.0 * torch.sqrt(math.pi * tank_area), gravity)
 
 
 def limit_emptying(rate: Tensor, level: Tensor, resolution: Tensor) -> Tensor:
@@ -58,18 +62,47 @@ def limit_emptying(rate: Tensor, level: Tensor, resolution: Tensor) -> Tensor:
     return torch.maximum(rate, slowest)
 
 
+def weir_law(excess: Tensor, strength: Tensor) -> tuple[Tensor, Tensor]:
+    """Flow over a crest w(x) = strength x^(3/2), m^3/s, and its slope w'(x), m^2/s, at the excess x (m) above it."""
+    above = torch.clamp(excess, min=0.0)
+    root = torch.sqrt(above + _DRY)
+    return strength * above * root, 1.5 * strength * root
+
+
+def weir_slope(flow: Tensor, excess: Tensor) -> Tensor:
+    """The slope 1.5 w / x of a flow over a crest (m^3/s) that effects have changed, at the excess x (m), m^2/s."""
+    return 1.5 * flow / (torch.clamp(excess, min=0.0) + _DRY)
+
+
+def limit_spill(
+    flow: Tensor, slope: Tensor, *, excess: Tensor, inflow: Tensor | float, tank_area: Tensor, resolution: Tensor
+) -> Tensor:
+    """Flow over a crest (m^3/s), limited so that the tank is stable at a step of `resolution` (s).
+
+    The law w = `flow` with the slope w' = `slope` (m^2/s) at the excess (m) above the crest is much faster than the
+    tank itself. Where the number w' r / A, with r = `resolution`, exceeds its stable limit by a > 0, the flow is taken
+    linearly implicitly (Rosenbrock, 1963): (w + a q) / (1 + a), with the net inflow q = `inflow` (m^3/s) of the tank.
+    The steady state is w = q for every step.
+    """
+    stiffness = torch.clamp(slope * resolution / tank_area - STABLE_SPILL_TIMES_STEP, min=0.0)
+    spill = torch.clamp((flow + stiffness * inflow) / (1.0 + stiffness), min=0.0)
+    return torch.where(excess > 0.0, spill, 0.0)
+
+
 def weir_flow(
     excess: Tensor, inflow: Tensor | float, tank_area: Tensor, strength: Tensor, resolution: Tensor
 ) -> Tensor:
-    """Flow over a rim, or over a share of it, m^3/s.
+    """Flow over a rim, or over a share of it, m^3/s: `weir_law` limited by `limit_spill`."""
+    flow, slope = weir_law(excess, strength)
+    return limit_spill(flow, slope, excess=excess, inflow=inflow, tank_area=tank_area, resolution=resolution)
 
-    w(x) = strength x^(3/2) at the excess x = `excess` (m) above the rim, while `inflow` (m^3/s) enters the tank. This
-    is much faster than the tank itself. Where the number w'(x) r / A exceeds its stable limit by a > 0, with r =
-    `resolution` (s), the flow is taken linearly implicitly (Rosenbrock, 1963): (w + a q) / (1 + a). The steady state is
-    w = q for every step.
+
+def limit_draw(flow: Tensor, level: Tensor, inflow: Tensor, tank_area: Tensor, resolution: Tensor) -> Tensor:
+    """A flow drawn from a tank (m^3/s), limited to what the tank holds and receives: min(flow, max(q + 2 A h / r, 0)).
+
+    q = `inflow` (m^3/s): net inflow of the tank without this flow; r = `resolution` (s). The level then never falls
+    faster than `limit_emptying` allows, so that the target receives what the source loses, and a dry tank passes on
+    exactly its inflow.
     """
-    above = torch.clamp(excess, min=0.0)
-    root = torch.sqrt(above + _DRY)
-    stiffness = torch.clamp(1.5 * strength * root * resolution / tank_area - STABLE_SPILL_TIMES_STEP, min=0.0)
-    spill = torch.clamp((strength * above * root + stiffness * inflow) / (1.0 + stiffness), min=0.0)
-    return torch.where(excess > 0.0, spill, 0.0)
+    available = inflow + EMPTYING_RATE_TIMES_STEP * tank_area * level / resolution
+    return torch.minimum(flow, torch.clamp(available, min=0.0))

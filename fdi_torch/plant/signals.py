@@ -18,11 +18,13 @@ class Clock:
     """One integration step, or one sampling interval, [start, start + step] in s.
 
     resolution: the shortest time that the integrator resolves, s; it sets the smoothing of square roots and rims.
+    explicit: whether the steps are stable only for rates of change below about 2 / resolution.
     """
 
     start: Tensor
     step: Tensor
     resolution: Tensor
+    explicit: bool = True
 
     @property
     def middle(self) -> Tensor:

@@ -157,8 +157,8 @@ def _undersampled_inputs(recording: Recording, plant: PlantDescription) -> Itera
     h; samples of a sine of period T have cos(2 pi d / T). The standard error of the correlation over N independent
     samples is 1 / sqrt(N).
     """
-    for pump in plant.pumps:
-        areas = [tank.area for tank in plant.tanks if tank.name == pump.target]
+    for pump in plant.metered_flows():
+        areas = [tank.area for tank in plant.tanks if tank.name == pump.near_tank]
         if pump.channel not in recording.input_names or not areas:
             continue
         name, values = pump.channel, recording.inputs[:, recording.input_names.index(pump.channel)]
@@ -166,7 +166,7 @@ def _undersampled_inputs(recording: Recording, plant: PlantDescription) -> Itera
         before, after = values[:-1][both_known], values[1:][both_known]
         variance = float(torch.cat([before, after]).var(correction=0)) if len(before) else 0.0
         unknown_change = pump.gain * variance**0.5 * recording.interval / areas[0]
-        if not unknown_change > _scatter(recording, plant, pump.target):
+        if not unknown_change > _scatter(recording, plant, pump.near_tank):
             continue
         correlation = 1.0 - float((after - before).square().mean()) / (2.0 * variance)
         if correlation + CERTAIN / len(before) ** 0.5 < TWO_SAMPLES_A_HOLD:

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from fdi_torch.plant.description import PlantDescription, Pump, Sensor
+from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
 
@@ -17,12 +18,12 @@ SMALL_SHARE = 0.01
 
 
 def plant_limit_findings(recording: Recording, plant: PlantDescription) -> Iterator[ChannelFinding]:
-    """Findings of all sensors, pumps and valves that the recording has."""
+    """Findings of all sensors, pumps, transfers and valves that the recording has."""
     for sensor in plant.sensors:
         if sensor.column in recording.output_names:
             column = recording.output_names.index(sensor.column)
             yield from _level_findings(sensor, plant, recording.outputs[recording.mask[:, column], column])
-    for pump in plant.pumps:
+    for pump in plant.metered_flows():
         if pump.channel in recording.input_names:
             yield from _pump_findings(pump, recording.inputs[:, recording.input_names.index(pump.channel)])
     for valve in dict.fromkeys(pipe.valve for pipe in plant.pipes if pipe.valve):
@@ -49,7 +50,7 @@ def _level_findings(sensor: Sensor, plant: PlantDescription, readings: Tensor) -
         yield ChannelFinding("range", sensor.column, text, {"low": low, "count": below})
 
 
-def _pump_findings(pump: Pump, command: Tensor) -> Iterator[ChannelFinding]:
+def _pump_findings(pump: MeteredFlow, command: Tensor) -> Iterator[ChannelFinding]:
     flow = pump.gain * command[torch.isfinite(command)]
     if not len(flow):
         return

@@ -27,9 +27,9 @@ def tank_places(plant: PlantDescription) -> dict[str, Place]:
 
 
 def _falls(plant: PlantDescription) -> list[tuple[str, str]]:
-    """(upper, lower) tank for every pipe in free fall and every overflow."""
-    pipes = [(p.source, p.target) for p in plant.pipes if p.free_fall and p.target != OUTSIDE]
-    return pipes + [(t.name, t.overflow_to) for t in plant.tanks if t.overflow_to not in (OUTSIDE, t.name)]
+    """(upper, lower) tank for every flow in free fall and every overflow."""
+    flows = [(c.source, c.target) for c in plant.flow_components() if c.falls and c.target != OUTSIDE]
+    return flows + [(t.name, t.overflow_to) for t in plant.tanks if t.overflow_to not in (OUTSIDE, t.name)]
 
 
 def _rows(names: Iterable[str], falls: list[tuple[str, str]]) -> dict[str, int]:
@@ -43,7 +43,7 @@ def _rows(names: Iterable[str], falls: list[tuple[str, str]]) -> dict[str, int]:
 
 def _neighbours(plant: PlantDescription) -> dict[str, list[str]]:
     joined: dict[str, list[str]] = {t.name: [] for t in plant.tanks}
-    ends = [(p.source, p.target) for p in plant.pipes if p.target != OUTSIDE]
+    ends = [(c.source, c.target) for c in plant.flow_components() if OUTSIDE not in (c.source, c.target)]
     for a, b in ends + _falls(plant):
         if b not in joined[a]:
             joined[a].append(b)
@@ -52,7 +52,7 @@ def _neighbours(plant: PlantDescription) -> dict[str, list[str]]:
 
 
 def _walk(plant: PlantDescription, neighbours: dict[str, list[str]]) -> list[str]:
-    """The tanks in order along their pipes, each chain starting at one of its ends."""
+    """The tanks in order along their connections, each chain starting at one of its ends."""
     ends_first = sorted((t.name for t in plant.tanks), key=lambda name: len(neighbours[name]) > 1)
     order: dict[str, None] = {}
     for start in ends_first:

@@ -1,7 +1,8 @@
-"""Drawing of the rig: tanks with their levels, pipes, pumps and sensors, with the diagnosis on them."""
+"""Drawing of the rig: tanks with their levels, flow components and sensors, with the diagnosis on them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -13,7 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
+from fdi_torch.plant.flow_component import FlowComponent, Sketch
 from fdi_torch.report.html import short
 from fdi_torch.report.numbers import percent
 from fdi_torch.report.rig_layout import tank_places
@@ -71,12 +73,13 @@ class _Drawing:
             self.overflow(tank)
         for location in (*self.overlay.marks, *self.overlay.probabilities):
             self.pair(location)
-        for pipe in self.plant.pipes:
-            self.pipe(pipe)
+        above = [c for c in self.plant.flow_components() if c.source == OUTSIDE]
+        for component in (c for c in self.plant.flow_components() if c not in above):
+            self.flow(component)
         for tank in self.plant.tanks:
             self.tank(tank)
-        for pump in self.plant.pumps:
-            self.pump(pump)
+        for component in above:
+            self.flow(component)
         for sensor in self.plant.sensors:
             self.sensor(sensor)
 
@@ -111,7 +114,7 @@ class _Drawing:
             self.axes.text(x, y - k * step, text, ha=ha, va=va, color=colour, weight=weight, fontsize=9.0, zorder=6)
 
     def line(self, name: str, points: Sequence[Point], arrow: bool = False) -> None:
-        """Draw a pipe along points, highlighted if it has a discrepancy."""
+        """Draw a line along points, highlighted if it has a discrepancy."""
         x, y = np.array(points).T
         if self.overlay.probabilities.get(name, 0.0) > 0.0:
             self.axes.plot(
@@ -144,20 +147,6 @@ class _Drawing:
         self.axes.plot(*np.array(walls).T, color=self.colour(tank.name), lw=2.0, zorder=5, solid_joinstyle="miter")
         self.words(tank.name, (x, y + TALL - 0.08), "center", "top", width=WITHIN)
 
-    def pump(self, pump: Pump) -> None:
-        x, y = self.corner(pump.target)
-        same = [p.name for p in self.plant.pumps if p.target == pump.target]
-        x += (same.index(pump.name) - (len(same) - 1) / 2) * 0.7 - (0.22 if self.fed_from_above(pump.target) else 0.0)
-        centre, radius = (x, y + TALL + 0.55), 0.17
-        self.line(pump.name, [(x, centre[1] - radius), (x, y + TALL + 0.06)], arrow=True)
-        probability = self.overlay.probabilities.get(pump.name, 0.0)
-        self.axes.add_patch(Circle(centre, radius, facecolor=PAPER, edgecolor=self.colour(pump.name), lw=1.6, zorder=4))
-        if probability > 0.0:
-            self.axes.add_patch(Circle(centre, 1.6 * radius, facecolor=MARK, alpha=strength(probability), zorder=5))
-        blade = [(x - 0.1, centre[1] + 0.07), (x + 0.1, centre[1] + 0.07), (x, centre[1] - 0.13)]
-        self.axes.add_patch(Polygon(blade, facecolor=self.colour(pump.name), edgecolor="none", zorder=5))
-        self.words(pump.name, (x, centre[1] + radius + 0.08), "center", "bottom")
-
     def sensor(self, sensor: Sensor) -> None:
         x, y = self.corner(sensor.tank)
         same = [s.name for s in self.plant.sensors if s.tank == sensor.tank]
@@ -169,49 +158,90 @@ class _Drawing:
         self.axes.add_patch(Circle(centre, 0.085, facecolor=PAPER, edgecolor=colour, lw=1.6, zorder=7))
         self.words(sensor.name, (centre[0] + 0.15, centre[1] + 0.1), "left", "top")
 
-    def pipe(self, pipe: Pipe) -> None:
-        points = self.route(pipe)
-        self.line(pipe.name, points, arrow=pipe.is_outlet)
-        middle = _middle(points)
-        if pipe.valve:
-            self.valve(middle, self.colour(pipe.name), upright=points[0][0] == points[-1][0])
-        if pipe.target == OUTSIDE:
-            self.words(pipe.name, (points[-1][0], points[-1][1] - 0.06), "center", "top")
-        elif pipe.is_outlet:
-            self.words(pipe.name, (middle[0] + 0.12, middle[1] + 0.1), "left", "top")
+    def flow(self, component: FlowComponent) -> None:
+        """Draw a flow component as its `sketch` declares: a line along its route with its symbol."""
+        sketch = component.sketch()
+        points = self.route(component, sketch)
+        self.line(component.name, points, arrow=sketch.arrow)
+        start, end = _longest_piece(points)
+        middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
+        if sketch.route == "from_above":
+            middle = points[0][0], points[0][1] + sketch.round
+        if sketch.symbol:
+            self.symbol(component.name, sketch, middle, _direction(start, end))
+        if sketch.route == "from_above":
+            self.words(component.name, (middle[0], middle[1] + sketch.round + 0.08), "center", "bottom")
+        elif component.target == OUTSIDE:
+            self.words(component.name, (points[-1][0], points[-1][1] - 0.06), "center", "top")
+        elif component.falls:
+            self.words(component.name, (middle[0] + 0.12, middle[1] + 0.1), "left", "top")
         else:
-            self.words(
-                pipe.name, (middle[0], min(middle[1], self.corner(pipe.source)[1] + 0.12) - 0.18), "center", "top"
-            )
+            low = min(middle[1], self.corner(component.source)[1] + 0.12) - 0.18 - sketch.round
+            self.words(component.name, (middle[0], low), "center", "top")
 
-    def route(self, pipe: Pipe) -> list[Point]:
-        """Corner points of a pipe."""
-        x, y = self.corner(pipe.source)
-        rise = TALL * min(pipe.elevation / self.tank_height(pipe.source), 0.9)
-        if pipe.target == OUTSIDE:
-            out = [p.name for p in self.plant.pipes if p.source == pipe.source and p.target == OUTSIDE]
-            x += 0.3 * (out.index(pipe.name) - (len(out) - 1) / 2)
+    def route(self, component: FlowComponent, sketch: Sketch) -> list[Point]:
+        """Corner points of a flow component's line."""
+        if sketch.route == "from_above":
+            return self.route_from_above(component, sketch)
+        x, y = self.corner(component.source)
+        rise = TALL * min(sketch.height / self.tank_height(component.source), 0.9)
+        if sketch.route == "over_wall":
+            return self.route_over_wall(component, rise)
+        flows = [c for c in self.plant.flow_components() if c.sketch().route == sketch.route]
+        if component.target == OUTSIDE:
+            out = [c.name for c in flows if c.source == component.source and c.target == OUTSIDE]
+            x += 0.3 * (out.index(component.name) - (len(out) - 1) / 2)
             return [(x, y + rise), (x, y - 0.55)]
-        to_x, to_y = self.corner(pipe.target)
-        if pipe.free_fall:
+        to_x, to_y = self.corner(component.target)
+        if component.falls:
             to_x += 0.22
             return [(x + 0.22, y), (x + 0.22, y - 0.3), (to_x, y - 0.3), (to_x, to_y + TALL + 0.06)]
         side = 0.5 if to_x > x else -0.5
-        same = [p.name for p in self.plant.pipes if {p.source, p.target} == {pipe.source, pipe.target}]
-        rise += 0.12 + 0.28 * same.index(pipe.name)
+        same = [c.name for c in flows if {c.source, c.target} == {component.source, component.target}]
+        rise += 0.12 + 0.28 * same.index(component.name)
         if y == to_y and abs(to_x - x) <= COLUMN:
             return [(x + side, y + rise), (to_x - side, to_y + rise)]
         self.crossings += 1
         low = min(y, to_y) - 0.16 - 0.12 * self.crossings
         return [(x + 0.6 * side, y), (x + 0.6 * side, low), (to_x - 0.6 * side, low), (to_x - 0.6 * side, to_y)]
 
-    def valve(self, middle: Point, colour: str, upright: bool) -> None:
-        """Draw a bow tie across the pipe: its opening is measured."""
-        a, b = np.array([[-0.12, 0.08], [-0.12, -0.08], [0.12, 0.08], [0.12, -0.08]]).T
-        x, y = (b, a) if upright else (a, b)
-        self.axes.add_patch(
-            Polygon(np.stack((x + middle[0], y + middle[1]), 1), facecolor=PAPER, edgecolor=colour, lw=1.2, zorder=4)
-        )
+    def route_from_above(self, component: FlowComponent, sketch: Sketch) -> list[Point]:
+        """From a symbol above the target down to its rim."""
+        x, y = self.corner(component.target)
+        same = [c.name for c in self.plant.flow_components() if c.source == OUTSIDE and c.target == component.target]
+        fed = 0.22 if self.fed_from_above(component.target) else 0.0
+        x += (same.index(component.name) - (len(same) - 1) / 2) * 0.7 - fed
+        return [(x, y + TALL + 0.55 - sketch.round), (x, y + TALL + 0.06)]
+
+    def route_over_wall(self, component: FlowComponent, rise: float) -> list[Point]:
+        """Over a wall of the source at the height `rise`, and down outside it or into the target."""
+        x, y = self.corner(component.source)
+        if component.target == OUTSIDE:
+            return [(x + 0.38, y + rise), (x + 0.62, y + rise), (x + 0.62, y - 0.45)]
+        to_x, to_y = self.corner(component.target)
+        side = 1.0 if to_x >= x else -1.0
+        return [
+            (x + 0.38 * side, y + rise),
+            (x + 0.7 * side, y + rise),
+            (x + 0.7 * side, to_y + TALL + 0.3),
+            (to_x - 0.3 * side, to_y + TALL + 0.3),
+            (to_x - 0.3 * side, to_y + TALL + 0.06),
+        ]
+
+    def symbol(self, name: str, sketch: Sketch, middle: Point, direction: Point) -> None:
+        """Draw a component's symbol at the middle of its line, turned into the direction of the flow."""
+        colour, probability = self.colour(name), self.overlay.probabilities.get(name, 0.0)
+        if sketch.round:
+            self.axes.add_patch(Circle(middle, sketch.round, facecolor=PAPER, edgecolor=colour, lw=1.6, zorder=4))
+            if probability > 0.0:
+                halo = Circle(middle, 1.6 * sketch.round, facecolor=MARK, alpha=strength(probability), zorder=5)
+                self.axes.add_patch(halo)
+        (x, y), (cos, sin) = middle, direction
+        corners = [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in sketch.symbol]
+        if sketch.round:
+            self.axes.add_patch(Polygon(corners, facecolor=colour, edgecolor="none", zorder=5))
+        else:
+            self.axes.add_patch(Polygon(corners, facecolor=PAPER, edgecolor=colour, lw=1.2, zorder=4))
 
     def overflow(self, tank: Tank) -> None:
         """Draw the overflow of a tank into another one, dotted."""
@@ -239,7 +269,7 @@ class _Drawing:
             self.words(location, ((x + to_x) / 2, (y + to_y) / 2 + 1.3), "center", "top")
 
     def fed_from_above(self, tank: str) -> bool:
-        return any(p.free_fall and p.target == tank for p in self.plant.pipes)
+        return any(c.falls and c.target == tank for c in self.plant.flow_components())
 
     def tank_height(self, name: str) -> float:
         return next(t.height for t in self.plant.tanks if t.name == name)
@@ -250,11 +280,15 @@ def strength(share: float) -> float:
     return 0.5 * share**3
 
 
-def _middle(points: Sequence[Point]) -> Point:
-    """Middle of the longest straight piece."""
-    pieces = list(pairwise(points))
-    a, b = max(pieces, key=lambda piece: abs(piece[0][0] - piece[1][0]) + abs(piece[0][1] - piece[1][1]))
-    return (a[0] + b[0]) / 2, (a[1] + b[1]) / 2
+def _longest_piece(points: Sequence[Point]) -> tuple[Point, Point]:
+    """Ends of the longest straight piece of a line."""
+    return max(pairwise(points), key=lambda piece: abs(piece[0][0] - piece[1][0]) + abs(piece[0][1] - piece[1][1]))
+
+
+def _direction(start: Point, end: Point) -> Point:
+    """Unit vector from start to end."""
+    length = math.hypot(end[0] - start[0], end[1] - start[1])
+    return (end[0] - start[0]) / length, (end[1] - start[1]) / length
 
 
 def _arrow_head(tip: Point, colour: str) -> Polygon:

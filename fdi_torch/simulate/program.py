@@ -212,9 +212,9 @@ class _Builder:
         return [self.tracer.node(r) for r in rates]
 
     def _step_clock(self) -> Clock:
-        """The clock of a lane's adaptive step."""
+        """The clock of a lane's adaptive step, which is implicit and therefore stable for every rate of change."""
         start, step = (self.tracer.tensor(n) for n in self._inputs("part", 2))
-        return Clock(start, step, self.clock.resolution)
+        return Clock(start, step, self.clock.resolution, explicit=False)
 
     def _readings(self) -> tuple[Section, Section]:
         network, tensor, node = self.network, self.tracer.tensor, self.tracer.node

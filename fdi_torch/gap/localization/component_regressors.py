@@ -1,7 +1,8 @@
 """Local signals of each kind of component, and the regressors of its discrepancy.
 
-A pump depends on its command and its tank's level, a pipe on its head and its valve, a tank on its level, a pair of
-tanks on their difference, a sensor on its reading. Pumps, pipes and sensors may also depend on the past of these.
+A commanded flow depends on its command and its tank's level, any other flow on its head and its valve, a tank on its
+level, a pair of tanks on their difference, a sensor on its reading. Flows and sensors may also depend on the past of
+these.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from fdi_torch.gap.localization.regressors import (
     steps_in_value,
     stictions,
 )
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump
+from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.plant.effect import place_kind
+from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.plant.scales import time_scale
 
 Signals = dict[str, Tensor]
@@ -92,10 +94,8 @@ def discrepancy_model_at(place: str, plant: PlantDescription) -> DiscrepancyMode
     if kind == "tank":
         return _tank(place, plant)
     component = plant.component(place)
-    if isinstance(component, Pump):
-        return _pump(component, plant)
-    assert isinstance(component, Pipe)
-    return _pipe(component, plant)
+    assert isinstance(component, FlowComponent)
+    return _commanded(component, plant) if component.commanded else _by_head(component, plant)
 
 
 def reading_regressors(s: Signals, step: Tensor, ends: SignalRanges, scale: float) -> list[Tensor]:
@@ -111,13 +111,14 @@ def fine_reading_regressors(s: Signals, ends: SignalRanges) -> list[Tensor]:
     return ends.fine_hinges(s, "reading", 12)
 
 
-def _pump(pump: Pump, plant: PlantDescription) -> DiscrepancyModel:
-    index, tank, scale = plant.pumps.index(pump), _index(plant, pump.target), time_scale(plant)
+def _commanded(component: FlowComponent, plant: PlantDescription) -> DiscrepancyModel:
+    name, tank, scale = component.name, _index(plant, component.near_tank), time_scale(plant)
+    actuator = _actuator(plant, name)
 
     def signals(trajectory: Forcing) -> Signals:
         return {
-            "command": trajectory.commands[index],
-            "flow": trajectory.pumps[index],
+            "command": trajectory.commands[actuator],
+            "flow": trajectory.flows[name],
             "level": trajectory.levels[tank],
         }
 
@@ -131,35 +132,36 @@ def _pump(pump: Pump, plant: PlantDescription) -> DiscrepancyModel:
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         return [*ends.fine_hinges(s, "command", 9), *(s["flow"] * b for b in ends.fine_hinges(s, "level", 6))]
 
-    return DiscrepancyModel(signals, flows, fine, "flow", OUTSIDE, pump.target)
+    return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 
 
-def _pipe(pipe: Pipe, plant: PlantDescription) -> DiscrepancyModel:
-    index, scale = plant.pipes.index(pipe), time_scale(plant)
-    valve = len(plant.pumps) + sum(1 for p in plant.pipes[:index] if p.valve)
+def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyModel:
+    name, scale = component.name, time_scale(plant)
+    has_valve = component.input_channel is not None
 
     def signals(trajectory: Forcing) -> Signals:
-        head = trajectory.levels[_index(plant, pipe.source)] - pipe.elevation
-        if not pipe.is_outlet:
-            far_head = trajectory.levels[_index(plant, pipe.target)] - pipe.elevation
-            head = head.clamp(min=0.0) - far_head.clamp(min=0.0) if pipe.elevation else head - far_head
-        signals_here = {"root": _root(head), "flow": trajectory.pipes[index]}
-        return signals_here | ({"opening": trajectory.commands[valve]} if pipe.valve else {})
+        here = {"root": _root(trajectory.heads[name]), "flow": trajectory.flows[name]}
+        return here | ({"opening": trajectory.commands[_actuator(plant, name)]} if has_valve else {})
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         regressors = [*ends.hinges(s, "root", 16), *lags_and_decays(s["flow"], step, scale)]
         regressors += [s["flow"] * j for j in ends.steps_in_value(s, "root", 24)]
         regressors += [s["flow"] * on for _, on in ends.relays(s, "root")]
-        if pipe.valve:
+        if has_valve:
             regressors += [s["root"] * b for b in ends.hinges(s, "opening", 9)]
             regressors += lags_and_decays(s["root"] * s["opening"], step, scale)
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        of_opening = [s["root"] * b for b in ends.fine_hinges(s, "opening", 9)] if pipe.valve else []
+        of_opening = [s["root"] * b for b in ends.fine_hinges(s, "opening", 9)] if has_valve else []
         return [*ends.fine_hinges(s, "root", 16), *of_opening]
 
-    return DiscrepancyModel(signals, flows, fine, "flow", pipe.source, pipe.target)
+    return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
+
+
+def _actuator(plant: PlantDescription, name: str) -> int:
+    """Index of a component among those with an input channel."""
+    return [c.name for c in plant.flows_in_order() if c.input_channel is not None].index(name)
 
 
 def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
