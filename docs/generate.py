@@ -145,7 +145,7 @@ def plant_file() -> str:
                 "--plant FILE` checks one, and `--picture FILE` draws it. Values have units; the table gives SI units.",
                 key_table(keys_of("check")),
                 "## Flow components",
-                "A flow component has a section for its kind, and its name is its key there. Effects can be placed on it "
+                "A flow component has a section for its kind, and its name is its key there. Effects are placed on it "
                 "by that name.",
                 *(flow_kind(kind) for kind in FLOW_KINDS),
                 "## Shipped plants",
