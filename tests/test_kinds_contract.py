@@ -17,8 +17,10 @@ from fdi_torch.config import ConfigError, build_plant, dump_plant
 from fdi_torch.config.yaml_files import parse_yaml
 from fdi_torch.effects import build_network, place
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank, Transfer, Weir
+from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
+from fdi_torch.plant.kinds.transfer import Transfer
+from fdi_torch.plant.kinds.weir import Weir
 from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Recording
 from fdi_torch.report.schematic import schematic

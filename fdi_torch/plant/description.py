@@ -29,8 +29,6 @@ __all__ = [
     "Pump",
     "Sensor",
     "Tank",
-    "Transfer",
-    "Weir",
     "describe",
 ]
 
