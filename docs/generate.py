@@ -17,7 +17,11 @@ from typing import Any
 import fdi_torch
 from fdi_torch.cli import COMMANDS
 from fdi_torch.config.key_reference import keys
+from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.logbook.schemas import TOPICS
+from fdi_torch.plant.description import FLOW_KINDS, PlantDescription, Tank
+from fdi_torch.plant.effect import fits
+from fdi_torch.plant.flow_component import FlowComponent
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -140,6 +144,10 @@ def plant_file() -> str:
                 "Generated from the model that reads the file. `fdi new plant` writes a commented example, `fdi check "
                 "--plant FILE` checks one, and `--picture FILE` draws it. Values have units; the table gives SI units.",
                 key_table(keys_of("check")),
+                "## Flow components",
+                "A flow component has a section for its kind, and its name is its key there. Effects are placed on it "
+                "by that name.",
+                *(flow_kind(kind) for kind in FLOW_KINDS),
                 "## Shipped plants",
                 "A name may stand in place of a file: " + ", ".join(f"`{path.stem}`" for path in shipped) + ".",
                 "```yaml\n" + (ROOT / "configs/plants/three_tank.yaml").read_text(encoding="utf-8") + "```",
@@ -147,6 +155,20 @@ def plant_file() -> str:
         )
         + "\n"
     )
+
+
+def flow_kind(kind: type[FlowComponent]) -> str:
+    """The law of a kind of flow component, an example, and the effects that can be placed on it."""
+    tanks = (Tank("A", 0.015, 0.5), Tank("B", 0.015, 0.5))
+    parts: dict[str, Any] = {kind.part(): (kind.example("X", "A", "B"),)}
+    plant = PlantDescription("example", tanks, **parts)
+    component = next(plant.flow_components())
+    section = plant_mapping(plant)[kind.part()]["X"]
+    example = ", ".join(f"{key}: {value}" for key, value in section.items())
+    names = [f"[`{e.name}`](effects.md#{e.name})" for e in fdi_torch.EFFECTS if fits(e, plant, component.name)]
+    law = plain(inspect.cleandoc(kind.__doc__ or ""))
+    block = f"```yaml\n{kind.part()}:\n  X: {{{example}}}\n```"
+    return f"### {kind.part()}\n\n{law}\n\n{block}\n\nEffects: {', '.join(names)}."
 
 
 def effects() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -12,12 +13,14 @@ from rigs import blank_recording, factor, rescaled
 from torch import Tensor
 
 import fdi_torch
-from fdi_torch.config import build_plant, dump_plant
+from fdi_torch.config import ConfigError, build_plant, dump_plant
 from fdi_torch.config.yaml_files import parse_yaml
-from fdi_torch.effects import build_network
+from fdi_torch.effects import build_network, place
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
+from fdi_torch.plant.kinds.transfer import Transfer
+from fdi_torch.plant.kinds.weir import Weir
 from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Recording
 from fdi_torch.report.schematic import schematic
@@ -27,17 +30,17 @@ from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.reference_engine import ReferenceEngine
 from fdi_torch.simulate.step_control import StepControl
 
-SAMPLE, SAMPLES = 5.0, 40
+SAMPLE, SAMPLES = 2.5, 80
 AREA, HEIGHT = 0.015, 0.5
 kinds = pytest.mark.parametrize("kind", FLOW_KINDS, ids=lambda kind: kind.__name__)
 
 
-def plant_with(kind: type[FlowComponent], start: tuple[float, float] = (0.35, 0.35)) -> PlantDescription:
+def plant_with(kind: type[FlowComponent], start: tuple[float, float] = (0.25, 0.25)) -> PlantDescription:
     """A pump into A, one component of the kind from A to B, one from B to the outside, and a small outlet of each."""
     tanks = (Tank("A", AREA, HEIGHT, start[0]), Tank("B", AREA, HEIGHT, start[1]))
     outlets = (Pipe("OUTA", "A", OUTSIDE, 0.15e-4, 0.6), Pipe("OUTB", "B", OUTSIDE, 0.15e-4, 0.6))
     plant = PlantDescription(
-        f"a plant with a {kind.__name__}", tanks, outlets, (Pump("Q", "A", 4e-5),), (Sensor("a", "A"), Sensor("b", "B"))
+        f"a plant with a {kind.__name__}", tanks, outlets, (Pump("Q", "A", 7e-5),), (Sensor("a", "A"), Sensor("b", "B"))
     )
     present = getattr(plant, kind.part())
     return replace(plant, **{kind.part(): (*present, kind.example("X", "A", "B"), kind.example("Y", "B", OUTSIDE))})
@@ -46,9 +49,9 @@ def plant_with(kind: type[FlowComponent], start: tuple[float, float] = (0.35, 0.
 def inputs_of(plant: PlantDescription) -> Recording:
     """Every channel between 10 and 60 % of its full scale."""
     full = {c.input_channel[0]: c.full_command for c in plant.flow_components() if c.input_channel is not None}
-    steps = torch.rand(SAMPLES // 5, len(full), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    steps = torch.rand(SAMPLES // 10, len(full), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     scale = torch.tensor([full[channel] for channel in plant.channels()], dtype=torch.float64)
-    values = scale * (0.1 + 0.5 * steps.repeat_interleave(5, dim=0))
+    values = scale * (0.1 + 0.5 * steps.repeat_interleave(10, dim=0))
     return blank_recording(plant, values, torch.arange(SAMPLES, dtype=torch.float64) * SAMPLE)
 
 
@@ -302,3 +305,52 @@ def test_its_units_are_true(kind: type[FlowComponent], metre: float, second: flo
     engine = ReferenceEngine(network, ParameterSpace(), lay_out(recording, other.channels(), SAMPLE * second))
     levels = engine.levels(network.nominal.new_zeros(0)) / metre
     assert torch.allclose(levels, levels_of(kind), rtol=1e-6, atol=1e-9)
+
+
+def test_weirs_in_a_row_are_computed_along_the_water() -> None:
+    """Whatever their order in the file; a circle of transfers is cut."""
+    tanks = tuple(Tank(name, AREA, HEIGHT) for name in "ABC")
+    weirs = (Weir("second", "B", "C", 0.3, 0.02), Weir("first", "A", "B", 0.3, 0.02))
+    circle = (Transfer("X", "C", "A", 1e-5), Transfer("Y", "A", "C", 1e-5))
+    plant = PlantDescription("row", tanks, weirs=weirs, transfers=circle)
+    names = [component.name for component in plant.flows_in_order()]
+    assert names.index("first") < names.index("second")
+    assert sorted(names) == ["X", "Y", "first", "second"]
+
+
+def test_an_argument_that_is_no_kind_is_named() -> None:
+    with pytest.raises(TypeError, match="weirs"):
+        fdi_torch.Plant([Tank("A", AREA, HEIGHT)], sensors=[Sensor("a", "A")], weir=[])
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ("{source: A, target: A, crest: 10 cm, width: 2 cm}", "weirs.W: expected two different ends, got A twice"),
+        ("{source: B, crest: 10 cm, width: 2 cm}", "weirs.W.source: expected one of the tanks A, got 'B'"),
+        ("{source: A, crest: 10 cm, width: 0 cm}", "weirs.W.width: expected a positive number, got 0.0 m"),
+        ("{source: A, crest: 10 cm, width: 2 cm, discharge_coefficient: 60}", "weirs.W.discharge_coefficient"),
+        ("{source: A, width: 2 cm}", "weirs.W.crest"),
+    ],
+)
+def test_a_wrong_weir_is_named_with_its_key(keys: str, problem: str) -> None:
+    text = f"tanks: {{A: {{area: 150 cm^2, height: 50 cm}}}}\nsensors: {{a: {{tank: A}}}}\nweirs: {{W: {keys}}}\n"
+    with pytest.raises(ConfigError, match=re.escape(problem)):
+        build_plant(parse_yaml(text.encode(), "plant"), "plant")
+
+
+@kinds
+def test_gap_names_its_most_usual_fault(kind: type[FlowComponent], tmp_path: Path) -> None:
+    """Among the usual faults of everything in the plant and leaks; a fault of 20 % of the flow."""
+    plant = plant_with(kind)
+    effect, size = kind.usual_faults[0].split(".")
+    network = build_network(plant, [place(effect, "X")])
+    nominal = network.constants[f"X.{effect}.{size}"].nominal
+    space = ParameterSpace([network.constants[f"X.{effect}.{size}"]])
+    recording = inputs_of(plant)
+    engine = ReferenceEngine(network, space, lay_out(recording, plant.channels(), SAMPLE))
+    readings = engine.readings(torch.tensor([nominal - 0.2 if nominal else 0.2], dtype=torch.float64))
+    noise = 5e-4 * torch.randn(readings.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    recording = replace(recording, outputs=readings + noise, mask=None)
+    found = fdi_torch.gap(plant, recording, out=tmp_path, library=("plugging", "pump_gain", "leak"))
+    assert [(c.effect, c.location) for c in found.answer.causes] == [(effect, "X")]

@@ -29,6 +29,12 @@ pumps:
   Q: {target: A, max_flow: 6 l/min}
   # Q: {target: A, max_flow: 6 l/min, gain: 0.5 l/min/V}    # where the command is a voltage; l/min alone: of a duty
 
+# weirs:                      # overflow over a crest below the rim
+#   over: {source: A, target: B, crest: 50 cm, width: 4 cm}
+
+# transfers:                  # commanded or measured flows out of a tank; the recording has a column of that name
+#   back: {source: B, target: A, max_flow: 3 l/min}
+
 sensors:
   hA: {tank: A}
   hB: {tank: B}

@@ -5,22 +5,25 @@ from __future__ import annotations
 import inspect
 import sys
 from dataclasses import dataclass
+from typing import Any
 
 from fdi_torch.effects import EFFECTS, effect
 from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank, Transfer, Weir
+from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Effect, fits, place_kinds_of
 from fdi_torch.tables import Shown, Table
 
 # A rig with every kind of place, the default if no plant is given.
+_FURTHER: dict[str, Any] = {
+    kind.part(): (kind.example(f"{kind.__name__}12", "T1", "T2"),) for kind in FLOW_KINDS if kind not in (Pipe, Pump)
+}
 _ANY = PlantDescription(
     "any plant",
     (Tank("T1", 0.02, 1.0), Tank("T2", 0.02, 1.0)),
     (Pipe("P12", "T1", "T2", 1e-4, 0.6, valve="v12"), Pipe("OUT", "T2", OUTSIDE, 1e-4, 0.6, valve="vOUT")),
     (Pump("Q1", "T1", 1e-4),),
     (Sensor("h1", "T1"), Sensor("h2", "T2")),
-    weirs=(Weir.example("W12", "T1", "T2"),),
-    transfers=(Transfer.example("X21", "T2", "T1"),),
+    **_FURTHER,
 )
 _ONSETS = ("onset", "begin")
 

@@ -29,8 +29,6 @@ __all__ = [
     "Pump",
     "Sensor",
     "Tank",
-    "Transfer",
-    "Weir",
     "describe",
 ]
 
@@ -113,7 +111,7 @@ class PlantDescription:
         Flows that depend on the net inflow of their source follow the water: a flow into a tank precedes one out of it.
         """
         depth = _depths(self)
-        return sorted(self.flow_components(), key=lambda c: (c.order, depth[c.name]))
+        return sorted(self.flow_components(), key=lambda c: (c.order, depth.get(c.name, 0)))
 
     def component(self, name: str) -> Tank | FlowComponent | Sensor:
         for component in self.components():
@@ -149,14 +147,13 @@ FLOW_KINDS: tuple[type[FlowComponent], ...] = tuple(
 
 
 def _depths(plant: PlantDescription) -> dict[str, int]:
-    """Number of flows of its own order that each flow component is behind along the water, at most; circles are cut."""
-    flows = list(plant.flow_components())
+    """Number of flows of its own order that a flow depending on net inflows is behind, at most; circles are cut."""
+    flows = [c for c in plant.flow_components() if c.order > FlowOrder.BY_LEVELS]
     depth = {c.name: 0 for c in flows}
-    for _ in range(len(plant.tanks)):
-        for c in flows if any(c.order > FlowOrder.BY_LEVELS for c in flows) else ():
-            ahead = [depth[o.name] + 1 for o in flows if o.order == c.order and o.target == c.source]
-            if c.order > FlowOrder.BY_LEVELS:
-                depth[c.name] = min(max(ahead, default=0), len(plant.tanks))
+    for _ in flows:
+        for c in flows:
+            before = [depth[o.name] + 1 for o in flows if o.order == c.order and o.target == c.source]
+            depth[c.name] = min(max(before, default=0), len(flows))
     return depth
 
 

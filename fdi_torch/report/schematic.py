@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from textwrap import wrap
 
 import numpy as np
@@ -15,8 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
-from fdi_torch.plant.flow_component import FlowComponent, Sketch
+from fdi_torch.plant.flow_component import FlowComponent, FlowOrder, Sketch
 from fdi_torch.report.html import short
+from fdi_torch.report.line_geometry import Point, arrow_head, direction, longest_piece
 from fdi_torch.report.numbers import percent
 from fdi_torch.report.rig_layout import tank_places
 from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
@@ -24,9 +23,9 @@ from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
 INCH = 0.8  # per unit of the drawing; a tank is one unit wide
 TALL = 1.4
 COLUMN, ROW = 1.95, 3.1
+ASIDE, LANE = 0.68, 0.36  # from a tank's middle to a line beside its left wall, and on to the next one
 LETTER = 0.1  # largest width of a letter beside a sensor
 LINE, WITHIN = 0.2, 9  # height of a line; letters per line within a tank
-Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -52,13 +51,15 @@ class _Drawing:
     def __init__(self, plant: PlantDescription, overlay: Overlay) -> None:
         self.plant, self.overlay = plant, overlay
         self.places = tank_places(plant)
-        self.crossings = 0
+        self.crossings = self.besides = 0
         rows = 1 + max(row for row, _ in self.places.values())
         columns = 1 + max(column for _, column in self.places.values())
         longest = max((len(words) for name in plant.locations() for words in self.diagnosis(name)), default=0)
         margin = max(1.0, 0.058 * longest)
         beside = max((len(w) for s in plant.sensors for w in (short(s.name, 16), *self.diagnosis(s.name))), default=0)
-        left, right = -margin, (columns - 1) * COLUMN + max(margin, 0.8 + LETTER * beside)
+        beside_left = [len(short(c.name, 16)) for c in plant.flow_components() if c.order > FlowOrder.BY_LEVELS]
+        aside = ASIDE + LANE * len(beside_left) + LETTER * max(beside_left) if beside_left else 0.0
+        left, right = -max(margin, aside), (columns - 1) * COLUMN + max(margin, 0.8 + LETTER * beside)
         words = 0.2 * max((len(self.diagnosis(name)) for name in plant.locations()), default=0)
         bottom, top = -(rows - 1) * ROW - 0.85 - words, TALL + 1.05 + words
         self.figure = Figure(figsize=((right - left) * INCH, (top - bottom) * INCH))
@@ -122,7 +123,7 @@ class _Drawing:
             )
         self.axes.plot(x, y, color=self.colour(name), lw=2.4 if name in self.overlay.marks else 1.6, zorder=2)
         if arrow:
-            self.axes.add_patch(_arrow_head(points[-1], self.colour(name)))
+            self.axes.add_patch(arrow_head(points[-1], direction(points[-2], points[-1]), self.colour(name)))
 
     def tank(self, tank: Tank) -> None:
         x, y = self.corner(tank.name)
@@ -163,17 +164,19 @@ class _Drawing:
         sketch = component.sketch()
         points = self.route(component, sketch)
         self.line(component.name, points, arrow=sketch.arrow)
-        start, end = _longest_piece(points)
+        start, end = longest_piece(points)
         middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
         if sketch.route == "from_above":
             middle = points[0][0], points[0][1] + sketch.round
         if sketch.symbol:
-            self.symbol(component.name, sketch, middle, _direction(start, end))
+            self.symbol(component.name, sketch, middle, direction(start, end))
         if sketch.route == "from_above":
             self.words(component.name, (middle[0], middle[1] + sketch.round + 0.08), "center", "bottom")
         elif component.target == OUTSIDE:
             self.words(component.name, (points[-1][0], points[-1][1] - 0.06), "center", "top")
-        elif component.falls:
+        elif middle[0] < self.corner(component.source)[0] - 0.5:
+            self.words(component.name, (middle[0] - 0.08 - sketch.round, middle[1] + 0.1), "right", "top")
+        elif component.falls and start[0] == end[0]:
             self.words(component.name, (middle[0] + 0.12, middle[1] + 0.1), "left", "top")
         else:
             low = min(middle[1], self.corner(component.source)[1] + 0.12) - 0.18 - sketch.round
@@ -201,6 +204,8 @@ class _Drawing:
         rise += 0.12 + 0.28 * same.index(component.name)
         if y == to_y and abs(to_x - x) <= COLUMN:
             return [(x + side, y + rise), (to_x - side, to_y + rise)]
+        if x == to_x and sketch.arrow:
+            return self.route_beside((x - 0.5, y + rise), to_x, to_y)
         self.crossings += 1
         low = min(y, to_y) - 0.16 - 0.12 * self.crossings
         return [(x + 0.6 * side, y), (x + 0.6 * side, low), (to_x - 0.6 * side, low), (to_x - 0.6 * side, to_y)]
@@ -214,19 +219,22 @@ class _Drawing:
         return [(x, y + TALL + 0.55 - sketch.round), (x, y + TALL + 0.06)]
 
     def route_over_wall(self, component: FlowComponent, rise: float) -> list[Point]:
-        """Over a wall of the source at the height `rise`, and down outside it or into the target."""
+        """Over a wall of the source at the height `rise`: down outside it, or into the target."""
         x, y = self.corner(component.source)
         if component.target == OUTSIDE:
-            return [(x + 0.38, y + rise), (x + 0.62, y + rise), (x + 0.62, y - 0.45)]
+            return [(x - 0.5, y + rise), (x - ASIDE, y + rise), (x - ASIDE, y - 0.45)]
         to_x, to_y = self.corner(component.target)
-        side = 1.0 if to_x >= x else -1.0
-        return [
-            (x + 0.38 * side, y + rise),
-            (x + 0.7 * side, y + rise),
-            (x + 0.7 * side, to_y + TALL + 0.3),
-            (to_x - 0.3 * side, to_y + TALL + 0.3),
-            (to_x - 0.3 * side, to_y + TALL + 0.06),
-        ]
+        if to_y != y:
+            return self.route_beside((x - 0.5, y + rise), to_x, to_y)
+        side = 0.5 if to_x > x else -0.5
+        return [(x + side, y + rise), (to_x - side, y + rise)]
+
+    def route_beside(self, start: Point, to_x: float, to_y: float) -> list[Point]:
+        """From the left wall of a tank past it to the rim of a tank in another row."""
+        self.besides += 1
+        lane, above = start[0] + 0.5 - ASIDE - LANE * (self.besides - 1), to_y + TALL + 0.14 + 0.1 * self.besides
+        end = to_x - 0.2 - 0.12 * self.besides
+        return [start, (lane, start[1]), (lane, above), (end, above), (end, to_y + TALL + 0.06)]
 
     def symbol(self, name: str, sketch: Sketch, middle: Point, direction: Point) -> None:
         """Draw a component's symbol at the middle of its line, turned into the direction of the flow."""
@@ -278,19 +286,3 @@ class _Drawing:
 def strength(share: float) -> float:
     """Opacity of a location by its probability (0 to 1); cubic, so that certain locations stand out."""
     return 0.5 * share**3
-
-
-def _longest_piece(points: Sequence[Point]) -> tuple[Point, Point]:
-    """Ends of the longest straight piece of a line."""
-    return max(pairwise(points), key=lambda piece: abs(piece[0][0] - piece[1][0]) + abs(piece[0][1] - piece[1][1]))
-
-
-def _direction(start: Point, end: Point) -> Point:
-    """Unit vector from start to end."""
-    length = math.hypot(end[0] - start[0], end[1] - start[1])
-    return (end[0] - start[0]) / length, (end[1] - start[1]) / length
-
-
-def _arrow_head(tip: Point, colour: str) -> Polygon:
-    x, y = tip
-    return Polygon([(x - 0.08, y + 0.14), (x + 0.08, y + 0.14), (x, y)], facecolor=colour, edgecolor="none", zorder=4)

@@ -13,7 +13,7 @@ from fdi_torch.plant.local_conditions import Local
 from fdi_torch.plant.metered_flow import MeteredFlow, gain_field
 from fdi_torch.plant.orifice import limit_draw
 
-ARROW = ((-0.06, -0.09), (-0.06, 0.09), (0.11, 0.0))
+ARROW = ((-0.05, -0.08), (-0.05, 0.08), (0.1, 0.0))
 
 
 @dataclass(frozen=True)
@@ -50,4 +50,4 @@ class Transfer(MeteredFlow):
         return limit_draw(flow, local.level, local.net, local.area, local.clock.resolution)
 
     def sketch(self) -> Sketch:
-        return Sketch("pipe", symbol=ARROW, round=0.15)
+        return Sketch("pipe", symbol=ARROW, round=0.13)
