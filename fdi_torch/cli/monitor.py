@@ -18,7 +18,8 @@ from fdi_torch.parameters import display_unit
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     folder = [f"output.folder={arguments.out}"] if arguments.out else []
-    monitor_run = load_monitor(arguments.config, [*arguments.set, *folder])
+    url = [f"source.url={arguments.source}"] if arguments.source else []
+    monitor_run = load_monitor(arguments.config, [*arguments.set, *folder, *url])
     with screen.progress("monitor") as advance, live(arguments, monitor_run.name, screen) as listener:
         callbacks = MonitorCallbacks(
             advance, lambda e: _show_event(e, screen), lambda p: _show_setup(p, screen), listener
