@@ -1,13 +1,14 @@
-"""An MQTT broker as tests need it: started on a free port, killed and started again."""
+"""Servers as tests of live sources need them, on free ports: an MQTT broker, and a network that can be cut."""
 
 from __future__ import annotations
 
 import shutil
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -64,3 +65,46 @@ def broker(folder: Path) -> Iterator[Broker]:
         yield running
     finally:
         running.stop()
+
+
+class Proxy:
+    """A forwarder of TCP connections that can be cut and mended, as a network can."""
+
+    def __init__(self, target: int) -> None:
+        self.port, self._target = free_port(), target
+        self._open: list[socket.socket] = []
+        self.mend()
+
+    def mend(self) -> None:
+        self._listener = socket.create_server(("127.0.0.1", self.port), reuse_port=False)
+        threading.Thread(target=self._accept, args=(self._listener,), daemon=True).start()
+
+    def cut(self) -> None:
+        """Close the door and all connections."""
+        _close(self._listener)
+        for end in self._open:
+            _close(end)
+        self._open.clear()
+
+    def _accept(self, listener: socket.socket) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = listener.accept()
+                far = socket.create_connection(("127.0.0.1", self._target))
+                self._open += [near, far]
+                for a, b in ((near, far), (far, near)):
+                    threading.Thread(target=_forward, args=(a, b), daemon=True).start()
+
+
+def _forward(source: socket.socket, target: socket.socket) -> None:
+    with suppress(OSError):
+        while data := source.recv(65536):
+            target.sendall(data)
+    for end in (source, target):
+        _close(end)
+
+
+def _close(end: socket.socket) -> None:
+    with suppress(OSError):
+        end.shutdown(socket.SHUT_RDWR)
+    end.close()

@@ -184,4 +184,13 @@ def _connection(config: SourceConfig, address: Address, tags: list[str]) -> Conn
         second = unit_factor(clock.unit, "s") if clock is not None and clock.unit else None
         name = None if clock is None else clock.tag
         return MqttSource(address, tags, name, second, clock is not None and clock.unix, config.session)
+    if config.session:
+        raise ValueError("session: expected this key of an MQTT source only; leave it out")
+    if scheme == "opcua":
+        if config.clock is not None:
+            raise ValueError("clock: expected none for OPC UA, whose values have times of their own; leave it out")
+        from fdi_torch.live.opcua import OpcUaSource
+
+        # A row is complete before `reorder` ends if all its values come with one notification.
+        return OpcUaSource(address, tags, config.period, min(config.period, 0.5 * config.reorder))
     raise AssertionError(scheme)

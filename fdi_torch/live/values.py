@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -91,6 +90,11 @@ class BackOff:
         self.first, self.longest = first, longest
         self._next = first
 
+    @property
+    def fresh(self) -> bool:
+        """Whether no attempt has failed since the last success."""
+        return self._next == self.first
+
     def failed(self) -> float:
         """The time to wait before the next attempt."""
         wait, self._next = self._next, min(2.0 * self._next, self.longest)
@@ -98,10 +102,3 @@ class BackOff:
 
     def succeeded(self) -> None:
         self._next = self.first
-
-    def wait(self, stop: threading.Event | None = None) -> None:
-        """Wait as long as `failed` says, or until `stop` is set."""
-        if stop is None:
-            time.sleep(self.failed())
-        else:
-            stop.wait(self.failed())
