@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Iterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AllowInfNan, BeforeValidator, Field, field_validator
 
@@ -33,7 +33,7 @@ class TagConfig(Strict):
     tag: str | None = Field(
         None,
         description="address of the value: TOPIC or TOPIC:FIELD (MQTT), node such as ns=2;s=Rig.h1 (OPC UA), or "
-        "holding:100 (Modbus)",
+        "holding:100:float32 (Modbus: coil, discrete, input or holding; address from 0; type, by default uint16)",
     )
     unit: str | None = Field(None, description="unit of its numbers, as in cm")
     factor: float = Field(1.0, description="the number is multiplied by this")
@@ -46,7 +46,7 @@ class TagConfig(Strict):
 
 
 class LiveClockConfig(Strict):
-    tag: str = Field(description="MQTT: field of each message with the time")
+    tag: str = Field(description="MQTT: field of each message with the time; Modbus: register with the time")
     unit: str | None = Field(None, description="unit of the time if it is a number; without it, ISO 8601 stamps")
     unix: bool = Field(False, description="whether its numbers count from 1970")
 
@@ -65,6 +65,8 @@ class SourceConfig(Strict):
         "value has a time of its own, and 0 s (no rounding) elsewhere",
     )
     reorder: Seconds = Field(0.5, ge=0, description="time for which a row waits for values and earlier rows, s")
+    device: int = Field(1, ge=0, le=255, description="Modbus: unit identifier of the device")
+    word_order: Literal["big", "little"] = Field("big", description="Modbus: register that comes first in longer types")
     session: str = Field("", description="MQTT: name under which the broker keeps messages for this monitor")
     hold: Hold = Field("zero_order", description="course of inputs between samples")
     start_levels: StartLevels = Field("free", description="free, equilibrium, or a mapping such as {T1: 50 cm}")
@@ -79,7 +81,7 @@ class SourceConfig(Strict):
 class LiveRows(Iterator["Row | str"]):
     """Rows of a live source, and a sentence for each event of the connection.
 
-    Ends when nothing has arrived for `idle` s. earlier: rows of an earlier run that is resumed; origin: its origin.
+    Ends when no new row has arrived for `idle` s. earlier: rows of an earlier run that is resumed; origin: its origin.
     Raises ConfigError for an unusable mapping, and if the source cannot be reached at first.
     """
 
@@ -121,9 +123,11 @@ class LiveRows(Iterator["Row | str"]):
                     if isinstance(item, str):
                         yield item
                     else:
-                        quiet_since = now
                         self._buffer.put(item, now)
-                yield from self._buffer.rows(time.monotonic())
+                rows = self._buffer.rows(time.monotonic())
+                if any(not isinstance(row, str) for row in rows):  # values that are repeated make no row
+                    quiet_since = time.monotonic()
+                yield from rows
             yield from self._buffer.rows(time.monotonic(), all_of_them=True)
         finally:
             self._connection.close()
@@ -174,23 +178,28 @@ def _full_tag(tag: str, address: Address) -> str:
 
 
 def _connection(config: SourceConfig, address: Address, tags: list[str]) -> Connection:
-    scheme = address.scheme.removesuffix("s")
-    if scheme == "mqtt":
+    clock = config.clock
+    name = None if clock is None else clock.tag
+    second = unit_factor(clock.unit, "s") if clock is not None and clock.unit else None
+    dated = clock is not None and clock.unix
+    if address.scheme.startswith("mqtt"):
         if any(mark in text for text in (config.url, *tags) for mark in "#+"):
             raise ValueError(f"url: expected a topic without the wildcards # and +, got '{config.url}'; give each tag")
         from fdi_torch.live.mqtt import MqttSource
 
-        clock = config.clock
-        second = unit_factor(clock.unit, "s") if clock is not None and clock.unit else None
-        name = None if clock is None else clock.tag
-        return MqttSource(address, tags, name, second, clock is not None and clock.unix, config.session)
+        return MqttSource(address, tags, name, second, dated, config.session)
     if config.session:
         raise ValueError("session: expected this key of an MQTT source only; leave it out")
-    if scheme == "opcua":
+    if address.scheme == "opcua":
         if config.clock is not None:
             raise ValueError("clock: expected none for OPC UA, whose values have times of their own; leave it out")
         from fdi_torch.live.opcua import OpcUaSource
 
         # A row is complete before `reorder` ends if all its values come with one notification.
         return OpcUaSource(address, tags, config.period, min(config.period, 0.5 * config.reorder))
-    raise AssertionError(scheme)
+    from fdi_torch.live.modbus import ModbusSource
+
+    if name is not None and second is None:
+        raise ValueError("clock: expected a unit of the register's number, got none; add unit: s")
+    order = config.word_order
+    return ModbusSource(address, tags, config.period, name, second or 1.0, dated, config.device, order)
