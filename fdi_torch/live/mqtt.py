@@ -11,10 +11,10 @@ from typing import Any
 import orjson
 
 from fdi_torch.live.address import Address, credentials
+from fdi_torch.live.extras import library_of
 from fdi_torch.live.values import Inbox, Item, Value
 from fdi_torch.logbook import number_at
 from fdi_torch.recordings.time_stamps import seconds_of
-from fdi_torch.tables import needed
 
 WAIT = 10.0
 """Time within which a broker must answer the first connection, s."""
@@ -40,7 +40,7 @@ class MqttClient:
         on_message: Callable[[str, bytes], None] | None = None,
         on_state: Callable[[str], None] | None = None,
     ) -> None:
-        paho = needed("paho.mqtt.client", "mqtt")
+        paho = library_of("mqtt", "paho.mqtt.client")
         self._topics, self._place = topics, address.place
         self._on_message, self._on_state = on_message, on_state
         self._answered, self._lost_at = threading.Event(), None
@@ -183,3 +183,26 @@ def _number(data: Any) -> float:
     if isinstance(data, bool | int | float):
         return float(data)
     raise ValueError("expected a number, got a JSON object; name the field, as in tag: 'rig/level:value'")
+
+
+class EventPublisher:
+    """Publisher of events below the topic of `address` (by default fdi): TOPIC/event, and the retained TOPIC/state.
+
+    Events that happen while the connection is lost are sent after its renewal.
+    """
+
+    def __init__(self, address: Address) -> None:
+        self._topic = address.path.rstrip("/") or "fdi"
+        self._client = MqttClient(address)
+
+    def __enter__(self) -> EventPublisher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.close(wait=WAIT)
+
+    def publish(self, event: Mapping[str, Any]) -> None:
+        """Publish an event as in the output of --json; its state and faults become the retained message."""
+        state = {key: event.get(key) for key in ("time", "state", "faults", "headline")}
+        self._client.publish(f"{self._topic}/event", orjson.dumps(event))
+        self._client.publish(f"{self._topic}/state", orjson.dumps(state), retain=True)

@@ -35,4 +35,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="end after this time without samples (60 s with --follow, never with a live source)",
     )
     parser.add_argument("--resume", action="store_true", help="continue a killed run of the same file or source")
+    parser.add_argument(
+        "--publish",
+        metavar="URL",
+        help="publish each event as JSON to mqtt://HOST[:PORT]/TOPIC: TOPIC/event, and TOPIC/state with the latest "
+        "state (needs the extra `mqtt`)",
+    )
+    parser.add_argument(
+        "--metrics",
+        metavar="[HOST:]PORT",
+        nargs="?",
+        const="127.0.0.1:9464",
+        help="serve Prometheus metrics (without a value: 127.0.0.1:9464, reachable from this machine only; "
+        "0.0.0.0:PORT opens them to the whole network without a password; needs the extra `prometheus`)",
+    )
     add_live(parser)
