@@ -43,8 +43,9 @@ class MqttClient:
         paho = library_of("mqtt", "paho.mqtt.client")
         self._topics, self._place = topics, address.place
         self._on_message, self._on_state = on_message, on_state
-        self._answered, self._lost_at = threading.Event(), None
-        self._refusal = ""
+        self._answered, self._refusal = threading.Event(), ""
+        self._lost_at: float | None = None
+        self._last: Any = None  # the message that was published last
         self._client = paho.Client(
             paho.CallbackAPIVersion.VERSION2, client_id=session, clean_session=not session, protocol=paho.MQTTv311
         )
@@ -59,17 +60,14 @@ class MqttClient:
 
     def publish(self, topic: str, payload: bytes, retain: bool = False) -> None:
         """Send a message, or keep it until the connection is renewed."""
-        self._client.publish(topic, payload, qos=1, retain=retain)
+        self._last = self._client.publish(topic, payload, qos=1, retain=retain)
 
     def close(self, wait: float = 0.0) -> None:
-        """Disconnect, after waiting up to `wait` s for unsent messages."""
-        end = time.monotonic() + wait
-        while self._client.is_connected() and self._client._out_messages and time.monotonic() < end:
-            time.sleep(0.01)
+        """Disconnect, after waiting up to `wait` s for the last message to be confirmed."""
+        if self._last is not None and self._client.is_connected():
+            self._last.wait_for_publish(wait)
         self._client.disconnect()
         self._client.loop_stop()
-
-    _lost_at: float | None
 
     def _connect(self, address: Address) -> None:
         try:

@@ -119,7 +119,7 @@ class RowBuffer:
             return []
         self._reported = 2 * self._count
         return [
-            f"{self._count} rows came more than {self._reorder:g} s late and are left out; a longer source.reorder "
+            f"samples more than {self._reorder:g} s late were left out, {self._count} so far; a longer source.reorder "
             "waits for them"
         ]
 
