@@ -17,6 +17,7 @@ LAYERS = (
     {"plant"},
     {"effects", "simulate"},
     {"estimate", "logbook", "recordings"},
+    {"live"},
     {"blind"},
     {"report", "gap", "study", "monitor"},
     {"config"},
@@ -49,6 +50,10 @@ DOORS = {
     "distributed": ("study/cluster.py",),
     "rich": ("cli/",),
     "foxglove": ("logbook/live.py",),
+    "paho": ("live/mqtt.py",),
+    "asyncua": ("live/opcua.py",),
+    "pymodbus": ("live/modbus.py",),
+    "prometheus_client": ("live/metrics.py",),
 }
 
 

@@ -9,6 +9,7 @@ import torch
 from mcap.writer import Writer
 
 from fdi_torch.config import ConfigError, RecordingConfig, load_plant, read_recording
+from fdi_torch.config.growing_recordings import growing_rows
 from fdi_torch.logbook import RunLog
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.mcap_files import read_mcap
@@ -120,3 +121,30 @@ def test_something_else_than_a_log_is_refused_in_a_sentence(tmp_path: Path) -> N
     (tmp_path / "run.mcap").write_text("t_s,h1_cm")
     with pytest.raises(ConfigError, match=r"run.mcap"):
         read_recording(RecordingConfig(file="run.mcap"), load_plant("three_tank"), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value"),
+    [
+        ("h1", "plus", ["h2"]),
+        ("h1", "quality", "state"),
+        ("h1", "words", {"FAIL": None}),
+        ("Q1", "held", "10 s"),
+        ("t", "shift", "5 s"),
+        ("t", "zone", "Europe/Berlin"),
+    ],
+)
+@pytest.mark.parametrize("followed", [False, True])
+def test_keys_that_a_log_cannot_have_are_refused(
+    tmp_path: Path, name: str, key: str, value: object, followed: bool
+) -> None:
+    """They were ignored: a sum of two pumps lost one of them without a word."""
+    written(tmp_path / "own.mcap")
+    entry = {"file": "own.mcap", "columns": {name: {key: value}}}
+    config = RecordingConfig.model_validate(entry)
+    plant = load_plant("three_tank")
+    with pytest.raises(ConfigError, match=rf"{name}\.{key}: expected no such key|expected neither zone nor sort"):
+        if followed:
+            list(growing_rows(config, plant, tmp_path, idle=0.1))
+        else:
+            read_recording(config, plant, tmp_path)

@@ -6,7 +6,7 @@ import argparse
 
 import orjson
 
-from fdi_torch.cli.options import live
+from fdi_torch.cli.outlets import Publish, outlets
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
@@ -18,10 +18,17 @@ from fdi_torch.parameters import display_unit
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     folder = [f"output.folder={arguments.out}"] if arguments.out else []
-    monitor_run = load_monitor(arguments.config, [*arguments.set, *folder])
-    with screen.progress("monitor") as advance, live(arguments, monitor_run.name, screen) as listener:
+    url = [f"source.url={arguments.source}"] if arguments.source else []
+    monitor_run = load_monitor(arguments.config, [*arguments.set, *folder, *url])
+    with (
+        screen.progress("monitor") as advance,
+        outlets(arguments, monitor_run.name, screen) as (
+            listener,
+            publish,
+        ),
+    ):
         callbacks = MonitorCallbacks(
-            advance, lambda e: _show_event(e, screen), lambda p: _show_setup(p, screen), listener
+            advance, lambda e: _show_event(e, screen, publish), lambda p: _show_setup(p, screen), listener
         )
         done = run_monitor(monitor_run, callbacks, arguments.follow, arguments.idle, arguments.resume)
     slow = "" if done.spent < done.lasted else "; slower than real time"
@@ -31,10 +38,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     return 0
 
 
-def _show_event(event: Event, screen: Screen) -> None:
+def _show_event(event: Event, screen: Screen, publish: Publish) -> None:
     if event.announced:
         screen.say(event.line)
-    screen.line(orjson.dumps({"format": FORMAT, **event.to_dict()}).decode())
+    data = {"format": FORMAT, **event.to_dict()}
+    screen.line(orjson.dumps(data).decode())
+    publish(data)
 
 
 def _show_setup(prepared: PreparedMonitor, screen: Screen) -> None:

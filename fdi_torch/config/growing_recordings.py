@@ -17,6 +17,7 @@ from fdi_torch.logbook import LogError, Message, follow, number_at
 from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recordings.csv_growing import GrowingCsv
+from fdi_torch.recordings.mcap_files import expect_keys_of_logs
 from fdi_torch.recordings.source import ChannelSource
 
 POLL = 0.1  # s
@@ -84,6 +85,7 @@ def _mcap_rows(
     path: Path, plant: PlantDescription, mapping: Mapping[str, ChannelSource], idle: float
 ) -> Iterator[Row | str]:
     """Messages grouped by time: inputs are held, a missing reading is NaN."""
+    expect_keys_of_logs(path, mapping)
     inputs, outputs = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
     sources = {name: mapping.get(name, ChannelSource()) for name in (*inputs, *outputs)}
     places = {n: _place(n, source, n in inputs) for n, source in sources.items() if source.constant is None}

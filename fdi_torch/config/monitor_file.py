@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from fdi_torch.config.estimation import names_in_full
+from fdi_torch.config.live_source import SourceConfig
 from fdi_torch.config.loaded_recordings import separate_recordings
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import naming_source
@@ -61,7 +62,8 @@ class ObserverConfig(Strict):
 
 class MonitorConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
-    recording: RecordingConfig = Field(description="the recording to follow")
+    recording: RecordingConfig = Field(description="the recording to follow; none beside `source`")
+    source: SourceConfig | None = Field(None, description="a live source in place of a recording")
     fault_free: tuple[Seconds, Seconds] = Field(description="interval from which the noise is estimated, s")
     calibrate: list[str] = Field(default_factory=list, description="constants fitted to the fault-free part first")
     faults: list[str] = Field(default_factory=list, description="parameters that may change; by default the usual ones")
@@ -78,6 +80,17 @@ class MonitorConfig(Strict):
     step: BenchSeconds = Field(1.0, description="longest integration step, s")
     output: OutputConfig = Field(default_factory=OutputConfig)
     seed: int = Field(0, ge=0, description="seed of the simulation that sets the threshold of the GLR")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_source_is_the_recording(cls, data: Any) -> Any:
+        """Let `recording` describe a live source to whatever asks for its name, inputs and initial levels."""
+        if not isinstance(data, dict) or not isinstance(source := data.get("source"), dict):
+            return data
+        if data.get("recording") is not None:
+            raise ValueError("expected either recording or source, got both; leave one out")
+        shared = {key: source[key] for key in ("hold", "start_levels") if key in source}
+        return {**data, "recording": {"file": str(source.get("url")), **shared}}
 
 
 @dataclass(frozen=True)

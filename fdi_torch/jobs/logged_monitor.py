@@ -14,6 +14,7 @@ from torch import Tensor
 
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.gap.preprocess.acquisition import usable
+from fdi_torch.jobs.row_buffer import CLOCK
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.monitor.diagnosability import diagnosability
 from fdi_torch.monitor.events import FORMAT, Event
@@ -126,6 +127,10 @@ class LoggedMonitor:
             self._report(event)
         self.spent += time.monotonic() - start
         return any(event.kind == "notice" for event in events)
+
+    def log_origin(self, origin: float) -> None:
+        """Log time 0 of a live source, s since 1970, with which a resumed run goes on."""
+        self.log.write(CLOCK, {"origin": origin}, self._now)
 
     def close(self) -> None:
         """Report the summary of each alarm at the end."""

@@ -6,24 +6,36 @@ resumed by processing the logged samples again, which is a thousand times faster
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.growing_recordings import Row, growing_rows
+from fdi_torch.config.live_source import LiveRows
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
 from fdi_torch.jobs.logged_monitor import ALARM, LoggedMonitor, MonitorCallbacks, event_key
-from fdi_torch.jobs.row_buffer import logged_rows, recording_of_rows, resumed_rows, rows_until, samples_of_rows
+from fdi_torch.jobs.row_buffer import (
+    logged_origin,
+    logged_rows,
+    recording_of_rows,
+    resumed_rows,
+    rows_until,
+    samples_of_rows,
+)
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook import RunLog
 from fdi_torch.monitor.live_batches import DelayWatch, LiveBatches
 from fdi_torch.recording import Recording
+
+IDLE = 60.0
+"""Time without a sample after which a growing file counts as complete, s."""
 
 
 @dataclass(frozen=True)
@@ -37,25 +49,29 @@ class MonitorSummary:
 
 
 def run_monitor(
-    run: MonitorRun, callbacks: MonitorCallbacks, follow: bool = False, idle: float = 60.0, resume: bool = False
+    run: MonitorRun, callbacks: MonitorCallbacks, follow: bool = False, idle: float | None = None, resume: bool = False
 ) -> MonitorSummary:
-    """Prepare a monitor from the fault-free part and run it along the recording, or with `follow` along a growing file.
+    """Prepare a monitor from the fault-free part and run it along the recording, or with `follow` along a growing file,
+    or along a live source.
 
-    Everything logged before an error or Ctrl-C is kept. idle: s without a sample after which a growing file counts as
-    complete. resume: continue a killed or interrupted run of the same file; the result is the same as without the
-    interruption, and events in the earlier log are not reported again.
+    Everything logged before an error or Ctrl-C is kept. idle: s without a sample after which the samples count as
+    complete; by default 60 s for a growing file, and never for a live source. resume: continue a killed or interrupted
+    run of the same file or source; the result is the same as without the interruption, and events in the earlier log
+    are not reported again.
     """
     callbacks.tell(0.0, "reading")
     path, unfinished = _log_to_write(run, resume)
+    follow = follow or run.config.source is not None
     whole = None if follow else read_recording(run.config.recording, run.plant, run.base, run.given)
     earlier_rows = logged_rows(unfinished, run) if follow and unfinished is not None else []
+    origin = logged_origin(unfinished) if unfinished is not None else None
     messages = unfinished.messages([ALARM]) if unfinished is not None else ()
     reported = Counter(event_key(message.payload) for message in messages)
     with RunLog(path, "monitor", **origin_of(run, whole), listener=callbacks.log, after_interruption=RESUMES) as log:
         monitor = LoggedMonitor(run, log, callbacks, reported)
         try:
             if whole is None:
-                _follow_file(run, monitor, callbacks, idle, earlier_rows)
+                _follow(monitor, callbacks, _source(run, idle, origin, earlier_rows), earlier_rows)
             else:
                 monitor.process_recording(whole)
             monitor.close()
@@ -85,14 +101,25 @@ def _log_to_write(run: MonitorRun, resume: bool) -> tuple[Path, LoggedRun | None
     return unfinished
 
 
-def _follow_file(
-    run: MonitorRun, monitor: LoggedMonitor, callbacks: MonitorCallbacks, idle: float, earlier_rows: Sequence[Row]
+def _source(
+    run: MonitorRun, idle: float | None, origin: float | None, earlier_rows: Sequence[Row]
+) -> Iterator[Row | str]:
+    """The rows of the live source, or else of the growing file."""
+    if run.config.source is not None:
+        return LiveRows(run.config.source, run.plant, math.inf if idle is None else idle, origin, earlier_rows)
+    return growing_rows(run.config.recording, run.plant, run.base, IDLE if idle is None else idle)
+
+
+def _follow(
+    monitor: LoggedMonitor, callbacks: MonitorCallbacks, source: Iterator[Row | str], earlier_rows: Sequence[Row]
 ) -> None:
-    """Process samples as they are written to the file, after waiting for the end of the fault-free part."""
-    source = growing_rows(run.config.recording, run.plant, run.base, idle)
+    """Process samples as they come, after waiting for the end of the fault-free part."""
+    run = monitor.run
     batches = LiveBatches(resumed_rows(earlier_rows, source) if earlier_rows else source)
     rows, notices = _wait_for_fault_free_part(run, callbacks, batches)
     monitor.learn(recording_of_rows(rows_until(rows, run.config.fault_free[1]) or rows, run))
+    if isinstance(source, LiveRows) and source.origin is not None:
+        monitor.log_origin(source.origin)
     delay_watch = DelayWatch(time.monotonic)
     first: list[Row | str] = [*notices, *rows]
     every_batch: Iterable[list[Row | str]] = chain([first], batches)

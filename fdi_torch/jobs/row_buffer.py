@@ -14,6 +14,8 @@ from fdi_torch.logbook import series
 from fdi_torch.monitor.samples import GAP, Samples
 from fdi_torch.recording import Recording
 
+CLOCK = "/source/clock"
+
 
 def samples_of_rows(rows: Sequence[Row], run: MonitorRun) -> Samples:
     """The rows as samples, in SI."""
@@ -76,6 +78,11 @@ def logged_rows(log: Log, run: MonitorRun) -> list[Row]:
     readings = [outputs[sensor.column][:count] for sensor in run.plant.sensors]
     times = inputs["t"][:count].tolist()
     return [(t, [float(c[k]) for c in commands], [float(r[k]) for r in readings]) for k, t in enumerate(times)]
+
+
+def logged_origin(log: Log) -> float | None:
+    """Time 0 of a live source in a monitor's log, s since 1970; None if its clock has no date."""
+    return next((float(message.payload["origin"]) for message in log.messages([CLOCK])), None)
 
 
 def resumed_rows(earlier: Sequence[Row], source: Iterable[Row | str]) -> Iterator[Row | str]:

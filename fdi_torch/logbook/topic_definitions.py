@@ -32,6 +32,11 @@ TOPICS: dict[str, Topic] = {
         named=True,
     ),
     "/plant/truth": Topic("fdi_torch.plant_truth", "true states and faults of a simulated plant", named=True),
+    "/source/clock": Topic(
+        "fdi_torch.source_clock",
+        "the clock of a live source",
+        {"origin": ("number", "s", "time 0 of the plant, since 1970-01-01 UTC")},
+    ),
     "/observer/residual": Topic(
         "fdi_torch.residual", "reading less observer's output; *_statistic, *_threshold where tested", named=True
     ),

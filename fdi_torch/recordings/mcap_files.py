@@ -29,6 +29,7 @@ def read_mcap(
     channels, and LogError for a damaged log.
     """
     mapping = mapping or {}
+    expect_keys_of_logs(path, mapping)
     run = read_run(path)
     channels = {name: mapping.get(name, ChannelSource()) for name in (*inputs, *outputs)}
     sources = {name: source for name, source in channels.items() if source.constant is None}
@@ -48,6 +49,14 @@ def read_mcap(
         table = {name: _find(path, name, source, logged) for name, source in sources.items()}
         hold = "linear" if signals.hold == "linear" else "zero_order"
     return _recording(path, signals, scale, table, channels, tuple(inputs), tuple(outputs), hold)
+
+
+def expect_keys_of_logs(path: Path, mapping: Mapping[str, ChannelSource]) -> None:
+    """Raises ValueError for a key of the mapping that applies to cells of a table only."""
+    for name, source in mapping.items():
+        for key in ("plus", "quality", "good", "words", "held", "stamps", "zone", "shift", "sort"):
+            if getattr(source, key, None):
+                raise ValueError(f"{path}: columns.{name}.{key}: expected no such key for an MCAP log; leave it out")
 
 
 def _seconds(path: Path, time: ChannelSource | None) -> float:

@@ -10,6 +10,7 @@ EXAMPLES = """
 examples:
   fdi monitor --config monitor.yaml                along a recording
   fdi monitor --config monitor.yaml --follow       along a CSV file that is still being written
+  fdi monitor --config monitor.yaml --source mqtt://broker/rig      along a live source
   fdi monitor --config monitor.yaml --resume       continue a killed run
   fdi monitor --config monitor.yaml --live         with a live view in Foxglove or Lichtblick
 """
@@ -22,11 +23,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--follow", action="store_true", help="the file is still being written; process its samples as they come"
     )
     parser.add_argument(
+        "--source",
+        metavar="URL",
+        help="live source mqtt://HOST[:PORT][/TOPIC], opcua://HOST[:PORT][/PATH] or modbus://HOST[:PORT]; the file "
+        "maps its tags under `source` (needs the extra `mqtt`, `opcua` or `modbus`)",
+    )
+    parser.add_argument(
         "--idle",
         metavar="TIME",
         type=seconds,
-        default=60.0,
-        help="--follow: end after this time without samples (60 s)",
+        help="end after this time without samples (60 s with --follow, never with a live source)",
     )
-    parser.add_argument("--resume", action="store_true", help="continue a killed run of the same file")
+    parser.add_argument("--resume", action="store_true", help="continue a killed run of the same file or source")
+    parser.add_argument(
+        "--publish",
+        metavar="URL",
+        help="publish each event as JSON to mqtt://HOST[:PORT]/TOPIC: TOPIC/event, and TOPIC/state with the latest "
+        "state (needs the extra `mqtt`)",
+    )
+    parser.add_argument(
+        "--metrics",
+        metavar="[HOST:]PORT",
+        nargs="?",
+        const="127.0.0.1:9464",
+        help="serve Prometheus metrics (without a value: 127.0.0.1:9464, reachable from this machine only; "
+        "0.0.0.0:PORT opens them to the whole network without a password; needs the extra `prometheus`)",
+    )
     add_live(parser)

@@ -1,0 +1,107 @@
+"""Prometheus metrics of a running monitor. Only this file imports prometheus_client (extra `prometheus`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import orjson
+
+from fdi_torch.live.extras import library_of
+from fdi_torch.logbook.channel import Channel
+
+PORT = 9464
+"""Default port of the OpenTelemetry exporter for Prometheus."""
+
+
+class Metrics:
+    """Listener that turns logged messages into metrics. Created by `serve_metrics`. Numbers are SI."""
+
+    def __init__(self, library: Any) -> None:
+        self.registry = library.CollectorRegistry()
+        self.port = 0
+
+        def gauge(name: str, meaning: str, *labels: str) -> Any:
+            return library.Gauge(f"fdi_{name}", meaning, labels, registry=self.registry)
+
+        def counter(name: str, meaning: str, *labels: str) -> Any:
+            return library.Counter(f"fdi_{name}", meaning, labels, registry=self.registry)
+
+        self._samples = counter("samples", "samples processed")
+        self._events = counter("events", "events of the monitor", "kind")
+        self._time = gauge("plant_time_seconds", "time of the last sample")
+        self._inputs = gauge("input", "inputs of the plant, SI", "channel")
+        self._readings = gauge("reading", "readings of the sensors, SI", "channel")
+        self._residuals = gauge("residual", "reading less output of the observer, SI", "channel")
+        self._detector = gauge("detector", "statistic of the detector and its threshold", "quantity")
+        self._present = gauge("fault_present", "1 while the monitor attributes the readings to this fault", "fault")
+        self._probability = gauge("fault_probability", "probability that this parameter has changed", "fault")
+        self._size = gauge("fault_size", "estimated parameter, SI", "fault")
+
+    def __call__(self, channel: Channel, log_time: int, data: bytes) -> None:
+        """Take one message of the log."""
+        handler = _HANDLERS.get(channel.topic)
+        if handler is not None:
+            handler(self, orjson.loads(data))
+
+    def _input(self, payload: dict[str, Any]) -> None:
+        _set_all(self._inputs, payload)
+
+    def _output(self, payload: dict[str, Any]) -> None:
+        self._samples.inc()
+        self._time.set(payload["t"])
+        _set_all(self._readings, payload)
+
+    def _residual(self, payload: dict[str, Any]) -> None:
+        tests = {name: payload.pop(name) for name in list(payload) if name.endswith(("_statistic", "_threshold"))}
+        for name, value in tests.items():
+            if value is not None:
+                self._detector.labels(name.rpartition("_")[2]).set(value)
+        _set_all(self._residuals, payload)
+
+    def _event(self, payload: dict[str, Any]) -> None:
+        self._events.labels(payload["event"]).inc()
+
+    def _fault(self, payload: dict[str, Any]) -> None:
+        name = f"{payload['location']}.{payload['fault']}"
+        self._present.labels(name).set(bool(payload["present"]))
+        for gauge, key in ((self._probability, "probability"), (self._size, "size")):
+            if payload.get(key) is not None:
+                gauge.labels(name).set(payload[key])
+
+
+_HANDLERS = {
+    "/plant/input": Metrics._input,
+    "/plant/output": Metrics._output,
+    "/observer/residual": Metrics._residual,
+    "/observer/alarm": Metrics._event,
+    "/diagnosis/fault": Metrics._fault,
+}
+
+
+def _set_all(gauge: Any, payload: dict[str, Any]) -> None:
+    """Set a gauge for each named number; one without a value, as of a missing reading, becomes NaN."""
+    for name, value in payload.items():
+        if name != "t" and (value is None or isinstance(value, int | float)):
+            gauge.labels(name).set(float("nan") if value is None else value)
+
+
+@contextmanager
+def serve_metrics(host: str = "127.0.0.1", port: int = PORT) -> Iterator[Metrics]:
+    """A server of /metrics during the block. port 0: any free port. Raises ValueError for an address in use."""
+    library = library_of("prometheus", "prometheus_client")
+    metrics = Metrics(library)
+    try:
+        server, thread = library.start_http_server(port, host, metrics.registry)
+    except OSError as error:
+        raise ValueError(
+            f"--metrics: expected a free address, got {host}:{port} ({error}); name another port"
+        ) from error
+    metrics.port = server.server_port
+    try:
+        yield metrics
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()

@@ -1,0 +1,171 @@
+"""The monitor on OPC UA: a recording replayed by a real server gives the events of the file."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from live_servers import Proxy, free_port, wait_for_port
+from test_live_mqtt import MESSAGES, told
+from test_monitor_follow import config, monitored, texts, written
+
+from fdi_torch.cli import main
+
+asyncua = pytest.importorskip("asyncua")
+
+NAMES = ("Q1", "Q2", "h1", "h2", "h3")
+START = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+class Plc:
+    """An OPC UA server with a node a channel, in a thread of its own."""
+
+    def __init__(self) -> None:
+        self.port = free_port()
+        self._ready = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
+        self._thread.start()
+        assert self._ready.wait(30.0)
+        wait_for_port(self.port)
+
+    async def _run(self) -> None:
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        server = asyncua.Server()
+        await server.init()
+        server.set_endpoint(f"opc.tcp://127.0.0.1:{self.port}/rig")
+        self.nodes = {}
+        for name in NAMES:
+            node = await server.nodes.objects.add_variable(f"ns=2;s=Rig.{name}", f"2:{name}", 0.0)
+            self.nodes[name] = node
+        async with server:
+            self._server = server
+            self._ready.set()
+            await self._stop.wait()
+
+    def write(self, sample: dict[str, float], bad: tuple[str, ...] = ()) -> None:
+        asyncio.run_coroutine_threadsafe(self._write(sample, bad), self._loop).result(10.0)
+
+    async def _write(self, sample: dict[str, float], bad: tuple[str, ...]) -> None:
+        ua = asyncua.ua
+        for name in NAMES:
+            status = ua.StatusCode(ua.StatusCodes.BadSensorFailure if name in bad else ua.StatusCodes.Good)
+            value = ua.DataValue(
+                ua.Variant(float(sample[name]), ua.VariantType.Double),
+                status,
+                SourceTimestamp=START + timedelta(seconds=sample["t"]),
+            )
+            await self._server.write_attribute_value(self.nodes[name].nodeid, value)
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(10.0)
+
+
+@pytest.fixture
+def plc() -> Iterator[Plc]:
+    running = Plc()
+    yield running
+    running.close()
+
+
+def source(port: int, **changes: object) -> dict[str, object]:
+    tags: dict[str, object] = {name: {"tag": f"ns=2;s=Rig.{name}", "unit": "cm^3/s"} for name in ("Q1", "Q2")}
+    tags |= {name: {"tag": f"ns=2;s=Rig.{name}", "unit": "cm"} for name in ("h1", "h2", "h3")}
+    return {"url": f"opcua://127.0.0.1:{port}/rig", "tags": tags, "reorder": "0.2 s", **changes}
+
+
+@pytest.fixture
+def once_subscribed(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], None]], threading.Thread]:
+    """Run a function in a thread once the monitor has subscribed."""
+    from fdi_torch.live.opcua import OpcUaSource
+
+    subscribed, original = threading.Event(), OpcUaSource._subscribe
+
+    async def patched(self: OpcUaSource, client: Any) -> None:
+        await original(self, client)
+        subscribed.set()
+
+    monkeypatch.setattr(OpcUaSource, "_subscribe", patched)
+
+    def start(then: Callable[[], None]) -> threading.Thread:
+        def run() -> None:
+            assert subscribed.wait(60.0)
+            then()
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        return thread
+
+    return start
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_recording_through_a_server_gives_the_events_of_the_file(
+    cut: bool,
+    tmp_path: Path,
+    plc: Plc,
+    once_subscribed: Callable[[Callable[[], None]], threading.Thread],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """cut: the network is cut around the onset; the server keeps the samples in the session."""
+    expected = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
+    proxy = Proxy(plc.port)
+    plc.write(MESSAGES[0])
+
+    def replay() -> None:
+        for k, sample in enumerate(MESSAGES):
+            if cut and k == 195:
+                proxy.cut()
+            plc.write(sample)
+            time.sleep(0.005)
+            if cut and k == 225:
+                time.sleep(0.5)
+                proxy.mend()
+
+    thread = once_subscribed(replay)
+    path = config(tmp_path, recording=None, source=source(proxy.port))
+    events = monitored(["--config", path, "--idle", "4" if cut else "1.5"], capsys)
+    thread.join()
+    proxy.cut()
+    assert told(events) == told(expected)
+    assert ("lost" in texts(events), "again after" in texts(events)) == (cut, cut)
+
+
+def test_a_bad_status_is_a_missing_reading(tmp_path: Path, plc: Plc) -> None:
+    from fdi_torch.config.live_source import LiveRows
+    from fdi_torch.config.monitor_file import load_monitor
+
+    run = load_monitor(config(tmp_path, recording=None, source=source(plc.port)))
+    assert run.config.source is not None
+    plc.write(MESSAGES[0])
+    rows = LiveRows(run.config.source, run.plant, idle=0.8)
+    plc.write(MESSAGES[1], bad=("h2",))
+    got = [row for row in rows if not isinstance(row, str)]
+    assert [t for t, _, _ in got] == [0.0, 1.0]
+    assert rows.origin == START.timestamp()
+    _, inputs, levels = got[1]
+    assert inputs == pytest.approx([50e-6, 50e-6])
+    assert levels[1] != levels[1] and [levels[0], levels[2]] == pytest.approx(
+        [0.01 * MESSAGES[1]["h1"], 0.01 * MESSAGES[1]["h3"]]
+    )
+
+
+def test_a_node_or_server_that_is_missing_is_named(
+    tmp_path: Path, plc: Plc, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = source(plc.port)
+    wrong["tags"]["h1"]["tag"] = "ns=2;s=Rig.none"  # type: ignore[index]
+    assert main(["monitor", "--config", config(tmp_path, recording=None, source=wrong), "--quiet"]) == 2
+    assert "nodes at 127.0.0.1" in (said := capsys.readouterr().err) and "ns=2;s=Rig.none" in said
+    absent = config(tmp_path, recording=None, source=source(free_port()))
+    assert main(["monitor", "--config", absent, "--quiet"]) == 2
+    assert "expected an OPC UA server" in capsys.readouterr().err
+    clock = config(tmp_path, recording=None, source=source(plc.port, clock={"tag": "t"}))
+    assert main(["monitor", "--config", clock, "--quiet"]) == 2
+    assert "clock: expected none for OPC UA" in capsys.readouterr().err
