@@ -1,4 +1,4 @@
-"""The report page: each run's verdict, then its sections, in one file without network access or scripts."""
+"""The report page: each run's verdict, then its sections, in one file without network access."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from pathlib import Path
 
 from fdi_torch.report.html import Markup, join, tag
 from fdi_torch.report.material import Material
+from fdi_torch.report.script import CHART_STYLE, POLICY, SCRIPT
 from fdi_torch.report.section import Maker, Picture, Section, section_html
 from fdi_torch.report.sections import SECTIONS
 from fdi_torch.report.style import save
 from fdi_torch.report.stylesheet import STYLESHEET
 from fdi_torch.report.verdict import headline, how_it_ended, kind_words
-
-# Even if something passed the escaping, the browser would load and run nothing.
-POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,8 @@ def page(reports: Sequence[RunReport], first: Sequence[Section] = ()) -> str:
             Markup('<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'),
             Markup(f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'),
             tag("title", f"{title} – fdi_torch"),
-            tag("style", Markup(STYLESHEET)),
+            tag("style", Markup(CHART_STYLE + STYLESHEET)),
+            tag("script", Markup(SCRIPT)),
         ]
     )
     return f"<!doctype html>\n{tag('html', tag('head', head), tag('body', tag('main', *articles)), lang='en')}\n"

@@ -26,7 +26,8 @@ INK, SOFT, FAINT = "#1f2933", "#67727e", "#d3d9e0"
 MODEL, MARK, OTHER = "#0b6cab", "#b84a00", "#0b7558"
 PAPER = "#fefefe"
 
-_VARIABLES = {INK: "ink", SOFT: "soft", FAINT: "faint", MODEL: "model", MARK: "mark", OTHER: "other", PAPER: "paper"}
+# Colour -> name of its CSS variable.
+VARIABLES = {INK: "ink", SOFT: "soft", FAINT: "faint", MODEL: "model", MARK: "mark", OTHER: "other", PAPER: "paper"}
 _SETTINGS: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "fdi_torch",
@@ -124,7 +125,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
     svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', rf'\1 role="img" aria-label="{description}"', svg, count=1)
     svg = re.sub(r"(font(?:-family)?:[^;\"]*?)'DejaVu Sans'(, [^;\"]*)?", r"\1system-ui, sans-serif", svg)
-    for colour, variable in _VARIABLES.items():
+    for colour, variable in VARIABLES.items():
         svg = svg.replace(colour, f"var(--{variable})")
     return _own_ids(svg, name)
 

@@ -29,6 +29,36 @@ figure { margin: 0; min-width: 0; }
 figure.wide { grid-column: 1 / -1; }
 figure svg { display: block; width: 100%; height: auto; }
 figure.wide svg text { paint-order: stroke; stroke: var(--paper); stroke-width: .22em; stroke-linejoin: round; }
+.column { display: grid; gap: .8rem; min-width: 0; align-content: start; }
+figure { position: relative; }
+figure > svg { cursor: zoom-in; }
+.live > svg { display: none; }
+.chart-head { display: flex; flex-wrap: wrap; justify-content: space-between; gap: 0 .6rem; min-height: 1.7rem; }
+.chart-title { font-weight: 600; font-size: .95rem; }
+.readout { display: flex; flex-wrap: wrap; gap: 0 .9rem; font-size: .82rem; color: var(--soft); min-height: 1.4em;
+  font-variant-numeric: tabular-nums; }
+.readout .of { color: var(--line); } .readout output { display: inline-block; min-width: 4.5rem; }
+.readout i { display: inline-block; width: 1.1em; margin-right: .35em; border-top: 2px solid; vertical-align: .25em; }
+.readout i.dashed { border-top-style: dashed; }
+.readout .at { min-width: 5.5rem; margin-left: auto; text-align: right; }
+.field { touch-action: pan-y; min-width: 0; } .field:focus-visible { outline: 2px solid var(--model); }
+.stretch { font-size: .82rem; color: var(--soft); min-height: 1.4em; font-variant-numeric: tabular-nums; }
+.u-select { background: color-mix(in srgb, var(--model) 18%, transparent); }
+.u-hz .u-cursor-x, .u-vt .u-cursor-y { border-right: 1px dashed var(--soft); }
+.u-hz .u-cursor-y, .u-vt .u-cursor-x { border-bottom: 1px dashed var(--soft); }
+.tools { display: inline-flex; gap: .2rem; margin-left: auto; }
+button { font: inherit; font-size: .78rem; line-height: 1.3; color: var(--model); background: var(--paper);
+  border: 1px solid var(--faint); border-radius: 5px; padding: .1rem .45rem; cursor: pointer; }
+.tools .pan { display: none; } .zoomed .pan { display: inline-block; }
+figure > .larger { position: absolute; top: 0; right: 0; z-index: 1; }
+@media (hover: hover) { .larger, .near { opacity: 0; } figure:hover .larger, figure:hover .near, .larger:focus-visible,
+  .near:focus-visible { opacity: 1; } }
+dialog.enlarged { width: 96vw; max-width: none; height: 96vh; max-height: none; border: 1px solid var(--faint);
+  border-radius: 10px; background: var(--paper); color: var(--ink); padding: 1rem 1.2rem; overflow: auto; }
+dialog::backdrop { background: rgb(0 0 0 / .55); }
+dialog .close { position: sticky; top: 0; float: right; z-index: 2; } dialog .larger { display: none; }
+dialog .column { clear: both; } dialog figure { max-width: none !important; clear: both; }
+dialog figure > svg { cursor: default; max-height: 84vh; }
 figcaption { font-size: .85rem; color: var(--soft); }
 .note, .meta { color: var(--soft); font-size: .9rem; }
 .lead { font-size: 1.05rem; }
@@ -64,7 +94,8 @@ ul { margin: .3rem 0; padding-left: 1.2rem; }
   .wide td::before { content: attr(data-label); color: var(--soft); text-align: left; }
   .wide td:first-child { font-weight: 600; } .wide td:first-child::before { font-weight: 400; } }
 @page { margin: 15mm 14mm; }
-@media print { :root { color-scheme: light; --ink: #000000; --soft: #444444; --faint: #bbbbbb; --paper: #ffffff;
+@media print { .chart, button, dialog { display: none !important; } .live > svg { display: block; }
+  :root { color-scheme: light; --ink: #000000; --soft: #444444; --faint: #bbbbbb; --paper: #ffffff;
   --ground: #ffffff; --model: #0b6cab; --mark: #b84a00; --other: #0b7558; }
   body { font-size: 10.5pt; } main { padding: 0; max-width: none; } section { border: 0; padding: 0; margin: 1rem 0; }
   figure, tr, dl div { break-inside: avoid; } h1, h2, h3 { break-after: avoid; }

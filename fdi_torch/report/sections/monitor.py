@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit
-from fdi_torch.report.panels import residual_panel
-from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.section import Section, signals
+from fdi_torch.report.style import MARK, MODEL
 
 RESIDUAL, ALARM = "/observer/residual", "/observer/alarm"
 _SUFFIXES = ("_statistic", "_threshold")
@@ -24,14 +25,17 @@ def residual_section(material: Material) -> Section | None:
     pictures, tests = [], []
     for k, name in enumerate(name for name in columns if not name.endswith(_SUFFIXES)):
         unit, scale = shown_unit(material.unit(RESIDUAL, name))
-        figure = residual_panel(name, axis("read − observer", unit), time, scale * columns[name], events=alarms)
-        pictures.append(Picture(f"observer_residual_{k + 1}", figure))
+        line, label = Line("measured − predicted", time, scale * columns[name], MODEL), axis("residual", unit)
+        chart = Chart(name, "time, s", label, [line], level=0.0, events=alarms, clock="monitor", height=2.1)
+        pictures.append(signals(f"observer_residual_{k + 1}", chart))
     for k, name in enumerate(name for name in columns if name.endswith("_statistic")):
         channel = name.removesuffix("_statistic")
         limit = columns.get(f"{channel}_threshold")
-        limits = [] if limit is None else [limit]
-        figure = residual_panel(f"{channel}: test", "statistic", time, columns[name], limits, alarms)
-        tests.append(Picture(f"observer_statistic_{k + 1}", figure))
+        lines = [Line("statistic", time, columns[name], MODEL)]
+        lines += [] if limit is None else [Line("threshold", time, limit, MARK, dashed=True)]
+        title = "Test of all sensors" if channel == "all" else f"Test of {channel}"
+        chart = Chart(title, "time, s", "test statistic, 1", lines, log=True, events=alarms, clock="monitor")
+        tests.append(signals(f"observer_statistic_{k + 1}", chart))
     words = "Vertical lines: alarms. Dashed: thresholds." if alarms else "Dashed: thresholds. No alarm was raised."
     return Section("Residuals", [words, pictures, *([tests] if tests else [])])
 
