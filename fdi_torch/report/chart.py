@@ -20,7 +20,9 @@ MOST_EVENTS = 50
 
 
 class Line(NamedTuple):
-    """A signal: y (T,) over x (T,). steps: the value holds until the next sample. wide: visible below other lines."""
+    """A signal: y (T,) over x (T,). steps: the value holds until the next sample. wide: broad and pale,
+    so that it is visible below other lines.
+    """
 
     name: str
     x: np.ndarray
@@ -35,7 +37,8 @@ class Line(NamedTuple):
 class Chart:
     """Lines over a common axis.
 
-    log: use a logarithmic axis if the values are positive and span more than a decade. level: a horizontal reference
+    log: use a logarithmic axis if the values span more than a decade; with zeros among them it is linear below the
+    median of the positive values (asinh). level: a horizontal reference
     line; at a level of 0 the lines are residuals. events: times of vertical lines. clock: charts of one clock show the
     same crosshair and zoom together. from_zero: the vertical axis begins at 0. height: of the picture, inches.
     """
@@ -52,11 +55,16 @@ class Chart:
     height: float = HEIGHT
 
     @property
-    def logarithmic(self) -> bool:
-        """True if a logarithmic axis is wanted, and all values are positive and span more than a decade."""
+    def scale(self) -> tuple[str, float]:
+        """Kind of the vertical axis, "linear", "log" or "asinh", and the width of the linear part of the last."""
         values = np.concatenate([np.asarray(line.y, dtype=float) for line in self.lines] or [np.zeros(0)])
         values = values[np.isfinite(values)]
-        return bool(self.log and len(values) and values.min() > 0 and values.max() > 20 * values.min())
+        if not self.log or not (values > 0).any() or values.min() < 0:
+            return "linear", 0.0
+        low = float(values.min() or np.median(values[values > 0]))
+        if values.max() <= 20 * low:
+            return "linear", 0.0
+        return ("log", 0.0) if values.min() > 0 else ("asinh", low)
 
 
 def draw(chart: Chart) -> Figure:
@@ -70,6 +78,7 @@ def draw(chart: Chart) -> Figure:
             color=line.colour,
             lw=2.6 if line.wide else 0.8 if chart.level == 0.0 else 1.2,
             ls="--" if line.dashed else "-",
+            alpha=0.44 if line.wide else 1.0,
             drawstyle="steps-post" if line.steps else "default",
             label=short(line.name, 18),
         )
@@ -77,8 +86,9 @@ def draw(chart: Chart) -> Figure:
         axes.axvline(moment, color=MARK, lw=0.9, alpha=0.8)
     if chart.from_zero:
         axes.set_ylim(bottom=0.0)
-    if chart.logarithmic:
-        logarithmic(axes)
+    kind, width = chart.scale
+    if kind != "linear":
+        logarithmic(axes, width)
     if len(chart.lines) > 1:
         label_lines(axes)
     return figure
@@ -102,7 +112,7 @@ def chart_json(chart: Chart) -> str:
         "y": clean(chart.y_label),
         "clocks": [_base64(clock, "<f8") for clock in clocks],
         "lines": lines,
-        "log": chart.logarithmic,
+        "scale": chart.scale,
         "level": chart.level,
         "from_zero": chart.from_zero,
         "events": [float(moment) for moment in list(chart.events)[:MOST_EVENTS]],

@@ -20,7 +20,7 @@ def bar_panel(
     strong: Sequence[bool],
 ) -> Figure:
     """Horizontal bars from the top, each with its value at the end; `strong` ones are highlighted."""
-    height = max(1.2, 0.75 + 0.29 * len(names))
+    height = 0.6 + 0.29 * len(names)
     figure, axes = panel(short(title), short(x_label), "", height=height)
     rows = list(range(len(names)))
     lengths = np.nan_to_num(np.asarray(values, dtype=float))

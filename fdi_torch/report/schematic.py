@@ -23,7 +23,7 @@ INCH = 0.8  # per unit of the drawing; a tank is one unit wide
 TALL = 1.4
 COLUMN, ROW = 1.95, 3.1
 LETTER = 0.1  # largest width of a letter beside a sensor
-LINE, WITHIN = 0.2, 9  # height of a line; letters per line within a tank
+LINE, WITHIN = 0.2, 9  # height of a line; letters per line within a tank and between tanks
 Point = tuple[float, float]
 
 
@@ -55,10 +55,13 @@ class _Drawing:
         columns = 1 + max(column for _, column in self.places.values())
         longest = max((len(words) for name in plant.locations() for words in self.diagnosis(name)), default=0)
         margin = max(1.0, 0.058 * longest)
-        beside = max((len(w) for s in plant.sensors for w in (short(s.name, 16), *self.diagnosis(s.name))), default=0)
+        beside = max((len(words) for s in plant.sensors for words, *_ in self.lines(s.name, WITHIN)), default=0)
         left, right = -margin, (columns - 1) * COLUMN + max(margin, 0.8 + LETTER * beside)
-        words = 0.2 * max((len(self.diagnosis(name)) for name in plant.locations()), default=0)
-        bottom, top = -(rows - 1) * ROW - 0.85 - words, TALL + 1.05 + words
+        above, below = (
+            LINE * max((len(self.diagnosis(part.name)) for part in parts), default=0)
+            for parts in (plant.pumps, plant.pipes)
+        )
+        bottom, top = -(rows - 1) * ROW - 0.85 - below, TALL + 1.05 + above
         self.figure = Figure(figsize=((right - left) * INCH, (top - bottom) * INCH))
         FigureCanvasAgg(self.figure)
         self.axes: Axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -167,7 +170,7 @@ class _Drawing:
             self.axes.add_patch(Circle(centre, 0.2, facecolor=MARK, alpha=strength(probability), zorder=6))
         colour = self.colour(sensor.name)
         self.axes.add_patch(Circle(centre, 0.085, facecolor=PAPER, edgecolor=colour, lw=1.6, zorder=7))
-        self.words(sensor.name, (centre[0] + 0.15, centre[1] + 0.1), "left", "top")
+        self.words(sensor.name, (centre[0] + 0.12, centre[1] + 0.1), "left", "top", width=WITHIN)
 
     def pipe(self, pipe: Pipe) -> None:
         points = self.route(pipe)

@@ -14,7 +14,8 @@ def _text(name: str) -> str:
 
 
 LICENCE = _text("uPlot.LICENSE.txt")
-SCRIPT = "\n".join((f"/*\n{LICENCE}*/", _text("uPlot.iife.min.js"), _text("charts.js")))
+_OWN = f'(() => {{\n"use strict";\n{_text("charts.js")}\n{_text("page.js")}}})();\n'
+SCRIPT = "\n".join((f"/*\n{LICENCE}*/", _text("uPlot.iife.min.js"), _OWN))
 CHART_STYLE = _text("uPlot.min.css")
 
 # Even if something passed the escaping, the browser would load nothing, and run nothing but SCRIPT.

@@ -33,10 +33,14 @@ Column = tuple[Picture, ...]  # pictures below each other, such as a sensor's re
 
 @dataclass(frozen=True)
 class Section:
-    """blocks: markup, text (a paragraph), or a list of pictures and columns of pictures in a grid."""
+    """blocks: markup, text (a paragraph), or a list of pictures and columns of pictures in a grid.
+
+    lead: belongs to the result, which stands at the top of the page beside the rig.
+    """
 
     title: str
     blocks: Sequence[Markup | str | Sequence[Picture | Column]]
+    lead: bool = False
 
     @property
     def pictures(self) -> list[Picture]:
@@ -52,15 +56,15 @@ def signals(name: str, chart: Chart, caption: str = "") -> Picture:
     return Picture(name, draw(chart), caption, chart=chart)
 
 
-def section_html(section: Section, prefix: str) -> Markup:
-    """The section as HTML. prefix: makes picture ids unique on the page."""
+def section_html(section: Section, prefix: str, own_id: str) -> Markup:
+    """The section as HTML. prefix: makes picture ids unique on the page. own_id: that of the section."""
     blocks = []
     for block in section.blocks:
         if isinstance(block, str):
             blocks.append(block if isinstance(block, Markup) else tag("p", block))
         else:
             blocks.append(tag("div", *(_entry(entry, prefix) for entry in block), class_="grid"))
-    return tag("section", tag("h3", section.title), join(blocks))
+    return tag("section", tag("h3", section.title), join(blocks), id=own_id)
 
 
 def _entry(entry: Picture | Column, prefix: str) -> Markup:

@@ -9,6 +9,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import ceil, floor, log10
 from pathlib import Path
 from typing import Any
 
@@ -80,8 +81,15 @@ def panel(title: str, x_label: str, y_label: str, width: float = WIDTH, height: 
     return figure, axes
 
 
-def logarithmic(axes: Axes) -> None:
-    """Make the vertical axis logarithmic, with plain numbers."""
+def logarithmic(axes: Axes, linear_width: float = 0.0) -> None:
+    """Make the vertical axis logarithmic, with plain numbers; with a `linear_width` it is linear below that (asinh)."""
+    if linear_width:
+        axes.set_yscale("asinh", linear_width=linear_width)
+        high = axes.dataLim.y1
+        axes.set_yticks([0.0, *(10.0**k for k in range(ceil(log10(linear_width)), floor(log10(high)) + 1))])
+        axes.yaxis.set_major_formatter(lambda value, place: f"{value:g}")
+        axes.set_ylim(0.0, 1.3 * high)
+        return
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(lambda value, place: f"{value:g}")
     low, high = axes.get_ylim()

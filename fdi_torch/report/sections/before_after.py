@@ -12,6 +12,7 @@ from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.predictions import MODELS, holdout_prefix
 from fdi_torch.report.section import Picture, Section, signals
+from fdi_torch.report.sections.signals import clock_of
 
 BINS = 24
 
@@ -43,7 +44,9 @@ def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
                 lines.append(Line(words, time, scale * (read[:, i] - predicted[:, i]), colour))
         if lines:
             title_here = f"{name}, {title.replace('_', ' ')}"
-            chart = Chart(title_here, "time, s", axis("measured − model", unit), lines, level=0.0, clock=prefix)
+            chart = Chart(
+                title_here, "time, s", axis("measured − model", unit), lines, level=0.0, clock=clock_of(prefix)
+            )
             pictures.append(signals(f"{prefix}_{i + 1}", chart))
     return pictures
 

@@ -13,6 +13,8 @@ from fdi_torch.report.numbers import number, shown_unit
 from fdi_torch.report.schematic import Overlay, schematic
 from fdi_torch.report.section import Picture, Section
 
+RIG = "rig"  # name of the picture
+
 
 def rig_section(material: Material) -> Section | None:
     """The schematic with the last levels, the diagnosed effects, and the probability of a discrepancy by location."""
@@ -24,7 +26,7 @@ def rig_section(material: Material) -> Section | None:
     parts += ["Orange: diagnosed effects."] if overlay.marks else []
     parts += [f"Strength of colour: {material.meaning_of_shares}."] if overlay.probabilities else []
     caption = " ".join([f"{plant.name}, not to scale.", *parts])
-    return Section("The rig", [[Picture("rig", schematic(plant, overlay), caption, wide=True)]])
+    return Section("The rig", [[Picture(RIG, schematic(plant, overlay), caption, wide=True)]], lead=True)
 
 
 def last_levels(material: Material, plant: PlantDescription) -> dict[str, float]:

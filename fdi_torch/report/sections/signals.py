@@ -7,7 +7,7 @@ import numpy as np
 from fdi_torch.logbook import Signals
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.downsampling import corner_points
-from fdi_torch.report.html import table
+from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit
 from fdi_torch.report.predictions import predicted
@@ -19,12 +19,12 @@ def fit_section(material: Material) -> Section | None:
     """Readings, predictions and residuals of each sensor; readings only if the log has no predictions."""
     blocks: list[str | list[Column]] = []
     fitted = False
-    for k, recording in enumerate(material.recordings):
+    for k, (recording, group) in enumerate(zip(material.recordings, material.groups, strict=True)):
         several = len(material.recordings) > 1
-        model = predicted(material.arrays, k, several, recording.outputs.shape, material.groups[k])
+        model = predicted(material.arrays, k, several, recording.outputs.shape, group)
         fitted |= model is not None
-        blocks += [f"Recording {material.groups[k] or 'diagnosed'}".replace("_", " ")] if several else []
-        blocks.append(_output_panels(recording, model, f"_{k + 1}" if several else ""))
+        blocks += [tag("h4", recording_name(group))] if several else []
+        blocks.append(_output_panels(recording, model, f"_{k + 1}" if several else "", clock_of(group)))
         if model is not None:
             blocks += [_misfit_table(recording, model)]
     if not blocks:
@@ -35,8 +35,9 @@ def fit_section(material: Material) -> Section | None:
 def inputs_section(material: Material) -> Section | None:
     """Inputs: panels for those that vary, text for constant ones."""
     blocks: list[str | list[Picture]] = []
-    for k, recording in enumerate(material.recordings):
-        suffix = f"_{k + 1}" if len(material.recordings) > 1 else ""
+    for k, (recording, group) in enumerate(zip(material.recordings, material.groups, strict=True)):
+        several = len(material.recordings) > 1
+        suffix = f"_{k + 1}" if several else ""
         pictures, constant = [], []
         for i, name in enumerate(recording.input_names):
             unit, scale = shown_unit(recording.input_units[i])
@@ -46,22 +47,35 @@ def inputs_section(material: Material) -> Section | None:
                 continue
             time, corners = _steps(recording, values)
             line = Line("command", time, corners, MODEL, steps=recording.hold == "zero_order")
-            chart = Chart(name, "time, s", axis("command", unit), [line], clock=f"recording{suffix}")
+            title = f"{name}, {recording_name(group).lower()}" if several else name
+            chart = Chart(title, "time, s", axis("command", unit), [line], clock=clock_of(group))
             pictures.append(signals(f"input{suffix}_{i + 1}", chart))
-        blocks += [f"Constant: {', '.join(constant)}."] if constant else []
+        of = f"{recording_name(group)}, constant" if several else "Constant"
+        blocks += [f"{of}: {', '.join(constant)}."] if constant else []
         blocks += [pictures] if pictures else []
     return Section("Inputs", blocks) if blocks else None
+
+
+def recording_name(group: str) -> str:
+    """'Diagnosed recording', 'Hold-out 2': a recording of a log with several."""
+    words = group.replace("_", " ").replace("holdout", "hold-out") or "diagnosed recording"
+    return words[:1].upper() + words[1:]
+
+
+def clock_of(group: str) -> str:
+    """Name of the clock of a recording's charts."""
+    return f"recording {group}"
 
 
 def _steps(recording: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corner_points(recording.time, values) if recording.hold == "zero_order" else (recording.time, values)
 
 
-def _output_panels(recording: Signals, model: np.ndarray | None, suffix: str) -> list[Column]:
+def _output_panels(recording: Signals, model: np.ndarray | None, suffix: str, clock: str) -> list[Column]:
     """A column for each sensor: readings and estimate, and below them the residual."""
     columns: list[Column] = []
     readings = np.where(recording.mask, recording.outputs, np.nan)
-    time, clock = recording.time, f"recording{suffix}"
+    time = recording.time
     for i, name in enumerate(recording.output_names):
         unit, scale = shown_unit(recording.output_units[i])
         lines = [Line("measured", time, scale * readings[:, i], SOFT, wide=model is not None)]
