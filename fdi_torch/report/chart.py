@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 
 from fdi_torch.report.downsampling import extremes, thinned
 from fdi_torch.report.html import clean, short
-from fdi_torch.report.style import HEIGHT, MARK, SOFT, VARIABLES, label_lines, logarithmic, panel
+from fdi_torch.report.style import HEIGHT, MARK, SOFT, VARIABLES, label_lines, logarithmic, panel, styled
 
 MOST_SAMPLES = 6000  # of a line; longer ones keep the extremes of half as many segments
 MOST_EVENTS = 50
+ONE_ROW = 44  # letters of title and names of lines that fit one row above the picture
 
 
 class Line(NamedTuple):
@@ -91,6 +92,9 @@ def draw(chart: Chart) -> Figure:
         logarithmic(axes, width)
     if len(chart.lines) > 1:
         label_lines(axes)
+        if len(chart.title) + sum(len(line.name) + 4 for line in chart.lines) > ONE_ROW:
+            with styled():
+                axes.set_title(short(chart.title), pad=18.0)
     return figure
 
 

@@ -78,7 +78,7 @@ def _article(report: RunReport, prefix: str) -> Markup:
 def _lead(report: RunReport, sections: list[Markup]) -> list[Markup]:
     """The result: the rig and, beside it or below a wide one, the other leading sections."""
     rig = next((picture.figure for picture in report.pictures if picture.name == RIG), None)
-    if rig is None or len(sections) == 1:
+    if rig is None or len(sections) < 2:
         return sections
     parts = [sections[0], tag("div", *sections[1:], class_="findings")]
     return parts if rig.get_figwidth() > WIDEST_BESIDE else [tag("div", *parts, class_="lead")]

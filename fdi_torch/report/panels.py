@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 from fdi_torch.report.html import short
 from fdi_torch.report.style import INK, MARK, MODEL, OTHER, panel
 
+BAR_NAME = 26  # letters of a bar's name
+
 
 def bar_panel(
     title: str,
@@ -29,7 +31,7 @@ def bar_panel(
     for row, length, text in zip(rows, lengths, texts, strict=True):
         axes.text(length + 0.02 * reach, row, text, va="center", fontsize=9.0, color=INK)
     axes.set_xlim(0.0, 1.28 * reach)
-    axes.set_yticks(rows, [short(name, 26) for name in names])
+    axes.set_yticks(rows, [short(name, BAR_NAME) for name in names])
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
     return figure

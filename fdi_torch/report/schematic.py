@@ -102,7 +102,8 @@ class _Drawing:
         marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
         shares = self.diagnosis(name)[len(marks) :]
         marks = [line for text in marks for line in wrap(text, width, break_long_words=False)]
-        lines = [(short(name, 16), INK, "normal"), *((text, MARK, "bold") for text in marks)]
+        tinted = name in self.places and self.overlay.probabilities.get(name, 0.0) > 0.0
+        lines = [(short(name, 16), INK, "normal"), *((text, INK if tinted else MARK, "bold") for text in marks)]
         return [*lines, *((text, INK, "bold") for text in shares)]
 
     def words(self, name: str, point: Point, ha: str, va: str, width: int = 26) -> None:
@@ -142,7 +143,7 @@ class _Drawing:
             place = height + (0.05 if height < 0.3 else -0.24)
             free = TALL - 0.08 - LINE * len(self.lines(tank.name, WITHIN)) - 0.22  # below the words of the tank
             place = max(min(place, free), 0.04)
-            self.axes.text(x, y + place, f"{100 * level:.1f} cm", ha="center", color=MODEL, fontsize=9.0, zorder=6)
+            self.axes.text(x, y + place, f"{100 * level:.1f} cm", ha="center", color=INK, fontsize=9.0, zorder=6)
         walls = [(x - 0.5, y + TALL), (x - 0.5, y), (x + 0.5, y), (x + 0.5, y + TALL)]
         self.axes.plot(*np.array(walls).T, color=self.colour(tank.name), lw=2.0, zorder=5, solid_joinstyle="miter")
         self.words(tank.name, (x, y + TALL - 0.08), "center", "top", width=WITHIN)
@@ -250,7 +251,7 @@ class _Drawing:
 
 def strength(share: float) -> float:
     """Opacity of a location by its probability (0 to 1); cubic, so that certain locations stand out."""
-    return 0.5 * share**3
+    return 0.3 * share**3
 
 
 def _middle(points: Sequence[Point]) -> Point:

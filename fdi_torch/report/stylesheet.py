@@ -25,7 +25,7 @@ nav { position: sticky; top: 0; z-index: 5; display: flex; flex-wrap: wrap; gap:
 nav a { text-decoration: none; } nav a:hover { text-decoration: underline; }
 section, article { scroll-margin-top: 4rem; }
 .lead { display: grid; grid-template-columns: minmax(0, 5fr) minmax(0, 7fr); gap: 1rem; margin: 1rem 0; }
-.findings { display: grid; align-content: start; gap: 1rem;
+.findings { display: grid; gap: 1rem;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 270px), 1fr)); }
 .findings > :first-child { grid-column: 1 / -1; } .lead section, .findings section { margin: 0; min-width: 0; }
 .findings p, .findings ul { font-size: .95rem; }
@@ -104,7 +104,7 @@ ul { margin: .3rem 0; padding-left: 1.2rem; }
   .wide tr { border-bottom: 1px solid var(--faint); padding: .35rem 0; font-size: .9rem; }
   .wide td { display: flex; justify-content: space-between; gap: 1rem; border: 0; padding: .05rem 0; min-width: 0;
     text-align: right; white-space: normal; overflow-wrap: anywhere; } .wide td:empty { display: none; }
-  .wide td::before { content: attr(data-label); color: var(--soft); text-align: left; }
+  .wide td::before { flex: none; max-width: 50%; content: attr(data-label); color: var(--soft); text-align: left; }
   .wide td:first-child { font-weight: 600; } .wide td:first-child::before { font-weight: 400; } }
 @page { margin: 15mm 14mm; }
 @media print { .chart, button, dialog, nav { display: none !important; } .live > svg { display: block; }

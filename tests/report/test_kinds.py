@@ -150,7 +150,7 @@ def test_a_monitor_page_shows_residuals_thresholds_and_events(tmp_path: Path) ->
 def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
     made = report(write_study, tmp_path)
     assert headline(made.material) == "40 trials in 2 settings"
-    assert titles(made)[1:4] == ["Settings", "Isolation", "Errors"]
+    assert titles(made)[:3] == ["Settings", "Isolation", "Errors"] and titles(made)[4] == "The rig"
     assert {"trials_1", "errors_2", "isolation"} <= names(made) and ">T1.leak<" in page([made])
     assert "38 of 40 modes stated correctly; 2 faults missed" in page([made]) and "none (10 %)" in page([made])
 
@@ -158,7 +158,7 @@ def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
 def test_a_challenge_page_shows_scores_confusion_and_misses(tmp_path: Path) -> None:
     made = report(write_challenge, tmp_path)
     assert headline(made.material) == "45 of 60 hidden causes diagnosed correctly, 13 named wrongly"
-    assert titles(made)[1:4] == ["Right answers", "Confusion of causes", "Wrong answers"]
+    assert titles(made)[:4] == ["Right answers", "Confusion of causes", "Wrong answers", "The rig"]
     assert "Trials" not in titles(made)
     assert {"challenge_1_right", "challenge_1_sure", "challenge_1_seconds", "challenge_4_seconds"} <= names(made)
     assert {"challenge_confusion_1", "challenge_unknown", "challenge_left_out"} <= names(made)
@@ -170,7 +170,7 @@ def test_a_rehearsal_page_shows_the_tables_of_the_command(tmp_path: Path) -> Non
     made = report(write_rehearsal, tmp_path)
     text = page([made])
     assert headline(made.material) == "0 of 2 faults missed, 1 of 1 named right"
-    assert titles(made)[:3] == ["The rig", "Validation of the monitor", "Configuration"]
+    assert titles(made)[:3] == ["Validation of the monitor", "The rig", "Configuration"]
     assert "1 of 1 (21 .. 100 %)" in text and "too short" not in text.partition("<h3>Provenance")[0]
     assert NASTY not in text
     del made.material.run.metadata["fdi_torch.result"]

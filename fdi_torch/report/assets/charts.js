@@ -109,7 +109,7 @@ class Chart {
       scales: { x: { time: false, range: (plot, low, high) => this.clock.span || [low, high] }, y: this.range() },
       axes: [{ ...axis(this.about.x, 26), values: plain },
              { ...axis(this.about.y, 50), values: plain, splits: kind === "asinh" ? decades : undefined, size: (plot, values) =>
-               14 + 7 * Math.max(3, ...(values || []).map(value => (value || "").length)) }],
+               16 + 7.6 * Math.max(3, ...(values || []).map(value => (value || "").length)) }],
       series: [{}, ...this.lines.map(line => ({
         label: line.name, stroke: () => colour(line.colour) + (line.wide ? "70" : ""), dash: line.dashed ? [6, 4] : undefined,
         width: line.wide ? 3 : residual ? 1 : 1.4,

@@ -12,7 +12,7 @@ from fdi_torch.report.sections.isolation import isolation_section
 from fdi_torch.report.sections.monitor import event_section, residual_section, statistic_section
 from fdi_torch.report.sections.origin import configuration_section, health_section, provenance_section
 from fdi_torch.report.sections.rehearsal import rehearsal_section
-from fdi_torch.report.sections.rig import rig_section
+from fdi_torch.report.sections.rig import plain_rig_section, rig_section
 from fdi_torch.report.sections.search import refinement_section, search_section
 from fdi_torch.report.sections.signals import fit_section, inputs_section
 from fdi_torch.report.sections.study import error_section, summary_section, trials_section
@@ -50,6 +50,7 @@ SECTIONS: tuple[Maker, ...] = (
     posterior_section,
     search_section,
     refinement_section,
+    plain_rig_section,
     configuration_section,
     provenance_section,
     health_section,

@@ -13,7 +13,7 @@ from fdi_torch.report.html import table, tag
 from fdi_torch.report.json_numbers import as_float
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, percent, probability_text, shown_unit, with_error
-from fdi_torch.report.panels import bar_panel
+from fdi_torch.report.panels import BAR_NAME, bar_panel
 from fdi_torch.report.section import Picture, Section
 
 MOST_BARS = 10
@@ -42,7 +42,7 @@ def where_section(material: Material) -> Section | None:
     label = "share of the gap, %" if material.answer.get("format") == FORMAT_1 else "probability, %"
     figure = bar_panel("", label, names, shares, texts, [name in guilty for name in names])
     _up_to_all(figure)
-    words = f"{meaning[:1].upper()}{meaning[1:]}. Orange: where the likeliest explanation has its causes."
+    words = f"{meaning[:1].upper()}{meaning[1:]}. Orange: causes of the likeliest explanation."
     return Section("Where the gap lies", [words, [Picture("gap_where", figure, caption)]], lead=True)
 
 
@@ -58,11 +58,12 @@ def causes_section(material: Material) -> Section | None:
     certain = answer.get("certain") or []
     if certain and answer.get("verdict") != "named":
         blocks.append(f"With 95 % probability, whichever explanation is true: {explanation_words(certain)}.")
+    bars = _posterior(answer)
     plausible = [explanation_words(causes) for causes in answer.get("ambiguity_set") or _content(answer)]
-    if len(plausible) > 1:
+    if len(plausible) > 1 and (not bars or max(map(len, plausible)) > BAR_NAME):
         blocks += ["Explanations with 95 % of the probability together:"]
         blocks.append(tag("ul", *(tag("li", words) for words in plausible)))
-    blocks += _posterior(answer)
+    blocks += bars
     blocks += [tag("ul", *(tag("li", str(remark)) for remark in answer["remarks"]))] if answer.get("remarks") else []
     return Section("What causes it", blocks, lead=True) if blocks else None
 
