@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.logbook import Comparison, align
+from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import folded, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit, with_error
-from fdi_torch.report.panels import Line, line_panel
 from fdi_torch.report.predictions import predicted
-from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
 
 COLOURS = (MODEL, MARK, OTHER, SOFT)
@@ -74,8 +74,8 @@ def _convergence(compared: Comparison, runs: Sequence[Material]) -> list[Picture
         lines: list[Line] = []
         for label, cost, colour in zip(compared.labels, costs, COLOURS, strict=False):
             present = np.isfinite(cost)
-            lines.append((label, steps[present], cost[present], colour))
-        pictures.append(Picture(f"compare_cost_{k + 1}", line_panel(title, step, "cost", lines, log=True)))
+            lines.append(Line(label, steps[present], cost[present], colour))
+        pictures.append(signals(f"compare_cost_{k + 1}", Chart(title, step, "cost", lines, log=True)))
     return pictures
 
 
@@ -90,8 +90,11 @@ def _residuals(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
         residual = np.where(recording.mask, recording.outputs - model, np.nan)
         for i, name in enumerate(recording.output_names):
             unit, scale = shown_unit(recording.output_units[i])
-            lines.setdefault((name, unit), []).append((label, recording.time, scale * residual[:, i], colour))
+            lines.setdefault((name, unit), []).append(Line(label, recording.time, scale * residual[:, i], colour))
     return [
-        Picture(f"compare_residual_{k + 1}", line_panel(name, "time, s", axis("read − estimate", unit), sensor_lines))
+        signals(
+            f"compare_residual_{k + 1}",
+            Chart(name, "time, s", axis("residual", unit), sensor_lines, level=0.0, clock="residuals"),
+        )
         for k, ((name, unit), sensor_lines) in enumerate(lines.items())
     ]

@@ -16,15 +16,24 @@ def thinned(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.
     """
     if len(time) <= 2 * bins:
         return time, values
-    edges = np.linspace(0, len(time), bins + 1).astype(int)
+    kept = extremes(values, bins)
+    return time[kept], values[kept]
+
+
+def extremes(values: np.ndarray, bins: int) -> np.ndarray:
+    """Indices of the minimum and maximum of each of `bins` segments of a signal (T,), T >= bins.
+
+    Of a segment without finite values the first sample is taken.
+    """
+    edges = np.linspace(0, len(values), bins + 1).astype(int)
     kept: list[int] = []
     for first, last in pairwise(edges.tolist()):
         part = values[first:last]
         if not np.isfinite(part).any():
-            kept.append(int(first))
+            kept.append(first)
             continue
-        kept += sorted({int(first + np.nanargmin(part)), int(first + np.nanargmax(part))})
-    return time[kept], values[kept]
+        kept += sorted({first + int(np.nanargmin(part)), first + int(np.nanargmax(part))})
+    return np.array(kept)
 
 
 def corner_points(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

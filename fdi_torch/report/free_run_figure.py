@@ -39,7 +39,7 @@ def _draw(upper: Axes, lower: Axes, recording: Recording, i: int, runs: Mapping[
     counted, outputs = recording.mask[:, i].cpu().numpy(), recording.outputs[:, i].cpu().numpy()
     read = scale * np.where(counted, outputs, np.nan)
     time = recording.time.cpu().numpy()
-    upper.plot(*thinned(time, read), color=SOFT, lw=2.0, label="read")
+    upper.plot(*thinned(time, read), color=SOFT, lw=2.0, label="measured")
     lower.axhline(0.0, color=SOFT, lw=0.7)
     for (name, predicted), color in zip(runs.items(), (MARK, MODEL)[-len(runs) :], strict=True):
         model = scale * predicted.detach().cpu().numpy()
@@ -47,6 +47,6 @@ def _draw(upper: Axes, lower: Axes, recording: Recording, i: int, runs: Mapping[
         lower.plot(*thinned(time, read - model), color=color, lw=0.8)
     upper.set_title(short(recording.output_names[i]), loc="left")
     upper.set_ylabel(axis("reading", unit))
-    lower.set_ylabel(axis("read − run", unit))
+    lower.set_ylabel(axis("measured − run", unit))
     lower.set_xlabel("time, s")
     label_lines(upper)

@@ -1,4 +1,4 @@
-"""The report page: each run's verdict, then its sections, in one file without network access or scripts."""
+"""The report page: each run's verdict, then its sections, in one file without network access."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from pathlib import Path
 
 from fdi_torch.report.html import Markup, join, tag
 from fdi_torch.report.material import Material
+from fdi_torch.report.script import CHART_STYLE, POLICY, SCRIPT
 from fdi_torch.report.section import Maker, Picture, Section, section_html
 from fdi_torch.report.sections import SECTIONS
+from fdi_torch.report.sections.rig import RIG
 from fdi_torch.report.style import save
 from fdi_torch.report.stylesheet import STYLESHEET
 from fdi_torch.report.verdict import headline, how_it_ended, kind_words
 
-# Even if something passed the escaping, the browser would load and run nothing.
-POLICY = "default-src 'none'; style-src 'unsafe-inline'"
+WIDEST_BESIDE = 6.8  # inches of a rig beside the result; a wider one would have letters too small to read
 
 
 @dataclass(frozen=True)
@@ -39,14 +40,19 @@ def report_of(material: Material, makers: Sequence[Maker] = SECTIONS) -> RunRepo
 def page(reports: Sequence[RunReport], first: Sequence[Section] = ()) -> str:
     """The complete page. first: sections about all runs, such as their comparison."""
     title = " · ".join(report.material.run.path.stem for report in reports[:4])
-    articles = [*(section_html(section, "all-") for section in first)]
-    articles += [_article(report, f"r{k}-") for k, report in enumerate(reports)]
+    articles = [_article(report, f"r{k}-") for k, report in enumerate(reports)]
+    if len(reports) > 1:
+        runs = [(f"r{k}-run", report.material.run.path.stem) for k, report in enumerate(reports)]
+        listed = [*((f"all-{k}", section.title) for k, section in enumerate(first)), *runs]
+        shared = (section_html(section, "all-", f"all-{k}") for k, section in enumerate(first))
+        articles = [_index(listed), *shared, *articles]
     head = join(
         [
             Markup('<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'),
             Markup(f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'),
             tag("title", f"{title} – fdi_torch"),
-            tag("style", Markup(STYLESHEET)),
+            tag("style", Markup(CHART_STYLE + STYLESHEET)),
+            tag("script", Markup(SCRIPT)),
         ]
     )
     return f"<!doctype html>\n{tag('html', tag('head', head), tag('body', tag('main', *articles)), lang='en')}\n"
@@ -61,7 +67,26 @@ def _article(report: RunReport, prefix: str) -> Markup:
     material = report.material
     top = [tag("h1", f"{kind_words(material)} · {material.run.path.stem}"), tag("h2", headline(material))]
     top += [tag("p", sentence, class_="meta") for sentence in how_it_ended(material)]
-    return tag("article", *top, *(section_html(section, prefix) for section in report.sections))
+    named = [(f"{prefix}s{k}", section) for k, section in enumerate(report.sections)]
+    lead = [section_html(section, prefix, name) for name, section in named if section.lead]
+    others = [section_html(section, prefix, name) for name, section in named if not section.lead]
+    ordered = [each for each in named if each[1].lead] + [each for each in named if not each[1].lead]
+    index = _index([(name, section.title) for name, section in ordered])
+    return tag("article", *top, index, *_lead(report, lead), *others, id=f"{prefix}run")
+
+
+def _lead(report: RunReport, sections: list[Markup]) -> list[Markup]:
+    """The result: the rig and, beside it or below a wide one, the other leading sections."""
+    rig = next((picture.figure for picture in report.pictures if picture.name == RIG), None)
+    if rig is None or len(sections) < 2:
+        return sections
+    parts = [sections[0], tag("div", *sections[1:], class_="findings")]
+    return parts if rig.get_figwidth() > WIDEST_BESIDE else [tag("div", *parts, class_="lead")]
+
+
+def _index(entries: Sequence[tuple[str, str]]) -> Markup:
+    """Links to parts of the page, given as id and title."""
+    return tag("nav", *(tag("a", title, href=f"#{name}") for name, title in entries), aria_label="Sections")
 
 
 def _made(maker: Maker, material: Material) -> Section | None:

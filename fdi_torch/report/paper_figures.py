@@ -45,7 +45,7 @@ def outputs_figure(time: np.ndarray, read: np.ndarray, estimate: np.ndarray, cha
     figure, panels = _stack(read.shape[1], "Outputs and their estimate")
     for i, axes in enumerate(panels):
         _mark(axes, changes)
-        axes.plot(*thinned(time, read[:, i]), color=SOFT, lw=2.4, label="read")
+        axes.plot(*thinned(time, read[:, i]), color=SOFT, lw=2.4, label="measured")
         axes.plot(*thinned(time, estimate[:, i]), color=MODEL, lw=1.0, label="estimate")
         axes.set_ylabel(f"h{i + 1}, cm")
     label_lines(panels[0])

@@ -25,7 +25,7 @@ TALL = 1.4
 COLUMN, ROW = 1.95, 3.1
 ASIDE, LANE = 0.68, 0.36  # from a tank's middle to a line beside its left wall, and on to the next one
 LETTER = 0.1  # largest width of a letter beside a sensor
-LINE, WITHIN = 0.2, 9  # height of a line; letters per line within a tank
+LINE, WITHIN = 0.2, 9  # height of a line; letters per line within a tank and between tanks
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,16 @@ class _Drawing:
         columns = 1 + max(column for _, column in self.places.values())
         longest = max((len(words) for name in plant.locations() for words in self.diagnosis(name)), default=0)
         margin = max(1.0, 0.058 * longest)
-        beside = max((len(w) for s in plant.sensors for w in (short(s.name, 16), *self.diagnosis(s.name))), default=0)
+        beside = max((len(words) for s in plant.sensors for words, *_ in self.lines(s.name, WITHIN)), default=0)
         beside_left = [len(short(c.name, 16)) for c in plant.flow_components() if c.order > FlowOrder.BY_LEVELS]
         aside = ASIDE + LANE * len(beside_left) + LETTER * max(beside_left) if beside_left else 0.0
         left, right = -max(margin, aside), (columns - 1) * COLUMN + max(margin, 0.8 + LETTER * beside)
-        words = 0.2 * max((len(self.diagnosis(name)) for name in plant.locations()), default=0)
-        bottom, top = -(rows - 1) * ROW - 0.85 - words, TALL + 1.05 + words
+        flows = plant.flow_components()
+        above, below = (
+            LINE * max((len(self.diagnosis(c.name)) for c in flows if (c.source == OUTSIDE) is outside), default=0)
+            for outside in (True, False)
+        )
+        bottom, top = -(rows - 1) * ROW - 0.85 - below, TALL + 1.05 + above
         self.figure = Figure(figsize=((right - left) * INCH, (top - bottom) * INCH))
         FigureCanvasAgg(self.figure)
         self.axes: Axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -103,7 +107,8 @@ class _Drawing:
         marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
         shares = self.diagnosis(name)[len(marks) :]
         marks = [line for text in marks for line in wrap(text, width, break_long_words=False)]
-        lines = [(short(name, 16), INK, "normal"), *((text, MARK, "bold") for text in marks)]
+        tinted = name in self.places and self.overlay.probabilities.get(name, 0.0) > 0.0
+        lines = [(short(name, 16), INK, "normal"), *((text, INK if tinted else MARK, "bold") for text in marks)]
         return [*lines, *((text, INK, "bold") for text in shares)]
 
     def words(self, name: str, point: Point, ha: str, va: str, width: int = 26) -> None:
@@ -143,7 +148,7 @@ class _Drawing:
             place = height + (0.05 if height < 0.3 else -0.24)
             free = TALL - 0.08 - LINE * len(self.lines(tank.name, WITHIN)) - 0.22  # below the words of the tank
             place = max(min(place, free), 0.04)
-            self.axes.text(x, y + place, f"{100 * level:.1f} cm", ha="center", color=MODEL, fontsize=9.0, zorder=6)
+            self.axes.text(x, y + place, f"{100 * level:.1f} cm", ha="center", color=INK, fontsize=9.0, zorder=6)
         walls = [(x - 0.5, y + TALL), (x - 0.5, y), (x + 0.5, y), (x + 0.5, y + TALL)]
         self.axes.plot(*np.array(walls).T, color=self.colour(tank.name), lw=2.0, zorder=5, solid_joinstyle="miter")
         self.words(tank.name, (x, y + TALL - 0.08), "center", "top", width=WITHIN)
@@ -157,7 +162,7 @@ class _Drawing:
             self.axes.add_patch(Circle(centre, 0.2, facecolor=MARK, alpha=strength(probability), zorder=6))
         colour = self.colour(sensor.name)
         self.axes.add_patch(Circle(centre, 0.085, facecolor=PAPER, edgecolor=colour, lw=1.6, zorder=7))
-        self.words(sensor.name, (centre[0] + 0.15, centre[1] + 0.1), "left", "top")
+        self.words(sensor.name, (centre[0] + 0.12, centre[1] + 0.1), "left", "top", width=WITHIN)
 
     def flow(self, component: FlowComponent) -> None:
         """Draw a flow component as its `sketch` declares: a line along its route with its symbol."""
@@ -285,4 +290,4 @@ class _Drawing:
 
 def strength(share: float) -> float:
     """Opacity of a location by its probability (0 to 1); cubic, so that certain locations stand out."""
-    return 0.5 * share**3
+    return 0.3 * share**3

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
+from fdi_torch.report.chart import Chart, chart_json, draw
 from fdi_torch.report.html import Markup, clean, escape, join, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.style import inline_svg
@@ -16,44 +17,69 @@ REM_PER_INCH = 7.6  # width of a wide picture; its text then has the size of the
 
 @dataclass(frozen=True)
 class Picture:
-    """name: of its file, without suffix. caption: description, also for screen readers. wide: uses a whole row."""
+    """name: of its file, without suffix. caption: description, also for screen readers. wide: uses a whole row.
+    chart: its signals, for the interactive chart; see `signals`.
+    """
 
     name: str
     figure: Figure
     caption: str = ""
     wide: bool = False
+    chart: Chart | None = None
+
+
+Column = tuple[Picture, ...]  # pictures below each other, such as a sensor's readings and residuals
 
 
 @dataclass(frozen=True)
 class Section:
-    """blocks: markup, text (a paragraph), or a list of pictures in a grid."""
+    """blocks: markup, text (a paragraph), or a list of pictures and columns of pictures in a grid.
+
+    lead: belongs to the result, which stands at the top of the page beside the rig.
+    """
 
     title: str
-    blocks: Sequence[Markup | str | Sequence[Picture]]
+    blocks: Sequence[Markup | str | Sequence[Picture | Column]]
+    lead: bool = False
 
     @property
     def pictures(self) -> list[Picture]:
-        return [picture for block in self.blocks if not isinstance(block, str) for picture in block]
+        entries = [entry for block in self.blocks if not isinstance(block, str) for entry in block]
+        return [p for entry in entries for p in ((entry,) if isinstance(entry, Picture) else entry)]
 
 
 Maker = Callable[[Material], "Section | None"]
 
 
-def section_html(section: Section, prefix: str) -> Markup:
-    """The section as HTML. prefix: makes picture ids unique on the page."""
+def signals(name: str, chart: Chart, caption: str = "") -> Picture:
+    """A picture of signals that is an interactive chart where scripts run."""
+    return Picture(name, draw(chart), caption, chart=chart)
+
+
+def section_html(section: Section, prefix: str, own_id: str) -> Markup:
+    """The section as HTML. prefix: makes picture ids unique on the page. own_id: that of the section."""
     blocks = []
     for block in section.blocks:
         if isinstance(block, str):
             blocks.append(block if isinstance(block, Markup) else tag("p", block))
         else:
-            blocks.append(tag("div", *(_figure(picture, prefix) for picture in block), class_="grid"))
-    return tag("section", tag("h3", section.title), join(blocks))
+            blocks.append(tag("div", *(_entry(entry, prefix) for entry in block), class_="grid"))
+    return tag("section", tag("h3", section.title), join(blocks), id=own_id)
+
+
+def _entry(entry: Picture | Column, prefix: str) -> Markup:
+    if isinstance(entry, Picture):
+        return _figure(entry, prefix)
+    return tag("div", *(_figure(picture, prefix) for picture in entry), class_="column")
 
 
 def _figure(picture: Picture, prefix: str) -> Markup:
     described = escape(clean(picture.caption or picture.name))
     svg = Markup(inline_svg(picture.figure, f"{prefix}{picture.name}", described))
     caption = [tag("figcaption", picture.caption)] if picture.caption else []
+    if picture.chart is not None:
+        clock = f"{prefix}{picture.chart.clock or picture.name}"
+        return tag("figure", svg, *caption, data_chart=chart_json(picture.chart), data_clock=clock)
     if not picture.wide:
         return tag("figure", svg, *caption)
     width = f"max-width: {REM_PER_INCH * picture.figure.get_figwidth():.1f}rem"

@@ -9,6 +9,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import ceil, floor, log10
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,8 @@ INK, SOFT, FAINT = "#1f2933", "#67727e", "#d3d9e0"
 MODEL, MARK, OTHER = "#0b6cab", "#b84a00", "#0b7558"
 PAPER = "#fefefe"
 
-_VARIABLES = {INK: "ink", SOFT: "soft", FAINT: "faint", MODEL: "model", MARK: "mark", OTHER: "other", PAPER: "paper"}
+# Colour -> name of its CSS variable.
+VARIABLES = {INK: "ink", SOFT: "soft", FAINT: "faint", MODEL: "model", MARK: "mark", OTHER: "other", PAPER: "paper"}
 _SETTINGS: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "fdi_torch",
@@ -79,8 +81,15 @@ def panel(title: str, x_label: str, y_label: str, width: float = WIDTH, height: 
     return figure, axes
 
 
-def logarithmic(axes: Axes) -> None:
-    """Make the vertical axis logarithmic, with plain numbers."""
+def logarithmic(axes: Axes, linear_width: float = 0.0) -> None:
+    """Make the vertical axis logarithmic, with plain numbers; with a `linear_width` it is linear below that (asinh)."""
+    if linear_width:
+        axes.set_yscale("asinh", linear_width=linear_width)
+        high = axes.dataLim.y1
+        axes.set_yticks([0.0, *(10.0**k for k in range(ceil(log10(linear_width)), floor(log10(high)) + 1))])
+        axes.yaxis.set_major_formatter(lambda value, place: f"{value:g}")
+        axes.set_ylim(0.0, 1.3 * high)
+        return
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(lambda value, place: f"{value:g}")
     low, high = axes.get_ylim()
@@ -124,7 +133,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
     svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', rf'\1 role="img" aria-label="{description}"', svg, count=1)
     svg = re.sub(r"(font(?:-family)?:[^;\"]*?)'DejaVu Sans'(, [^;\"]*)?", r"\1system-ui, sans-serif", svg)
-    for colour, variable in _VARIABLES.items():
+    for colour, variable in VARIABLES.items():
         svg = svg.replace(colour, f"var(--{variable})")
     return _own_ids(svg, name)
 

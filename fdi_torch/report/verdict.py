@@ -14,6 +14,7 @@ from fdi_torch.report.sections.rehearsal import rehearsal_tables
 from fdi_torch.report.sections.study import ESTIMATORS
 from fdi_torch.report.windowed_fit_result import logged_windows
 
+MOST_LISTED = 2  # alarms in the headline
 KINDS = {
     "train": "Fault diagnosis",
     "simulate": "Simulation",
@@ -71,9 +72,16 @@ def monitor_words(material: Material) -> str:
     unfinished = {n: m for n, m in last.items() if states[n] not in ("recovered", "retired")}
     still_open = [f"{m['headline']}{_since(m)} ({states[n]})" for n, m in unfinished.items()]
     ended = [f"{m['headline']}" for n, m in last.items() if states[n] == "recovered"]
-    parts = [_listed(still_open)] if still_open else []
-    parts += [f"recovered: {_listed(ended)}"] if ended else []
+    parts = [_latest("open alarms", still_open)] if still_open else []
+    parts += [f"recovered: {_latest('alarms', ended)}"] if ended else []
     return "; ".join(parts)
+
+
+def _latest(what: str, items: list[str]) -> str:
+    """All of a few items; the number of many and the latest, as the others are among the events."""
+    if len(items) <= MOST_LISTED:
+        return _listed(items)
+    return f"{len(items)} {what}, the latest: {items[-1]}"
 
 
 def _since(event: Mapping[str, Any]) -> str:

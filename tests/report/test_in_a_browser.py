@@ -1,15 +1,18 @@
-"""The page in a real browser, wide and narrow: nothing sticks out, no picture is missing, letters can be read."""
+"""Every kind of page in a real browser: wide and narrow, light and dark, and on paper.
+
+The screenshots lie in pytest's folder for temporary files; with `--basetemp=FOLDER` they are easy to look at.
+"""
 
 from __future__ import annotations
 
-import html
-import json
-import shutil
-import subprocess
+import io
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
+from browser import browser, draw_all, opened  # noqa: F401
+from matplotlib.image import imread
 from sample_runs import (
     NASTY,
     material_of,
@@ -22,75 +25,160 @@ from sample_runs import (
 )
 
 from fdi_torch.config import load_plant
-from fdi_torch.report.page import page, report_of
+from fdi_torch.jobs.report import comparison_of
+from fdi_torch.report.page import RunReport, page, report_of
 
-CHROMIUM = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), ""
-)
-pytestmark = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+DATA = Path(__file__).parents[1] / "data"
+WRITERS = {
+    "train": (write_train, "three_tank"),
+    "gap": (write_gap, "quadruple_tank"),
+    "monitor": (write_monitor, "dts200"),
+    "study": (write_study, "cascaded_tanks"),
+    "challenge": (write_challenge, "three_tank"),
+    "rehearsal": (write_rehearsal, "three_tank"),
+}
+LOGS = ("windows", "what_if", "monitor", "gap")
+KINDS = (*WRITERS, *(f"logged_{name}" for name in LOGS), "compare", "nasty")
+PAPER = 688  # pixels of an A4 page between its margins
 
-# One frame of the wanted width for each page and width: the window itself cannot be made narrow everywhere.
-MEASURE = """
-<script>
-onload = () => {
-  const frames = [...document.querySelectorAll("iframe")];
-  document.body.dataset.found = JSON.stringify(frames.map(frame => {
-    const page = frame.contentDocument, root = page.documentElement;
-    const boxes = [...page.querySelectorAll("svg")].map(svg => svg.getBoundingClientRect());
-    const letters = [...page.querySelectorAll("svg text")].map(text => text.getBoundingClientRect().height);
-    return {width: root.clientWidth, needed: root.scrollWidth, pictures: boxes.length,
-      smallest: Math.min(...boxes.map(box => Math.min(box.width, box.height))),
-      right: Math.max(...boxes.map(box => box.right)), letters: Math.min(...letters),
-      title: page.querySelector("h2").textContent, scripts: page.scripts.length};
-  }));
-};
-</script>
-"""
+# What is wrong with a page, in words. Text on a canvas is not seen; whether it is drawn is.
+FAULTS = """() => {
+  const wrong = [], body = document.body;
+  if (document.documentElement.scrollWidth > innerWidth) wrong.push("the page is wider than the window");
+  const numbers = colour => (colour.match(/[\\d.]+/g) || []).map(Number);
+  const light = colour => {
+    const linear = v => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+    const [r, g, b] = numbers(colour).map(v => linear(v / 255));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const ground = element => {
+    for (let e = element; e; e = e.parentElement) {
+      const colour = getComputedStyle(e).backgroundColor;
+      if (numbers(colour).length === 3) return colour;
+    }
+    return "rgb(255, 255, 255)";
+  };
+  // The topmost shape of a picture that lies below a text, over the ground of the page.
+  const below = (svg, text, box) => {
+    const x = (box.left + box.right) / 2, y = (box.top + box.bottom) / 2;
+    let colour = ground(svg.parentElement);
+    for (const shape of svg.querySelectorAll("path, rect, text")) {
+      if (shape === text) return colour;
+      const around = shape.getBoundingClientRect(), style = getComputedStyle(shape), fill = numbers(style.fill);
+      const inside = around.left <= x && x <= around.right && around.top <= y && y <= around.bottom;
+      if (shape.tagName === "text" || !inside || fill.length < 3) continue;
+      const share = (fill[3] ?? 1) * style.opacity * style.fillOpacity, under = numbers(colour);
+      colour = `rgb(${under.map((value, k) => share * fill[k] + (1 - share) * value).join()})`;
+    }
+    return colour;
+  };
+  const boxes = [], walker = document.createTreeWalker(body, NodeFilter.SHOW_TEXT);
+  while (walker.nextNode()) {
+    const node = walker.currentNode, parent = node.parentElement, text = node.textContent.trim();
+    if (!text || parent.closest("script, style, nav") || !parent.checkVisibility({ opacityProperty: true })) continue;
+    const range = document.createRange(), style = getComputedStyle(parent), svg = parent.closest("svg");
+    range.selectNodeContents(node);
+    const slanted = svg && /rotate\\((?!-?(0|90)[ )])/.test(parent.getAttribute("transform") || "");
+    const own = svg ? [parent.getBoundingClientRect()] : [...range.getClientRects()];
+    for (const box of own) if (box.width && box.height && !slanted) boxes.push({ box, text, svg });
+    const [a, b] = [light(svg ? style.fill : style.color), light(svg ? below(svg, parent, own[0]) : ground(parent))];
+    const contrast = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+    if (contrast < 4.5) wrong.push(`contrast of ${contrast.toFixed(2)}: ${text}`);
+    const height = svg ? own[0].height : parseFloat(style.fontSize);
+    if (height && height < 8.5) wrong.push(`letters of ${height.toFixed(1)} pixels: ${text}`);
+    for (const box of own) if (box.right > innerWidth + 1 && !parent.closest(".scroll")) wrong.push(`cut off: ${text}`);
+  }
+  boxes.sort((one, other) => one.box.top - other.box.top);
+  boxes.forEach((one, i) => {
+    for (let k = i + 1; k < boxes.length && boxes[k].box.top < one.box.bottom - 3; k++) {
+      const other = boxes[k];
+      const across = Math.min(one.box.right, other.box.right) - Math.max(one.box.left, other.box.left);
+      const down = Math.min(one.box.bottom, other.box.bottom) - other.box.top;
+      if (across > 3 && down > 3) wrong.push(`on top of each other: ${one.text} | ${other.text}`);
+    }
+  });
+  for (const figure of document.querySelectorAll("figure")) {
+    const shown = [...figure.querySelectorAll("svg, canvas")].filter(picture => picture.checkVisibility());
+    if (shown.length !== 1) wrong.push(`${shown.length} pictures in one figure`);
+    const canvas = shown.find(picture => picture.tagName === "CANVAS");
+    if (!canvas) continue;
+    const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+    let drawn = 0;
+    for (let k = 3; k < pixels.length; k += 4) drawn += pixels[k] > 0;
+    if (drawn < 0.005 * canvas.width * canvas.height) wrong.push("an empty chart");
+  }
+  return [...new Set(wrong)];
+}"""
 
 
-def measured(pages: list[Path], widths: list[int], folder: Path) -> list[dict[str, Any]]:
-    """What the browser says of each page at each width, and its screenshot."""
-    frames = [
-        f'<iframe src="{p.name}" style="width:{w}px;height:900px;border:0"></iframe>' for w in widths for p in pages
-    ]
-    (folder / "all.html").write_text("<!doctype html><body>" + "".join(frames) + MEASURE, encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files", "--hide-scrollbars"]
-    command = [CHROMIUM, *options, f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=20000", "--dump-dom"]
-    done = subprocess.run([*command, f"file://{folder / 'all.html'}"], capture_output=True, text=True, timeout=120)
-    text = done.stdout.partition('data-found="')[2].partition('"')[0]
-    return json.loads(html.unescape(text))
+def made(kind: str, folder: Path) -> str:
+    """The page of a kind of run."""
+
+    def report(path: Path, plant: str = "three_tank") -> RunReport:
+        return report_of(material_of(path, load_plant(plant)))
+
+    if kind == "compare":
+        both = [report(write_train(folder / f"{name}.mcap")) for name in ("first", "second")]
+        return page(both, [comparison_of(both)])
+    if kind == "nasty":
+        return page([report(write_train(folder / "nasty.mcap", name=f"{NASTY * 4}.leak.size"))])
+    if kind.startswith("logged_"):
+        return page([report(DATA / f"log_format_1_{kind.removeprefix('logged_')}.mcap")])
+    write, plant = WRITERS[kind]
+    return page([report(write(folder / f"{kind}.mcap"), plant)])
 
 
-def test_pages_fit_a_desk_and_a_phone(tmp_path: Path) -> None:
-    writers = (write_train, write_gap, write_monitor, write_study, write_challenge, write_rehearsal)
-    pages, plants = [], ("three_tank", "quadruple_tank", "dts200", "cascaded_tanks", "three_tank", "three_tank")
-    for write, plant in zip(writers, plants, strict=True):
-        material = material_of(write(tmp_path / f"{write.__name__}.mcap"), load_plant(plant))
-        pages.append(tmp_path / f"{write.__name__}.html")
-        pages[-1].write_text(page([report_of(material)]), encoding="utf-8")
-    nasty = material_of(write_train(tmp_path / "nasty.mcap", name=f"{NASTY * 4}.leak.size"), load_plant("three_tank"))
-    pages.append(tmp_path / "nasty.html")
-    pages[-1].write_text(page([report_of(nasty)]), encoding="utf-8")
-    found = measured(pages, [1280, 390], tmp_path)
-    assert [view["width"] for view in found] == [1280] * 7 + [390] * 7
-    for view, shown in zip(found, [*pages, *pages], strict=True):
-        assert view["needed"] <= view["width"], f"{view['title']} sticks out at {view['width']}"
-        assert view["pictures"] >= (1 if shown.stem == write_rehearsal.__name__ else 2)
-        assert view["smallest"] > 40 and view["right"] <= view["width"]
-        assert view["letters"] >= 8.5, f"{view['title']}: letters of {view['letters']} pixels at {view['width']}"
-        assert view["scripts"] == 0
+@pytest.fixture(scope="module", params=KINDS)
+def path(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp("pages") / f"{request.param}.html"
+    target.write_text(made(request.param, target.parent), encoding="utf-8")
+    return target
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_screenshot_shows_the_page(width: int, tmp_path: Path) -> None:
-    source, target = tmp_path / "page.html", tmp_path / "page.png"
-    material = material_of(write_train(tmp_path / "run.mcap"), load_plant("three_tank"))
-    source.write_text(page([report_of(material)]), encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--user-data-dir={tmp_path / 'p'}"]
-    command = [CHROMIUM, *options, f"--window-size={width},2000", f"--screenshot={target}", f"file://{source}"]
-    subprocess.run(command, capture_output=True, timeout=120, check=True)
-    from matplotlib.image import imread
+def test_a_page_can_be_read_on_a_desk_and_a_phone(browser: Any, path: Path, width: int, scheme: str) -> None:  # noqa: F811
+    tab, said = opened(browser, path, width, color_scheme=scheme)
+    draw_all(tab)
+    assert tab.evaluate(FAULTS) == [] and said == []
+    target = path.with_name(f"{path.stem}_{width}_{scheme}.png")
+    tab.screenshot(path=target, full_page=True)
+    pixels = imread(target)[:, :, :3]
+    assert pixels.shape[1] == width and pixels.std() > 0.02
+    assert (pixels.mean() > 0.8) if scheme == "light" else (pixels.mean() < 0.3)
+    tab.context.close()
 
-    pixels = imread(target)
-    assert pixels.shape[:2] == (2000, width)
-    assert pixels[:, :, :3].std() > 0.05, "the screenshot is empty"
+
+@pytest.mark.slow
+def test_a_page_can_be_printed(browser: Any, path: Path) -> None:  # noqa: F811
+    pypdf = pytest.importorskip("pypdf")
+    tab, said = opened(browser, path, PAPER, color_scheme="dark")
+    draw_all(tab)
+    tab.emulate_media(media="print")
+    assert tab.evaluate(FAULTS) == [] and said == []
+    printed = tab.pdf(prefer_css_page_size=True, format="A4")
+    path.with_suffix(".pdf").write_bytes(printed)
+    before_content = "h1, h2, h3, h4, summary, p:has(+ .grid)"
+    leading = tab.eval_on_selector_all(before_content, "all => all.map(each => each.textContent)")
+    pages = [squeezed(each.extract_text()) for each in pypdf.PdfReader(io.BytesIO(printed)).pages]
+    for k, text in enumerate(pages[:-1]):
+        last = [words for words in map(squeezed, leading) if text.endswith(words[-60:])]
+        assert not last, f"page {k + 1} ends with what belongs to the next one: {last}"
+    tab.context.close()
+
+
+def squeezed(text: str) -> str:
+    """Text without spaces, which PDF does not keep."""
+    return re.sub(r"\s", "", text)
+
+
+@pytest.mark.parametrize("height", [900])
+def test_the_result_of_a_gap_is_on_one_screen(browser: Any, height: int, tmp_path: Path) -> None:  # noqa: F811
+    target = tmp_path / "gap.html"
+    target.write_text(page([report_of(material_of(write_gap(tmp_path / "gap.mcap"), load_plant("three_tank")))]))
+    tab, _ = opened(browser, target)
+    for title in ("The rig", "What causes it", "Where the gap lies", "How far it closes"):
+        box = tab.locator("section", has=tab.locator(f"h3:text-is('{title}')")).bounding_box()
+        assert box["y"] >= 0 and box["y"] + box["height"] <= height, title
+    tab.context.close()

@@ -28,7 +28,7 @@ from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.material import gather
 from fdi_torch.report.page import RunReport, page, report_of
 from fdi_torch.report.sections.before_after import profile_section, sample_noise
-from fdi_torch.report.verdict import headline
+from fdi_torch.report.verdict import _latest, headline
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -53,13 +53,13 @@ def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> No
         "The rig",
         "What causes it",
         "Where the gap lies",
-        "The discrepancy",
         "How far it closes",
+        "The discrepancy",
+        "Errors on data not used for fitting",
         "Before and after",
         "Calibration constants",
         "What the gap depends on",
         "Next experiment",
-        "Limits of these inputs",
     ]
     assert {
         "gap_where",
@@ -142,7 +142,7 @@ def test_noise_is_seen_through_a_moving_signal() -> None:
 def test_a_monitor_page_shows_residuals_thresholds_and_events(tmp_path: Path) -> None:
     made = report(write_monitor, tmp_path)
     assert headline(made.material) == "Fault: leak at T1 (size 0.200 ± 0.010)"
-    assert titles(made)[1:3] == ["Events", "Residuals"]
+    assert titles(made)[1:3] == ["Detection", "Events"] and titles(made)[3] == "Residuals"
     assert {"observer_residual_3", "observer_statistic_1"} <= names(made)
     assert "the residual leaves its fault-free range" in page([made])
 
@@ -150,7 +150,7 @@ def test_a_monitor_page_shows_residuals_thresholds_and_events(tmp_path: Path) ->
 def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
     made = report(write_study, tmp_path)
     assert headline(made.material) == "40 trials in 2 settings"
-    assert titles(made)[1:4] == ["Settings", "Isolation", "Errors"]
+    assert titles(made)[:3] == ["Settings", "Isolation", "Errors"] and titles(made)[4] == "The rig"
     assert {"trials_1", "errors_2", "isolation"} <= names(made) and ">T1.leak<" in page([made])
     assert "38 of 40 modes stated correctly; 2 faults missed" in page([made]) and "none (10 %)" in page([made])
 
@@ -158,7 +158,7 @@ def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
 def test_a_challenge_page_shows_scores_confusion_and_misses(tmp_path: Path) -> None:
     made = report(write_challenge, tmp_path)
     assert headline(made.material) == "45 of 60 hidden causes diagnosed correctly, 13 named wrongly"
-    assert titles(made)[1:4] == ["Right answers", "Confusion of causes", "Wrong answers"]
+    assert titles(made)[:4] == ["Right answers", "Confusion of causes", "Wrong answers", "The rig"]
     assert "Trials" not in titles(made)
     assert {"challenge_1_right", "challenge_1_sure", "challenge_1_seconds", "challenge_4_seconds"} <= names(made)
     assert {"challenge_confusion_1", "challenge_unknown", "challenge_left_out"} <= names(made)
@@ -170,8 +170,8 @@ def test_a_rehearsal_page_shows_the_tables_of_the_command(tmp_path: Path) -> Non
     made = report(write_rehearsal, tmp_path)
     text = page([made])
     assert headline(made.material) == "0 of 2 faults missed, 1 of 1 named right"
-    assert titles(made)[:3] == ["The rig", "Validation of the monitor", "Configuration"]
-    assert "1 of 1 (21 .. 100 %)" in text and "too short" not in text.partition("Provenance")[0]
+    assert titles(made)[:3] == ["Validation of the monitor", "The rig", "Configuration"]
+    assert "1 of 1 (21 .. 100 %)" in text and "too short" not in text.partition("<h3>Provenance")[0]
     assert NASTY not in text
     del made.material.run.metadata["fdi_torch.result"]
     assert headline(made.material) == "Faults found and naming, without a result yet"
@@ -191,7 +191,7 @@ def test_windows_that_make_no_sense_are_not_shown(tmp_path: Path) -> None:
     with RunLog(path, "train") as log:
         log.result({"windows": [good, {"start": NASTY}, 7], "stretches": [beyond, {"name": NASTY}]})
     made = report_of(material_of(path, load_plant("three_tank")))
-    text = page([made]).partition("Provenance")[0]
+    text = page([made]).partition("<h3>Provenance")[0]
     assert "1 windows, each" not in text and "One window" in text and "&gt; 2" in text and NASTY not in text
 
 
@@ -199,7 +199,7 @@ def test_several_runs_share_a_page(tmp_path: Path) -> None:
     text = page(
         [report_of(material_of(write(tmp_path / f"{write.__name__}.mcap"))) for write in (write_gap, write_study)]
     )
-    assert text.count("<article>") == 2
+    assert text.count("<article ") == 2
 
 
 def test_a_cause_shows_its_size_in_whatever_order_its_parameters_were_logged() -> None:
@@ -227,3 +227,43 @@ def test_a_variable_that_stands_still_has_no_panel() -> None:
     after = profile_section(material)
     assert before is not None and after is not None
     assert [len(section.pictures) for section in (before, after)] == [8, 7]
+
+
+def test_the_result_stands_beside_the_rig_and_the_index_lists_every_section(tmp_path: Path) -> None:
+    text = page([report(write_gap, tmp_path)])
+    lead = text.partition('<div class="lead">')[2].partition("The discrepancy</h3>")[0]
+    assert re.findall("<h3>([^<]*)</h3>", lead) == [
+        "The rig",
+        "What causes it",
+        "Where the gap lies",
+        "How far it closes",
+    ]
+    index = re.findall('<a href="#([^"]*)">([^<]*)</a>', text.partition("<nav")[2].partition("</nav>")[0])
+    assert index == re.findall('<section id="([^"]*)"><h3>([^<]*)</h3>', text) and len(index) > 10
+
+
+def test_inputs_and_readings_say_of_which_recording_they_are(tmp_path: Path) -> None:
+    time = np.arange(50.0)
+    with RunLog(tmp_path / "run.mcap", "gap", env={}, git={}) as log:
+        for group, level in (("", 1e-5), ("holdout", 3e-5), ("recording_2", 2e-5)):
+            varied = level * (1 + (time > 20))
+            inputs = np.stack([varied, np.full(50, level)], 1)
+            log.recording(time, inputs, inputs, ("Q1", "Q2"), ("h1", "h2"), ("m^3/s",) * 2, ("m",) * 2, group=group)
+    text = page([report_of(material_of(tmp_path / "run.mcap"))])
+    assert re.findall("<h4>([^<]*)</h4>", text) == ["Diagnosed recording", "Hold-out", "Recording 2"]
+    assert {"Q1, diagnosed recording", "Q1, hold-out", "Q1, recording 2"} <= set(
+        re.findall("&quot;title&quot;:&quot;([^&]*)&quot;", text)
+    )
+    assert "Hold-out, constant: Q2 at 30 cm³/s." in text
+
+
+def test_a_headline_of_many_alarms_counts_them() -> None:
+    assert _latest("open alarms", ["a", "b"]) == "a and b"
+    assert _latest("open alarms", ["a", "b", "c"]) == "3 open alarms, the latest: c"
+
+
+def test_provenance_has_no_arrays(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "run.mcap", "train", env={}, git={}) as log:
+        log.result({"status": "converged", "covariance": [[1.25, 2.25], [2.25, 3.25]], "names": ["a", "b"]})
+    text = page([report_of(material_of(tmp_path / "run.mcap"))])
+    assert "converged" in text and "2.25" not in text and "covariance" not in text

@@ -53,7 +53,8 @@ def test_each_section_is_there_that_the_log_has_something_for(log: Path) -> None
 
 def test_the_page_needs_nothing_from_outside(log: Path) -> None:
     tags = Tags(page([report_of(material_of(log, load_plant("three_tank")))]))
-    assert not {"script", "link", "iframe", "object", "img", "foreignobject"} & set(tags.names)
+    assert tags.names.count("script") == 1, "the charts, which the policy allows by their hash"
+    assert not {"link", "iframe", "object", "img", "foreignobject"} & set(tags.names)
     pointing = [v for n, v in tags.attributes if n in ("href", "src", "xlink:href", "action")]
     assert all(v.startswith("#") for v in pointing)
     assert not [n for n, _ in tags.attributes if n.startswith("on")]
@@ -69,7 +70,7 @@ def test_ids_are_unique_and_every_reference_has_its_target(log: Path) -> None:
 def test_a_name_with_markup_is_only_a_name(tmp_path: Path) -> None:
     path = write_train(tmp_path / "run.mcap", name=f"{NASTY}.$x_{{\\frac\x00\u202e")
     text = page([report_of(material_of(path, load_plant("three_tank")))])
-    assert "script" not in Tags(text).names
+    assert Tags(text).names.count("script") == 1, "that of the charts"
     assert "&lt;script&gt;alert(&quot;1&quot;)&lt;/script&gt;" in text
     assert "\x00" not in text and "\u202e" not in text
 

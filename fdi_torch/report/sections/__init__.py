@@ -5,14 +5,14 @@ from fdi_torch.report.sections.before_after import holdout_section, profile_sect
 from fdi_torch.report.sections.blind_benchmark import confusion_section, misses_section, scores_section
 from fdi_torch.report.sections.estimate import estimate_section, posterior_section
 from fdi_torch.report.sections.gap import causes_section, disturbances_section, where_section
-from fdi_torch.report.sections.gap_closure import closure_section, constants_section
+from fdi_torch.report.sections.gap_closure import closure_section, constants_section, errors_section
 from fdi_torch.report.sections.gap_curves import curves_section, shape_section
 from fdi_torch.report.sections.gap_next import limits_section, next_input_section
 from fdi_torch.report.sections.isolation import isolation_section
-from fdi_torch.report.sections.monitor import event_section, residual_section
+from fdi_torch.report.sections.monitor import event_section, residual_section, statistic_section
 from fdi_torch.report.sections.origin import configuration_section, health_section, provenance_section
 from fdi_torch.report.sections.rehearsal import rehearsal_section
-from fdi_torch.report.sections.rig import rig_section
+from fdi_torch.report.sections.rig import plain_rig_section, rig_section
 from fdi_torch.report.sections.search import refinement_section, search_section
 from fdi_torch.report.sections.signals import fit_section, inputs_section
 from fdi_torch.report.sections.study import error_section, summary_section, trials_section
@@ -22,10 +22,11 @@ SECTIONS: tuple[Maker, ...] = (
     rig_section,
     causes_section,
     where_section,
+    closure_section,
     disturbances_section,
     curves_section,
     shape_section,
-    closure_section,
+    errors_section,
     holdout_section,
     constants_section,
     profile_section,
@@ -33,6 +34,7 @@ SECTIONS: tuple[Maker, ...] = (
     limits_section,
     estimate_section,
     windows_section,
+    statistic_section,
     event_section,
     residual_section,
     scores_section,
@@ -48,6 +50,7 @@ SECTIONS: tuple[Maker, ...] = (
     posterior_section,
     search_section,
     refinement_section,
+    plain_rig_section,
     configuration_section,
     provenance_section,
     health_section,

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdi_torch.logbook import Signals
+from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, shown_unit
-from fdi_torch.report.panels import Line, line_panel
 from fdi_torch.report.predictions import MODELS, holdout_prefix
-from fdi_torch.report.section import Picture, Section
-from fdi_torch.report.style import SOFT
+from fdi_torch.report.section import Picture, Section, signals
+from fdi_torch.report.sections.signals import clock_of
 
 BINS = 24
 
@@ -41,11 +41,13 @@ def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
             predicted = arrays.get(f"{prefix}_{model}")
             if predicted is not None:
                 words, colour = MODELS[model]
-                lines.append((words, time, scale * (read[:, i] - predicted[:, i]), colour))
+                lines.append(Line(words, time, scale * (read[:, i] - predicted[:, i]), colour))
         if lines:
             title_here = f"{name}, {title.replace('_', ' ')}"
-            figure = line_panel(title_here, "time, s", axis("read − model", unit), lines)
-            pictures.append(Picture(f"{prefix}_{i + 1}", figure))
+            chart = Chart(
+                title_here, "time, s", axis("measured − model", unit), lines, level=0.0, clock=clock_of(prefix)
+            )
+            pictures.append(signals(f"{prefix}_{i + 1}", chart))
     return pictures
 
 
@@ -62,11 +64,9 @@ def profile_section(material: Material) -> Section | None:
     pictures = []
     varied = (v for v in _variables(material, recording) if np.nanmin(v[2]) < np.nanmax(v[2]))
     for k, (title, label, variable) in enumerate(varied):
-        lines: list[Line] = [(MODELS[m][0], *_binned(variable, size), MODELS[m][1]) for m, size in excess.items()]
-        figure = line_panel(title, label, "residual, × noise", lines)
-        figure.axes[0].axhline(1.0, color=SOFT, lw=0.8, ls=":")
-        figure.axes[0].set_ylim(bottom=0.0)
-        pictures.append(Picture(f"gap_by_{k + 1}", figure))
+        lines = [Line(MODELS[m][0], *_binned(variable, size), MODELS[m][1]) for m, size in excess.items()]
+        chart = Chart(title, label, "residual, × noise", lines, level=1.0, from_zero=True)
+        pictures.append(signals(f"gap_by_{k + 1}", chart))
     words = "Root mean square residual of all sensors, each divided by its noise; 1 means noise only."
     return Section("What the gap depends on", [words, pictures])
 
@@ -96,7 +96,7 @@ def _variables(material: Material, recording: Signals) -> Iterator[tuple[str, st
     yield "By time", "time, s", recording.time
     for i, name in enumerate(recording.output_names):
         unit, scale = shown_unit(recording.output_units[i])
-        yield f"By {name}", axis(f"{name} read", unit), scale * recording.outputs[:, i]
+        yield f"By {name}", axis(f"{name} measured", unit), scale * recording.outputs[:, i]
     for i, name in enumerate(recording.input_names):
         unit, scale = shown_unit(recording.input_units[i])
         yield f"By {name}", axis(f"{name} commanded", unit), scale * recording.inputs[:, i]

@@ -29,7 +29,7 @@ def estimate_section(material: Material) -> Section | None:
     notes = [str(note) for note in final.get("unidentifiable") or ()]
     notes += [f"{name} lies at the edge of its range" for name in final.get("at_bound") or ()]
     listed = [tag("ul", *(tag("li", note) for note in notes))] if notes else []
-    return Section("Estimate", [table(header, rows, left=2), *_water(material), *listed])
+    return Section("Estimate", [table(header, rows, left=2), *_water(material), *listed], lead=True)
 
 
 def posterior_section(material: Material) -> Section | None:
@@ -47,7 +47,7 @@ def posterior_section(material: Material) -> Section | None:
     pictures = [_ellipse(material, final, covariance, pair, k) for k, pair in enumerate(ranked)]
     words = "Regions with 50 % and 95 % of the probability, most correlated pairs first."
     words += " The green cross marks the simulated values." if material.truth else ""
-    rows = [[names[i], *(f"{correlation[i, j]:z.2f}" for j in determined)] for i in determined]
+    rows = [[names[i], *(_signed(correlation[i, j]) for j in determined)] for i in determined]
     grid = table(["correlation", *(str(names[j]) for j in determined)], rows)
     return Section("Uncertainty", [words, pictures, grid]) if pictures else None
 
@@ -112,4 +112,8 @@ def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: t
     simulated = all(name in material.truth for name in names)
     truth = (scales[0] * material.truth[names[0]], scales[1] * material.truth[names[1]]) if simulated else None
     rho = part[0, 1] / np.sqrt(part[0, 0] * part[1, 1])
-    return Picture(f"ellipse_{k + 1}", ellipse_panel(names, units, centre, part, truth), f"correlation {rho:z.2f}")
+    return Picture(f"ellipse_{k + 1}", ellipse_panel(names, units, centre, part, truth), f"correlation {_signed(rho)}")
+
+
+def _signed(correlation: float) -> str:
+    return f"{correlation:z.2f}".replace("-", "−")

@@ -7,17 +7,18 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from fdi_torch.gap.verdict_words import causes_of
+from fdi_torch.gap.verdict_words import FORMAT_1, causes_of
 from fdi_torch.gap.verdict_words import explanation_words as in_words
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.json_numbers import as_float
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, probability_text, shown_unit, with_error
-from fdi_torch.report.panels import bar_panel
+from fdi_torch.report.numbers import number, percent, probability_text, shown_unit, with_error
+from fdi_torch.report.panels import BAR_NAME, bar_panel
 from fdi_torch.report.section import Picture, Section
 
 MOST_BARS = 10
 LEAST_SHOWN = 1e-4  # of a probability
+LEAST_PLACE = 1e-3  # of a place that gets a bar
 CONTENT = 0.95  # probability of the plausible explanations together
 
 
@@ -25,9 +26,12 @@ def where_section(material: Material) -> Section | None:
     """Probability of a discrepancy at each component, whatever its law."""
     where = {str(m["location"]): m for m in material.of("/gap/where")}
     where |= {str(place["location"]): place for place in material.answer.get("where", [])}
-    ranked = sorted(where.items(), key=lambda item: -float(item[1]["share"]))[:MOST_BARS]
+    ranked = sorted(where.items(), key=lambda item: -float(item[1]["share"]))
     if not ranked:
         return None
+    shown = [item for item in ranked if float(item[1]["share"]) >= LEAST_PLACE] or ranked[:3]
+    caption = f"Below {percent(LEAST_PLACE)}: {len(ranked) - len(shown)} other places." if ranked[len(shown) :] else ""
+    ranked = shown[:MOST_BARS]
     shares = [100.0 * float(place["share"]) for _, place in ranked]
     texts = [probability_text(float(place["share"])) + _chance(place) for _, place in ranked]
     guilty = {str(cause["location"]) for cause in material.answer.get("causes", [])}
@@ -35,10 +39,11 @@ def where_section(material: Material) -> Section | None:
         guilty |= {str(cause["location"]) for cause in causes_of(item)}
     names = [name for name, _ in ranked]
     meaning = material.meaning_of_shares
-    figure = bar_panel("Where", "%", names, shares, texts, [name in guilty for name in names])
+    label = "share of the gap, %" if material.answer.get("format") == FORMAT_1 else "probability, %"
+    figure = bar_panel("", label, names, shares, texts, [name in guilty for name in names])
     _up_to_all(figure)
-    words = f"{meaning[:1].upper()}{meaning[1:]}. Orange: where the likeliest explanation has its causes."
-    return Section("Where the gap lies", [words, [Picture("gap_where", figure)]])
+    words = f"{meaning[:1].upper()}{meaning[1:]}. Orange: causes of the likeliest explanation."
+    return Section("Where the gap lies", [words, [Picture("gap_where", figure, caption)]], lead=True)
 
 
 def causes_section(material: Material) -> Section | None:
@@ -53,13 +58,14 @@ def causes_section(material: Material) -> Section | None:
     certain = answer.get("certain") or []
     if certain and answer.get("verdict") != "named":
         blocks.append(f"With 95 % probability, whichever explanation is true: {explanation_words(certain)}.")
+    bars = _posterior(answer)
     plausible = [explanation_words(causes) for causes in answer.get("ambiguity_set") or _content(answer)]
-    if len(plausible) > 1:
+    if len(plausible) > 1 and (not bars or max(map(len, plausible)) > BAR_NAME):
         blocks += ["Explanations with 95 % of the probability together:"]
         blocks.append(tag("ul", *(tag("li", words) for words in plausible)))
-    blocks += _posterior(answer)
+    blocks += bars
     blocks += [tag("ul", *(tag("li", str(remark)) for remark in answer["remarks"]))] if answer.get("remarks") else []
-    return Section("What causes it", blocks) if blocks else None
+    return Section("What causes it", blocks, lead=True) if blocks else None
 
 
 def disturbances_section(material: Material) -> Section | None:
@@ -106,7 +112,7 @@ def _posterior(answer: Mapping[str, Any]) -> list[Any]:
         return []
     percents = [100.0 * chance for chance in chances]
     texts = [probability_text(0.01 * percent) for percent in percents]
-    figure = bar_panel("Explanations", "probability, %", names, percents, texts, within)
+    figure = bar_panel("", "probability, %", names, percents, texts, within)
     _up_to_all(figure)
     return [[Picture("gap_posterior", figure, "Orange: together they have 95 % of the probability.")]]
 

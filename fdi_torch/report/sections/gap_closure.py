@@ -26,23 +26,31 @@ FROZEN = {"recalibrated": "constants recalibrated without it", "nominal": "nomin
 def closure_section(material: Material) -> Section | None:
     """Errors on data that no fit has seen."""
     closure = material.answer.get("closure") or {}
-    stages = [name for name in STAGES if isinstance(closure.get(name), int | float)]
+    stages, words = _stages(material)
     if not stages:
         return None
     unit = str(closure.get("unit", ""))
-    words = STAGES | ({"augmented": "with the free form"} if material.answer.get("verdict") == "unknown" else {})
-    stages = [m for m in stages if m != "ceiling" or material.answer.get("verdict") != "unknown"]
     names = [words[name] for name in stages]
     values = [float(closure[name]) for name in stages]
+    texts = [f"{number(v, 3)} {unit}".rstrip() for v in values]
+    label = axis("free-run error on hold-outs (rms)", unit)
+    figure = bar_panel("", label, names, values, texts, [name == "augmented" for name in stages])
+    return Section("How far it closes", [_closed(closure), [Picture("gap_closure", figure)]], lead=True)
+
+
+def errors_section(material: Material) -> Section | None:
+    """The errors behind the closure: by model and sensor, and by hold-out."""
+    closure = material.answer.get("closure") or {}
+    stages, words = _stages(material)
+    if not stages:
+        return None
+    unit = str(closure.get("unit", ""))
     frozen, named = closure.get("frozen") or {}, words["augmented"]
     extra = [(f"{named}, {other}", as_float(frozen.get(key))) for key, other in FROZEN.items() if key in frozen]
-    texts = [f"{number(v, 3)} {unit}".rstrip() for v in values]
-    label = axis("free-run root mean square error", unit)
-    figure = bar_panel("Hold-out", label, names, values, texts, [name == "augmented" for name in stages])
     header = [f"plant{', error in ' + unit if unit else ''}", "all", *_headed(closure)]
     rows = [[words[m], number(float(closure[m]), 3), *_by_sensor(closure, m)] for m in stages]
     rows += [[name, number(value, 3), *[""] * (len(header) - 2)] for name, value in extra]
-    blocks: list[Any] = [_closed(closure), [Picture("gap_closure", figure)], table(header, rows)]
+    blocks: list[Any] = [table(header, rows)]
     blocks += _each_holdout(closure, unit)
     if extra and "ceiling" in closure:
         blocks.append(
@@ -50,7 +58,15 @@ def closure_section(material: Material) -> Section | None:
             "could reach. If the errors with other constants are far larger, recalibration without the cause had "
             "absorbed part of it; using both would count the gap twice."
         )
-    return Section("How far it closes", blocks)
+    return Section("Errors on data not used for fitting", blocks)
+
+
+def _stages(material: Material) -> tuple[list[str], dict[str, str]]:
+    """The models that have an error, and the name of each model."""
+    closure, unknown = material.answer.get("closure") or {}, material.answer.get("verdict") == "unknown"
+    stages = [name for name in STAGES if isinstance(closure.get(name), int | float)]
+    words = STAGES | ({"augmented": "with the free form"} if unknown else {})
+    return [name for name in stages if name != "ceiling" or not unknown], words
 
 
 def constants_section(material: Material) -> Section | None:

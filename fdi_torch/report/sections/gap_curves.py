@@ -7,12 +7,12 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import short
 from fdi_torch.report.json_numbers import as_float, as_vector
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, shown_unit
-from fdi_torch.report.panels import line_panel
-from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, panel
 
 MOST_CURVES = 12
@@ -68,8 +68,8 @@ def shape_section(material: Material) -> Section | None:
         unit, scale = shown_unit(_VARIABLE_UNITS.get(variable, "SI"))
         x, y = scale * as_vector(curve["at"]), as_float(curve.get("scale", 1.0)) * as_vector(curve["share"])
         title = f"{shape.get('location', '')}: by {variable}"
-        figure = line_panel(title, axis(variable, unit), "discrepancy, SI", [("discrepancy", x, y, MARK)])
-        figure.axes[0].axhline(0.0, color=SOFT, lw=0.8)
-        pictures.append(Picture(f"gap_shape_{k + 1}", figure))
+        line = Line("discrepancy", x, y, MARK)
+        chart = Chart(title, axis(variable, unit), "discrepancy, SI", [line], level=0.0)
+        pictures.append(signals(f"gap_shape_{k + 1}", chart))
     words = "What must be added at this location to explain the readings, whatever its cause."
     return Section("The discrepancy", [words, pictures])

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import folded, tag
 from fdi_torch.report.json_numbers import as_float, as_vector
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, percent, shown_unit
-from fdi_torch.report.panels import line_panel
-from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.section import Section, signals
 from fdi_torch.report.sections.gap import explanation_words
 from fdi_torch.report.style import MODEL
 
@@ -30,10 +30,9 @@ def next_input_section(material: Material) -> Section | None:
     for k, (name, channel) in enumerate(steps.items()):
         unit, scale = shown_unit(str(units.get(name, "")))
         time, values = as_vector(channel["at"]), scale * as_vector(channel["value"])
-        line = (name, np.append(time, end), np.append(values, values[-1:]), MODEL)
-        figure = line_panel(name, "time, s", axis("command", unit), [line])
-        figure.axes[0].lines[0].set_drawstyle("steps-post")
-        pictures.append(Picture(f"gap_next_input_{k + 1}", figure))
+        line = Line("command", np.append(time, end), np.append(values, values[-1:]), MODEL, steps=True)
+        chart = Chart(name, "time, s", axis("command", unit), [line], clock="next")
+        pictures.append(signals(f"gap_next_input_{k + 1}", chart))
     return Section("Next experiment", [_next_words(proposal), pictures])
 
 

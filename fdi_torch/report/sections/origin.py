@@ -26,12 +26,13 @@ def configuration_section(material: Material) -> Section | None:
 
 
 def provenance_section(material: Material) -> Section | None:
-    """Versions, seeds, hashes of the data, and the log's name."""
+    """Versions, seeds, hashes of the data, and the log's name; arrays of the result are in its own sections."""
     blocks = [pairs([("log", material.run.path.name), ("written by", material.run.library)])]
     for record, title in RECORDS.items():
         values = material.about(record)
         if values:
-            blocks.append(folded(f"{title} ({len(values)})", pairs(list(values.items()))))
+            plain = [(name, value) for name, value in values.items() if not value.startswith(("[", "{"))]
+            blocks += [folded(f"{title} ({len(plain)})", pairs(plain))] if plain else []
     return Section("Provenance", blocks)
 
 

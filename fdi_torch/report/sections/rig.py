@@ -13,18 +13,32 @@ from fdi_torch.report.numbers import number, shown_unit
 from fdi_torch.report.schematic import Overlay, schematic
 from fdi_torch.report.section import Picture, Section
 
+RIG = "rig"  # name of the picture
+
 
 def rig_section(material: Material) -> Section | None:
     """The schematic with the last levels, the diagnosed effects, and the probability of a discrepancy by location."""
+    return _section(material, with_result=True)
+
+
+def plain_rig_section(material: Material) -> Section | None:
+    """The schematic of a run without levels and diagnosis, such as a study; it stands below the results."""
+    return _section(material, with_result=False)
+
+
+def _section(material: Material, with_result: bool) -> Section | None:
     plant = material.plant
     if plant is None:
         return None
     overlay = Overlay(last_levels(material, plant), marks_of(material), probabilities_of(material))
+    if with_result != bool(overlay.levels or overlay.marks or overlay.probabilities):
+        return None
     parts = ["Levels are the last readings."] if overlay.levels else []
     parts += ["Orange: diagnosed effects."] if overlay.marks else []
     parts += [f"Strength of colour: {material.meaning_of_shares}."] if overlay.probabilities else []
     caption = " ".join([f"{plant.name}, not to scale.", *parts])
-    return Section("The rig", [[Picture("rig", schematic(plant, overlay), caption, wide=True)]])
+    picture = Picture(RIG, schematic(plant, overlay), caption, wide=True)
+    return Section("The rig", [[picture]], lead=with_result)
 
 
 def last_levels(material: Material, plant: PlantDescription) -> dict[str, float]:

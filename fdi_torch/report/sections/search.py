@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import axis, number, shown_unit
-from fdi_torch.report.panels import Line, line_panel
-from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.sections.estimate import last_estimate
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
 
@@ -23,11 +23,12 @@ def search_section(material: Material) -> Section | None:
     if len(events) < 2:
         return None
     steps = column(events, "generation")
-    lines: list[Line] = [("best", steps, column(events, "best_cost"), MODEL)]
+    lines = [Line("best", steps, column(events, "best_cost"), MODEL)]
     mean = column(events, "mean_cost")
     if np.isfinite(mean).any():
-        lines.append(("mean", steps, mean, SOFT))
-    pictures = [Picture("search_cost", line_panel("Cost", "generation", "cost", lines, log=True))]
+        lines.append(Line("mean", steps, mean, SOFT))
+    chart = Chart("Cost", "generation", "cost", lines, log=True, clock="search")
+    pictures = [signals("search_cost", chart)]
     pictures += _best_members(material, events, steps)
     last = events[-1]
     words = f"Differential evolution, {int(steps[-1])} generations"
@@ -45,13 +46,13 @@ def refinement_section(material: Material) -> Section | None:
     lines: list[Line] = []
     for colour, lane in zip(colours, lanes, strict=False):
         start = [m for m in events if int(m.get("problem", 0)) == lane]
-        lines.append((f"start {lane + 1}", np.arange(len(start)), column(start, "cost"), colour))
-    figure = line_panel("Cost", "iteration", "cost", lines, log=True)
+        lines.append(Line(f"start {lane + 1}", np.arange(len(start)), column(start, "cost"), colour))
+    chart = Chart("Cost", "iteration", "cost", lines, log=True)
     lowest = float(np.nanmin(column(events, "cost")))
     words = (
         f"{len(events)} iterations from {len(lanes)} start{'s' if len(lanes) > 1 else ''}; lowest cost {lowest:.8g}."
     )
-    return Section("Refinement", [words, [Picture("refinement_cost", figure)]])
+    return Section("Refinement", [words, [signals("refinement_cost", chart)]])
 
 
 def column(events: Sequence[Payload], name: str) -> np.ndarray:
@@ -67,10 +68,11 @@ def _best_members(material: Material, events: Sequence[Payload], steps: np.ndarr
     pictures = []
     for k, name in enumerate(names):
         unit, scale = shown_unit(material.unit(GENERATIONS, name))
-        figure = line_panel(
-            name, "generation", axis("best member", unit), [(name, steps, scale * column(events, name), MODEL)]
-        )
+        lines = [Line("best member", steps, scale * column(events, name), MODEL)]
         if name in material.truth:
-            figure.axes[0].axhline(scale * material.truth[name], color=OTHER, lw=1.0, ls="--")
-        pictures.append(Picture(f"search_parameter_{k + 1}", figure))
+            lines.append(
+                Line("simulated", steps, np.full(len(steps), scale * material.truth[name]), OTHER, dashed=True)
+            )
+        chart = Chart(name, "generation", axis("best member", unit or "1"), lines, clock="search")
+        pictures.append(signals(f"search_parameter_{k + 1}", chart))
     return pictures

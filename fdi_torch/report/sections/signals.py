@@ -5,26 +5,26 @@ from __future__ import annotations
 import numpy as np
 
 from fdi_torch.logbook import Signals
+from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.downsampling import corner_points
-from fdi_torch.report.html import table
+from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit
-from fdi_torch.report.panels import Line, line_panel, residual_panel
 from fdi_torch.report.predictions import predicted
-from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.section import Column, Picture, Section, signals
 from fdi_torch.report.style import MODEL, SOFT
 
 
 def fit_section(material: Material) -> Section | None:
     """Readings, predictions and residuals of each sensor; readings only if the log has no predictions."""
-    blocks: list[str | list[Picture]] = []
+    blocks: list[str | list[Column]] = []
     fitted = False
-    for k, recording in enumerate(material.recordings):
+    for k, (recording, group) in enumerate(zip(material.recordings, material.groups, strict=True)):
         several = len(material.recordings) > 1
-        model = predicted(material.arrays, k, several, recording.outputs.shape, material.groups[k])
+        model = predicted(material.arrays, k, several, recording.outputs.shape, group)
         fitted |= model is not None
-        blocks += [f"Recording {material.groups[k] or 'diagnosed'}".replace("_", " ")] if several else []
-        blocks.append(_output_panels(recording, model, f"_{k + 1}" if several else ""))
+        blocks += [tag("h4", recording_name(group))] if several else []
+        blocks.append(_output_panels(recording, model, f"_{k + 1}" if several else "", clock_of(group)))
         if model is not None:
             blocks += [_misfit_table(recording, model)]
     if not blocks:
@@ -35,8 +35,9 @@ def fit_section(material: Material) -> Section | None:
 def inputs_section(material: Material) -> Section | None:
     """Inputs: panels for those that vary, text for constant ones."""
     blocks: list[str | list[Picture]] = []
-    for k, recording in enumerate(material.recordings):
-        suffix = f"_{k + 1}" if len(material.recordings) > 1 else ""
+    for k, (recording, group) in enumerate(zip(material.recordings, material.groups, strict=True)):
+        several = len(material.recordings) > 1
+        suffix = f"_{k + 1}" if several else ""
         pictures, constant = [], []
         for i, name in enumerate(recording.input_names):
             unit, scale = shown_unit(recording.input_units[i])
@@ -45,34 +46,50 @@ def inputs_section(material: Material) -> Section | None:
                 constant.append(f"{name} at {number(float(np.nanmax(values)))} {unit}".rstrip())
                 continue
             time, corners = _steps(recording, values)
-            figure = line_panel(name, "time, s", axis("command", unit), [(name, time, corners, MODEL)])
-            figure.axes[0].lines[0].set_drawstyle("steps-post" if recording.hold == "zero_order" else "default")
-            pictures.append(Picture(f"input{suffix}_{i + 1}", figure))
-        blocks += [f"Constant: {', '.join(constant)}."] if constant else []
+            line = Line("command", time, corners, MODEL, steps=recording.hold == "zero_order")
+            title = f"{name}, {recording_name(group).lower()}" if several else name
+            chart = Chart(title, "time, s", axis("command", unit), [line], clock=clock_of(group))
+            pictures.append(signals(f"input{suffix}_{i + 1}", chart))
+        of = f"{recording_name(group)}, constant" if several else "Constant"
+        blocks += [f"{of}: {', '.join(constant)}."] if constant else []
         blocks += [pictures] if pictures else []
     return Section("Inputs", blocks) if blocks else None
+
+
+def recording_name(group: str) -> str:
+    """'Diagnosed recording', 'Hold-out 2': a recording of a log with several."""
+    words = group.replace("_", " ").replace("holdout", "hold-out") or "diagnosed recording"
+    return words[:1].upper() + words[1:]
+
+
+def clock_of(group: str) -> str:
+    """Name of the clock of a recording's charts."""
+    return f"recording {group}"
 
 
 def _steps(recording: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corner_points(recording.time, values) if recording.hold == "zero_order" else (recording.time, values)
 
 
-def _output_panels(recording: Signals, model: np.ndarray | None, suffix: str) -> list[Picture]:
-    pictures = []
+def _output_panels(recording: Signals, model: np.ndarray | None, suffix: str, clock: str) -> list[Column]:
+    """A column for each sensor: readings and estimate, and below them the residual."""
+    columns: list[Column] = []
     readings = np.where(recording.mask, recording.outputs, np.nan)
+    time = recording.time
     for i, name in enumerate(recording.output_names):
         unit, scale = shown_unit(recording.output_units[i])
-        lines: list[Line] = [("read", recording.time, scale * readings[:, i], SOFT)]
+        lines = [Line("measured", time, scale * readings[:, i], SOFT, wide=model is not None)]
         if model is not None:
-            lines.append(("estimate", recording.time, scale * model[:, i], MODEL))
-        figure = line_panel(name, "time, s", axis("reading", unit), lines)
-        pictures.append(Picture(f"output{suffix}_{i + 1}", figure))
-    for i, name in enumerate(recording.output_names if model is not None else ()):
-        unit, scale = shown_unit(recording.output_units[i])
-        residual = scale * (readings[:, i] - model[:, i])  # type: ignore[index]
-        figure = residual_panel(f"{name}: residual", axis("read − estimate", unit), recording.time, residual)
-        pictures.append(Picture(f"residual{suffix}_{i + 1}", figure))
-    return pictures
+            lines.append(Line("estimate", time, scale * model[:, i], MODEL))
+        chart = Chart(name, "time, s", axis("reading", unit), lines, clock=clock)
+        pictures = [signals(f"output{suffix}_{i + 1}", chart)]
+        if model is not None:
+            residual = Line("measured − estimate", time, scale * (readings[:, i] - model[:, i]), MODEL)
+            label = axis("residual", unit)
+            chart = Chart(f"{name}: residual", "time, s", label, [residual], level=0.0, clock=clock, height=2.1)
+            pictures.append(signals(f"residual{suffix}_{i + 1}", chart))
+        columns.append(tuple(pictures))
+    return columns
 
 
 def _misfit_table(recording: Signals, model: np.ndarray) -> str:

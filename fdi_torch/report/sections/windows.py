@@ -29,7 +29,9 @@ def windows_section(material: Material) -> Section | None:
     header = ["fault", "from, s", "to, s", "size", "flow"]
     listed = table(header, [_row(s) for s in stretches]) if stretches else "No fault was present in any window."
     caption = "When each fault was present (dark), and where its window does not determine it (pale)."
-    return Section("Window by window", [words, [Picture("windows", _bars(windows), caption, wide=True)], listed])
+    return Section(
+        "Window by window", [words, [Picture("windows", _bars(windows), caption, wide=True)], listed], lead=True
+    )
 
 
 def _row(stretch: dict[str, Any]) -> list[str]:
@@ -49,7 +51,7 @@ def _row(stretch: dict[str, Any]) -> list[str]:
 
 def _bars(windows: Sequence[dict[str, Any]]) -> Figure:
     suspects = [name for name, entry in windows[0].items() if isinstance(entry, dict)][:MOST_SUSPECTS]
-    figure, axes = panel("", "time, s", "", width=5.6, height=1.0 + 0.28 * len(suspects))
+    figure, axes = panel("", "time, s", "", height=0.8 + 0.28 * len(suspects))
     for row, name in enumerate(suspects):
         for state, strength in (("present", 1.0), ("cannot tell", 0.25)):
             spans = [

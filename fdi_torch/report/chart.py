@@ -1,0 +1,150 @@
+"""A chart of signals: its description, from which the picture and the data of the interactive chart are made."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import orjson
+from matplotlib.figure import Figure
+
+from fdi_torch.report.downsampling import extremes, thinned
+from fdi_torch.report.html import clean, short
+from fdi_torch.report.style import HEIGHT, MARK, SOFT, VARIABLES, label_lines, logarithmic, panel, styled
+
+MOST_SAMPLES = 6000  # of a line; longer ones keep the extremes of half as many segments
+MOST_EVENTS = 50
+ONE_ROW = 44  # letters of title and names of lines that fit one row above the picture
+
+
+class Line(NamedTuple):
+    """A signal: y (T,) over x (T,). steps: the value holds until the next sample. wide: broad and pale,
+    so that it is visible below other lines.
+    """
+
+    name: str
+    x: np.ndarray
+    y: np.ndarray
+    colour: str
+    dashed: bool = False
+    steps: bool = False
+    wide: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Lines over a common axis.
+
+    log: use a logarithmic axis if the values span more than a decade; with zeros among them it is linear below the
+    median of the positive values (asinh). level: a horizontal reference
+    line; at a level of 0 the lines are residuals. events: times of vertical lines. clock: charts of one clock show the
+    same crosshair and zoom together. from_zero: the vertical axis begins at 0. height: of the picture, inches.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    lines: Sequence[Line]
+    log: bool = False
+    level: float | None = None
+    events: Sequence[float] = ()
+    clock: str = ""
+    from_zero: bool = False
+    height: float = HEIGHT
+
+    @property
+    def scale(self) -> tuple[str, float]:
+        """Kind of the vertical axis, "linear", "log" or "asinh", and the width of the linear part of the last."""
+        values = np.concatenate([np.asarray(line.y, dtype=float) for line in self.lines] or [np.zeros(0)])
+        values = values[np.isfinite(values)]
+        if not self.log or not (values > 0).any() or values.min() < 0:
+            return "linear", 0.0
+        low = float(values.min() or np.median(values[values > 0]))
+        if values.max() <= 20 * low:
+            return "linear", 0.0
+        return ("log", 0.0) if values.min() > 0 else ("asinh", low)
+
+
+def draw(chart: Chart) -> Figure:
+    """The picture, with its lines labelled in their colours if there are several."""
+    figure, axes = panel(short(chart.title), short(chart.x_label), short(chart.y_label, 60), height=chart.height)
+    if chart.level is not None:
+        axes.axhline(chart.level, color=SOFT, lw=0.8, ls="-" if chart.level == 0.0 else ":")
+    for line in chart.lines:
+        axes.plot(
+            *thinned(np.asarray(line.x, dtype=float), np.asarray(line.y, dtype=float)),
+            color=line.colour,
+            lw=2.6 if line.wide else 0.8 if chart.level == 0.0 else 1.2,
+            ls="--" if line.dashed else "-",
+            alpha=0.44 if line.wide else 1.0,
+            drawstyle="steps-post" if line.steps else "default",
+            label=short(line.name, 18),
+        )
+    for moment in list(chart.events)[:MOST_EVENTS]:
+        axes.axvline(moment, color=MARK, lw=0.9, alpha=0.8)
+    if chart.from_zero:
+        axes.set_ylim(bottom=0.0)
+    kind, width = chart.scale
+    if kind != "linear":
+        logarithmic(axes, width)
+    if len(chart.lines) > 1:
+        label_lines(axes)
+        if len(chart.title) + sum(len(line.name) + 4 for line in chart.lines) > ONE_ROW:
+            with styled():
+                axes.set_title(short(chart.title), pad=18.0)
+    return figure
+
+
+def chart_json(chart: Chart) -> str:
+    """The chart as JSON for `assets/charts.js`: labels, lines and axes; samples as base64 of little-endian floats."""
+    clocks: list[np.ndarray] = []
+    lines = []
+    for members in _of_one_clock(chart.lines):
+        kept, complete = _kept(members)
+        clocks.append(np.asarray(members[0].x, dtype=float)[kept])
+        for line in members:
+            drawn = np.asarray(line.y, dtype=float)[kept]
+            about = {"name": clean(line.name), "colour": VARIABLES[line.colour], "clock": len(clocks) - 1}
+            about |= {"dashed": line.dashed, "steps": line.steps, "wide": line.wide, "complete": complete}
+            lines.append(about | {"y": _base64(drawn, "<f4")})
+    described: dict[str, Any] = {
+        "title": clean(chart.title),
+        "x": clean(chart.x_label),
+        "y": clean(chart.y_label),
+        "clocks": [_base64(clock, "<f8") for clock in clocks],
+        "lines": lines,
+        "scale": chart.scale,
+        "level": chart.level,
+        "from_zero": chart.from_zero,
+        "events": [float(moment) for moment in list(chart.events)[:MOST_EVENTS]],
+    }
+    return orjson.dumps(described).decode()
+
+
+def _of_one_clock(lines: Sequence[Line]) -> list[list[Line]]:
+    """The lines grouped by equal x, so that these are stored once."""
+    groups: list[list[Line]] = []
+    for line in lines:
+        same = next((g for g in groups if np.array_equal(g[0].x, line.x)), None)
+        if same is None:
+            groups.append([line])
+        else:
+            same.append(line)
+    return groups
+
+
+def _kept(lines: Sequence[Line]) -> tuple[np.ndarray, bool]:
+    """Indices of the samples to keep for lines (T,) with equal x, and whether these are all."""
+    count = len(lines[0].x)
+    if count <= MOST_SAMPLES:
+        return np.arange(count), True
+    kept = [extremes(np.asarray(line.y, dtype=float), MOST_SAMPLES // 2) for line in lines]
+    return np.unique(np.concatenate(kept)), False
+
+
+def _base64(values: np.ndarray, kind: str) -> str:
+    with np.errstate(over="ignore"):
+        return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
