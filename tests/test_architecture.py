@@ -21,7 +21,7 @@ LAYERS = (
     {"report", "gap", "study", "monitor"},
     {"config"},
     {"jobs"},
-    {"paper"},
+    {"paper", "view"},
     {"cli", "train", "__main__", "__init__"},
 )
 RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
@@ -48,6 +48,8 @@ DOORS = {
     "dask": ("study/cluster.py",),
     "distributed": ("study/cluster.py",),
     "rich": ("cli/",),
+    "starlette": ("view/server.py",),
+    "uvicorn": ("view/server.py",),
     "foxglove": ("logbook/live.py",),
 }
 

@@ -4,6 +4,7 @@ mcap.
 
 from fdi_torch.logbook.compare import Comparison, align, compare
 from fdi_torch.logbook.errors import LogError
+from fdi_torch.logbook.exclusive_file import being_written
 from fdi_torch.logbook.export import export, export_attachment
 from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.follow import follow
@@ -34,6 +35,7 @@ __all__ = [
     "align",
     "arrays",
     "as_array",
+    "being_written",
     "compare",
     "content_hash",
     "export",
