@@ -9,6 +9,7 @@ from fdi_torch.logbook.export import export, export_attachment
 from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.follow import follow
 from fdi_torch.logbook.inspect import Inspection, inspect_log
+from fdi_torch.logbook.layout import foxglove_layout
 from fdi_torch.logbook.live import Live, serve
 from fdi_torch.logbook.payload import as_array, unpack
 from fdi_torch.logbook.reader import Message, Run, read_run
@@ -41,6 +42,7 @@ __all__ = [
     "export",
     "export_attachment",
     "follow",
+    "foxglove_layout",
     "inspect_log",
     "last_state",
     "mapped_signals",

@@ -19,7 +19,7 @@ NEWEST = 20
 COLUMNS = {"log": "log", "started": "started, UTC", "kind": "kind", "state": "state", "verdict": "verdict"}
 STYLE = """
 form { display: flex; flex-wrap: wrap; gap: .6rem; align-items: center; margin: .6rem 0; }
-form > div, form > .scroll { flex-basis: 100%; }
+form > div { flex-basis: 100%; min-width: 0; }
 input[type=search] { min-width: 14rem; } input, select, button { font: inherit; padding: .2rem .5rem; }
 nav { margin: 0 0 1rem; } progress { width: min(100%, 30rem); }
 """
