@@ -33,6 +33,7 @@ DOORS = {
     "pyarrow": ("recordings/parquet.py", "recordings/feather.py"),
     "openpyxl": ("recordings/excel.py",),
     "h5py": ("recordings/hdf5.py",),
+    "sqlalchemy": ("recordings/database.py",),
     "pandas": (),
     "xarray": (),
     "scipy": (
