@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from pathlib import Path
 
@@ -139,3 +140,38 @@ def test_the_value_of_the_variable_is_hidden_in_the_drivers_messages(
     monkeypatch.delenv("DB_PASSWORD")
     with pytest.raises(ValueError, match="expected a value of the environment variable DB_PASSWORD, got none; set it"):
         write_query(address, tmp_path / "table", Path)
+
+
+def test_influxdb_is_queried_over_its_own_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server of Arrow Flight, InfluxDB's protocol for queries, that answers one of them and records the token."""
+    import pyarrow as pa
+    from pyarrow import flight
+
+    asked: list[tuple[dict[str, str], str]] = []
+
+    class Headers(flight.ServerMiddlewareFactory):  # type: ignore[misc]
+        def start_call(self, info: object, headers: dict[str, list[str]]) -> None:
+            token.append(headers.get("authorization", [""])[0])
+
+    class Server(flight.FlightServerBase):  # type: ignore[misc]
+        def do_get(self, context: object, ticket: flight.Ticket) -> flight.RecordBatchStream:
+            question = json.loads(ticket.ticket)
+            asked.append((question, token[-1]))
+            if "absent" in question["sql_query"]:
+                raise flight.FlightUnauthorizedError(f"no table for {token[-1]}")
+            stamps = pa.array([0, 2_000_000_000, 4_000_000_000], pa.timestamp("ns"))
+            return flight.RecordBatchStream(pa.table({"t": stamps, "h1_cm": [10.0, None, 12.5]}))
+
+    token: list[str] = []
+    monkeypatch.setenv("INFLUX_TOKEN", PASSWORD)
+    with Server("grpc://127.0.0.1:0", middleware={"headers": Headers()}) as server:
+        address = f"influxdb://127.0.0.1:{server.port}/plant?token=${{INFLUX_TOKEN}}&query=SELECT * FROM"
+        write_query(f"{address} run", tmp_path / "table", Path)
+        with pytest.raises(ValueError, match=r"got an error: .*no table for Bearer \*\*\*") as error:
+            write_query(f"{address} absent", tmp_path / "other", Path)
+    assert "s3cret" not in str(error.value)
+    (question, authorization), _ = asked
+    assert (question["sql_query"], question["database"]) == ("SELECT * FROM run", "plant")
+    assert authorization == f"Bearer {PASSWORD}"
+    lines = (tmp_path / "table").read_text().splitlines()
+    assert lines == ["t\th1_cm", "1970-01-01T00:00:00\t10.0", "1970-01-01T00:00:02\t", "1970-01-01T00:00:04\t12.5"]

@@ -1,4 +1,4 @@
-"""The result of a database query as a table (SQLAlchemy, extra `sql`). Its only importer.
+"""The result of a database query as a table (SQLAlchemy, extra `sql`, and InfluxDB). The only importer of SQLAlchemy.
 
 A query is one address: `DATABASE?query=SQL`, such as `sqlite:///plant.db?query=SELECT t_s, Q1_cm3_s, h1_cm FROM run`.
 The SQL is last and taken as it is written. Passwords stand in environment variables, as `${NAME}`, so that
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
+from fdi_torch.recordings import influx
 from fdi_torch.recordings.table_files import Row, tab_separated
 from fdi_torch.tables import needed
 
@@ -77,6 +78,9 @@ def _value(name: str, address: str) -> str:
 
 def _rows(database: str, query: str, find: Callable[[str], Path]) -> Iterator[Row]:
     """The names of the columns, then the rows."""
+    if database.startswith(("influxdb://", f"{influx.SECURE}://")):
+        yield from influx.rows(database, query, _inserted)
+        return
     library = needed("sqlalchemy", "sql")
     engine = _engine(library, database, find)
     statement = library.text(query.replace(":", r"\:"))  # a colon is part of a time or a cast, not a parameter
@@ -90,6 +94,11 @@ def _rows(database: str, query: str, find: Callable[[str], Path]) -> Iterator[Ro
         engine.dispose()
 
 
+def _inserted(text: str, encode: Callable[[str], str] = str) -> str:
+    """The text with the values of the environment variables that it names."""
+    return _VARIABLE.sub(lambda match: encode(os.environ[match[1]]), text)
+
+
 def _engine(library: Any, database: str, find: Callable[[str], Path]) -> Any:
     """The connections to a database; an SQLite file is opened for reading only, and never created."""
     scheme, _, rest = database.partition("://")
@@ -98,5 +107,4 @@ def _engine(library: Any, database: str, find: Callable[[str], Path]) -> Any:
         return library.create_engine(
             "sqlite://", creator=lambda: sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)
         )
-    whole = _VARIABLE.sub(lambda match: quote(os.environ[match[1]], safe=""), database)
-    return library.create_engine(whole, hide_parameters=True)
+    return library.create_engine(_inserted(database, lambda value: quote(value, safe="")), hide_parameters=True)
