@@ -22,7 +22,7 @@ LAYERS = (
     {"report", "gap", "study", "monitor"},
     {"config"},
     {"jobs"},
-    {"paper"},
+    {"paper", "view"},
     {"cli", "train", "__main__", "__init__"},
 )
 RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
@@ -34,6 +34,8 @@ DOORS = {
     "pyarrow": ("recordings/parquet.py", "recordings/feather.py"),
     "openpyxl": ("recordings/excel.py",),
     "h5py": ("recordings/hdf5.py",),
+    "influxdb_client_3": ("recordings/influx.py",),
+    "sqlalchemy": ("recordings/database.py",),
     "pandas": (),
     "xarray": (),
     "scipy": (
@@ -49,6 +51,8 @@ DOORS = {
     "dask": ("study/cluster.py",),
     "distributed": ("study/cluster.py",),
     "rich": ("cli/",),
+    "starlette": ("view/server.py",),
+    "uvicorn": ("view/server.py",),
     "foxglove": ("logbook/live.py",),
     "paho": ("live/mqtt.py",),
     "asyncua": ("live/opcua.py",),

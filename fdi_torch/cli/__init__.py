@@ -35,6 +35,7 @@ COMMANDS = {
     "rehearse": "validate a monitor on simulated runs: false alarms, delays, isolation",
     "export": "export a plant as an FMU for other simulation tools",
     "report": "make one HTML page of one or more logs",
+    "view": "show the logs of a folder as local pages: list, compare, follow running jobs",
     "inspect": "show what a log contains and whether it is intact, or export its messages",
     "replay": "repeat a logged run and compare, or try another setting",
     "compare": "compare runs: settings, data and results",

@@ -9,7 +9,7 @@ from pathlib import Path
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
 from fdi_torch.config.plant_file import load_plant
-from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.config.recording_config import RecordingConfig, config_of
 from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.preprocess.acquisition import examined
 from fdi_torch.parameters import display_unit
@@ -61,7 +61,7 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
         return run_file.plant, run_file.config.recordings, run_file.base
     if arguments.plant is None:
         raise ValueError("expected --plant, a recording and --plant, or --config; see fdi check --help")
-    named = [] if arguments.recording is None else [RecordingConfig(file=arguments.recording)]
+    named = [] if arguments.recording is None else [config_of(arguments.recording)]
     return load_plant(arguments.plant), named, Path.cwd()
 
 

@@ -12,7 +12,6 @@ from fdi_torch.config.estimation import full_name
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.reading_noise import reading_noise
-from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
 from fdi_torch.monitor.monitor_setup import usual_faults
 from fdi_torch.parameters import parse_quantity
@@ -44,7 +43,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Recording, bool]:
     """A recording with the inputs, and whether they are constant ones from the command line."""
     if Path(arguments.input).exists():
-        return read_recording(RecordingConfig(file=arguments.input), plant, Path.cwd()), False
+        return read_recording(arguments.input, plant, Path.cwd()), False
     units = plant.channel_units()
     amounts = arguments.input.split(",")
     if len(amounts) != len(units):

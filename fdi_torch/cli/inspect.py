@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import orjson
+
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.disk import named_errors
-from fdi_torch.logbook import Inspection, export, export_attachment, inspect_log, read_run
+from fdi_torch.disk import named_errors, write_text
+from fdi_torch.logbook import Inspection, export, export_attachment, foxglove_layout, inspect_log, read_run
 
 MOST_RESULTS = 12
 RECORDS = ("run", "status", "data", "seeds", "git")
@@ -18,6 +20,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     if arguments.attachment is not None:
         path = export_attachment(read_run(arguments.log, salvage=True), arguments.attachment, arguments.out or ".")
         screen.note(f"attachment: {path}")
+    elif arguments.layout is not None:
+        write_layout(arguments, screen)
     elif arguments.topic is not None:
         write_topic(arguments, screen)
     else:
@@ -44,6 +48,15 @@ def write_topic(arguments: argparse.Namespace, screen: Screen) -> None:
                     path.unlink()
                     raise
     screen.note(f"{count} messages of {arguments.topic}: {arguments.out or 'standard output'}")
+
+
+def write_layout(arguments: argparse.Namespace, screen: Screen) -> None:
+    """Write the layout that shows this log in Foxglove or Lichtblick; an existing file is replaced."""
+    path = Path(arguments.layout)
+    layout = foxglove_layout(read_run(arguments.log, salvage=True))
+    write_text(path, orjson.dumps(layout, option=orjson.OPT_INDENT_2).decode() + "\n")
+    screen.say(f"layout: {path}; in Foxglove or Lichtblick, open {arguments.log}, then import the layout")
+    screen.result({"format": "fdi_torch.inspect/1", "path": str(arguments.log), "layout": str(path)})
 
 
 def show(inspection: Inspection, screen: Screen) -> None:

@@ -14,13 +14,14 @@ from pydantic import ValidationError
 
 from fdi_torch.config.channels import channel_mapping, expect_units, is_log, unrecorded_valves
 from fdi_torch.config.problems import ConfigError, explain
-from fdi_torch.config.recording_config import FileConfig, RecordingConfig, StartLevel, in_seconds
+from fdi_torch.config.recording_config import FileConfig, RecordingConfig, StartLevel, config_of, in_seconds
 from fdi_torch.config.yaml_files import find_data, find_file, read_extended
 from fdi_torch.logbook import LogError
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv_files
+from fdi_torch.recordings.database import is_query, write_query
 from fdi_torch.recordings.mcap_files import read_mcap
 from fdi_torch.recordings.source import ChannelSource, FileSource, TagRows
 
@@ -74,8 +75,8 @@ def named_recordings(name: str, plant: PlantDescription, base: Path) -> list[Rec
 
     name: a CSV or MCAP file, or a YAML file with a list under `recordings`, as in a run file.
     """
-    if Path(name).suffix not in (".yaml", ".yml"):
-        return [part.recording for part in load_recordings([RecordingConfig(file=name)], plant, base)]
+    if is_query(name) or Path(name).suffix not in (".yaml", ".yml"):
+        return [part.recording for part in load_recordings([config_of(name)], plant, base)]
     path = find_file(name, base)
     listed = read_extended(path).get("recordings")
     if not listed:
@@ -112,13 +113,16 @@ def read_recording(
     recordings in memory, by the name that `file` gives them. Raises ConfigError naming file, row and column.
     """
     if not isinstance(config, RecordingConfig):
-        config = RecordingConfig(file=str(config))
+        config = config_of(str(config))
     channels, columns = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
     in_memory = (given or {}).get(config.file)
-    path = Path(config.file) if in_memory else find_data(config.file, base or Path.cwd())
+    folder = base or Path.cwd()
     try:
-        if in_memory is None:
-            recording = _read(config, path, base or Path.cwd(), plant, channels, columns)
+        if in_memory is None and is_query(config.file):
+            recording = _read_query(config, folder, plant, channels, columns)
+        elif in_memory is None:
+            path = find_data(config.file, folder)
+            recording = _read(config, path, folder, plant, channels, columns)
         else:
             recording = in_memory.selected(channels, columns)
         names = (*recording.input_names, *recording.output_names)
@@ -158,6 +162,21 @@ def read_frame(frame: Any, plant: PlantDescription, **keys: Any) -> Recording:
             raise explain(error, "data frame") from None
         except ConfigError as error:
             raise ConfigError([problem.replace(str(path), "data frame") for problem in error.problems]) from None
+
+
+def _read_query(
+    config: RecordingConfig, base: Path, plant: PlantDescription, inputs: Sequence[str], outputs: Sequence[str]
+) -> Recording:
+    """Read the table of a database query as a CSV file; its hash is that of the table."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "query"
+        try:
+            write_query(config.file, path, lambda name: find_data(name, base))
+            return replace(_read(config, path, base, plant, inputs, outputs), source=config.file)
+        except ConfigError as error:
+            raise ConfigError([problem.replace(str(path), config.file) for problem in error.problems]) from None
+        except (ValueError, ImportError) as error:
+            raise ValueError(str(error).replace(str(path), config.file)) from None
 
 
 def _read(

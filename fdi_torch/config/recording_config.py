@@ -8,10 +8,11 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo
 
-from pydantic import AllowInfNan, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, AllowInfNan, BeforeValidator, Field, model_validator
 
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.database import expect_no_password, is_query
 from fdi_torch.recordings.time_stamps import expect_zone
 from fdi_torch.untrusted_input import MOST_SAMPLES
 
@@ -97,10 +98,16 @@ class TagsConfig(Strict):
     quality: str | None = Field(None, description="header of the column that says whether the value counts")
 
 
+def _name(value: str) -> str:
+    if is_query(value):
+        expect_no_password(value)
+    return value
+
+
 class FileConfig(Strict):
-    file: str = Field(
+    file: Annotated[str, AfterValidator(_name)] = Field(
         description="CSV (plain or .gz), MCAP, Parquet, Feather, Excel, MATLAB or HDF5 file; looked for here and below "
-        "FDI_TORCH_DATA"
+        "FDI_TORCH_DATA; or a database query, DATABASE?query=SQL"
     )
     header: bool = Field(True, description="false: columns have numbers instead of names, {t: {column: 1, unit: s}}")
     sheet: str | None = Field(None, description="of an Excel workbook; by default the first")
@@ -151,3 +158,8 @@ class RecordingConfig(FileConfig):
     hold: Literal["zero_order", "linear"] = Field("zero_order", description="course of inputs between samples")
     trusted: bool = Field(False, description="do not check for wrong units, swapped channels and clock errors")
     start_levels: StartLevels = Field("free", description="free, equilibrium, or a mapping such as {T1: 50 cm}")
+
+
+def config_of(name: str) -> RecordingConfig:
+    """The entry for a recording named alone. Raises ValueError for an address with a written password."""
+    return RecordingConfig(file=_name(name))

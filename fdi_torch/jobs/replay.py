@@ -119,6 +119,8 @@ def comparable(trials: Sequence[int] = ()) -> Select:
         for message in messages:
             if message.topic == ALARM and message.payload.get("event") == "notice":
                 continue  # about delays and unreadable rows, which a replay does not have
+            if message.topic.startswith("/estimate/") and message.topic.endswith(("/output", "/residual")):
+                continue  # follow from estimate and recording, which are compared; older logs lack them
             if message.topic == STATE and not state_is_due(message.payload["generation"]):
                 continue
             if message.topic != TRIAL:

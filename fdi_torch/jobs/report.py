@@ -11,6 +11,7 @@ from fdi_torch.disk import write_text
 from fdi_torch.logbook import Run, compare, read_run
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.comparison import comparison_section
+from fdi_torch.report.html import Markup
 from fdi_torch.report.material import gather
 from fdi_torch.report.page import RunReport, page, report_of, write_pictures
 from fdi_torch.report.section import Section
@@ -55,10 +56,9 @@ def report(
     reports: list[RunReport] = []
     notes: list[str] = []
     for k, path in enumerate(paths):
-        log = read_run(path, salvage=True)
-        reports.append(report_of(gather(log, plant_of(log, notes))))
+        reports.append(report_of_log(path, notes))
         tell((k + 1) / (len(paths) + 1), path.name)
-    write_text(target, page(reports, [comparison_of(reports)] if len(reports) > 1 else []))
+    write_text(target, page_of(reports))
     written: list[Path] = []
     for k, each in enumerate(reports if pictures else ()):
         several = f"{k + 1}_" if len(reports) > 1 else ""
@@ -66,6 +66,17 @@ def report(
     tell(1.0, "done")
     headlines = {str(each.material.run.path): headline(each.material) for each in reports}
     return Report(target, tuple(written), headlines, tuple(notes))
+
+
+def report_of_log(path: Path, notes: list[str]) -> RunReport:
+    """The report of one log; what could not be shown is added to `notes`. Raises LogError if it cannot be read."""
+    log = read_run(path, salvage=True)
+    return report_of(gather(log, plant_of(log, notes)))
+
+
+def page_of(reports: Sequence[RunReport], above: Sequence[Markup] = ()) -> str:
+    """The page of the runs; several are compared first. above: elements at its top."""
+    return page(reports, [comparison_of(reports)] if len(reports) > 1 else [], above)
 
 
 def comparison_of(reports: Sequence[RunReport]) -> Section:

@@ -29,6 +29,7 @@ from fdi_torch.jobs.run_setup import (
 )
 from fdi_torch.logbook import DeferredTopic, Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure, save
 from fdi_torch.report.style import inline_svg
 from fdi_torch.tables import Shown, Table
@@ -109,6 +110,7 @@ def estimate_logged(run: Run, fitting: Fitting, log: RunLog, tell: Tell, resume:
     with tensors_on(usable_device(run.config.device)):
         result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, resume)
     log_result(log, result, fitting.space)
+    log_predictions(log, result, fitting.recordings)
     return result
 
 
@@ -240,6 +242,15 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace) -> None
     log.result(final.to_dict() | {"kind": result.diagnosis.kind, "explained": result.diagnosis.explained})
     if final.status != "converged":
         log.set_status("not_converged", final.status)
+
+
+def log_predictions(log: RunLog, result: HybridResult, recordings: Sequence[Recording]) -> None:
+    """Log the readings that the model predicts at the estimate, and the residuals, for each recording."""
+    for k, (r, predicted) in enumerate(zip(recordings, result.predicted, strict=True)):
+        names, units = r.output_names, r.output_units
+        group = "" if len(recordings) == 1 else str(k + 1)
+        noise = result.estimate.noise_std
+        log.predictions(r.time, r.outputs, predicted, names, units, mask=r.mask, noise_std=noise, group=group)
 
 
 def draw(run: Run, fitting: Fitting, result: HybridResult, log: Path) -> tuple[Path, ...]:

@@ -4,10 +4,12 @@ mcap.
 
 from fdi_torch.logbook.compare import Comparison, align, compare
 from fdi_torch.logbook.errors import LogError
+from fdi_torch.logbook.exclusive_file import being_written
 from fdi_torch.logbook.export import export, export_attachment
 from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.follow import follow
 from fdi_torch.logbook.inspect import Inspection, inspect_log
+from fdi_torch.logbook.layout import foxglove_layout
 from fdi_torch.logbook.live import Live, serve
 from fdi_torch.logbook.payload import as_array, unpack
 from fdi_torch.logbook.reader import Message, Run, read_run
@@ -34,11 +36,13 @@ __all__ = [
     "align",
     "arrays",
     "as_array",
+    "being_written",
     "compare",
     "content_hash",
     "export",
     "export_attachment",
     "follow",
+    "foxglove_layout",
     "inspect_log",
     "last_state",
     "mapped_signals",

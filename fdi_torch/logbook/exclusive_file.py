@@ -73,16 +73,24 @@ class ExclusiveFile:
         os.close(self._file)
 
 
+def being_written(path: Path) -> bool:
+    """Whether a process holds the file open as an `ExclusiveFile`. Raises OSError if it cannot be opened.
+
+    Ask only about a file that is not empty: the shared lock may otherwise precede its writer's.
+    """
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
 def _taken(path: Path) -> str:
     """The reason why an existing file cannot be used: it is being written, or its writer was killed."""
     try:
-        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        if being_written(path):
+            return f"{path}: another run is writing this file; choose another name"
     except OSError as error:
         return str(log_error(path, error))
-    try:
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return f"{path}: another run is writing this file; choose another name"
-    finally:
-        os.close(file)
     return f"{path}: left by a run that did not end; save it with `fdi recover {path}`, then delete it"

@@ -20,6 +20,7 @@ from fdi_torch.logbook.write_buffer import DeferredTopic, WriteBuffer
 
 Named = Mapping[str, Any]
 _RESERVED = ("t", NON_FINITE, WALL, "masked")
+_NORMAL_95 = 1.96  # half width of the central 95 % of a normal distribution, standard deviations
 _BLOCK = 4096
 _FEW = 32
 """Up to this many samples are written faster one by one."""
@@ -154,6 +155,41 @@ class Messages:
             [
                 (f"{root}/input", as_array(inputs), input_names, input_units, None, {"hold": hold}),
                 (f"{root}/output", as_array(outputs), output_names, output_units, mask, None),
+            ],
+            as_array(time),
+        )
+
+    def predictions(
+        self,
+        time: Any,
+        outputs: Any,
+        predicted: Any,
+        names: Sequence[str],
+        units: Sequence[str],
+        *,
+        mask: Any = None,
+        noise_std: Any = None,
+        group: str = "",
+    ) -> None:
+        """Write the model's readings and the residuals to `/estimate/output` and `/estimate/residual`.
+
+        time (T,) s, outputs and predicted (T, N), mask (T, N): True for valid readings; other residuals are NaN.
+        noise_std (N,): noise level of each sensor, whose 95 % band (1.96 standard deviations) is written beside it.
+        group: as for `recording`.
+        """
+        root = f"/estimate/{group}" if group else "/estimate"
+        model, readings = as_array(predicted).astype(np.float64), as_array(outputs).astype(np.float64)
+        valid = np.isfinite(readings) if mask is None else as_array(mask).astype(bool)
+        residual, columns, shown = np.where(valid, readings - model, np.nan), list(names), list(units)
+        if noise_std is not None:
+            band = np.broadcast_to(_NORMAL_95 * as_array(noise_std), residual.shape)
+            residual = np.concatenate([residual, -band, band], axis=1)
+            columns += [f"{name}_{side}" for side in ("low", "high") for name in names]
+            shown += [*units, *units]
+        self.recording_blocks(
+            [
+                (f"{root}/output", model, names, units, None, None),
+                (f"{root}/residual", residual, columns, shown, None, None),
             ],
             as_array(time),
         )

@@ -104,6 +104,14 @@ TOPICS: dict[str, Topic] = {
         },
         named=True,
     ),
+    "/estimate/output": Topic(
+        "fdi_torch.estimated_output", "readings that the model predicts at the estimate", named=True
+    ),
+    "/estimate/residual": Topic(
+        "fdi_torch.estimate_residual",
+        "reading less prediction at the estimate; *_low, *_high: 95 % band of the noise, where its level is known",
+        named=True,
+    ),
     "/diagnosis/fault": Topic(
         "fdi_torch.fault",
         "a fault found, or found absent",
@@ -182,9 +190,9 @@ TOPICS: dict[str, Topic] = {
 
 
 def topic_definition(topic: str) -> Topic:
-    """The definition of a topic; `/plant/GROUP/input` has that of `/plant/input`."""
+    """The definition of a topic; `/plant/GROUP/input` has that of `/plant/input`, and so for `/estimate/GROUP/...`."""
     parts = topic.split("/")
-    key = f"/{parts[1]}/{parts[3]}" if len(parts) == 4 and parts[1] == "plant" else topic
+    key = f"/{parts[1]}/{parts[3]}" if len(parts) == 4 and parts[1] in ("plant", "estimate") else topic
     if key not in TOPICS:
         raise ValueError(f"expected one of the topics {', '.join(TOPICS)}, got {topic}")
     return TOPICS[key]

@@ -122,6 +122,12 @@ def _lines(rows: Iterable[Row]) -> list[str]:
     return text.getvalue().splitlines(keepends=True)
 
 
+def tab_separated(rows: Iterator[Row]) -> Iterator[list[str]]:
+    """Blocks of lines of rows of plain values, the first of which is the header."""
+    while block := list(islice(rows, _AT_ONCE)):
+        yield _lines(block)
+
+
 def _trimmed(row: Row) -> Row:
     """The row without trailing empty cells."""
     last = next((k for k in range(len(row), 0, -1) if row[k - 1] not in (None, "")), 0)

@@ -35,7 +35,7 @@ def escape(content: Any) -> Markup:
     return content if isinstance(content, Markup) else Markup(html.escape(clean(content)))
 
 
-def tag(name: str, *content: Any, **attributes: str) -> Markup:
+def tag(name: str, /, *content: Any, **attributes: str) -> Markup:
     """An element; write `class_` and `for_` for attributes that are Python keywords."""
     written = "".join(f' {key.rstrip("_").replace("_", "-")}="{escape(value)}"' for key, value in attributes.items())
     return Markup(f"<{name}{written}>{''.join(escape(part) for part in content)}</{name}>")
@@ -45,7 +45,7 @@ def join(parts: Sequence[Any], between: str = "") -> Markup:
     return Markup(escape(between).join(escape(part) for part in parts))
 
 
-def table(header: Sequence[Any], rows: Sequence[Sequence[Any]], left: int = 1) -> Markup:
+def table(header: Sequence[Any], rows: Sequence[Sequence[Any]], left: int = 1, most: int = MOST_ROWS) -> Markup:
     """A table whose first `left` columns are left-aligned; very long tables are cut, with a note.
 
     A table of more than NARROW columns is `wide`: on a phone its rows become cards, each cell with its `data-label`.
@@ -55,9 +55,9 @@ def table(header: Sequence[Any], rows: Sequence[Sequence[Any]], left: int = 1) -
     head = tag("tr", *(tag("th", name, class_=side) for name, side in zip(header, sides, strict=True)))
     shown = [
         tag("tr", *(tag("td", c, class_=s, data_label=n) for c, s, n in zip(row, sides, labels, strict=True)))
-        for row in rows[:MOST_ROWS]
+        for row in rows[:most]
     ]
-    cut = [] if len(rows) <= MOST_ROWS else [tag("p", f"and {len(rows) - MOST_ROWS} more rows", class_="note")]
+    cut = [] if len(rows) <= most else [tag("p", f"and {len(rows) - most} more rows", class_="note")]
     width = {"class_": "wide"} if len(header) > NARROW else {}
     return join([tag("div", tag("table", tag("thead", head), tag("tbody", *shown), **width), class_="scroll"), *cut])
 

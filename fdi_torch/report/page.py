@@ -37,8 +37,8 @@ def report_of(material: Material, makers: Sequence[Maker] = SECTIONS) -> RunRepo
     return RunReport(material, tuple(section for section in made if section is not None))
 
 
-def page(reports: Sequence[RunReport], first: Sequence[Section] = ()) -> str:
-    """The complete page. first: sections about all runs, such as their comparison."""
+def page(reports: Sequence[RunReport], first: Sequence[Section] = (), above: Sequence[Markup] = ()) -> str:
+    """The complete page. first: sections about all runs, such as their comparison. above: elements before them."""
     title = " · ".join(report.material.run.path.stem for report in reports[:4])
     articles = [_article(report, f"r{k}-") for k, report in enumerate(reports)]
     if len(reports) > 1:
@@ -46,16 +46,22 @@ def page(reports: Sequence[RunReport], first: Sequence[Section] = ()) -> str:
         listed = [*((f"all-{k}", section.title) for k, section in enumerate(first)), *runs]
         shared = (section_html(section, "all-", f"all-{k}") for k, section in enumerate(first))
         articles = [_index(listed), *shared, *articles]
+    return document(title, [*above, *articles])
+
+
+def document(title: str, content: Sequence[Markup], style: str = "", refresh: int = 0) -> str:
+    """An HTML document under the content security policy. style: further CSS. refresh: seconds until it reloads."""
     head = join(
         [
             Markup('<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'),
             Markup(f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'),
+            Markup(f'<meta http-equiv="refresh" content="{refresh}">' if refresh else ""),
             tag("title", f"{title} – fdi_torch"),
-            tag("style", Markup(CHART_STYLE + STYLESHEET)),
+            tag("style", Markup(CHART_STYLE + STYLESHEET + style)),
             tag("script", Markup(SCRIPT)),
         ]
     )
-    return f"<!doctype html>\n{tag('html', tag('head', head), tag('body', tag('main', *articles)), lang='en')}\n"
+    return f"<!doctype html>\n{tag('html', tag('head', head), tag('body', tag('main', *content)), lang='en')}\n"
 
 
 def write_pictures(report: RunReport, folder: Path) -> list[Path]:

@@ -8,6 +8,7 @@ EXAMPLES = """
 examples:
   fdi inspect logs/own.mcap                        contents and integrity
   fdi inspect logs/own.mcap --topic /plant/output --out output.csv
+  fdi inspect logs/own.mcap --layout own.json      to be imported in Foxglove or Lichtblick
   fdi inspect logs/own.mcap --attachment config.yaml
 """
 
@@ -19,6 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--format", choices=("csv", "ndjson", "npz"), default="csv", help="output format (default: csv)"
     )
     parser.add_argument("--attachment", metavar="NAME", help="write this attachment instead, such as config.yaml")
+    parser.add_argument(
+        "--layout", metavar="FILE.json", help="write a layout for Foxglove and Lichtblick that shows this very log"
+    )
     parser.add_argument(
         "--out", metavar="FILE|DIR", help="file for the messages (default: standard output), folder for an attachment"
     )

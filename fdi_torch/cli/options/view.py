@@ -1,0 +1,26 @@
+"""Show the logs of a folder as pages on this machine: list, filter, sort, compare, and follow running jobs.
+
+The pages need no scripts and no network; only this machine can reach them. Ctrl-C ends the command.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+EXAMPLES = """
+examples:
+  fdi view                                         the logs in ./logs
+  fdi view /data/runs --port 8080 --open
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "folder",
+        metavar="FOLDER",
+        nargs="?",
+        default="logs",
+        help="folder of logs, with its subfolders (default: logs)",
+    )
+    parser.add_argument("--port", metavar="N", type=int, default=0, help="port of the pages (default: any free one)")
+    parser.add_argument("--open", action="store_true", help="open the list in the browser")

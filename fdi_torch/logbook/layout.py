@@ -1,0 +1,182 @@
+"""A Foxglove and Lichtblick layout that shows what a log has: a plot per sensor, inputs, search, events.
+
+Every message path names a field of the schema of its topic. Fields whose names a path would have to quote, such as
+`T1.leak.size`, are left out.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import orjson
+
+from fdi_torch.logbook.errors import LogError
+from fdi_torch.logbook.reader import Run
+
+_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_PLAIN_TOPIC = re.compile(r"(/[A-Za-z0-9_-]+)+")
+_BESIDE = ("_statistic", "_threshold", "_low", "_high")
+_COST = {
+    "/estimator/de/generation": ("Search", "generation", ("best_cost", "mean_cost")),
+    "/estimator/refine/iteration": ("Refinement", "iteration", ("cost",)),
+}
+_TABLES = ("/observer/alarm", "/diagnosis/fault", "/gap/where", "/study/summary", "/study/trial")
+_TEXTS = ("/estimate/final", "/gap/verdict")
+_SECONDS = {"t", "timestamp", "wall"}
+MOST_PER_TAB = 4
+
+Panel = tuple[str, dict[str, Any]]  # type of the panel, configuration
+Fields = Mapping[str, Mapping[str, str]]  # topic -> field that holds a number -> unit
+
+
+def foxglove_layout(run: Run) -> dict[str, Any]:
+    """The layout for this log, as JSON values. Raises LogError if the log has nothing that a panel could show."""
+    fields = numeric_fields(run)
+    tabs = {
+        "Sensors": _sensor_plots(fields),
+        "Residuals": _residual_plots(fields),
+        "Inputs": _input_plots(fields),
+        "Search": _cost_plots(fields),
+        "Events": [("Table", {"topicPath": topic}) for topic in _TABLES if topic in fields],
+        "Results": [("RawMessages", {"topicPath": topic}) for topic in _TEXTS if topic in fields],
+    }
+    log: list[Panel] = [("RosOut", {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/log"})]
+    panels: dict[str, dict[str, Any]] = {}
+    pages = [
+        {"title": title if first == 0 else f"{title} {first // MOST_PER_TAB + 1}", "layout": _column(names)}
+        for title, made in tabs.items()
+        for first in range(0, len(made), MOST_PER_TAB)
+        if (names := _named(panels, made[first : first + MOST_PER_TAB]))
+    ]
+    if not pages:
+        raise LogError(f"{run.path}: expected signals, events or results, got none that a layout could show")
+    panels["Tab!fdi"] = {"activeTabIdx": 0, "tabs": pages}
+    layout: Any = "Tab!fdi"
+    if "/log" in fields:
+        (name,) = _named(panels, log)
+        layout = {"direction": "column", "first": "Tab!fdi", "second": name, "splitPercentage": 82}
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 10},
+        "layout": layout,
+    }
+
+
+def numeric_fields(run: Run) -> dict[str, dict[str, str]]:
+    """For each topic, its numeric fields that a message path can name without quoting, with their units."""
+    fields: dict[str, dict[str, str]] = {}
+    seen = set()
+    for message in run.messages():
+        channel = message.channel
+        if channel in seen or not _PLAIN_TOPIC.fullmatch(channel.topic):
+            continue
+        seen.add(channel)
+        units = dict(channel.metadata)
+        known = fields.setdefault(channel.topic, {})
+        for name, part in _properties(channel.schema_data).items():
+            if part.get("type") in ("number", "integer") and _PLAIN.fullmatch(name):
+                known[name] = units.get(f"unit.{name}", "")
+    return fields
+
+
+def _properties(schema: bytes) -> dict[str, Any]:
+    """The properties of a JSON schema; empty for other schemas."""
+    try:
+        found = orjson.loads(schema)["properties"]
+        return {name: part for name, part in found.items() if isinstance(part, dict)}
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def _sensor_plots(fields: Fields) -> list[Panel]:
+    """One plot per sensor of each recording: measured, and estimated where the log has it."""
+    plots = []
+    for topic in fields:
+        if not (topic.startswith("/plant/") and topic.endswith("/output")):
+            continue
+        model = topic.replace("/plant/", "/estimate/", 1)
+        for name, unit in _signals(fields[topic]):
+            lines = [(f"{topic}.{name}", "measured")]
+            lines += [(f"{model}.{name}", "estimated")] if name in fields.get(model, {}) else []
+            plots.append(_plot(_title(name, topic, unit), lines))
+    return plots
+
+
+def _residual_plots(fields: Fields) -> list[Panel]:
+    """One plot per sensor: residual with its band, or with the test statistic and threshold of the monitor."""
+    plots = []
+    for topic in fields:
+        if not (topic.startswith(("/estimate/", "/observer/")) and topic.endswith("/residual")):
+            continue
+        present = fields[topic]
+        for name, unit in _signals(present):
+            band = [(f"{topic}.{name}_{side}", side) for side in ("low", "high") if f"{name}_{side}" in present]
+            plots.append(_plot(_title(f"{name}: residual", topic, unit), [(f"{topic}.{name}", "residual"), *band]))
+            test = [(f"{topic}.{name}_{k}", k) for k in ("statistic", "threshold") if f"{name}_{k}" in present]
+            plots += [_plot(_title(f"{name}: test statistic", topic, ""), test)] if test else []
+    return plots
+
+
+def _input_plots(fields: Fields) -> list[Panel]:
+    """One plot per recording and unit of its inputs."""
+    plots = []
+    for topic in fields:
+        if topic.startswith("/plant/") and topic.endswith("/input"):
+            units = dict.fromkeys(unit for _, unit in _signals(fields[topic]))
+            for unit in units:
+                lines = [(f"{topic}.{name}", name) for name, its in _signals(fields[topic]) if its == unit]
+                plots.append(_plot(_title("Inputs", topic, unit), lines))
+    return plots
+
+
+def _cost_plots(fields: Fields) -> list[Panel]:
+    return [
+        _plot(f"{title}: cost over {step}", [(f"{topic}.{name}", name) for name in costs], f"{topic}.{step}")
+        for topic, (title, step, costs) in _COST.items()
+        if {step, *costs} <= fields.get(topic, {}).keys()
+    ]
+
+
+def _signals(present: Mapping[str, str]) -> list[tuple[str, str]]:
+    """The fields that are signals of their own, with their units."""
+    beside = {name + end for name in present for end in _BESIDE}
+    return [(name, unit) for name, unit in present.items() if name not in _SECONDS and name not in beside]
+
+
+def _title(name: str, topic: str, unit: str) -> str:
+    """The name with the recording's group and the unit."""
+    parts = topic.split("/")
+    group = f" ({parts[2]})" if len(parts) == 4 else ""
+    return f"{name}{group}{', ' + unit if unit else ''}"
+
+
+def _plot(title: str, lines: Sequence[tuple[str, str]], over: str = "") -> Panel:
+    """A plot of message paths with labels, over time or over another field."""
+    paths = [
+        {"value": value, "enabled": True, "timestampMethod": "receiveTime", "label": label} for value, label in lines
+    ]
+    plot: dict[str, Any] = {"title": title, "paths": paths, "showLegend": True, "legendDisplay": "floating"}
+    plot |= {"showXAxisLabels": True, "showYAxisLabels": True, "isSynced": not over}
+    plot |= {"xAxisVal": "custom", "xAxisPath": {"value": over, "enabled": True}} if over else {"xAxisVal": "timestamp"}
+    return "Plot", plot
+
+
+def _named(panels: dict[str, dict[str, Any]], made: Sequence[Panel]) -> list[str]:
+    """Add the panels under new names, which are returned."""
+    names = []
+    for kind, config in made:
+        names.append(f"{kind}!p{len(panels) + 1}")
+        panels[names[-1]] = config
+    return names
+
+
+def _column(names: Sequence[str]) -> Any:
+    """Panels of equal height below each other."""
+    if len(names) == 1:
+        return names[0]
+    share = 100.0 / len(names)
+    return {"direction": "column", "first": names[0], "second": _column(names[1:]), "splitPercentage": share}

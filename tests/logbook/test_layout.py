@@ -1,0 +1,107 @@
+"""Layouts for viewers: every message path exists in the log, found by the library's own reader of MCAP files."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from example_logs import FIXED, write_everything
+from mcap.reader import make_reader
+
+from fdi_torch.cli import DONE, MISUSE, main
+from fdi_torch.logbook import RunLog, foxglove_layout, read_run, series
+
+DATA = Path(__file__).parents[1] / "data"
+GOLDEN = sorted(DATA.glob("log_format_1*.mcap"))
+
+
+def schemas(path: Path) -> dict[str, dict[str, str]]:
+    """Topic -> field -> JSON type, from the summary of the file."""
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    found: dict[str, dict[str, str]] = {}
+    for channel in summary.channels.values():
+        properties = json.loads(summary.schemas[channel.schema_id].data)["properties"]
+        found.setdefault(channel.topic, {}).update({name: part["type"] for name, part in properties.items()})
+    return found
+
+
+def paths(node: Any) -> Any:
+    """Every text that begins like a topic."""
+    if isinstance(node, dict):
+        node = list(node.values())
+    if isinstance(node, list):
+        for part in node:
+            yield from paths(part)
+    elif isinstance(node, str) and node.startswith("/"):
+        yield node
+
+
+def expect_sound(layout: dict[str, Any], log: Path) -> list[str]:
+    """The paths of a layout, all of which exist in the log; every panel is placed once."""
+    known, shown = schemas(log), list(paths(layout["configById"]))
+    for path in shown:
+        assert re.fullmatch(r"(/[\w-]+)+(\.\w+)?", path), path
+        topic, _, name = path.partition(".")
+        assert topic in known and (not name or known[topic][name] in ("number", "integer")), path
+    tabs = layout["configById"]["Tab!fdi"]["tabs"]
+    placed = re.findall(r'"(\w+!\w+)"', json.dumps([layout["layout"], *(tab["layout"] for tab in tabs)]))
+    assert sorted(placed) == sorted(layout["configById"])
+    return shown
+
+
+@pytest.mark.parametrize("log", GOLDEN, ids=lambda path: path.stem)
+def test_every_path_exists_in_the_log(log: Path) -> None:
+    assert expect_sound(foxglove_layout(read_run(log)), log)
+
+
+def test_a_plot_per_sensor_shows_measured_and_estimated(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
+        write_everything(log)
+    assert main(["inspect", str(tmp_path / "a.mcap"), "--layout", str(tmp_path / "a.json")]) == DONE
+    layout = json.loads((tmp_path / "a.json").read_text())
+    shown = expect_sound(layout, tmp_path / "a.mcap")
+    plots = {p["title"]: [line["value"] for line in p["paths"]] for p in layout["configById"].values() if "paths" in p}
+    assert plots["h2, m"] == ["/plant/output.h2", "/estimate/output.h2"]
+    residual = "/estimate/residual.h2"
+    assert [residual, f"{residual}_low", f"{residual}_high"] in plots.values()
+    assert plots["Inputs, m^3/s"] == ["/plant/input.Q1", "/plant/input.Q2"]
+    assert {"/log", "/observer/alarm", "/gap/verdict", "/estimate/final"} <= set(shown)
+
+
+def test_recordings_in_groups_have_plots_of_their_own_and_odd_names_none(tmp_path: Path) -> None:
+    time, two = np.arange(3.0), np.zeros((3, 2))
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
+        for group in ("1", "2"):
+            log.recording(time, two, two, ("Q1", "Q 2"), ("h1", "T.h"), ("m^3/s",) * 2, ("m",) * 2, group=group)
+            log.predictions(time, two, two, ("h1", "T.h"), ("m",) * 2, group=group)
+    shown = expect_sound(foxglove_layout(read_run(tmp_path / "a.mcap")), tmp_path / "a.mcap")
+    assert "/plant/2/output.h1" in shown and "/estimate/2/output.h1" in shown and "/plant/1/input.Q1" in shown
+    assert not any("T.h" in path or "Q 2" in path for path in shown)
+
+
+def test_a_log_without_content_has_no_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED):
+        pass
+    assert main(["inspect", str(tmp_path / "a.mcap"), "--layout", str(tmp_path / "a.json")]) == MISUSE
+    assert "got none that a layout could show" in capsys.readouterr().err and not (tmp_path / "a.json").exists()
+
+
+def test_the_modelled_series_are_the_readings_less_the_residuals(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    time, outputs, model = np.arange(40.0), rng.standard_normal((40, 2)), rng.standard_normal((40, 2))
+    mask = rng.random((40, 2)) > 0.2
+    with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
+        log.predictions(time, outputs, model, ("h1", "h2"), ("m", "m"), mask=mask, noise_std=[0.1, 0.2])
+    run = read_run(tmp_path / "a.mcap")
+    predicted, residual = series(run, "/estimate/output"), series(run, "/estimate/residual")
+    for k, name in enumerate(("h1", "h2")):
+        np.testing.assert_array_equal(predicted[name], model[:, k])
+        np.testing.assert_allclose(residual[name], np.where(mask[:, k], outputs[:, k] - model[:, k], np.nan))
+        np.testing.assert_allclose(residual[f"{name}_high"], 1.96 * (0.1, 0.2)[k])
+        np.testing.assert_allclose(residual[f"{name}_low"], -1.96 * (0.1, 0.2)[k])
