@@ -72,7 +72,7 @@ def show(done: TrainResult, screen: Screen) -> None:
 def show_uncertainty(done: TrainResult, screen: Screen) -> None:
     """Print the intervals of the profiles and of the draws, those that cannot be relied on with the reason first."""
     draws = done.result.estimate.draws
-    for line in [line for each in (*done.profiles, *([draws] if draws else [])) for line in each.warnings]:
+    for line in [line for profile in done.profiles for line in profile.warnings]:
         screen.say(f"- {line}")
     rows = []
     for profile in done.profiles:

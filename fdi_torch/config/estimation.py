@@ -92,7 +92,7 @@ class EstimationConfig(Strict):
     )
     objective: ObjectiveConfig = Field(default_factory=ObjectiveConfig)
     search: Annotated[EvolutionSettings, BeforeValidator(_known_settings)] = Field(
-        default_factory=EvolutionSettings, description="differential evolution"
+        default_factory=EvolutionSettings, description="search of the basin; strategy: l-shade, rand/1/bin or cma_es"
     )
     refine: RefineConfig = Field(default_factory=RefineConfig)
     step: StepConfig = Field(default_factory=StepConfig)

@@ -37,9 +37,9 @@ class Draws(Shown):
     """Draws from the posterior, SI units. M: walkers, each one chain; D: draws of each.
 
     values (M, D, P). log_posterior (M, D), up to a constant. r_hat, ess_bulk, ess_tail (P,): rank-normalised split
-    R-hat and effective sample sizes (Vehtari et al. 2021). acceptance: share of accepted steps. steps: steps of each walker,
-    of which the first half was discarded. observed: readings by name, (S,), NaN where masked. log_likelihood: of each
-    reading, (M, D, S) by name; empty where it would take more than 80 MB.
+    R-hat and effective sample sizes (Vehtari et al. 2021). acceptance: share of accepted steps. steps: steps
+    of each walker, of which the first half was discarded. observed: readings by name, (S,), NaN where masked.
+    log_likelihood: of each reading, (M, D, S) by name; empty where it would take more than 80 MB.
     """
 
     names: tuple[str, ...]

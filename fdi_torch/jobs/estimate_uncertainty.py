@@ -73,7 +73,8 @@ def readings_and_their_likelihood(
 
     Sensors of recording k > 0 have the suffix '@k'. The log-likelihoods are left out where they would be too many.
     """
-    observed, pointwise = {}, {}
+    observed: dict[str, Tensor] = {}
+    pointwise: dict[str, Tensor] = {}
     flat = values.flatten(0, 1)
     few = len(flat) * sum(int(term.data.values.numel()) for term in likelihood.terms) <= MOST_POINTWISE
     for k, term in enumerate(likelihood.terms):
