@@ -284,7 +284,7 @@ def test_l_shade_memory_moves_and_population_shrinks_to_the_smallest() -> None:
 def test_first_guess_is_part_of_the_first_population_and_cannot_be_lost(settings: EvolutionSettings) -> None:
     guess = torch.tensor([[1.0, 1.0, 1.0, 1.0], [9.0, 0.0, 0.0, 0.0]], dtype=DOUBLE)
     seen: list[Search] = []
-    settings = replace(settings, population=50, evaluations=80)
+    settings = replace(settings, population=50, patience=1)
     result = evolve(lambda x, _: rosenbrock(x), *box(3.0, (2,)), settings, first_guess=guess, on_generation=seen.append)
     assert torch.equal(result.best, torch.ones(2, 4, dtype=DOUBLE))
     clipped = torch.tensor([3.0, 0.0, 0.0, 0.0], dtype=DOUBLE)

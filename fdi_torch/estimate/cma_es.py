@@ -1,10 +1,10 @@
 """CMA-ES: evolution strategy with covariance matrix adaptation (Hansen 2016, arXiv 1604.00772, figure 6).
 
 A generation samples x = m + s A z, z normal, A A' = C, in units of the box, and moves mean m, step size s and
-covariance C towards the better half. The evolution path of s is the weighted mean of z itself, as with the Cholesky factor A of
-Krause, Arbones and Igel (2016, section 3). A candidate outside the box is reflected into it and judged there, while
-the update uses x, so that bounds do not shrink the covariance. The search starts in the middle of the box, or at the
-first guess, with a step size of 0.3 box widths. It suits costs with one broad basin; L-SHADE, with its larger
+covariance C towards the better half. The evolution path of s is the weighted mean of z itself, as for the Cholesky
+factor A of Krause, Arbones and Igel (2016, section 3). A candidate outside the box is reflected into it and judged
+there, while the update uses x, so that bounds do not shrink the covariance. The search starts in the middle of the box,
+or at the first guess, with a step size of 0.3 box widths. It suits costs with one broad basin; L-SHADE, with its larger
 population, is the safer choice for several.
 """
 

@@ -121,7 +121,9 @@ class Draws(Shown):
             "log_likelihood": {name: value.numpy() for name, value in self.log_likelihood.items()},
         }
         dims = {name: [f"{name}_sample"] for name in self.observed}
-        return needed("arviz_base", "draws").from_dict({k: v for k, v in groups.items() if v}, dims=dims)
+        # There may be more walkers than draws of each, which ArviZ takes for exchanged dimensions.
+        present = {name: group for name, group in groups.items() if group}
+        return needed("arviz_base", "draws").from_dict(present, dims=dims, check_conventions=False)
 
 
 def draw_posterior(
