@@ -26,6 +26,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "fdi_torch.estimate.fitting": ("Fitting", "set_up"),
     "fdi_torch.estimate.hybrid": ("HybridResult", "HybridSettings", "estimate_parameters"),
     "fdi_torch.estimate.evolution": ("EvolutionSettings", "evolve"),
+    "fdi_torch.estimate.posterior_draws": ("Draws", "draw_posterior"),
+    "fdi_torch.estimate.profile": ("Profile", "profile_likelihood"),
     "fdi_torch.estimate.levenberg_marquardt": ("levenberg_marquardt",),
     "fdi_torch.jobs.fmu_export": ("export_fmu",),
     "fdi_torch.jobs.python_functions": (

@@ -1,4 +1,4 @@
-"""Differential evolution: finds known optima, keeps its rules, and a problem never feels its neighbours."""
+"""Search strategies: each finds known optima, keeps its rules, and a problem never feels its neighbours."""
 
 import math
 from collections.abc import Callable
@@ -12,10 +12,14 @@ from torch import Tensor
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution import REASONS, EvolutionSettings, Search, evolve, snapshot
 from fdi_torch.estimate.generation import ask, draw_other, init, tell
+from fdi_torch.estimate.strategy import state_from_dict, strategy_named
 
 DOUBLE = torch.float64
 RAND_1 = EvolutionSettings("rand/1/bin", population=50, evaluations=60_000, factor=0.55)
 L_SHADE = EvolutionSettings("l-shade", population=80, evaluations=30_000)
+# Several minima need large populations (Hansen and Kern 2004, figure 2).
+CMA_ES = EvolutionSettings("cma_es", population=200, evaluations=60_000)
+ALL = pytest.mark.parametrize("settings", [RAND_1, L_SHADE, CMA_ES], ids=["rand/1/bin", "l-shade", "cma_es"])
 SHIFT = torch.tensor([0.7, -1.3, 1.9, -0.4], dtype=DOUBLE)
 # An orthogonal matrix without zeros.
 ROTATION = torch.eye(4, dtype=DOUBLE) - 0.5 * torch.ones(4, 4, dtype=DOUBLE)
@@ -51,7 +55,7 @@ def box(half: float, shape: tuple[int, ...] = (1,), parameters: int = 4) -> tupl
     return -high, high
 
 
-@pytest.mark.parametrize("settings", [RAND_1, L_SHADE], ids=["rand/1/bin", "l-shade"])
+@ALL
 @pytest.mark.parametrize(
     ("cost", "optimum"),
     [
@@ -74,10 +78,14 @@ def test_finds_the_known_optimum(
     assert found.double().mean() >= (0.6 if cost is HARDEST else 1.0)
 
 
-@pytest.mark.parametrize("rule", ["clip", "reflect", "midpoint", "resample"])
-def test_finds_an_optimum_in_a_corner_of_the_box(rule: str) -> None:
+@pytest.mark.parametrize(
+    "settings",
+    [*(replace(L_SHADE, bounds=rule) for rule in ("clip", "reflect", "midpoint", "resample")), CMA_ES],
+    ids=["clip", "reflect", "midpoint", "resample", "cma_es"],
+)
+def test_finds_an_optimum_in_a_corner_of_the_box(settings: EvolutionSettings) -> None:
     low, high = box(1.0)
-    result = evolve(lambda x, _: x.sum(-1), low, high, replace(L_SHADE, bounds=rule))
+    result = evolve(lambda x, _: x.sum(-1), low, high, settings)
     torch.testing.assert_close(result.best, low, rtol=0, atol=1e-3)
     assert ((result.population.nan_to_num() >= -1.0) & (result.population.nan_to_num() <= 1.0)).all()
 
@@ -112,7 +120,7 @@ def test_each_reason_to_stop_is_given() -> None:
     assert REASONS[0] == "running"
 
 
-@pytest.mark.parametrize("settings", [RAND_1, L_SHADE], ids=["rand/1/bin", "l-shade"])
+@ALL
 def test_cost_that_is_not_finite_never_wins(settings: EvolutionSettings) -> None:
     """A basin of NaN, infinity and minus infinity lies on the way; the first population has them too."""
 
@@ -128,7 +136,7 @@ def test_cost_that_is_not_finite_never_wins(settings: EvolutionSettings) -> None
     torch.testing.assert_close(result.best, torch.ones(2, 4, dtype=DOUBLE), rtol=0, atol=1e-4)
     valid = seen[-1].state.population[torch.isfinite(seen[-1].state.cost)]
     assert (valid[:, :3] >= 0.0).all()
-    assert not any(torch.isnan(search.state.memory_f).any() for search in seen)
+    assert not any(torch.isnan(value).any() for search in seen for value in search.state.to_dict().values())
 
 
 def scaled_costs(targets: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
@@ -141,7 +149,7 @@ def scaled_costs(targets: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
     return cost
 
 
-@pytest.mark.parametrize("settings", [RAND_1, L_SHADE], ids=["rand/1/bin", "l-shade"])
+@ALL
 @pytest.mark.parametrize("rule", ["clip", "reflect", "midpoint", "resample"])
 def test_problem_is_bit_equal_alone_and_among_neighbours_that_finish_or_fail(
     settings: EvolutionSettings, rule: str
@@ -161,7 +169,7 @@ def test_problem_is_bit_equal_alone_and_among_neighbours_that_finish_or_fail(
             assert torch.equal(value.nan_to_num(-7.0), getattr(together, name)[b].nan_to_num(-7.0)), (b, name)
 
 
-@pytest.mark.parametrize("settings", [RAND_1, L_SHADE], ids=["rand/1/bin", "l-shade"])
+@ALL
 def test_large_batch_on_several_threads_changes_no_bit(settings: EvolutionSettings) -> None:
     """Vectorised kernels treat the tails of a tensor apart; where a problem falls must not matter."""
     settings = replace(settings, evaluations=320)
@@ -175,9 +183,9 @@ def test_large_batch_on_several_threads_changes_no_bit(settings: EvolutionSettin
         assert torch.equal(alone.population.nan_to_num(-7.0), together.population[b].nan_to_num(-7.0))
 
 
-@pytest.mark.parametrize("settings", [RAND_1, L_SHADE], ids=["rand/1/bin", "l-shade"])
+@ALL
 def test_interrupted_search_resumes_bit_for_bit(settings: EvolutionSettings) -> None:
-    settings = replace(settings, evaluations=3000, target=1e-2)
+    settings = replace(settings, population=50, evaluations=3000, target=1e-2)
     targets = torch.zeros(2, 3, 4, dtype=DOUBLE)
     flat = scaled_costs(targets.reshape(6, 4))
     low, high = box(3.0, (2, 3))
@@ -272,10 +280,11 @@ def test_l_shade_memory_moves_and_population_shrinks_to_the_smallest() -> None:
     assert seen[40].state.archived > 0
 
 
-def test_first_guess_is_part_of_the_first_population_and_cannot_be_lost() -> None:
+@ALL
+def test_first_guess_is_part_of_the_first_population_and_cannot_be_lost(settings: EvolutionSettings) -> None:
     guess = torch.tensor([[1.0, 1.0, 1.0, 1.0], [9.0, 0.0, 0.0, 0.0]], dtype=DOUBLE)
     seen: list[Search] = []
-    settings = replace(RAND_1, evaluations=80)
+    settings = replace(settings, population=50, patience=1)
     result = evolve(lambda x, _: rosenbrock(x), *box(3.0, (2,)), settings, first_guess=guess, on_generation=seen.append)
     assert torch.equal(result.best, torch.ones(2, 4, dtype=DOUBLE))
     clipped = torch.tensor([3.0, 0.0, 0.0, 0.0], dtype=DOUBLE)
@@ -291,7 +300,7 @@ def test_follows_single_precision() -> None:
 def test_misuse_is_refused_in_words() -> None:
     low, high = box(1.0)
     flat = lambda x, _: sphere(x)  # noqa: E731
-    with pytest.raises(ValueError, match="expected strategy to be one of rand/1/bin, l-shade, got best/1"):
+    with pytest.raises(ValueError, match="expected strategy to be one of rand/1/bin, l-shade, cma_es, got best/1"):
         EvolutionSettings("best/1")
     with pytest.raises(ValueError, match="expected bounds to be one of clip, reflect"):
         EvolutionSettings(bounds="bounce")
@@ -307,3 +316,36 @@ def test_misuse_is_refused_in_words() -> None:
         evolve(flat, low, high, L_SHADE, first_guess=torch.zeros(81, 4, dtype=DOUBLE))
     with pytest.raises(ValueError, match="expected a budget of at least the population of 80"):
         evolve(flat, low, high, replace(L_SHADE, evaluations=50))
+
+
+@ALL
+def test_search_by_ask_and_tell_alone_is_that_of_evolve(settings: EvolutionSettings) -> None:
+    settings = replace(settings, population=20, evaluations=400)
+    low, high = box(3.0, (2,))
+    seeds = torch.tensor([4, 5])
+    strategy = strategy_named(settings.strategy)
+    state = strategy.init(low, high, settings, seeds)
+    for _ in range(10):
+        trial = strategy.ask(state, settings)
+        assert ((trial.candidates >= low[:, None]) & (trial.candidates <= high[:, None])).all()
+        state = strategy.tell(state, trial, rosenbrock(trial.candidates), settings)
+    seen: list[Search] = []
+    evolve(lambda x, _: rosenbrock(x), low, high, settings, seeds, on_generation=seen.append)
+    assert torch.equal(seen[9].state.population, state.population) and torch.equal(seen[9].state.cost, state.cost)
+
+
+def test_cma_es_learns_the_scales_and_the_rotation_of_the_cost() -> None:
+    """On a rotated ellipsoid the covariance becomes the inverse Hessian, up to a factor (Hansen 2016, section 1.1)."""
+    scales = torch.tensor([1.0, 10.0, 100.0, 1000.0], dtype=DOUBLE)
+    hessian = ROTATION.T @ torch.diag(scales) @ ROTATION
+    seen: list[Search] = []
+    settings = EvolutionSettings("cma_es", evaluations=6000, parameter_tolerance=1e-5)
+    evolve(lambda x, _: (x @ hessian * x).sum(-1), *box(5.0), settings, 2, on_generation=seen.append)
+    assert (seen[-1].state.population[0, 0].abs() < 1e-3).all()
+    eigenvalues = torch.linalg.eigvals(seen[-1].state.covariance[0] @ hessian).real  # type: ignore[attr-defined]
+    assert eigenvalues.max() / eigenvalues.min() < 10.0
+
+
+def test_the_state_of_no_strategy_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected the state of a search, got cost"):
+        state_from_dict({"cost": torch.zeros(1)})

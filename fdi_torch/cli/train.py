@@ -58,6 +58,7 @@ def show(done: TrainResult, screen: Screen) -> None:
     screen.say()
     for line in in_words(done):
         screen.say(line)
+    show_uncertainty(done, screen)
     rho = ", ".join(f"{float(r):.6f}" for r in done.result.correlation)
     steps = done.result.steps
     screen.say(f"correlation of each sensor: {rho} (sum {float(done.result.correlation.sum()):.6f})")
@@ -66,6 +67,32 @@ def show(done: TrainResult, screen: Screen) -> None:
     screen.say(f"log: {done.log}")
     for picture in done.pictures:
         screen.say(f"picture: {picture}")
+
+
+def show_uncertainty(done: TrainResult, screen: Screen) -> None:
+    """Print the intervals of the profiles and of the draws, those that cannot be relied on with the reason first."""
+    draws = done.result.estimate.draws
+    for line in [line for profile in done.profiles for line in profile.warnings]:
+        screen.say(f"- {line}")
+    rows = []
+    for profile in done.profiles:
+        unit, scale = display_unit(profile.unit)
+        limits = f"{scale * profile.low:.5g} .. {scale * profile.high:.5g}"
+        note = " and ".join(f"{end} end is not determined" for end in profile.ends)
+        rows.append([profile.name, unit or "1", f"{100 * profile.confidence:g} %", limits, note])
+    if rows:
+        header = ("parameter", "unit", "confidence", "interval", "remark")
+        screen.table("intervals from profile likelihoods", header, rows, left=2)
+        screen.say()
+    if draws is not None:
+        rows = []
+        for p, median, low, high in zip(done.fitting.space, draws.median(), *draws.interval(0.95), strict=True):
+            unit, scale = display_unit(p.unit)
+            limits = f"{scale * float(low):.5g} .. {scale * float(high):.5g}"
+            rows.append([p.name, unit or "1", f"{scale * float(median):.6g}", limits])
+        screen.table("draws from the posterior", ("parameter", "unit", "median", "95 % interval"), rows, left=2)
+        screen.say()
+        screen.say(draws.headline)
 
 
 def in_words(done: TrainResult) -> list[str]:
@@ -124,6 +151,8 @@ def as_json(done: TrainResult) -> dict[str, object]:
         "engine": result.engine,
         "log": str(done.log),
         "pictures": [str(p) for p in done.pictures],
+        **({"profiles": [profile.to_dict() for profile in done.profiles]} if done.profiles else {}),
+        **({"draws": result.estimate.draws.to_dict()} if result.estimate.draws else {}),
     }
 
 

@@ -92,11 +92,18 @@ class EstimationConfig(Strict):
     )
     objective: ObjectiveConfig = Field(default_factory=ObjectiveConfig)
     search: Annotated[EvolutionSettings, BeforeValidator(_known_settings)] = Field(
-        default_factory=EvolutionSettings, description="differential evolution"
+        default_factory=EvolutionSettings, description="search of the basin; strategy: l-shade, rand/1/bin or cma_es"
     )
     refine: RefineConfig = Field(default_factory=RefineConfig)
     step: StepConfig = Field(default_factory=StepConfig)
     confidence: Share = Field(0.95, gt=0, lt=1, description="confidence level of intervals and of the diagnosis")
+    profile: list[str] = Field(
+        default_factory=list,
+        description="parameters whose likelihood is profiled: intervals right at bounds and ridges",
+    )
+    draws: int = Field(
+        0, ge=0, le=1_000_000, description="draws from the posterior by an ensemble sampler (extra draws)"
+    )
     windows: Seconds | None = Field(
         None, gt=0, description="length of windows that are fitted separately, s, for faults that come and go"
     )

@@ -1,4 +1,4 @@
-"""Differential evolution of a batch of independent problems, run until each meets a stopping criterion.
+"""Search of a batch of independent problems, run until each meets a stopping criterion.
 
 The cost function is `cost(candidates (L, N, P), lanes (L,)) -> (L, N)` for the L problems that are still running, whose
 indices in the flattened batch are `lanes`. A stopped problem drops out without affecting the results of the others.
@@ -16,9 +16,9 @@ from torch import Tensor
 from fdi_torch.capacity import expect_room
 from fdi_torch.estimate.draws import problem_seeds
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
-from fdi_torch.estimate.generation import State, Trial, ask, init, tell
+from fdi_torch.estimate.strategy import SearchState, Strategy, state_from_dict, strategy_named
 
-__all__ = ["REASONS", "EvolutionResult", "EvolutionSettings", "Search", "State", "Trial", "evolve", "snapshot"]
+__all__ = ["REASONS", "EvolutionResult", "EvolutionSettings", "Search", "evolve", "snapshot"]
 
 Cost = Callable[[Tensor, Tensor], Tensor]
 
@@ -59,7 +59,7 @@ class Search:
     `evolve(..., resume=search)` continues from it bit for bit.
     """
 
-    state: State  # of the running problems, one flat leading dimension L
+    state: SearchState  # of the running problems, one flat leading dimension L
     lanes: Tensor  # (L,) int64
     finished: EvolutionResult  # of all problems, flat
     shape: tuple[int, ...]  # of the batch of problems
@@ -76,7 +76,7 @@ class Search:
             return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
         finished = EvolutionResult(**part("finished."))
-        return cls(State.from_dict(part("state.")), tensors["lanes"], finished, tuple(tensors["shape"].tolist()))
+        return cls(state_from_dict(part("state.")), tensors["lanes"], finished, tuple(tensors["shape"].tolist()))
 
 
 def evolve(
@@ -98,11 +98,12 @@ def evolve(
     Raises ValueError for mismatched shapes or an invalid box.
     """
     settings = settings or EvolutionSettings()
-    search = _without_stopped(resume or _begin(low, high, settings, seeds, first_guess), settings)
+    strategy = strategy_named(settings.strategy)
+    search = _without_stopped(resume or _begin(strategy, low, high, settings, seeds, first_guess), settings)
     while len(search.lanes):
-        trial = ask(search.state, settings)
+        trial = strategy.ask(search.state, settings)
         costs = cost(trial.candidates, search.lanes)
-        search = replace(search, state=tell(search.state, trial, costs, settings))
+        search = replace(search, state=strategy.tell(search.state, trial, costs, settings))
         if on_generation is not None:
             on_generation(search)
         search = _without_stopped(search, settings)
@@ -118,12 +119,12 @@ def snapshot(search: Search) -> EvolutionResult:
     )
 
 
-def stop_reason(state: State, settings: EvolutionSettings) -> Tensor:
+def stop_reason(state: SearchState, settings: EvolutionSettings) -> Tensor:
     """Stopping reason of each problem, (*problems) int64, an index into REASONS; 0 while it runs.
 
     converged: the range of the members is at most `parameter_tolerance` times the box's width in every parameter, and
-    the range of their costs at most `cost_tolerance` times `State.scale`. Only cost differences enter this criterion,
-    so a constant offset of the cost has no effect on it.
+    the range of their costs at most `cost_tolerance` times `SearchState.scale`. Only cost differences enter this
+    criterion, so a constant offset of the cost has no effect on it.
     """
     reason = torch.zeros_like(state.waited)
     if state.generation == 0:
@@ -141,7 +142,12 @@ def stop_reason(state: State, settings: EvolutionSettings) -> Tensor:
 
 
 def _begin(
-    low: Tensor, high: Tensor, settings: EvolutionSettings, seeds: int | Tensor, first_guess: Tensor | None
+    strategy: Strategy,
+    low: Tensor,
+    high: Tensor,
+    settings: EvolutionSettings,
+    seeds: int | Tensor,
+    first_guess: Tensor | None,
 ) -> Search:
     shape = tuple(low.shape[:-1])
     if not shape:
@@ -152,7 +158,7 @@ def _begin(
         first_guess = first_guess.expand(*shape, *first_guess.shape[-2:]).reshape(-1, *first_guess.shape[-2:])
     parameters = low.shape[-1]
     _expect_room(low.shape[:-1].numel(), parameters, settings)
-    state = init(low.flatten(0, -2), high.flatten(0, -2), settings, seeds.reshape(-1), first_guess)
+    state = strategy.init(low.flatten(0, -2), high.flatten(0, -2), settings, seeds.reshape(-1), first_guess)
     count, size = state.cost.shape
     finished = EvolutionResult(
         best=low.new_full((count, parameters), math.nan),

@@ -1,4 +1,4 @@
-"""Settings of the differential evolution."""
+"""Settings of the search."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from dataclasses import dataclass
 
 from fdi_torch.estimate.bounds import RULES
 
-STRATEGIES = ("rand/1/bin", "l-shade")
+# Name of each strategy -> module in `estimate` whose `STRATEGY` it is.
+STRATEGIES = {"rand/1/bin": "generation", "l-shade": "generation", "cma_es": "cma_es"}
 
 
 @dataclass(frozen=True)
 class EvolutionSettings:
-    """Settings of the differential evolution: first those of both strategies, then those of each one.
+    """Settings of the search: first those of all strategies, then those of each one.
 
-    population: number of members N; None: 10 P (rand/1/bin) or 18 P (l-shade), with P parameters.
-    evaluations: budget of cost evaluations per problem. bounds: rule that returns mutants to the box (bounds.RULES).
+    population: number of members N; None: 10 P (rand/1/bin), 18 P (l-shade) or
+    4 + 3 ln P (cma_es; more is safer where the cost has several minima), with P parameters.
+    evaluations: budget of cost evaluations per problem. bounds: rule that returns mutants of
+    differential evolution to the box (bounds.RULES); cma_es reflects.
     parameter_tolerance: relative to the box's width; cost_tolerance: relative to the scale of the costs, `State.scale`.
     patience: number of generations without improvement after which a problem has stalled.
     target: cost at which the search stops. factor, rate: F and CR.
@@ -56,7 +59,10 @@ class EvolutionSettings:
         _expect(self.cost_tolerance >= 0.0, "cost_tolerance of at least 0", self.cost_tolerance)
 
     def first_population(self, parameters: int) -> int:
-        return self.population or (18 if self.strategy == "l-shade" else 10) * max(parameters, 1)
+        several = max(parameters, 1)
+        if self.strategy == "cma_es":
+            return self.population or 4 + int(3.0 * math.log(several))
+        return self.population or (18 if self.strategy == "l-shade" else 10) * several
 
     def population_after(self, first: int, evaluations: int) -> int:
         """Population size of the next generation: constant, or linear in the evaluations (L-SHADE, equation 10)."""

@@ -10,8 +10,7 @@ size. Leading dimensions are independent problems; the results of each are bit-f
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,59 +19,38 @@ from fdi_torch.estimate.bounds import into_box
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.shade import draw_factor, draw_rate, update_archive, update_memory
+from fdi_torch.estimate.strategy import (
+    Proposal,
+    SearchState,
+    check_box,
+    checked_costs,
+    pick,
+    with_first_guess,
+    with_progress_counters,
+)
 
 _VARIATION, _REPAIR, _ARCHIVE = range(3)  # indices of the random streams of one generation
 
 
-@dataclass(frozen=True)
-class State:
-    """State of the search. Members are sorted, best first; a member without a valid cost has an infinite one.
+@dataclass(frozen=True, kw_only=True)
+class State(SearchState):
+    """State of differential evolution.
 
     memory_f, memory_cr: success-history memories; memory_cell: the cell to be overwritten next.
     archive: replaced parents, of which the first `archived` rows are in use.
-    scale: largest difference between median and best cost of any generation so far. Cost tolerances are relative to it,
-    which makes them independent of a constant offset of the cost.
-    anchor: best cost at the last significant improvement; waited: generations since then.
     """
 
-    population: Tensor  # (*problems, N, P)
-    cost: Tensor  # (*problems, N)
-    low: Tensor  # (*problems, P)
-    high: Tensor  # (*problems, P)
-    seed: Tensor  # (*problems) int64
     memory_f: Tensor  # (*problems, H)
     memory_cr: Tensor  # (*problems, H)
     memory_cell: Tensor  # (*problems) int64
     archive: Tensor  # (*problems, A, P)
     archived: Tensor  # (*problems) int64
-    scale: Tensor  # (*problems)
-    anchor: Tensor  # (*problems)
-    waited: Tensor  # (*problems) int64
-    first_population: int
-    generation: int = 0
-    evaluations: int = 0
-
-    def select(self, keep: Tensor) -> State:
-        """The problems selected by the mask `keep` (*problems), with one flat leading dimension."""
-        chosen: dict[str, Any] = {name: value[keep] for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **chosen)
-
-    def to_dict(self) -> dict[str, Tensor]:
-        """The state as plain tensors; `from_dict` restores it bit for bit."""
-        return {name: torch.as_tensor(value) for name, value in vars(self).items()}
-
-    @classmethod
-    def from_dict(cls, tensors: dict[str, Tensor]) -> State:
-        values: dict[str, Any] = {f.name: tensors[f.name] for f in fields(cls)}
-        counts = {name: int(values[name]) for name in ("first_population", "generation", "evaluations")}
-        return cls(**(values | counts))
 
 
 @dataclass(frozen=True)
-class Trial:
+class Trial(Proposal):
     """Candidates to be evaluated, with the factor F and the crossover rate CR that each was made with."""
 
-    candidates: Tensor  # (*problems, N, P)
     factor: Tensor  # (*problems, N)
     rate: Tensor  # (*problems, N)
 
@@ -86,17 +64,13 @@ def init(
     Raises ValueError for an empty or infinite box, mismatched shapes and a budget below the population size.
     """
     problems, parameters = low.shape[:-1], low.shape[-1]
-    _check_box(low, high, seed)
+    check_box(low, high, settings, seed)
     size = settings.first_population(parameters)
-    if size > settings.evaluations:
-        raise ValueError(
-            f"expected a budget of at least the population of {size}, got {settings.evaluations} evaluations; raise it"
-        )
     draws = uniform(stream(seed, 0, _VARIATION), size * parameters).to(low.dtype).unflatten(-1, (size, parameters))
     low_, high_ = low[..., None, :], high[..., None, :]
     population = (low_ + draws * (high_ - low_)).clamp(low_, high_)
     if first_guess is not None:
-        population = _with_first_guess(population, first_guess.to(low).clamp(low_, high_))
+        population = with_first_guess(population, first_guess.to(low).clamp(low_, high_))
     cells = settings.memory if settings.strategy == "l-shade" else 0
     return State(
         population=population,
@@ -114,26 +88,6 @@ def init(
         waited=torch.zeros_like(seed),
         first_population=size,
     )
-
-
-def _check_box(low: Tensor, high: Tensor, seed: Tensor) -> None:
-    if low.shape != high.shape or low.shape[:-1] != seed.shape:
-        raise ValueError(
-            f"expected low and high (*problems, P) and seeds (*problems), got {tuple(low.shape)}, {tuple(high.shape)} "
-            f"and {tuple(seed.shape)}; broadcast them first"
-        )
-    if not bool((torch.isfinite(low) & torch.isfinite(high) & (low <= high)).all()):
-        raise ValueError(
-            "expected a finite box low <= high for every parameter, got one that is infinite or empty; give it a range"
-        )
-
-
-def _with_first_guess(population: Tensor, guess: Tensor) -> Tensor:
-    if guess.shape[-2] > population.shape[-2]:
-        raise ValueError(
-            f"expected at most {population.shape[-2]} first guesses (the population), got {guess.shape[-2]}; give fewer"
-        )
-    return torch.cat((guess, population[..., guess.shape[-2] :, :]), -2)
 
 
 def ask(state: State, settings: EvolutionSettings) -> Trial:
@@ -211,13 +165,6 @@ def _ascending(values: list[Tensor]) -> list[Tensor]:
     return values
 
 
-def pick(rows: Tensor, index: Tensor) -> Tensor:
-    """Copy the rows `index` (*problems, K) of `rows` (*problems, M, P) into a new tensor (*problems, K, P)."""
-    problem = torch.arange(index[..., 0].numel(), device=index.device).reshape(*index.shape[:-1], 1)
-    flat = (index + problem * rows.shape[-2]).reshape(-1)
-    return rows.reshape(-1, rows.shape[-1]).index_select(0, flat).reshape(*index.shape, rows.shape[-1])
-
-
 def _repaired(mutant: Tensor, state: State, settings: EvolutionSettings) -> Tensor:
     size, parameters = mutant.shape[-2:]
 
@@ -234,9 +181,7 @@ def tell(state: State, trial: Trial, cost: Tensor, settings: EvolutionSettings) 
 
     cost (*problems, N): costs of the candidates; one that is not finite never replaces its parent.
     """
-    if cost.shape != state.cost.shape:
-        raise ValueError(f"expected costs {tuple(state.cost.shape)}, got {tuple(cost.shape)}; one for each candidate")
-    cost = torch.where(torch.isfinite(cost), cost, math.inf).to(state.cost.dtype)
+    cost = checked_costs(state, cost)
     better = cost < state.cost
     # In L-SHADE a candidate of equal cost replaces its parent too, so that the population can cross plateaus.
     replaces = better if settings.strategy == "rand/1/bin" else (cost <= state.cost) & torch.isfinite(cost)
@@ -250,7 +195,7 @@ def tell(state: State, trial: Trial, cost: Tensor, settings: EvolutionSettings) 
         generation=state.generation + 1,
         evaluations=state.evaluations + state.cost.shape[-1],
     )
-    return _with_progress_counters(_sorted_and_reduced(selected, settings), settings)
+    return with_progress_counters(_sorted_and_reduced(selected, settings), settings)
 
 
 def _with_updated_memory(state: State, trial: Trial, gain: Tensor, success: Tensor) -> State:
@@ -278,14 +223,14 @@ def _sorted_and_reduced(state: State, settings: EvolutionSettings) -> State:
     )
 
 
-def _with_progress_counters(state: State, settings: EvolutionSettings) -> State:
-    best, median = state.cost[..., 0], state.cost[..., state.cost.shape[-1] // 2]
-    difference = torch.where(torch.isfinite(median), median - best, 0.0)
-    scale = torch.maximum(state.scale, difference)
-    improved = best < state.anchor - settings.cost_tolerance * scale
-    return replace(
-        state,
-        scale=scale,
-        anchor=torch.where(improved, best, state.anchor),
-        waited=torch.where(improved, 0, state.waited + 1),
-    )
+@dataclass(frozen=True)
+class DifferentialEvolution:
+    """The strategies `rand/1/bin` and `l-shade`, which the settings distinguish."""
+
+    state = State
+    init = staticmethod(init)
+    ask = staticmethod(ask)
+    tell = staticmethod(tell)
+
+
+STRATEGY = DifferentialEvolution()

@@ -71,6 +71,7 @@ class HybridSettings:
 class HybridResult:
     """The estimate, its diagnosis, and how it was computed.
 
+    likelihood: negative log-likelihood behind the standard errors, with the noise levels of the estimate.
     correlation (C,): between readings and predictions of the first recording, per channel.
     predicted: readings (S, C) of each recording, simulated at the estimate, SI units.
     steps: integration steps of search and refinement, s. engine: name of the simulation engine.
@@ -80,6 +81,7 @@ class HybridResult:
     diagnosis: Diagnosis
     search: EvolutionResult
     refinement: Refined
+    likelihood: Problem
     correlation: Tensor
     predicted: tuple[Tensor, ...]
     steps: tuple[float, float]
@@ -329,7 +331,8 @@ def conclude(
         sensor_noise = sample_noise(term.data.known, term.data.weight)
         noise_ratios.append(float((noise_level[0] / sensor_noise.clamp(min=1e-12)).max()))
         inflated_noise.append(noise_level[0] * torch.sqrt(lasting(term.data.known - predicted[-1], term.data.weight)))
-    curvature = problem.at_noise(inflated_noise).linearise(theta, lanes).curvature[0]
+    likelihood = problem.at_noise(inflated_noise)
+    curvature = likelihood.linearise(theta, lanes).curvature[0]
     estimate = make_estimate(
         fitting.space,
         theta[0],
@@ -357,6 +360,7 @@ def conclude(
         diagnosis=diagnosis,
         search=search_result,
         refinement=refinement,
+        likelihood=likelihood,
         correlation=problem.correlations(theta.unsqueeze(1), lanes)[0, 0],
         predicted=tuple(predicted),
         steps=steps,

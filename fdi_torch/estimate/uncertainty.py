@@ -6,13 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import NormalDist
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from fdi_torch.estimate.information import RELATIVE_EIGENVALUE, Certainty, certainty, determined_combinations
 from fdi_torch.parameters import ParameterSpace
+
+if TYPE_CHECKING:
+    from fdi_torch.estimate.posterior_draws import Draws
 
 # A value within this fraction of the range of a bound counts as at the bound.
 _AT_BOUND = 1e-9
@@ -27,6 +30,7 @@ class Estimate:
     columns of undetermined parameters. at_bounds: 'low' or 'high' by name. undetermined: one sentence per group.
     noise_std (C,): noise level of each channel, known or estimated, in its unit. chi_square: of the residuals relative
     to the noise, with degrees_of_freedom. reached: how the estimate was computed, as plain values.
+    draws: from the posterior, if some were asked for.
     """
 
     names: tuple[str, ...]
@@ -41,6 +45,7 @@ class Estimate:
     chi_square: float | None = None
     degrees_of_freedom: int | None = None
     reached: Mapping[str, Any] = field(default_factory=dict)
+    draws: Draws | None = field(default=None, repr=False)
 
     @property
     def correlation(self) -> Tensor:
@@ -60,12 +65,24 @@ class Estimate:
         half_width = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * self.std
         return self.value - half_width, self.value + half_width
 
+    def to_arviz(self) -> Any:
+        """The draws as an xarray.DataTree by ArviZ (extra `draws`), see `Draws.to_arviz`.
+
+        Raises ValueError for an estimate without draws.
+        """
+        if self.draws is None:
+            raise ValueError(
+                "expected an estimate with draws, got none; set estimate.draws, or call TrainResult.sample()"
+            )
+        return self.draws.to_arviz()
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON. A number that is not finite becomes None; in `std` this means "not determined".
 
         The covariance is flattened row by row; `covariance_shape` holds its shape.
         """
-        plain = {name: plain_value(value, name) for name, value in vars(self).items() if name != "covariance"}
+        separate = ("covariance", "draws")
+        plain = {name: plain_value(value, name) for name, value in vars(self).items() if name not in separate}
         flat = plain_value(self.covariance.flatten(), "covariance")
         p_value = plain_value(self.p_value, "p_value")
         return plain | {"covariance": flat, "covariance_shape": list(self.covariance.shape), "p_value": p_value}

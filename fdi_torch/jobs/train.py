@@ -17,6 +17,9 @@ from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
 from fdi_torch.estimate.levenberg_marquardt import Progress
+from fdi_torch.estimate.posterior_draws import Draws
+from fdi_torch.estimate.profile import Profile
+from fdi_torch.jobs.estimate_uncertainty import profiled_names, profiles_of, with_draws
 from fdi_torch.jobs.log_paths import RESUMES, free_path, unfinished_search
 from fdi_torch.jobs.run_setup import (
     fitting_of,
@@ -32,7 +35,7 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure, save
 from fdi_torch.report.style import inline_svg
-from fdi_torch.tables import Shown, Table
+from fdi_torch.tables import Shown, Table, needed
 
 Tell = Callable[[float, str], None]
 STATE = "/estimator/de/population"
@@ -41,13 +44,14 @@ GENERATION, ITERATION = "/estimator/de/generation", "/estimator/refine/iteration
 
 @dataclass(frozen=True, repr=False)
 class TrainResult(Shown):
-    """result: estimate and diagnosis. truth: simulated values by name, empty for real data."""
+    """result: estimate and diagnosis. truth: simulated values by name, empty for real data. profiles: as asked for."""
 
     result: HybridResult
     fitting: Fitting
     truth: dict[str, float]
     log: Path
     pictures: tuple[Path, ...]
+    profiles: tuple[Profile, ...] = ()
 
     @property
     def headline(self) -> str:
@@ -74,6 +78,16 @@ class TrainResult(Shown):
         figure = fit_figure(self.fitting.recordings[0], self.result.predicted[0], self.headline)
         return str(inline_svg(figure, self.log.stem, self.headline))
 
+    def profile(self, *names: str, confidence: float = 0.95) -> tuple[Profile, ...]:
+        """Profile likelihoods of the named parameters, of all if none is named; see `profile_likelihood`."""
+        return profiles_of(self.fitting, self.result, names or self.result.estimate.names, confidence)
+
+    def sample(self, draws: int = 1000, seed: int = 0, most_steps: int = 16_000) -> Draws:
+        """Draws from the posterior (extra `draws`); see `draw_posterior`."""
+        drawn = with_draws(self.fitting, self.result, draws, seed, most_steps).estimate.draws
+        assert drawn is not None
+        return drawn
+
     def to_xarray(self, recording: int = 0) -> Any:
         """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
         return self.fitting.recordings[recording].compared(self.result.predicted[recording])
@@ -97,21 +111,29 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
     with RunLog(path, "train", **origin_of(run, loaded), listener=listener, after_interruption=RESUMES) as log:
         if not log.carry_over(before):
             log_recordings(log, loaded, truth)
-        result = estimate_logged(run, fitting, log, tell, search)
+        result, profiles = estimate_logged(run, fitting, log, tell, search)
         pictures = draw(run, fitting, result, path)
     tell(1.0, "done")
-    return TrainResult(result, fitting, truth, path, pictures)
+    return TrainResult(result, fitting, truth, path, pictures, profiles)
 
 
-def estimate_logged(run: Run, fitting: Fitting, log: RunLog, tell: Tell, resume: Search | None = None) -> HybridResult:
-    """Estimate the parameters, and log each step and the result."""
-    settings = hybrid_settings(run.config.estimate)
+def estimate_logged(
+    run: Run, fitting: Fitting, log: RunLog, tell: Tell, resume: Search | None = None
+) -> tuple[HybridResult, tuple[Profile, ...]]:
+    """Estimate the parameters, with the profiles and draws asked for, and log each step and the result."""
+    config, settings = run.config.estimate, hybrid_settings(run.config.estimate)
+    profiled = profiled_names(run, fitting.space)
+    if config.draws:
+        needed("emcee", "draws")
     watch = SearchLogger(log, fitting.space, settings, tell)
     with tensors_on(usable_device(run.config.device)):
         result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, resume)
-    log_result(log, result, fitting.space)
+        profiles = profiles_of(fitting, result, profiled, config.confidence) if profiled else ()
+        if config.draws:
+            result = with_draws(fitting, result, config.draws, run.config.seed, tell=tell)
+    log_result(log, result, fitting.space, profiles)
     log_predictions(log, result, fitting.recordings)
-    return result
+    return result, profiles
 
 
 def origin_of(run: Run, loaded: Sequence[LoadedRecording]) -> dict[str, Any]:
@@ -219,8 +241,8 @@ def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[s
     log.flush()
 
 
-def log_result(log: RunLog, result: HybridResult, space: ParameterSpace) -> None:
-    """Log the final estimate and the diagnosis of each fault."""
+def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profiles: Sequence[Profile] = ()) -> None:
+    """Log the final estimate with its profiles and draws, and the diagnosis of each fault."""
     final = result.estimate
     log.estimate(
         final.names,
@@ -239,7 +261,11 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace) -> None
         log.fault(effect, location, fault.present, unit=fault.unit, **present)
     several = len(result.predicted) > 1
     log.result_arrays(**{f"predicted_{k + 1}" if several else "predicted": p for k, p in enumerate(result.predicted)})
-    log.result(final.to_dict() | {"kind": result.diagnosis.kind, "explained": result.diagnosis.explained})
+    more: dict[str, Any] = {"profiles": [profile.to_dict() for profile in profiles]} if profiles else {}
+    if final.draws is not None:
+        log.result_arrays(draws=final.draws.values)
+        more["draws"] = final.draws.to_dict()
+    log.result(final.to_dict() | {"kind": result.diagnosis.kind, "explained": result.diagnosis.explained} | more)
     if final.status != "converged":
         log.set_status("not_converged", final.status)
 

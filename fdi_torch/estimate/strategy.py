@@ -1,0 +1,163 @@
+"""What a search strategy is: three functions on a state, `init`, `ask` and `tell`, that know costs and boxes only.
+
+A strategy is used by `evolve`, or alone:
+
+    strategy = strategy_named("cma_es")
+    state = strategy.init(low, high, settings, seed)
+    while ...:
+        trial = strategy.ask(state, settings)
+        state = strategy.tell(state, trial, cost(trial.candidates), settings)
+
+N: population size, P: parameters. Leading dimensions are independent problems; the results of each must be bit-for-bit
+those of running it alone, so that random numbers come from `draws` and sums from `batch_algebra`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from importlib import import_module
+from typing import Any, Protocol, Self, TypeVar
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchState:
+    """What every strategy keeps. Members are sorted, best first; one without a valid cost has an infinite one.
+
+    scale: largest difference between median and best cost of any generation so far. Cost tolerances are relative to it,
+    which makes them independent of a constant offset of the cost.
+    anchor: best cost at the last significant improvement; waited: generations since then.
+    """
+
+    population: Tensor  # (*problems, N, P)
+    cost: Tensor  # (*problems, N)
+    low: Tensor  # (*problems, P)
+    high: Tensor  # (*problems, P)
+    seed: Tensor  # (*problems) int64
+    scale: Tensor  # (*problems)
+    anchor: Tensor  # (*problems)
+    waited: Tensor  # (*problems) int64
+    first_population: int
+    generation: int = 0
+    evaluations: int = 0
+
+    def select(self, keep: Tensor) -> Self:
+        """The problems selected by the mask `keep` (*problems), with one flat leading dimension."""
+        chosen: dict[str, Any] = {name: value[keep] for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **chosen)
+
+    def to_dict(self) -> dict[str, Tensor]:
+        """The state as plain tensors; `from_dict` restores it bit for bit."""
+        return {name: torch.as_tensor(value) for name, value in vars(self).items()}
+
+    @classmethod
+    def from_dict(cls, tensors: dict[str, Tensor]) -> Self:
+        values: dict[str, Any] = {f.name: tensors[f.name] for f in fields(cls)}
+        counts = {name: int(values[name]) for name in ("first_population", "generation", "evaluations")}
+        return cls(**(values | counts))
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Candidates to be evaluated, all within the box."""
+
+    candidates: Tensor  # (*problems, N, P)
+
+
+AnyState = TypeVar("AnyState", bound=SearchState)
+
+
+class Strategy(Protocol):
+    """A search strategy. `state` is its type of state."""
+
+    @property
+    def state(self) -> type[SearchState]:
+        """Type of the state."""
+
+    def init(
+        self, low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor, first_guess: Tensor | None = None
+    ) -> Any:
+        """The state before the first generation, in the box low, high (*problems, P), with seeds (*problems) int64.
+
+        first_guess (*problems, K, P), K <= N: candidates of the first generation.
+        """
+
+    def ask(self, state: Any, settings: EvolutionSettings) -> Any:
+        """Propose the next candidates (*problems, N, P)."""
+
+    def tell(self, state: Any, trial: Any, cost: Tensor, settings: EvolutionSettings) -> Any:
+        """The next state from the costs (*problems, N) of the candidates; a cost that is not finite never wins."""
+
+
+def strategy_named(name: str) -> Strategy:
+    """The strategy of this name in `STRATEGIES`."""
+    found: Strategy = import_module(f"fdi_torch.estimate.{STRATEGIES[name]}").STRATEGY
+    return found
+
+
+def state_from_dict(tensors: dict[str, Tensor]) -> SearchState:
+    """The state of whichever strategy wrote these tensors. Raises ValueError if none did."""
+    for name in STRATEGIES:
+        kind = strategy_named(name).state
+        if {f.name for f in fields(kind)} == tensors.keys():
+            return kind.from_dict(tensors)
+    raise ValueError(f"expected the state of a search, got {', '.join(sorted(tensors))}; start the search again")
+
+
+def checked_costs(state: SearchState, cost: Tensor) -> Tensor:
+    """The costs of the candidates, infinite where they are not finite. Raises ValueError for another shape."""
+    if cost.shape != state.cost.shape:
+        raise ValueError(f"expected costs {tuple(state.cost.shape)}, got {tuple(cost.shape)}; one for each candidate")
+    return torch.where(torch.isfinite(cost), cost, torch.inf).to(state.cost.dtype)
+
+
+def check_box(low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor) -> None:
+    """Raises ValueError for an empty or infinite box, mismatched shapes and a budget below the population size."""
+    size = settings.first_population(low.shape[-1])
+    if low.shape != high.shape or low.shape[:-1] != seed.shape:
+        raise ValueError(
+            f"expected low and high (*problems, P) and seeds (*problems), got {tuple(low.shape)}, {tuple(high.shape)} "
+            f"and {tuple(seed.shape)}; broadcast them first"
+        )
+    if not bool((torch.isfinite(low) & torch.isfinite(high) & (low <= high)).all()):
+        raise ValueError(
+            "expected a finite box low <= high for every parameter, got one that is infinite or empty; give it a range"
+        )
+    if size > settings.evaluations:
+        raise ValueError(
+            f"expected a budget of at least the population of {size}, got {settings.evaluations} evaluations; raise it"
+        )
+
+
+def with_first_guess(population: Tensor, guess: Tensor) -> Tensor:
+    """The population (*problems, N, P) whose first members are replaced by the guesses (*problems, K, P)."""
+    if guess.shape[-2] > population.shape[-2]:
+        raise ValueError(
+            f"expected at most {population.shape[-2]} first guesses (the population), got {guess.shape[-2]}; give fewer"
+        )
+    return torch.cat((guess, population[..., guess.shape[-2] :, :]), -2)
+
+
+def with_progress_counters(state: AnyState, settings: EvolutionSettings) -> AnyState:
+    """The state with `scale`, `anchor` and `waited` of its sorted costs."""
+    best, median = state.cost[..., 0], state.cost[..., state.cost.shape[-1] // 2]
+    difference = torch.where(torch.isfinite(median), median - best, 0.0)
+    scale = torch.maximum(state.scale, difference)
+    improved = best < state.anchor - settings.cost_tolerance * scale
+    return replace(
+        state,
+        scale=scale,
+        anchor=torch.where(improved, best, state.anchor),
+        waited=torch.where(improved, 0, state.waited + 1),
+    )
+
+
+def pick(rows: Tensor, index: Tensor) -> Tensor:
+    """Copy the rows `index` (*problems, K) of `rows` (*problems, M, P) into a new tensor (*problems, K, P)."""
+    problem = torch.arange(index[..., 0].numel(), device=index.device).reshape(*index.shape[:-1], 1)
+    flat = (index + problem * rows.shape[-2]).reshape(-1)
+    return rows.reshape(-1, rows.shape[-1]).index_select(0, flat).reshape(*index.shape, rows.shape[-1])
