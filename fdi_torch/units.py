@@ -29,7 +29,7 @@ for _short, _long in {"gpm": "gallon / minute", "gph": "gallon / hour", "lpm": "
 _SIGNS = {"%": "percent", "‰": "permille"}
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 _NAME = r"[A-Za-zµμΩΩ°][A-Za-zµμ0-9_]*|[%‰]"
-_POWER = r"(?:\^|\*\*)\s*(?P<power>[+-]?\d)(?!\d)|(?P<super>⁻?[¹²³⁴⁵⁶⁷⁸⁹])"
+_POWER = r"(?:\^|\*\*)\s*(?P<power>[+-]?[0-9])(?![0-9])|(?P<super>⁻?[¹²³⁴⁵⁶⁷⁸⁹])"
 _TOKEN = re.compile(rf"\s*(?:(?P<name>{_NAME})|(?P<one>1)(?![\d.])|{_POWER}|(?P<sign>[*·/()]))", re.UNICODE)
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)(?![\d.])\s*(.*)", re.DOTALL | re.ASCII)
 _VOLUME_A_TIME = re.compile(r"^((?:[cdm]?m|ft|in)3|m?[lL]|gal)_(s|min|h)$")  # headers of loggers without '/'

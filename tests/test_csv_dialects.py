@@ -95,3 +95,16 @@ def test_stamps_are_followed_from_the_first_on(tmp_path: Path) -> None:
     seconds, _, readings, troubles = growing.new()
     assert (seconds.tolist(), readings.tolist()) == ([60.5], [[0.12]])
     assert "row 5, column time: expected a time stamp" in troubles[0]
+
+
+@pytest.mark.parametrize("cell", ["५०.५", "٥٠", "５０", "1_000"])
+def test_numbers_have_ascii_digits_and_no_underscores(tmp_path: Path, cell: str) -> None:
+    """An empty cell elsewhere sends a file to the slow parser; that must not change what is a number."""
+    for other in ("10", ""):
+        with pytest.raises(ValueError, match=f"row 2, column Q1_cm3_s: expected a number .* got '{cell}'; .*0 to 9"):
+            read(tmp_path, PLAIN.replace("0,50.5,10", f"0,{cell},{other}", 1))
+
+
+def test_stamps_have_ascii_digits(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="row 2, column time: expected a time stamp"):
+        read(tmp_path, STAMPED.format("२९.3.2026 00:30:00", "29.3.2026 00:30:05", "29.3.2026 00:30:10"))

@@ -129,7 +129,7 @@ def _moment(value: Any) -> float | datetime:
     return value if isinstance(value, datetime) else quantity(value, "s")
 
 
-_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d")
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d", re.ASCII)
 Moment = Annotated[float | datetime, BeforeValidator(_moment)]
 
 

@@ -136,9 +136,14 @@ def number_in(cell: str, delimiter: str) -> float:
         return BAD
     if delimiter != "," and "." not in text:
         text = text.replace(",", ".")
+    expected = f"expected a number or an empty cell, got '{cell.strip()}'"
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
         fix = f"say what it means, as in words: {{{text}: null}} for what does not count"
         fix = "write it with a point, as in 1180.5" if "," in text else fix
-        raise ValueError(f"expected a number or an empty cell, got '{cell.strip()}'; {fix}") from None
+        raise ValueError(f"{expected}; {fix}") from None
+    # float() also accepts the digits of other scripts and underscores; np.loadtxt of `parse_fast` does not.
+    if not text.isascii() or "_" in text:
+        raise ValueError(f"{expected}; write it with the digits 0 to 9 and without underscores")
+    return number
