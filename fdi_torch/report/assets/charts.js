@@ -97,10 +97,13 @@ class Chart {
       ticks: { stroke: () => colour("faint"), width: 0.6, size: 5 },
     });
     const [kind, width] = this.about.scale;
+    // Powers of ten; with their double and fivefold where there are few.
     const decades = (plot, index, low, high) => {
-      const ticks = [0];
-      for (let k = Math.ceil(Math.log10(width)); 10 ** k <= high; k++) ticks.push(10 ** k);
-      return ticks;
+      const first = Math.floor(Math.log10(kind === "log" ? low : width)), last = Math.ceil(Math.log10(high));
+      const steps = last - first > 2 ? [1] : [1, 2, 5], ticks = kind === "log" ? [] : [0];
+      for (let k = first; k <= last; k++) ticks.push(...steps.map(step => Number((step * 10 ** k).toPrecision(1))));
+      const least = kind === "log" ? low : width;
+      return ticks.filter(tick => tick === 0 || (tick >= least && tick <= high));
     };
     const plain = (plot, splits) => splits.map(value => (value === null ? null : text(value, 8)));
     const residual = this.about.level === 0;
@@ -108,15 +111,16 @@ class Chart {
       ...this.size(), legend: { show: false }, padding: [6, 20, 0, 0],
       scales: { x: { time: false, range: (plot, low, high) => this.clock.span || [low, high] }, y: this.range() },
       axes: [{ ...axis(this.about.x, 26), values: plain },
-             { ...axis(this.about.y, 50), values: plain, splits: kind === "asinh" ? decades : undefined, size: (plot, values) =>
+             { ...axis(this.about.y, 50), values: plain, splits: kind === "linear" ? undefined : decades,
+               filter: (plot, splits) => splits, size: (plot, values) =>
                16 + 7.6 * Math.max(3, ...(values || []).map(value => (value || "").length)) }],
       series: [{}, ...this.lines.map(line => ({
         label: line.name, stroke: () => colour(line.colour) + (line.wide ? "70" : ""), dash: line.dashed ? [6, 4] : undefined,
         width: line.wide ? 3 : residual ? 1 : 1.4,
-        paths: line.steps ? uPlot.paths.stepped({ align: 1 }) : undefined, points: { show: this.sparse() },
+        paths: line.steps ? uPlot.paths.stepped({ align: 1 }) : undefined, points: { show: this.sparse(), fill: () => colour(line.colour) },
       }))],
       cursor: {
-        drag: { x: true, y: false, setScale: false }, focus: { prox: 1e6 },
+        drag: { x: true, y: false, setScale: false },
         sync: { key: this.clock.key, setSeries: false, scales: ["x", null] },
         bind: {
           mousedown: (plot, over, act) => event => { if (event.button === 0 && !event.shiftKey) act(event); },

@@ -43,11 +43,11 @@ def limits_section(material: Material) -> Section | None:
     blocks: list[Any] = [*_confusability_words(impostors)]
     hidden = [explanation_words([cause]) for cause in excitation.get("hidden") or []]
     pairs = [" and ".join(explanation_words([c]) for c in p["between"]) for p in excitation.get("inseparable") or []]
-    small = "effects too small to be seen at their typical size"
-    for title, items in ((small, hidden), ("pairs of effects with the same signature", pairs)):
+    small = "Effects that these inputs do not show at their typical size"
+    for title, items in ((small, hidden), ("Pairs of effects with the same signature under these inputs", pairs)):
         if items:
             listed = tag("ul", *(tag("li", item) for item in items[:MOST_LISTED]))
-            blocks.append(folded(f"With these inputs: {len(items)} {title}", listed))
+            blocks.append(folded(f"{title}: {len(items)}", listed))
     return Section("Limits of these inputs", blocks) if blocks else None
 
 
