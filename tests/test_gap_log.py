@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -18,7 +19,7 @@ from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.jobs.gap import run_gap
 from fdi_torch.jobs.gap_replay import removed_options, settings_of
-from fdi_torch.logbook import own_signals, read_run
+from fdi_torch.logbook import own_signals, read_run, series
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.recordings.csv_files import write_csv
 from fdi_torch.report.material import gather
@@ -49,6 +50,9 @@ def test_a_gap_log_contains_the_whole_answer(logged: Path) -> None:
     assert re.fullmatch(said, headline(found))
     assert found.of("/gap/where")[0]["location"] == found.answer["where"][0]["location"]
     assert found.arrays["holdout_augmented"].shape == (300, 3)
+    for root, array in (("/estimate", "augmented"), ("/estimate/holdout", "holdout_augmented")):
+        predicted = series(log, f"{root}/output")
+        assert np.array_equal(np.stack([predicted[name] for name in ("h1", "h2", "h3")], 1), found.arrays[array])
 
 
 def test_a_verdict_replays_from_its_log_to_the_last_bit(logged: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -59,6 +59,8 @@ def run_gap(
         with one_thread():
             answer = solve_problem(case, say)
         log_answer(log, answer.to_dict(), answer.arrays)
+        for group, each in zip(groups(len(holdouts), len(recordings)), every, strict=True):
+            log_predictions(log, each, answer.arrays, group)
     return answer
 
 
@@ -73,6 +75,13 @@ def log_recording(log: RunLog, recording: Recording, group: str) -> None:
     r = recording
     names = (r.input_names, r.output_names, r.input_units, r.output_units)
     log.recording(r.time, r.inputs, r.outputs, *names, mask=r.mask, hold=r.hold, group=group)
+
+
+def log_predictions(log: RunLog, recording: Recording, arrays: Mapping[str, Tensor], group: str) -> None:
+    """Log the readings that the plant with the named causes predicts, where the answer has them."""
+    predicted, r = arrays.get(f"{group}_augmented" if group else "augmented"), recording
+    if predicted is not None and predicted.shape == r.outputs.shape:
+        log.predictions(r.time, r.outputs, predicted, r.output_names, r.output_units, mask=r.mask, group=group)
 
 
 def log_answer(log: RunLog, answer: Mapping[str, Any], arrays: Mapping[str, Tensor]) -> None:
