@@ -1,4 +1,4 @@
-"""Three intervals of each parameter of the built-in example, and the profiles of a ridge: `python -m benchmarks.uncertainty`.
+"""Intervals of the parameters of the built-in example, and profiles of a ridge: `python -m benchmarks.uncertainty`.
 
 Prints the table and draws the picture of docs/explanation/uncertainty.md; seed 1, as in the run file.
 """
