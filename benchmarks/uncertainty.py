@@ -1,6 +1,6 @@
-"""Three intervals of each parameter of the built-in example and of one at a ridge: `python -m benchmarks.uncertainty`.
+"""Intervals of the parameters of the built-in example, and profiles of a ridge: `python -m benchmarks.uncertainty`.
 
-Prints the table and draws the picture (of the ridge) of docs/explanation/uncertainty.md; seed 1, as in the run file.
+Prints the table and draws the picture of docs/explanation/uncertainty.md; seed 1, as in the run file.
 """
 
 from __future__ import annotations
@@ -58,4 +58,6 @@ def rows(name: str, *overrides: str) -> TrainResult:
 
 if __name__ == "__main__":
     rows("example", FASTER)
-    rows("ridge", FASTER, *RIDGE)
+    with TemporaryDirectory() as where:
+        ridge = fdi_torch.train(fdi_torch.load_run(None, [FASTER, *RIDGE, f"output.folder={where}"]))
+    print(ridge, *(profile.headline for profile in ridge.profile()), sep="\n")
