@@ -40,9 +40,12 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def with_error(value: float, std: float) -> str:
-    """'0.3000 ± 0.0020': the error with two digits, the value with as many decimals."""
+    """'0.3000 ± 0.0020', '(2.44 ± 0.24)·10⁻⁷': the error with two digits, the value with as many decimals."""
     if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
         return number(value)
+    if (largest := max(abs(value), std)) < 1e-3:
+        exponent = math.floor(math.log10(largest))
+        return f"({with_error(value / 10.0**exponent, std / 10.0**exponent)})·10{str(exponent).translate(_RAISED)}"
     digits = min(max(1 - math.floor(math.log10(std)), 0), 12)
     return _minus(f"{value:.{digits}f} ± {std:.{digits}f}") if abs(value) < 1e9 else f"{number(value)} ± {std:.2g}"
 
