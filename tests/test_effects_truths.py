@@ -33,7 +33,8 @@ def local(head: float, level: float = 0.5) -> Local:
     """A place with 1 m^2.5/s of capacity under a tank 1 m tall, roots drawn smooth below 1e-9 m."""
     one, zero, clock = number(1.0), number(0.0), Clock(number(0.0), number(1.0), number(1.0))
     constants = {"area": number(0.01), "max_flow": number(1e-4)}
-    return Local(clock, number(level), zero, number(head), one, one, zero, number(1e-9), one, number(9.81), constants)
+    flow = (number(head), one, one, zero, number(1e-9))
+    return Local(clock, number(level), zero, *flow, height=one, area=one, gravity=number(9.81), constants=constants)
 
 
 def through(actuator: Effect, commands: list[float], step: float, p: dict[str, Tensor]) -> list[float]:

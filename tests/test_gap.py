@@ -202,7 +202,7 @@ def test_a_pair_of_tanks_is_accepted_in_either_order() -> None:
     ("names", "left_out", "message"),
     [
         (("pump_lagg",), (), "the nearest is 'pump_lag'"),
-        (("pump_lag@T1",), (), "expected a place of kind pump, got T1"),
+        (("pump_lag@T1",), (), "expected a place of kind pump or transfer, got T1"),
         (("pump_lag",), ("pump_lag",), "expected at least one effect"),
         (("pump_lag@Q9",), (), "library: pump_lag@Q9: expected a place of plant three_tank .*got 'Q9'"),
         (("pump_lag@",), (), "expected a place after the @"),

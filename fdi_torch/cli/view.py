@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import webbrowser
+from contextlib import suppress
 from pathlib import Path
 
 from fdi_torch.cli import DONE
@@ -18,8 +19,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         screen.result({"format": "fdi_torch.view/1", "address": address})
         if arguments.open:
             webbrowser.open(address)
-        try:
+        with suppress(KeyboardInterrupt):  # the usual end
             serve()
-        except KeyboardInterrupt:  # the usual end
-            screen.note("ended")
+        screen.note("ended")
     return DONE

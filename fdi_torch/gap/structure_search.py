@@ -13,7 +13,7 @@ wrong equation.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -211,12 +211,13 @@ class ExplanationPool:
     def _relevant(self, parent: RankedExplanation, key: Key) -> bool:
         """Whether an extension of `parent` is expected to come within RARE of the best explanation.
 
-        Before any extension of `parent` is fitted, those of all explanations tell by how much more they may gain.
+        It may gain more than its first-order gain by the largest factor among all extensions that were fitted so far.
         """
         best = max(e.log_evidence for e in self.explanations.values())
+        pairs = [pair for k in self._expected_gains for pair in self._gains(k)]
+        factor = max([1.0, *(actual / gain for actual, gain in pairs if gain > PRIOR_GAIN)])
         expected = self._expected_gains[parent.key][key]
-        ratio = _gain_ratio([pair for k in self._expected_gains for pair in self._gains(k)])
-        return ratio * expected.gain + expected.prior + parent.log_evidence - best > math.log(RARE)
+        return factor * expected.gain + expected.prior + parent.log_evidence - best > math.log(RARE)
 
     def _improves(self, fit: Fit, costs: Mapping[Key, float]) -> bool:
         """Whether a fit gains more than its prior odds cost, against every explanation that it contains.
@@ -281,21 +282,21 @@ class ExplanationPool:
         """
         best = max(self.explanations.values(), key=lambda e: e.log_evidence)
         for key, expected_gains in self._expected_gains.items():
-            parent, ratio = self.explanations[key], _gain_ratio(self._gains(key))
+            # The effects of the best explanation, which are true if it is, gain more than others.
+            parent, true = self.explanations[key], {key | {cause} for cause in best.key}
+            ratio = _gain_ratio(self._gains(key, true))
             behind = best.log_evidence - parent.log_evidence
             for k, expected in expected_gains.items():
                 if k not in self.explanations:
                     yield ratio * expected.gain + expected.prior - behind, parent, expected
 
-    def _gains(self, key: Key) -> list[tuple[float, float]]:
-        """Actual and first-order gains of the fitted extensions of an explanation, without those that only add to the
-        effects of the best explanation."""
-        best = max(self.explanations.values(), key=lambda e: e.log_evidence)
+    def _gains(self, key: Key, without: Collection[Key] = ()) -> list[tuple[float, float]]:
+        """Actual and first-order gains of the fitted extensions of an explanation."""
         evidence = self.explanations[key].log_evidence
         return [
             (self.explanations[k].log_evidence - evidence - expected.prior, expected.gain)
             for k, expected in self._expected_gains[key].items()
-            if k in self.explanations and not k - key <= best.key
+            if k in self.explanations and k not in without
         ]
 
 

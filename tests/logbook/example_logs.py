@@ -44,6 +44,7 @@ def write_everything(log: RunLog, samples: int = 50) -> None:
         mask=mask,
         hold="linear",
     )
+    log.write("/source/clock", {"origin": 1.7e9}, 0.0)
     log.sample("/plant/truth", 0.0, {"T1.leak.size": 0.1}, {"T1.leak.size": "1"})
     levels = ("h1", "h2", "h3")
     log.residual(1.0, dict.fromkeys(levels, 1e-3), dict.fromkeys(levels, 4.2), {"h1": 5.0}, dict.fromkeys(levels, "m"))

@@ -32,7 +32,7 @@ OTHER_WAYS = [
     ("windows", "train", "ec97452a9f695053", "86e9be987de96a9b"),
     ("what_if", "train", "eb514534738c4dc9", "dfa3e0fa705884bc"),
 ]
-ADDED_LATER = {"/estimate/output", "/estimate/residual"}
+ADDED_LATER = {"/estimate/output", "/estimate/residual", "/source/clock"}
 
 
 def test_format_1_is_the_file_it_was() -> None:
