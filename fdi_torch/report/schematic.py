@@ -60,7 +60,7 @@ class _Drawing:
         beside_left = [len(short(c.name, 16)) for c in plant.flow_components() if c.order > FlowOrder.BY_LEVELS]
         aside = ASIDE + LANE * len(beside_left) + LETTER * max(beside_left) if beside_left else 0.0
         left, right = -max(margin, aside), (columns - 1) * COLUMN + max(margin, 0.8 + LETTER * beside)
-        flows = plant.flow_components()
+        flows = list(plant.flow_components())
         above, below = (
             LINE * max((len(self.diagnosis(c.name)) for c in flows if (c.source == OUTSIDE) is outside), default=0)
             for outside in (True, False)
