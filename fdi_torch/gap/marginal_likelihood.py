@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -25,6 +26,15 @@ from fdi_torch.gap.dataset import interpolate
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+
+
+@dataclass(frozen=True)
+class LinearParameters:
+    """Parameters in which the readings are linear. columns (S, C, M): derivatives of the readings by them. pull (M,):
+    root of the precision of their normal priors about zero."""
+
+    columns: Tensor
+    pull: Tensor
 
 
 def with_estimated_noise(
@@ -48,26 +58,25 @@ def estimate_disturbances(
     fitter: Fitter,
     fit: Fit,
     linearised: Linearised,
-    explained: Tensor | None = None,
+    further: LinearParameters | None = None,
     start: StateNoise | None = None,
     climb: bool = True,
 ) -> Likelihood:
     """The most likely disturbance noise about a linearised trajectory, with the parameters of a fit profiled out.
 
-    explained (S, C): further part of the readings that is explained.
+    further: coefficients that are profiled out as well.
     """
     data = fitter.data
     scale, weight, deviation = fitter.priors(fit.space, fit.theta)
     propagation, sensors = propagation_of(fitter, fit, linearised), _sensors(fitter)
-    residual = data.readings - linearised.readings[0]
-    if explained is not None:
-        residual = residual - explained
+    residual, jacobian = data.readings - linearised.readings[0], linearised.jacobian[0] * scale
+    if further is not None:
+        jacobian = torch.cat([jacobian, further.columns], dim=-1)
+        weight, deviation = torch.cat([weight, further.pull]), torch.cat([deviation, torch.zeros_like(further.pull)])
     # Unit of the flows: it moves a level by a tenth of the sensor noise from one sample to the next.
     gains = propagation.output.abs().amax(dim=0).amax(dim=-1).clamp(min=1e-12)
     unit = _areas(fitter) * float((sensors.std / gains).median()) / (10.0 * propagation.interval)
-    return estimate_state_noise(
-        propagation, sensors, residual, linearised.jacobian[0] * scale, weight, deviation, unit, start, climb
-    )
+    return estimate_state_noise(propagation, sensors, residual, jacobian, weight, deviation, unit, start, climb)
 
 
 def predicted_levels(fitter: Fitter, fit: Fit) -> Tensor:

@@ -25,12 +25,12 @@ from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import SCATTER, StateNoise, Wander
 from fdi_torch.estimate.state_noise import CORRELATION_TIMES, LOG_BOUND
 from fdi_torch.gap.candidate_fit import Fit, Fitter
-from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression, normal_equations
+from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression, WhitenedDiscrepancy
 from fdi_torch.gap.localization.fine_positions import with_best_position
 from fdi_torch.gap.localization.regressors import dominant_period
 from fdi_torch.gap.localization.single_regressor_gain import largest_influence, single_regressor_gains
-from fdi_torch.gap.localization.sparse_regression import SparseFit, column_costs, sparse_fit
-from fdi_torch.gap.marginal_likelihood import estimate_disturbances, occam, with_disturbances
+from fdi_torch.gap.localization.sparse_regression import SparseFit, column_costs
+from fdi_torch.gap.marginal_likelihood import LinearParameters, estimate_disturbances, occam, with_disturbances
 from fdi_torch.simulate.collocation import Linearised
 
 HARMONICS = 3  # of a dominant period of the residual
@@ -74,15 +74,16 @@ def localize(
     first_order = _first_order_gains(regression, starts, fit, places, base)
 
     def evaluate(discrepancy: Discrepancy, place: str, noise: StateNoise, under: Fitter) -> _EvaluatedDiscrepancy:
-        equations = normal_equations(under, fit, discrepancy)
-        regressed = sparse_fit(equations.gram, equations.score, column_costs(discrepancy.choices, largest))
+        costs = column_costs(discrepancy.choices, largest)
+        regressed = WhitenedDiscrepancy(under, fit, discrepancy).sparse_fit(costs)
         likelihood = _likelihood(under, fit, discrepancy.linearised) + noise.log_prior()
         gain = likelihood + regressed.evidence - base
         return _EvaluatedDiscrepancy(place, noise, under, discrepancy, regressed, gain)
 
     def with_likely_noise(known: _EvaluatedDiscrepancy, climb: bool) -> _EvaluatedDiscrepancy:
-        at = known.discrepancy
-        likely = estimate_disturbances(fitter, fit, at.linearised, known.explained, known.noise, climb=climb).noise
+        at, used = known.discrepancy, known.regressed.used
+        further = LinearParameters(at.columns[..., used], torch.sqrt(known.regressed.precision[used]))
+        likely = estimate_disturbances(fitter, fit, at.linearised, further, known.noise, climb).noise
         return evaluate(at, known.location, likely, with_disturbances(fitter, fit, likely))
 
     def with_finer_position(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:

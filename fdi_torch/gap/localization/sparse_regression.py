@@ -6,9 +6,8 @@ residual r, columns C, G = C'C, b = C'r and noise of unit variance,
     log E = b'S b / 2 + log det(S) / 2 + sum log(a) / 2,   S = (G + diag(a))^-1,
 
 over the columns that are used, each of which has a cost (`column_costs`). Their difference is maximised one column at a
-time: the column whose addition, removal or
-re-estimation gains most is changed until nothing gains (Tipping and Faul, 2003, "Fast marginal likelihood maximisation
-for sparse Bayesian models").
+time: the column whose addition, removal or re-estimation gains most is changed until nothing gains (Tipping and Faul,
+2003, "Fast marginal likelihood maximisation for sparse Bayesian models").
 """
 
 from __future__ import annotations
@@ -28,11 +27,22 @@ MOST_CHANGES = 500  # a guard against cycles by rounding
 @dataclass(frozen=True)
 class SparseFit:
     """evidence: log evidence against no coefficients, less the costs. mean (M,): posterior means of the coefficients.
-    used (M,) bool."""
+    precision (M,): of their priors, infinite for a column that is not used."""
 
     evidence: float
     mean: Tensor
-    used: Tensor
+    precision: Tensor
+
+    @property
+    def used(self) -> Tensor:
+        """Whether each column is used, (M,) bool."""
+        return torch.isfinite(self.precision)
+
+    def among(self, columns: Tensor) -> SparseFit:
+        """The fit of some columns as a fit of all. columns (M,) bool: those that were fitted."""
+        mean, precision = torch.zeros(columns.shape).to(self.mean), torch.full(columns.shape, math.inf).to(self.mean)
+        mean[columns], precision[columns] = self.mean, self.precision
+        return SparseFit(self.evidence, mean, precision)
 
 
 def column_costs(choices: Tensor, largest: float) -> Tensor:
@@ -52,7 +62,7 @@ def sparse_fit(gram: Tensor, score: Tensor, costs: Tensor) -> SparseFit:
     visible, size = size > VISIBLE, torch.sqrt(size.clamp(min=VISIBLE))
     unit, target = gram / size.unsqueeze(1) / size, score / size
     precision = torch.full_like(target, math.inf)
-    for _ in range(MOST_CHANGES):
+    for _ in range(MOST_CHANGES if len(target) else 0):
         gain, updated = _changes(unit, target, precision, costs)
         gain = torch.where(visible, gain, -math.inf)
         best = int(gain.argmax())
@@ -63,7 +73,7 @@ def sparse_fit(gram: Tensor, score: Tensor, costs: Tensor) -> SparseFit:
     posterior = _Posterior.of(unit, target, precision)
     evidence = 0.5 * float(target @ posterior.mean) - posterior.half_log_det
     evidence += 0.5 * float(torch.log(precision[used]).sum()) - float(costs[used].sum())
-    return SparseFit(evidence, posterior.mean / size, used)
+    return SparseFit(evidence, posterior.mean / size, precision * size.square())
 
 
 def _changes(unit: Tensor, target: Tensor, precision: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
