@@ -74,7 +74,8 @@ def test_large_random_flows_are_no_unknown_cause(flow: float, hold: int, seed: i
     under, likely = with_estimated_noise(fitter, null)
     found = localize(under, null, likely.noise, possible_places(nominal_plant()))
     odds = ODDS.unknown / len(possible_places(nominal_plant()))
-    assert found and sum(odds * math.exp(place.gain) for place in found) < 0.5
+    gains = [place.gain - found.itself for place in found.discrepancies]
+    assert gains and sum(odds * math.exp(gain) for gain in gains) < 0.5
 
 
 def diagnosed(recording: Recording) -> Answer:
@@ -95,9 +96,10 @@ def test_random_flows_are_no_gap(flow: float, hold: int) -> None:
         assert times == [0.0] * 3 and sizes == pytest.approx([flow] * 3, rel=0.3)
 
 
-def test_a_plugging_in_mid_record_is_named_despite_random_flows() -> None:
+def test_a_plugging_in_mid_record_is_found_despite_random_flows() -> None:
+    """An unknown law of the pipe that begins at one time says nearly the same."""
     answer = diagnosed(recorded(1.5e-6, 15, seed=5, plugged=0.4, onset=350.0))
-    assert answer.verdict == "named"
+    assert answer.posterior[0].probability > 0.9 and answer.where[0] == ("P13", pytest.approx(1.0, abs=0.03))
     (cause,) = answer.causes
     assert (cause.effect, cause.location) == ("plugging", "P13")
     size, onset = cause.parameters["size"], cause.parameters["onset"]

@@ -108,7 +108,7 @@ def test_a_slow_pump_is_distinguished_from_its_tank() -> None:
     case = problem_of(nominal_plant(), (recorded({"Q2.actuator_slew.slowness": 3e6}, 4),), (), Settings())
     fitter, null, _ = recalibrate(case.data)
     own, likely = with_estimated_noise(fitter, null)
-    found = localize(own, null, likely.noise, ("Q2", "T2", "OUT2"))
+    found = localize(own, null, likely.noise, ("Q2", "T2", "OUT2")).discrepancies
     assert found[0].location == "Q2"
     assert sorted(place.location for place in found) == ["OUT2", "Q2", "T2"]
 
@@ -148,7 +148,7 @@ def test_a_rounding_error_is_no_unknown_cause() -> None:
     fitter, fit, steps = recalibrate(problem_of(nominal_plant(), (run,), (), Settings()).data)
     assert [step > 0.0 for step in steps] == [False, False, True]
     under, likely = with_estimated_noise(fitter, fit)
-    assert not localize(under, fit, likely.noise, ["h3"])
+    assert not localize(under, fit, likely.noise, ["h3"]).discrepancies
 
 
 def test_a_sensor_that_drifts_by_more_than_its_rounding_is_unknown() -> None:
@@ -157,4 +157,4 @@ def test_a_sensor_that_drifts_by_more_than_its_rounding_is_unknown() -> None:
     run.outputs[:, 2] = (run.outputs[:, 2] / 0.02).round() * 0.02
     fitter, fit, _ = recalibrate(problem_of(nominal_plant(), (run,), (), Settings()).data)
     under, likely = with_estimated_noise(fitter, fit)
-    assert localize(under, fit, likely.noise, ["h3"])[0].gain > 10.0
+    assert localize(under, fit, likely.noise, ["h3"]).discrepancies[0].gain > 10.0

@@ -48,9 +48,9 @@ def with_estimated_noise(
     return with_disturbances(fitter, fit, likely.noise), likely
 
 
-def with_disturbances(fitter: Fitter, fit: Fit, noise: StateNoise) -> Fitter:
-    """The fitter with this disturbance noise, propagated along the trajectory of a fit."""
-    whitening = KalmanWhitening(propagation_of(fitter, fit, fit.linearised), _sensors(fitter), noise)
+def with_disturbances(fitter: Fitter, fit: Fit, noise: StateNoise, linearised: Linearised | None = None) -> Fitter:
+    """The fitter with this disturbance noise, propagated along a linearised trajectory, by default that of the fit."""
+    whitening = KalmanWhitening(propagation_of(fitter, fit, linearised or fit.linearised), _sensors(fitter), noise)
     return Fitter(fitter.data, fitter.noise, whitening)
 
 

@@ -87,6 +87,10 @@ def posterior_of(
         for explanation in {e.key: e for e in (likeliest, result.best, result.null)}.values():
             hypotheses += _with_unknowns(pool, result, explanation, places, len(places), _likeliest(hypotheses))
         hypotheses += _with_fewer_effects(pool, result, _likeliest(hypotheses), len(places))
+        least = _likeliest(hypotheses).weight + math.log(RARE)
+        hypotheses += [
+            _about_predicted_levels(h.explanation) for h in hypotheses if h.place is None and h.weight > least
+        ]
     best: dict[tuple[frozenset[CauseName], str | None], CauseHypothesis] = {}
     for h in hypotheses:
         key = frozenset(canonical(c, plant) for c in h.causes), h.unknown_at
@@ -102,6 +106,12 @@ def _likeliest(hypotheses: Sequence[CauseHypothesis]) -> CauseHypothesis:
     return max(hypotheses, key=lambda h: h.weight)
 
 
+def _about_predicted_levels(explanation: RankedExplanation) -> CauseHypothesis:
+    """An explanation linearised where discrepancies are, so that their gains do not contain that of another point."""
+    gain = localize(explanation.fitter, explanation.fit, explanation.noise, (), math.inf).itself
+    return CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + gain)
+
+
 def _with_unknowns(
     pool: ExplanationPool,
     result: SearchResult,
@@ -112,8 +122,9 @@ def _with_unknowns(
 ) -> list[CauseHypothesis]:
     """An explanation with an unknown discrepancy at each of some places, as far as relevant against the best."""
     needed = best.weight + math.log(RARE) - explanation.log_weight - math.log(ODDS.unknown / places)
-    discrepancies = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed)
-    return [_with_unknown(pool.fitter, result, explanation, place, places) for place in discrepancies]
+    found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed)
+    itself = CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + found.itself)
+    return [itself, *(_with_unknown(pool.fitter, result, explanation, d, places) for d in found.discrepancies)]
 
 
 def _with_unknown(

@@ -55,41 +55,54 @@ class LocalizedDiscrepancy:
     noise: StateNoise
 
 
+@dataclass(frozen=True)
+class Localization:
+    """discrepancies: of the places that may be relevant, the likeliest first. itself: gain in log evidence of the fit
+    without a discrepancy, if it is linearised where the discrepancies are, and not about its own trajectory."""
+
+    discrepancies: tuple[LocalizedDiscrepancy, ...]
+    itself: float
+
+
 def localize(
     fitter: Fitter, fit: Fit, noise: StateNoise, places: Sequence[str], needed: float = -math.inf
-) -> list[LocalizedDiscrepancy]:
-    """Evaluate the places and return the likeliest first.
+) -> Localization:
+    """Evaluate a discrepancy at each of the places.
 
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
-    the result is empty if no discrepancy can reach it.
+    there are none in the result if none can reach it.
     """
     base = _likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     period = dominant_period(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
     periods = tuple(period / k for k in range(1, HARMONICS + 1)) if period else ()
     regression = DiscrepancyRegression(fitter, fit, periods, STEPS)
+    if not math.isfinite(base + _evidence(fitter, fit, noise, regression.linearised)):
+        return Localization((), 0.0)
+    likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
+    itself = max(_evidence(fitter, fit, likely, regression.linearised) - base, 0.0)
     if _evidence_bound(fitter, fit, noise, regression.steps) - base < needed:
-        return []
+        return Localization((), itself)
     generator, largest = torch.Generator().manual_seed(0), largest_influence(fitter)
-    starts = [(n, with_disturbances(fitter, fit, n)) for n in (noise, _nearly_without_disturbances(noise))]
+    starts = (likely, _nearly_without_disturbances(likely))
     first_order = _first_order_gains(regression, starts, fit, places, base)
 
-    def evaluate(discrepancy: Discrepancy, place: str, noise: StateNoise, under: Fitter) -> _EvaluatedDiscrepancy:
+    def evaluate(discrepancy: Discrepancy, place: str, noise: StateNoise) -> _EvaluatedDiscrepancy:
+        under = with_disturbances(fitter, fit, noise, discrepancy.linearised)
         costs = column_costs(discrepancy.choices, largest)
         regressed = WhitenedDiscrepancy(under, fit, discrepancy).sparse_fit(costs)
-        likelihood = _likelihood(under, fit, discrepancy.linearised) + noise.log_prior()
-        gain = likelihood + regressed.evidence - base
-        return _EvaluatedDiscrepancy(place, noise, under, discrepancy, regressed, gain)
+        without = _likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - base
+        return _EvaluatedDiscrepancy(place, noise, under, discrepancy, regressed, without)
 
     def with_likely_noise(known: _EvaluatedDiscrepancy, climb: bool) -> _EvaluatedDiscrepancy:
         at, used = known.discrepancy, known.regressed.used
         further = LinearParameters(at.columns[..., used], torch.sqrt(known.regressed.precision[used]))
         likely = estimate_disturbances(fitter, fit, at.linearised, further, known.noise, climb).noise
-        return evaluate(at, known.location, likely, with_disturbances(fitter, fit, likely))
+        return evaluate(at, known.location, likely)
 
     def with_finer_position(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
         used = known.regressed.used
         finer = with_best_position(regression, known.location, known.under, fit, known.discrepancy, used, generator)
-        return evaluate(finer, known.location, known.noise, known.under) if finer else known
+        return evaluate(finer, known.location, known.noise) if finer else known
 
     localized: list[LocalizedDiscrepancy] = []
     # Largest differences seen so far: gain less its first-order estimate, and gain from further noise and positions.
@@ -98,7 +111,7 @@ def localize(
         if len(localized) >= CALIBRATION_PLACES and first_order[place] + excess < needed:
             break
         start = regression.of(place)
-        best = first = max((evaluate(start, place, *each) for each in starts), key=_gain)
+        best = first = max((evaluate(start, place, each) for each in starts), key=_gain)
         for turn in range(MOST_TURNS):
             if len(localized) >= CALIBRATION_PLACES and best.gain + further_gain < needed:
                 break
@@ -106,71 +119,77 @@ def localize(
             best = max(best, with_finer_position(best), key=_gain)
             if best.gain < before.gain + CONVERGED:
                 break
+        itself = max(itself, first.without, best.without)
         excess, further_gain = max(excess, best.gain - first_order[place]), max(further_gain, best.gain - first.gain)
         if not _is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
             needed = max(needed, best.gain + math.log(RARE))
             localized.append(LocalizedDiscrepancy(place, best.gain, _effect_size(fitter, best), periods, best.noise))
-    random = [*_drifting_sensors(fitter, fit, noise, places, base, needed)]
-    random += _random_flows(fitter, fit, noise, places, base)
+    random = [*_drifting_sensors(regression, likely, places, base, needed)]
+    random += _random_flows(regression, likely, places, base)
     for process in random:
         localized = [p for p in localized if p.location != process.location or p.gain > process.gain]
         if all(p.location != process.location for p in localized):
             localized.append(process)
-    return sorted(localized, key=_gain, reverse=True)
+    return Localization(tuple(sorted(localized, key=_gain, reverse=True)), itself)
 
 
 def _random_flows(
-    fitter: Fitter, fit: Fit, noise: StateNoise, places: Sequence[str], base: float
+    regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float
 ) -> list[LocalizedDiscrepancy]:
     """The tank with the largest disturbance, if more likely an unknown flow than one of the disturbances of the plant.
 
     The prior of its logarithm is uniform over the range of the estimate instead of normal about the others'.
     """
+    fitter, fit, linearised = regression.fitter, regression.fit, regression.linearised
     largest = int(noise.intensity.argmax())
     tank = fitter.data.plant.tanks[largest].name
     if tank not in places or len(noise.intensity) < 2:
         return []
     start = replace(noise, apart=largest)
-    apart = estimate_disturbances(fitter, fit, fit.linearised, start=start).noise
-    under = with_disturbances(fitter, fit, apart)
+    apart = estimate_disturbances(fitter, fit, linearised, start=start).noise
     cost = math.log(2.0 * LOG_BOUND / (SCATTER * math.sqrt(2.0 * math.pi)))
-    gain = _likelihood(under, fit, fit.linearised) + apart.log_prior() - base - cost
-    return [LocalizedDiscrepancy(tank, gain, _moved(under, fit), (), apart)]
+    gain = _evidence(fitter, fit, apart, linearised) - base - cost
+    size = _moved(with_disturbances(fitter, fit, apart, linearised), linearised)
+    return [LocalizedDiscrepancy(tank, gain, size, (), apart)]
 
 
-def _moved(fitter: Fitter, fit: Fit) -> float:
+def _moved(fitter: Fitter, linearised: Linearised) -> float:
     """Norm of what the disturbances move the readings by, in units of the sensor noise."""
     assert fitter.whitening is not None
     plant = fitter.data.plant
-    moved = fitter.whitening.smoothed(fitter.data.readings - fit.linearised.readings[0])
+    moved = fitter.whitening.smoothed(fitter.data.readings - linearised.readings[0])
     names = [t.name for t in plant.tanks]
     of_sensors = moved[:, [names.index(s.tank) for s in plant.sensors]]
     return float(torch.linalg.vector_norm(torch.where(fitter.data.mask, of_sensors, 0.0) / fitter.noise.std))
 
 
 def _drifting_sensors(
-    fitter: Fitter, fit: Fit, noise: StateNoise, places: Sequence[str], base: float, needed: float
+    regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float, needed: float
 ) -> list[LocalizedDiscrepancy]:
     """Sensors with a drift, as far as their gain in evidence can be relevant."""
-    sensors = [s.name for s in fitter.data.plant.sensors]
+    fitter, fit = regression.fitter, regression.fit
 
     def evaluate(noise: StateNoise) -> LocalizedDiscrepancy:
         assert noise.wander is not None
-        likelihood = _likelihood(with_disturbances(fitter, fit, noise), fit, fit.linearised) + noise.log_prior()
-        gain = likelihood - base - _drift_cost(fitter, noise.wander)
-        return LocalizedDiscrepancy(sensors[noise.wander.channel], gain, _drift_size(fitter, noise.wander), (), noise)
+        sensor = fitter.data.plant.sensors[noise.wander.channel].name
+        gain = _evidence(fitter, fit, noise, regression.at(sensor)[1]) - base - _drift_cost(fitter, noise.wander)
+        return LocalizedDiscrepancy(sensor, gain, _drift_size(fitter, noise.wander), (), noise)
+
+    def most_likely(start: LocalizedDiscrepancy) -> LocalizedDiscrepancy:
+        linearised = regression.at(start.location)[1]
+        return evaluate(estimate_disturbances(fitter, fit, linearised, start=start.noise).noise)
 
     starts = [
-        _initial_drift(fitter, fit, _nearly_without_disturbances(noise), sensors.index(p))
+        _initial_drift(fitter, regression.at(p)[1], _nearly_without_disturbances(noise), channel)
         for p in places
-        if p in sensors
+        if (channel := regression.sensor(p)) is not None
     ]
     drifts: list[LocalizedDiscrepancy] = []
     noise_gain = 0.0
     for initial in sorted(map(evaluate, starts), key=_gain, reverse=True):
         if drifts and initial.gain + noise_gain < needed:
             break
-        best = max(initial, evaluate(_most_likely_drift(fitter, fit, initial.noise)), key=_gain)
+        best = max(initial, most_likely(initial), key=_gain)
         noise_gain = max(noise_gain, best.gain - initial.gain)
         needed = max(needed, best.gain + math.log(RARE))
         assert best.noise.wander is not None
@@ -181,15 +200,16 @@ def _drifting_sensors(
 
 def _first_order_gains(
     regression: DiscrepancyRegression,
-    starts: Sequence[tuple[StateNoise, Fitter]],
+    starts: Sequence[StateNoise],
     fit: Fit,
     places: Sequence[str],
     base: float,
 ) -> dict[str, float]:
     """Gain in log evidence of the best single regressor of each place, under the better of the noises."""
     gains = dict.fromkeys(places, -math.inf)
-    for _, under in starts:
-        offset = _likelihood(under, fit, regression.linearised) - base
+    for noise in starts:
+        under = with_disturbances(regression.fitter, fit, noise, regression.linearised)
+        offset = _likelihood(under, fit, regression.linearised) + noise.log_prior() - base
         for place, gain in single_regressor_gains(
             regression, under, fit, places, torch.Generator().manual_seed(0)
         ).items():
@@ -227,14 +247,21 @@ def _nearly_without_disturbances(noise: StateNoise) -> StateNoise:
 
 @dataclass(frozen=True)
 class _EvaluatedDiscrepancy:
-    """A discrepancy at a place under one disturbance noise, that of the fitter `under`."""
+    """A discrepancy at a place under one disturbance noise, that of the fitter `under`.
+
+    without, gain: in log evidence against the fit alone, without and with the discrepancy's regressors.
+    """
 
     location: str
     noise: StateNoise
     under: Fitter
     discrepancy: Discrepancy
     regressed: SparseFit
-    gain: float
+    without: float
+
+    @property
+    def gain(self) -> float:
+        return self.without + self.regressed.evidence
 
     @property
     def explained(self) -> Tensor:
@@ -247,9 +274,11 @@ def _gain(discrepancy: _EvaluatedDiscrepancy | LocalizedDiscrepancy) -> float:
 
 
 def _likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
-    """Log evidence of a fit about a linearised trajectory, without prior odds."""
+    """Log evidence of a fit about a linearised trajectory, without prior odds; minus infinity if it is not finite."""
     space, theta = fit.space, fit.theta
     residual, jacobian = (x[0] for x in fitter.white(linearised))
+    if not math.isfinite(fitter.log_det + float(residual.square().sum() + jacobian.square().sum())):
+        return -math.inf
     scale, pull, off = fitter.priors(space, theta)
     rows = torch.cat([(jacobian * scale).flatten(0, 1), torch.diag(pull + 1e-9)])
     target = torch.cat([residual.flatten(), -off])
@@ -258,20 +287,20 @@ def _likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
     return -0.5 * float(remaining @ remaining) - 0.5 * fitter.log_det + occam(fitter, space, theta, jacobian)
 
 
+def _evidence(fitter: Fitter, fit: Fit, noise: StateNoise, linearised: Linearised) -> float:
+    """Log evidence of a fit and a noise model about a linearised trajectory, without prior odds."""
+    return _likelihood(with_disturbances(fitter, fit, noise, linearised), fit, linearised) + noise.log_prior()
+
+
 SMALLEST_DRIFT = 0.1  # as a share of the sensor's noise
 
 
-def _initial_drift(fitter: Fitter, fit: Fit, quiet: StateNoise, channel: int) -> StateNoise:
+def _initial_drift(fitter: Fitter, linearised: Linearised, quiet: StateNoise, channel: int) -> StateNoise:
     """Start of the optimisation: the whole residual of the sensor is drift. quiet: nearly no random flows."""
     valid = fitter.data.mask[:, channel]
-    residual = (fitter.data.readings - fit.linearised.readings[0])[valid, channel]
+    residual = (fitter.data.readings - linearised.readings[0])[valid, channel]
     std = max(float(residual.square().mean().sqrt()), float(fitter.noise.std[channel]))
     return replace(quiet, wander=Wander(channel, std, CORRELATION_TIMES[3] * fitter.data.row_spacing))
-
-
-def _most_likely_drift(fitter: Fitter, fit: Fit, start: StateNoise) -> StateNoise:
-    """The most likely size and correlation time of the drift, together with the other noise."""
-    return estimate_disturbances(fitter, fit, fit.linearised, start=start).noise
 
 
 def _drift_cost(fitter: Fitter, drift: Wander) -> float:

@@ -1,7 +1,7 @@
 """Candidate regressors of a discrepancy: signals along a recording, many more than a discrepancy needs.
 
 - Functions of a local variable: hinges (piecewise linear) and steps.
-- Functions with memory: lags, backlash, stiction, rate limits, relays, decays after a change.
+- Functions with memory: lags, delays, backlash, stiction, rate limits, relays, decays after a change.
 - Functions of time: steps, ramps, and sinusoids.
 
 Times are those of bench-scale tanks; `scale` multiplies them for other plants (`plant.scales.time_scale`).
@@ -15,9 +15,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from fdi_torch.gap.dataset import interpolate
 from fdi_torch.simulate.scan import scan_in_time
 
 LAGS = (3.0, 10.0, 30.0, 100.0, 300.0)  # time constants, s
+DELAYS = (4.0, 8.0, 16.0, 32.0)  # s; neighbours together make a delay between them
 DECAY_TIMES = (10.0, 40.0, 160.0)  # s, of the decay after a step up or down
 BACKLASH_BANDS = (0.03, 0.08, 0.16, 0.3)  # backlash, as shares of the signal's range
 STICTION_BANDS = (0.1, 0.2, 0.3, 0.4)  # as shares of the signal's range
@@ -38,10 +40,11 @@ def steps_in_value(x: Tensor, ends: tuple[float, float], count: int) -> list[Ten
 
 
 def lags_and_decays(x: Tensor, step: Tensor, scale: float) -> list[Tensor]:
-    """Difference between lagged x and x, and decays after each rise and fall of x."""
+    """Difference between lagged or delayed x and x, and decays after each rise and fall of x."""
     change = torch.diff(x, prepend=x[:1])
     rises, falls = change.clamp(min=0.0), (-change).clamp(min=0.0)
     lagging = [lagged(x, step, scale * tau) - x for tau in LAGS]
+    lagging += [delayed(x, step, scale * tau) - x for tau in DELAYS]
     decays = [decayed(y, step, scale * tau) for tau in DECAY_TIMES for y in (rises, falls)]
     return [*lagging, *decays]
 
@@ -87,6 +90,12 @@ def lagged(x: Tensor, step: Tensor, tau: float) -> Tensor:
     """First-order lag of x (K,), initially at rest, at the end of each step."""
     keep = torch.exp(-step / tau)
     return _scanned(keep, (1.0 - keep) * x, x[0])
+
+
+def delayed(x: Tensor, step: Tensor, tau: float) -> Tensor:
+    """x (K,) as it was tau seconds before, initially at rest."""
+    times = torch.cumsum(step, dim=0)
+    return interpolate(times - tau, times, x)
 
 
 def decayed(x: Tensor, step: Tensor, tau: float) -> Tensor:
