@@ -51,7 +51,7 @@ class Overflow(Effect):
         tank = plant.component(place)
         assert isinstance(tank, Tank)
         low, high = operating_range.levels[place]
-        depths = [tank.height - level for level in (*interior_points((0.5 * (low + high), high), 3), high)]
+        depths = [tank.height - level for level in (*interior_points((low, high), 6), high)]
         above = _above(place, plant)
         others = [t.name for t in plant.tanks if t.name not in (place, tank.overflow_to, *above)]
         shares = [{}, *({f"to_{name}": 0.7} for name in others)]

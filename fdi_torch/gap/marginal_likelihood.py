@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -98,6 +98,20 @@ def predicted_levels(fitter: Fitter, fit: Fit) -> Tensor:
         levels[0, first : first + len(nodes)] += torch.stack(at_nodes, dim=1)
         first += len(nodes)
     return levels.clamp(min=0.0)
+
+
+def about_predicted_levels(fitter: Fitter, fit: Fit) -> tuple[Fitter, Fit]:
+    """A fit linearised about the levels that are predicted from earlier readings, and the fitter along these.
+
+    Where a cause is missing, its own trajectory is far from the true levels, and effects act elsewhere on it.
+    """
+    if fitter.whitening is None:
+        return fitter, fit
+    engine = fitter.engine(fit.candidate, list(fit.effect_values))
+    linearised = engine.linearise(fit.theta.unsqueeze(0), predicted_levels(fitter, fit))
+    along = with_disturbances(fitter, fit, fitter.whitening.noise, linearised)
+    finite = bool(linearised.readings.isfinite().all() and linearised.jacobian.isfinite().all())
+    return (along, replace(fit, linearised=linearised)) if finite else (fitter, fit)
 
 
 def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagation:

@@ -3,10 +3,11 @@
     log weight(S)    = log evidence of S + log prior of its random flows
     log weight(S, p) = log weight(S) + gain of a free discrepancy at p + log odds of an unknown there
 
-each under its most likely disturbance noise (`marginal_likelihood.py`, `localization/localize.py`). No library has the
-exact law of a rig (Brynjarsdottir and O'Hagan, 2014). A discrepancy at a place where S has an effect, and small
-compared with it, is therefore attributed to the effect, and its weight goes to S. A large one means that the law there
-is a different one: then the effects at that place are part of the unknown.
+each under its most likely disturbance noise (`marginal_likelihood.py`, `localization/localize.py`). An unknown is a law
+that no library has: if effects at the same place predict as well by Akaike's criterion, its weight goes to them. No
+library has the exact law of a rig (Brynjarsdottir and O'Hagan, 2014). A discrepancy at a place where S has an effect,
+and small compared with it, is therefore attributed to the effect, and its weight goes to S. A large one means that the
+law there is a different one: then the effects at that place are part of the unknown.
 """
 
 from __future__ import annotations
@@ -139,7 +140,20 @@ def _with_unknown(
     if here and _is_small(fitter, result, explanation, place, here):
         return CauseHypothesis(explanation, causes, weight)
     weight += math.log(ODDS.unknown / places)
+    for known in result.explanations:
+        same_place = {at for _, at in known.key - explanation.key} == {place.location}
+        if known.key > explanation.key and same_place and _fitness(known, explanation) >= place.fitness:
+            return CauseHypothesis(known, causes_in_order(known.fit), weight)
     return CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight, place)
+
+
+def _fitness(known: RankedExplanation, alone: RankedExplanation) -> float:
+    """Log likelihood of an explanation less one nat for each parameter (Akaike, 1974), over that of a smaller one."""
+
+    def likelihood(e: RankedExplanation) -> float:
+        return -0.5 * e.fit.cost - 0.5 * e.fitter.log_det + e.noise.log_prior() - len(e.fit.space)
+
+    return likelihood(known) - likelihood(alone)
 
 
 def _is_small(

@@ -44,12 +44,15 @@ CALIBRATION_PLACES = 3  # places always evaluated; they show by how much first-o
 class LocalizedDiscrepancy:
     """A discrepancy at one component, in addition to a fit.
 
-    gain: in log evidence against the fit alone, without prior odds. size: norm of its influence on the readings, in
-    units of the sensor noise. periods: of its harmonics, s. noise: most likely disturbance noise with the discrepancy.
+    gain: in log evidence against the fit alone, without prior odds. fitness: log likelihood less one nat for each
+    parameter of the discrepancy (Akaike, 1974), over that of the fit alone. size: norm of its influence on the
+    readings, in units of the sensor noise. periods: of its harmonics, s. noise: most likely disturbance noise with the
+    discrepancy.
     """
 
     location: str
     gain: float
+    fitness: float
     size: float
     periods: tuple[float, ...]
     noise: StateNoise
@@ -123,7 +126,9 @@ def localize(
         excess, further_gain = max(excess, best.gain - first_order[place]), max(further_gain, best.gain - first.gain)
         if not _is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
             needed = max(needed, best.gain + math.log(RARE))
-            localized.append(LocalizedDiscrepancy(place, best.gain, _effect_size(fitter, best), periods, best.noise))
+            localized.append(
+                LocalizedDiscrepancy(place, best.gain, best.fitness, _effect_size(fitter, best), periods, best.noise)
+            )
     random = [*_drifting_sensors(regression, likely, places, base, needed)]
     random += _random_flows(regression, likely, places, base)
     for process in random:
@@ -150,7 +155,7 @@ def _random_flows(
     cost = math.log(2.0 * LOG_BOUND / (SCATTER * math.sqrt(2.0 * math.pi)))
     gain = _evidence(fitter, fit, apart, linearised) - base - cost
     size = _moved(with_disturbances(fitter, fit, apart, linearised), linearised)
-    return [LocalizedDiscrepancy(tank, gain, size, (), apart)]
+    return [LocalizedDiscrepancy(tank, gain, gain + cost - 1.0, size, (), apart)]
 
 
 def _moved(fitter: Fitter, linearised: Linearised) -> float:
@@ -172,8 +177,8 @@ def _drifting_sensors(
     def evaluate(noise: StateNoise) -> LocalizedDiscrepancy:
         assert noise.wander is not None
         sensor = fitter.data.plant.sensors[noise.wander.channel].name
-        gain = _evidence(fitter, fit, noise, regression.at(sensor)[1]) - base - _drift_cost(fitter, noise.wander)
-        return LocalizedDiscrepancy(sensor, gain, _drift_size(fitter, noise.wander), (), noise)
+        gain, cost = _evidence(fitter, fit, noise, regression.at(sensor)[1]) - base, _drift_cost(fitter, noise.wander)
+        return LocalizedDiscrepancy(sensor, gain - cost, gain - 2.0, _drift_size(fitter, noise.wander), (), noise)
 
     def most_likely(start: LocalizedDiscrepancy) -> LocalizedDiscrepancy:
         linearised = regression.at(start.location)[1]
@@ -262,6 +267,10 @@ class _EvaluatedDiscrepancy:
     @property
     def gain(self) -> float:
         return self.without + self.regressed.evidence
+
+    @property
+    def fitness(self) -> float:
+        return self.without + self.regressed.reduction - float(self.regressed.used.sum())
 
     @property
     def explained(self) -> Tensor:

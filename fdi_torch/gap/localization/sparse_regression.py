@@ -26,10 +26,12 @@ MOST_CHANGES = 500  # a guard against cycles by rounding
 
 @dataclass(frozen=True)
 class SparseFit:
-    """evidence: log evidence against no coefficients, less the costs. mean (M,): posterior means of the coefficients.
-    precision (M,): of their priors, infinite for a column that is not used."""
+    """evidence: log evidence against no coefficients, less the costs. reduction: of half of chi-square by the
+    coefficients. mean (M,): posterior means of the coefficients. precision (M,): of their priors, infinite for a column
+    that is not used."""
 
     evidence: float
+    reduction: float
     mean: Tensor
     precision: Tensor
 
@@ -42,7 +44,7 @@ class SparseFit:
         """The fit of some columns as a fit of all. columns (M,) bool: those that were fitted."""
         mean, precision = torch.zeros(columns.shape).to(self.mean), torch.full(columns.shape, math.inf).to(self.mean)
         mean[columns], precision[columns] = self.mean, self.precision
-        return SparseFit(self.evidence, mean, precision)
+        return SparseFit(self.evidence, self.reduction, mean, precision)
 
 
 def column_costs(choices: Tensor, largest: float) -> Tensor:
@@ -71,9 +73,10 @@ def sparse_fit(gram: Tensor, score: Tensor, costs: Tensor) -> SparseFit:
         precision[best] = updated[best]
     used = torch.isfinite(precision)
     posterior = _Posterior.of(unit, target, precision)
-    evidence = 0.5 * float(target @ posterior.mean) - posterior.half_log_det
+    reduction = 0.5 * float(target @ posterior.mean)
+    evidence = reduction - posterior.half_log_det
     evidence += 0.5 * float(torch.log(precision[used]).sum()) - float(costs[used].sum())
-    return SparseFit(evidence, posterior.mean / size, precision * size.square())
+    return SparseFit(evidence, reduction, posterior.mean / size, precision * size.square())
 
 
 def _changes(unit: Tensor, target: Tensor, precision: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
