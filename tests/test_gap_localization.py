@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize
+from torch import Tensor
 
+from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.dataset import interpolate
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
+from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression, WhitenedDiscrepancy
 from fdi_torch.gap.localization.localize import localize
 from fdi_torch.gap.localization.regressors import (
     backlash,
     decayed,
+    delayed,
     dominant_period,
     hinges,
     lagged,
@@ -24,9 +30,10 @@ from fdi_torch.gap.localization.regressors import (
     relays,
     stiction,
 )
-from fdi_torch.gap.localization.sparse_regression import sparse_fit
-from fdi_torch.gap.marginal_likelihood import with_estimated_noise
+from fdi_torch.gap.localization.sparse_regression import column_costs, sparse_fit
+from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances, with_estimated_noise
 from fdi_torch.gap.problem import problem_of
+from fdi_torch.simulate.collocation import Linearised
 from tests.test_gap import noise, nominal_plant, recorded
 
 
@@ -46,6 +53,7 @@ def test_regressors_with_memory_follow_their_equations() -> None:
         [0.0, 0.0, 1.0, 1.0, 1.0],
         [0.0, 0.25, 1.75, 1.75, 0.25],
     ]
+    assert delayed(torch.tensor([1.0, 3.0, 5.0, 9.0]), step.float(), 3.0).tolist() == [1.0, 1.0, 2.0, 4.0]
     assert rate_limited(torch.tensor([0.0, 5.0, 5.0, 1.0]), step, 1.0).tolist() == [0.0, 2.0, 4.0, 2.0]
 
 
@@ -101,6 +109,57 @@ def test_the_evidence_is_the_largest_of_all_subsets_with_their_best_precisions()
             best = max(best, -float(found.fun) - float(costs[subset].sum()))
     fit = sparse_fit(columns.T @ columns, columns.T @ readings, costs)
     assert fit.evidence == pytest.approx(best, abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def far_from_the_plant() -> tuple[Fitter, Fit, StateNoise]:
+    """A recording that the recalibrated plant explains badly: its fitter, its fit, and the most likely noise."""
+    case = problem_of(nominal_plant(), (recorded({"Q2.pump_gain.factor": 1.3}, 4),), (), Settings())
+    fitter, null, _ = recalibrate(case.data)
+    own, likely = with_estimated_noise(fitter, null)
+    return own, null, likely.noise
+
+
+def test_noise_and_evidence_of_a_discrepancy_refer_to_one_trajectory(
+    far_from_the_plant: tuple[Fitter, Fit, StateNoise],
+) -> None:
+    fitter, fit, noise = far_from_the_plant
+    about = DiscrepancyRegression(fitter, fit, (), 20).linearised
+    likely = estimate_disturbances(fitter, fit, about, start=noise, climb=False)
+    under = with_disturbances(fitter, fit, likely.noise, about)
+    least = -0.5 * under.log_det + likely.noise.log_prior() - 0.5 * least_chi_square(under, fit, about)
+    assert likely.log_likelihood == pytest.approx(least, abs=1e-2)
+
+
+def test_every_sample_counts_in_the_weight_of_a_discrepancy(far_from_the_plant: tuple[Fitter, Fit, StateNoise]) -> None:
+    """Sums of neighbouring samples would lose chi-square in proportion to the misfit."""
+    fitter, fit, noise = far_from_the_plant
+    regression = DiscrepancyRegression(fitter, fit, (), 20)
+    quiet = replace(noise, intensity=1e-3 * noise.intensity)
+    under, discrepancy = with_disturbances(fitter, fit, quiet, regression.linearised), regression.of("Q2")
+    found = WhitenedDiscrepancy(under, fit, discrepancy).sparse_fit(column_costs(discrepancy.choices, 1e6))
+    used = found.used
+    rows = discrepancy.columns[..., used], torch.sqrt(found.precision[used])
+    gained = least_chi_square(under, fit, regression.linearised)
+    gained -= least_chi_square(under, fit, regression.linearised, *rows)
+    assert gained > 1e4
+    assert found.reduction == pytest.approx(0.5 * gained, abs=0.1)
+
+
+def least_chi_square(
+    under: Fitter, fit: Fit, about: Linearised, columns: Tensor | None = None, pull: Tensor | None = None
+) -> float:
+    """Least chi-square with priors over the parameters of a fit, and over coefficients of further columns if given."""
+    scale, root, deviation = under.priors(fit.space, fit.theta)
+    residual, jacobian = (x[0] for x in under.white(about))
+    design, weights, off = (jacobian * scale).flatten(0, 1), root, -deviation
+    if columns is not None and pull is not None:
+        design = torch.cat([design, under.whiten(columns).flatten(0, 1)], dim=1)
+        weights, off = torch.cat([weights, pull]), torch.cat([off, torch.zeros_like(pull)])
+    norm = torch.linalg.vector_norm(torch.cat([design, torch.diag(weights)]), dim=0)
+    rows, target = torch.cat([design, torch.diag(weights)]) / norm, torch.cat([residual.flatten(), off])
+    basis, _ = torch.linalg.qr(rows)
+    return float((target - basis @ (basis.T @ target)).square().sum())
 
 
 def test_a_slow_pump_is_distinguished_from_its_tank() -> None:

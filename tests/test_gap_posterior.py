@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 
 from fdi_torch.estimate.evidence import ODDS, posterior
-from fdi_torch.gap.diagnose import verdict_of
+from fdi_torch.gap.diagnose import Settings, diagnose, verdict_of
 from fdi_torch.gap.marginal_likelihood import log_prior
 from fdi_torch.gap.posterior import CauseHypothesis
+from tests.test_gap import nominal_plant, recorded
 
 
 def test_all_sets_of_effects_of_one_size_share_one_prior() -> None:
@@ -38,3 +39,13 @@ def test_no_gap_needs_95_percent_as_any_other_verdict() -> None:
     assert verdict_of([nothing, leak], False, False, None) == "ambiguous"
     assert verdict_of([nothing, leak], False, False, "h1") == "unknown"
     assert verdict_of([leak], True, False, None) == "named"
+
+
+def test_an_unknown_that_an_effect_at_its_place_predicts_as_well_is_that_effect() -> None:
+    """A ramp in time of a pipe's flow is one regressor of an unknown, and two parameters of a drifting coefficient."""
+    drift = {"P32.coefficient_drift.rate": 5e-5}
+    named = diagnose(nominal_plant(), recorded(drift, 8))
+    assert [(c.effect, c.location) for c in named.causes] == [("coefficient_drift", "P32")]
+    assert named.verdict == "named"
+    denied = diagnose(nominal_plant(), recorded(drift, 8), settings=Settings(leave_out=("coefficient_drift",)))
+    assert denied.where[0][0] == "P32" and denied.causes[0].effect != "coefficient_drift"
