@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription, Pump, Sensor
 
 
@@ -77,6 +78,6 @@ def _sensor(sensor: Sensor, scales: Scales) -> Sensor:
 
 def _unit_of(plant: PlantDescription, constant: str, scales: Scales) -> float:
     """Tolerances of offsets are in the reading's unit, all others are relative."""
-    name, _, field = constant.rpartition(".")
-    sensor = next((s for s in plant.sensors if s.name == name), None)
-    return scales.length if field == "offset" and sensor is not None and sensor.unit == "m" else 1.0
+    name = ParameterName.parse(constant)
+    sensor = next((s for s in plant.sensors if s.name == name.prefix), None)
+    return scales.length if name.field == "offset" and sensor is not None and sensor.unit == "m" else 1.0

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from fdi_torch.estimate.evidence import posterior
+from fdi_torch.parameters import ParameterName
 
 SHAPE = ("period", "phase")  # fields that describe how an oscillation looks, not how large it is
 
@@ -27,11 +28,10 @@ class Fault:
 def faults_of(names: Sequence[str]) -> list[Fault]:
     """Group parameters into faults: period and phase of an oscillation belong to its amplitude."""
     faults = []
-    for column, name in enumerate(names):
-        effect, _, field = name.rpartition(".")
-        if field not in SHAPE:
-            shape = tuple(names.index(f"{effect}.{s}") for s in SHAPE if f"{effect}.{s}" in names)
-            faults.append(Fault(column, shape))
+    for column, name in enumerate(map(ParameterName.parse, names)):
+        if name.field not in SHAPE:
+            siblings = (str(name.sibling(field)) for field in SHAPE)
+            faults.append(Fault(column, tuple(names.index(s) for s in siblings if s in names)))
     return faults
 
 

@@ -25,6 +25,7 @@ from fdi_torch.monitor.oscillation import (
     with_phases_at,
     with_wrapped_phases,
 )
+from fdi_torch.parameters import ParameterName
 
 SIZE_STEP = 1e-4  # finite-difference step, as a share of a parameter's range
 ITERATIONS = 12
@@ -110,7 +111,7 @@ class Prior:
         """Log of the odds against no change. Simultaneous recoveries count as one event."""
         new = [c for c in hypothesis.sizes if c not in hypothesis.recovered]
         count = len(new) + bool(hypothesis.recovered)
-        places = len({self.names[c].partition(".")[0] for c in new}) + bool(hypothesis.recovered)
+        places = len({ParameterName.parse(self.names[c]).place for c in new}) + bool(hypothesis.recovered)
         return log_prior(count, places, max(self.single_changes, 1))
 
 
