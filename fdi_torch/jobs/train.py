@@ -15,7 +15,8 @@ from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.run_file import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
-from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
+from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
+from fdi_torch.estimate.hybrid_settings import HybridSettings
 from fdi_torch.estimate.levenberg_marquardt import Progress
 from fdi_torch.estimate.posterior_draws import Draws
 from fdi_torch.estimate.profile import Profile

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from fdi_torch.estimate.evidence import log_prior, log_volume
 from fdi_torch.estimate.information import certainty
-from fdi_torch.estimate.levenberg_marquardt import Linearisation, RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.linearisation import Linearisation
 from fdi_torch.monitor.hypothesis import NO_CHANGE, Fault, Hypothesis, HypothesisFit, with_posterior
 from fdi_torch.monitor.initial_guess import oscillation_guess, recovery_guesses, recovery_hypotheses, signature_guesses
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
