@@ -41,7 +41,7 @@ class ParameterName:
     @lru_cache(maxsize=4096)
     def parse(text: str) -> ParameterName:
         """'T1.leak.size' -> its parts. Whether they exist is left to the plant and to the library of effects."""
-        name, _, recording = text.partition("@")
+        name, _, recording = text.rpartition("@")
         if not recording.isdecimal():
             name, recording = text, "0"
         place, _, at_place = name.partition(".") if "." in name else ("", "", name)

@@ -21,6 +21,7 @@ from fdi_torch.plant.effect import Placement
         ("T1-T2.cross_flow.size", ("T1-T2", "cross_flow", "size", 0), "T1-T2.cross_flow", "cross_flow.size", False),
         ("T1.start_level@2", ("T1", "", "start_level", 2), "T1", "start_level", True),
         ("gravity", ("", "", "gravity", 0), "", "gravity", False),
+        ("T@1.start_level@2", ("T@1", "", "start_level", 2), "T@1", "start_level", True),
         ("me@home.size", ("me@home", "", "size", 0), "me@home", "size", True),
     ],
 )

@@ -95,7 +95,7 @@ class HypothesisFit:
 
     @property
     def misfit_ratio(self) -> float:
-        """Misfit over that of noise; 1 if noise can explain it."""
+        """Misfit relative to the expected misfit of pure noise; 1 if noise alone can explain the residuals."""
         return max(2.0 * self.misfit / self.noise_level, 1.0) if 2.0 * self.misfit > self.noise_limit else 1.0
 
 
