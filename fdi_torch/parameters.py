@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,6 +19,86 @@ from fdi_torch.names import shortened
 from fdi_torch.units import MOST_CHARACTERS, UnitError, factor, in_unit, is_unit, number_and_unit
 
 SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
+
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterName:
+    """The name of a parameter in its parts: 'T1.area' is a component's constant, 'T1.leak.size' an effect's parameter.
+
+    `str()` gives the form of YAML files, logs and keys of mappings. place: component or pair of tanks, '' for gravity.
+    effect: '' for a constant. recording: k for 'T1.start_level@k', a value that belongs to one recording alone; 0 else.
+    """
+
+    place: str
+    effect: str
+    field: str
+    recording: int = 0
+
+    @staticmethod
+    @lru_cache(maxsize=4096)
+    def parse(text: str) -> ParameterName:
+        """'T1.leak.size' -> its parts. Whether they exist is left to the plant and to the library of effects."""
+        name, _, recording = text.rpartition("@")
+        if not recording.isdecimal():
+            name, recording = text, "0"
+        place, _, at_place = name.partition(".") if "." in name else ("", "", name)
+        effect, _, field = at_place.rpartition(".")
+        return ParameterName(place, effect, field, int(recording))
+
+    @staticmethod
+    def of_effect(text: str) -> ParameterName:
+        """'T1.leak', which means the leak's size, or 'T1.leak.size'; the field of the former is ''."""
+        return ParameterName.parse(text if text.count(".") != 1 else f"{text}.")
+
+    def __str__(self) -> str:
+        text = ".".join(part for part in (self.place, self.effect, self.field) if part)
+        return f"{text}@{self.recording}" if self.recording else text
+
+    @property
+    def prefix(self) -> str:
+        """All but the field: 'T1.leak' for an effect at a place, 'T1' for a component's constant."""
+        return f"{self.place}.{self.effect}" if self.effect else self.place
+
+    @property
+    def at_place(self) -> str:
+        """All but the place: 'leak.size', 'area'."""
+        return f"{self.effect}.{self.field}" if self.effect else self.field
+
+    def sibling(self, field: str) -> ParameterName:
+        """Another parameter of the same effect or component."""
+        return replace(self, field=field)
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether a component has this parameter, as opposed to an effect or to the whole plant."""
+        return bool(self.place) and not self.effect
+
+
+def name_in_recording(name: str, recording: int) -> str:
+    """Name of a constant that differs between recordings: 'L.start_level', 'L.start_level@1' ..."""
+    return str(replace(ParameterName.parse(name), recording=recording))
+
+
+def common_name(name: str) -> str:
+    """The same name for all recordings: 'L.start_level@1' -> 'L.start_level'."""
+    return name_in_recording(name, 0)
+
+
+def is_effect_parameter(name: str) -> bool:
+    """Whether the name is that of an effect's parameter: 'T1.leak.size'."""
+    return bool(ParameterName.parse(name).effect)
+
+
+def by_prefix(values: Mapping[str, Value]) -> dict[str, dict[str, Value]]:
+    """Values by full name -> by prefix and field: {'T1.leak.size': v} -> {'T1.leak': {'size': v}}."""
+    grouped: dict[str, dict[str, Value]] = {}
+    for text, value in values.items():
+        name = ParameterName.parse(text)
+        grouped.setdefault(name.prefix, {})[name.field] = value
+    return grouped
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,17 @@
-"""Servers as tests of live sources need them, on free ports: an MQTT broker, and a network that can be cut."""
+"""Servers as tests of live sources need them, on free ports: an MQTT broker, a server of asyncio in a thread, and a
+network that can be cut.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 import socket
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -65,6 +68,33 @@ def broker(folder: Path) -> Iterator[Broker]:
         yield running
     finally:
         running.stop()
+
+
+class ThreadedServer:
+    """A server of asyncio on a free port, in a thread of its own. A subclass writes `serve`."""
+
+    def __init__(self) -> None:
+        self.port = free_port()
+        self._ready = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
+        self._thread.start()
+        assert self._ready.wait(30.0)
+        wait_for_port(self.port)
+
+    async def serve(self) -> AsyncIterator[None]:
+        """Start the server, yield once it runs, and stop it."""
+        raise NotImplementedError
+        yield
+
+    async def _run(self) -> None:
+        self.loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        async with asynccontextmanager(self.serve)():
+            self._ready.set()
+            await self._stop.wait()
+
+    def close(self) -> None:
+        self.loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(10.0)
 
 
 class Proxy:

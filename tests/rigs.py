@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for
+from fdi_torch.monitor.whitening import HIGHEST_ORDER, Whitening, score_whitenings
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import FLOW_KINDS, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.network import TankNetwork
@@ -77,6 +78,11 @@ def paper_network(plant: PlantDescription | None = None) -> tuple[TankNetwork, P
     """The three tanks with the paper's five fault parameters."""
     network = build_network(plant or three_tank(), placements_for(PAPER_PARAMETERS))
     return network, ParameterSpace(network.constants[name] for name in PAPER_PARAMETERS)
+
+
+def whitening_of(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> Whitening:
+    """The best whitening of residuals (S, C)."""
+    return score_whitenings(residual, highest_order)[0][1]
 
 
 def blank_recording(

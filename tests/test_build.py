@@ -81,7 +81,7 @@ def test_a_cache_that_is_a_link_is_refused(cache: Path, tmp_path: Path) -> None:
 
 
 def test_a_library_without_its_function_is_told_in_a_sentence(cache: Path) -> None:
-    with pytest.raises(build.BuildError, match=r"expected a library with answer, got .*; try another CXX"):
+    with pytest.raises(build.BuildError, match=r"expected a compiled library with answer, got .*; set CXX"):
         build.load_library("int other;\n", "answer")
 
 

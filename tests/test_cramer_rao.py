@@ -7,7 +7,7 @@ import torch
 from rigs import PAPER_PARAMETERS, REST, constant_inputs, paper_network, three_tank
 
 from fdi_torch.estimate.fitting import set_up
-from fdi_torch.estimate.hybrid import information_std
+from fdi_torch.estimate.refinement import information_std
 from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
 

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from rigs import whitening_of
 
 from fdi_torch.monitor.detection import (
     CHARTS,
@@ -27,7 +28,7 @@ from fdi_torch.monitor.run_length import (
     fixed_threshold,
     threshold_from_maxima,
 )
-from fdi_torch.monitor.whitening import fit_whitening, score_whitenings
+from fdi_torch.monitor.whitening import score_whitenings
 
 
 def noise(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -46,7 +47,7 @@ def test_a_rarely_read_sensor_needs_as_many_of_its_own_readings() -> None:
     rare[::10, 1] = noise(40) + 1.5
     alone = cusum(rare[::10, 1:], 0.5)
     torch.testing.assert_close(cusum(rare, 0.5)[::10], alone)
-    white = fit_whitening(
+    white = whitening_of(
         torch.stack([noise(400), torch.where(torch.arange(400) % 2 == 0, noise(400, seed=1), torch.nan)], 1)
     )
     assert torch.isfinite(white(torch.stack([torch.ones(4), torch.full((4,), torch.nan)], 1).double())[:, 0]).all()
@@ -71,7 +72,7 @@ def test_error_of_the_false_alarm_rate_learnt_from_one_recording() -> None:
     asked, h = 20000.0, fixed_threshold(20000.0, 3)
     spread = torch.stack([noise(1000, 3, seed=s).square().mean(0).sqrt() for s in range(400)])
     rates = 2.0 * torch.special.ndtr(-h * spread).sum(1)
-    claimed = log_rate_std("fixed", asked, 3, 0.5, fit_whitening(noise(1000, 3), 0))
+    claimed = log_rate_std("fixed", asked, 3, 0.5, whitening_of(noise(1000, 3), 0))
     assert claimed == pytest.approx(float(rates.log().std()), rel=0.15)
 
 
@@ -124,7 +125,7 @@ def test_glr_is_the_largest_normalised_sum(samples: int, k: int) -> None:
 
 def test_glr_false_alarms_with_wrong_variances_average_over_channels() -> None:
     """Windows that exceed the threshold by chance point anywhere: rates drawn channel by channel, by Monte Carlo."""
-    learnt = fit_whitening(noise(1000, 3), 0)
+    learnt = whitening_of(noise(1000, 3), 0)
     direction = noise(200_000, 3, seed=2)
     share = (direction / torch.linalg.vector_norm(direction, dim=1, keepdim=True)).square()
     off = noise(200_000, 3, seed=3) * learnt.slow_error
@@ -155,7 +156,7 @@ def test_coloured_noise_becomes_white(coefficient: float) -> None:
     drive, series = noise(4000, 2), torch.zeros(4000, 2, dtype=torch.float64)
     for k in range(1, 4000):
         series[k] = coefficient * series[k - 1] + drive[k]
-    whitening = fit_whitening(1e-3 * series + torch.tensor([0.0, 5e-3], dtype=torch.float64))
+    whitening = whitening_of(1e-3 * series + torch.tensor([0.0, 5e-3], dtype=torch.float64))
     assert whitening.order == (1 if coefficient else 0)
     white = whitening(1e-3 * series + torch.tensor([0.0, 5e-3], dtype=torch.float64))[10:]
     torch.testing.assert_close(white.std(0), torch.ones(2, dtype=torch.float64), rtol=0.02, atol=0)
@@ -166,7 +167,7 @@ def test_coloured_noise_becomes_white(coefficient: float) -> None:
 def test_channels_that_move_together_are_separated() -> None:
     e = noise(3000, 2)
     mixed = torch.stack([e[:, 0], 0.9 * e[:, 0] + 0.3 * e[:, 1]], dim=1)
-    white = fit_whitening(mixed)(mixed)
+    white = whitening_of(mixed)(mixed)
     assert (white[:, 0] * white[:, 1]).mean().abs() < 0.03
 
 
@@ -192,9 +193,9 @@ def test_misuse_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one sample"):
         make_detector("glr", 1000.0, 1.0, 3, generator, window=0)
     with pytest.raises(ValueError, match="at least 40 fault-free samples"):
-        fit_whitening(noise(30, 2))
+        whitening_of(noise(30, 2))
     with pytest.raises(ValueError, match="none in channel 2"):
-        fit_whitening(noise(200, 2) * torch.tensor([1.0, 0.0], dtype=torch.float64))
+        whitening_of(noise(200, 2) * torch.tensor([1.0, 0.0], dtype=torch.float64))
 
 
 def test_cusum_threshold_is_for_all_channels_together() -> None:
@@ -210,7 +211,7 @@ def test_the_stated_error_of_low_frequency_sums_is_right() -> None:
         coloured[:, k] = 0.7 * coloured[:, k - 1] + drawn[:, k]
     off, said = [], []
     for residual in coloured[:, 200:]:
-        learnt = fit_whitening(residual)
+        learnt = whitening_of(residual)
         slow = learnt.whitener @ (torch.eye(2, dtype=torch.float64) - learnt.coefficients.sum(0)) / (1.0 - 0.7)
         off.append(torch.linalg.vector_norm(slow, dim=1).log())
         said.append(learnt.slow_error)
@@ -220,7 +221,7 @@ def test_the_stated_error_of_low_frequency_sums_is_right() -> None:
 
 def test_thresholds_allow_for_noise_estimated_from_a_short_recording() -> None:
     generator = torch.Generator().manual_seed(1)
-    long, short = (fit_whitening(torch.randn(n, 2, generator=generator, dtype=torch.float64)) for n in (20000, 400))
+    long, short = (whitening_of(torch.randn(n, 2, generator=generator, dtype=torch.float64)) for n in (20000, 400))
     for chart in CHARTS:
         sure, unsure = (false_alarm_inflation(chart, 5000.0, 2, 0.5, learnt) for learnt in (long, short))
         assert 1.0 < sure < 1.05 < unsure < 2.0

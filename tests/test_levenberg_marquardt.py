@@ -11,13 +11,8 @@ from scipy.optimize import least_squares, lsq_linear
 from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import apply, row_sum, solve_positive
-from fdi_torch.estimate.levenberg_marquardt import (
-    Competition,
-    Linearisation,
-    Progress,
-    RefineSettings,
-    levenberg_marquardt,
-)
+from fdi_torch.estimate.levenberg_marquardt import Competition, Progress, RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.linearisation import Linearisation
 from fdi_torch.estimate.refined import Refined
 
 DOUBLE = torch.float64

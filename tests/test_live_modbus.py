@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from live_servers import Proxy, free_port, wait_for_port
+from live_servers import Proxy, ThreadedServer
 from test_live_mqtt import MESSAGES, told
 from test_monitor_follow import config, monitored, texts, written
 
@@ -29,22 +29,18 @@ def registers(sample: dict[str, float]) -> list[int]:
     return list(struct.unpack(">24H", struct.pack(">6d", *(sample[name] for name in FIELDS))))
 
 
-class Plc:
+class Plc(ThreadedServer):
     """A Modbus server whose registers go on to the next sample with each second reading. `sent`: their number."""
 
     def __init__(self) -> None:
-        self.port, self.reads = free_port(), 0
-        self._ready = threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
-        self._thread.start()
-        assert self._ready.wait(10.0)
-        wait_for_port(self.port)
+        self.reads = 0
+        super().__init__()
 
     @property
     def sent(self) -> int:
         return min(self.reads // 2, len(MESSAGES) - 1)
 
-    async def _run(self) -> None:
+    async def serve(self) -> AsyncIterator[None]:
         from pymodbus.server import ModbusTcpServer
 
         async def next_sample(
@@ -55,23 +51,16 @@ class Plc:
 
         data = simulator.SimData(FIRST, values=registers(MESSAGES[0]), datatype=simulator.DataType.REGISTERS)
         device = simulator.SimDevice(1, [data], action=next_sample)
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         server = ModbusTcpServer(device, address=("127.0.0.1", self.port))
         await server.serve_forever(background=True)
-        self._ready.set()
-        await self._stop.wait()
+        yield
         await server.shutdown()
-
-    def close(self) -> None:
-        self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join(10.0)
 
 
 @pytest.fixture
 def plc() -> Iterator[Plc]:
-    running = Plc()
-    yield running
-    running.close()
+    with closing(Plc()) as running:
+        yield running
 
 
 def source(port: int, **changes: object) -> dict[str, object]:

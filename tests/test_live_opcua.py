@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
-from live_servers import Proxy, free_port, wait_for_port
+from live_servers import Proxy, ThreadedServer, free_port
 from test_live_mqtt import MESSAGES, told
 from test_monitor_follow import config, monitored, texts, written
 
@@ -23,19 +24,10 @@ NAMES = ("Q1", "Q2", "h1", "h2", "h3")
 START = datetime(2026, 1, 1, tzinfo=UTC)
 
 
-class Plc:
+class Plc(ThreadedServer):
     """An OPC UA server with a node a channel, in a thread of its own."""
 
-    def __init__(self) -> None:
-        self.port = free_port()
-        self._ready = threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
-        self._thread.start()
-        assert self._ready.wait(30.0)
-        wait_for_port(self.port)
-
-    async def _run(self) -> None:
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+    async def serve(self) -> AsyncIterator[None]:
         server = asyncua.Server()
         await server.init()
         server.set_endpoint(f"opc.tcp://127.0.0.1:{self.port}/rig")
@@ -45,11 +37,10 @@ class Plc:
             self.nodes[name] = node
         async with server:
             self._server = server
-            self._ready.set()
-            await self._stop.wait()
+            yield
 
     def write(self, sample: dict[str, float], bad: tuple[str, ...] = ()) -> None:
-        asyncio.run_coroutine_threadsafe(self._write(sample, bad), self._loop).result(10.0)
+        asyncio.run_coroutine_threadsafe(self._write(sample, bad), self.loop).result(10.0)
 
     async def _write(self, sample: dict[str, float], bad: tuple[str, ...]) -> None:
         ua = asyncua.ua
@@ -62,16 +53,11 @@ class Plc:
             )
             await self._server.write_attribute_value(self.nodes[name].nodeid, value)
 
-    def close(self) -> None:
-        self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join(10.0)
-
 
 @pytest.fixture
 def plc() -> Iterator[Plc]:
-    running = Plc()
-    yield running
-    running.close()
+    with closing(Plc()) as running:
+        yield running
 
 
 def source(port: int, **changes: object) -> dict[str, object]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from rigs import whitening_of
 from torch import Tensor
 
 from fdi_torch.cli import main
@@ -34,7 +35,7 @@ from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
 from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
 from fdi_torch.monitor.stepper import Stepper
-from fdi_torch.monitor.whitening import Whitening, fit_whitening
+from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.equilibrium import equilibrium
 
@@ -240,7 +241,7 @@ def test_an_observer_offset_is_reported_if_significant_and_relevant() -> None:
     """Noise of 1 mm in 3600 samples: an offset of 0.05 mm is significant but irrelevant, 0.5 mm is reported."""
     noise = torch.randn(3600, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     residual = 1e-3 * noise + torch.tensor([0.0, 5e-5, 5e-4], dtype=torch.float64)
-    whitening = fit_whitening(residual)
+    whitening = whitening_of(residual)
     assert bool((whitening.mean != 0.0).all())
     white = whitening(residual + whitening.mean)
     assert white.mean(0).tolist() == pytest.approx(whitening.offset.tolist())

@@ -15,7 +15,7 @@ from fdi_torch.monitor.noise_model import learn_noise, operating_point
 from fdi_torch.monitor.observer import Observer, bind_parameters, initial_levels
 from fdi_torch.monitor.observer_gain import hand_gain, kalman_gain, linearised, riccati, spectral_radius, timed_gain
 from fdi_torch.monitor.observer_run import run_observers
-from fdi_torch.monitor.samples import Samples, samples_of_recording, stack_recordings
+from fdi_torch.monitor.samples import Samples, samples_of_recording
 from fdi_torch.monitor.stepper import PlantState, Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect
@@ -226,26 +226,19 @@ def test_a_plant_with_a_pure_delay_or_no_step_is_refused() -> None:
         Stepper(NETWORK, 0.0)
 
 
-def test_recordings_on_different_clocks_do_not_stack() -> None:
-    def recording(step: float) -> Recording:
-        time = step * torch.arange(5, dtype=torch.float64)
-        return Recording(
-            time,
-            time.new_zeros(5, 2),
-            time.new_zeros(5, 3),
-            ("Q1", "Q2"),
-            ("h1", "h2", "h3"),
-            ("m^3/s",) * 2,
-            ("m",) * 3,
-        )
-
-    assert stack_recordings([recording(1.0), recording(1.0)], PLANT).batch == (2,)
-    with pytest.raises(ValueError, match="expected recordings with the same sample times"):
-        stack_recordings([recording(1.0), recording(2.0)], PLANT)
-    with pytest.raises(ValueError, match="expected at least one recording"):
-        stack_recordings([], PLANT)
+def test_a_recording_without_an_input_of_the_plant_is_refused() -> None:
+    time = torch.arange(5, dtype=torch.float64)
+    recording = Recording(
+        time,
+        time.new_zeros(5, 2),
+        time.new_zeros(5, 3),
+        ("Q1", "Qx"),
+        ("h1", "h2", "h3"),
+        ("m^3/s",) * 2,
+        ("m",) * 3,
+    )
     with pytest.raises(ValueError, match="expected an input 'Q2'"):
-        samples_of_recording(replace(recording(1.0), input_names=("Q1", "Qx")), PLANT)
+        samples_of_recording(recording, PLANT)
 
 
 def test_operating_point_is_about_the_middle_of_the_readings() -> None:

@@ -10,7 +10,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from fdi_torch.estimate.levenberg_marquardt import Linearisation, levenberg_marquardt
+from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
+from fdi_torch.estimate.linearisation import Linearisation
 from fdi_torch.estimate.posterior_draws import Draws, draw_posterior
 from fdi_torch.estimate.profile import Profile, profile_likelihood
 from fdi_torch.estimate.uncertainty import Estimate, make_estimate

@@ -24,6 +24,7 @@ from fdi_torch.blind.random_flows import Disturbance
 from fdi_torch.blind.scaling import SAME, Scales, on_bench
 from fdi_torch.blind.sensor_noise import WHITE, NoiseCorrelation, draw_correlation
 from fdi_torch.blind.simulator import Drive, HiddenRigs, SimulatedRun, simulate
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 
 RECORDED, HELD_OUT = 3601, 2401
@@ -78,11 +79,11 @@ def as_built(plant: PlantDescription, rng: np.random.Generator) -> PlantDescript
     """
     off: dict[str, dict[str, float]] = {}
     for constant, tolerance in plant.tolerances.items():
-        name, _, field = constant.rpartition(".")
+        name = ParameterName.parse(constant)
         z = float(np.clip(rng.normal(), -WIDEST, WIDEST))
-        nominal = float(getattr(plant.component(name), field))
-        drawn = nominal + tolerance * z if field == "offset" else nominal * max(1 + tolerance * z, _LEAST)
-        off.setdefault(name, {})[field] = drawn
+        nominal = float(getattr(plant.component(name.place), name.field))
+        drawn = nominal + tolerance * z if name.field == "offset" else nominal * max(1 + tolerance * z, _LEAST)
+        off.setdefault(name.place, {})[name.field] = drawn
     return replace(
         plant,
         tanks=tuple(replace(t, **off.get(t.name, {})) for t in plant.tanks),  # type: ignore[arg-type]

@@ -1,8 +1,8 @@
-"""A rig of any size and speed as one on a bench, where the benchmark's seconds, litres and centimetres are usual ones.
+"""Conversion of a rig of any size and speed to bench size, for which the benchmark's absolute amounts are chosen.
 
-Lengths are measured in units of `length` m, times of `time` s, areas of `area` m^2: A dh/dt = q and
-q = C_d a sqrt(2 g h) keep their form if flows are measured in area x length / time and bores a in
-area x sqrt(length) / time. All are powers of ten, so that what is round in print stays round.
+The units are `length` m for lengths, `time` s for times and `area` m^2 for cross-sections of tanks. The balance
+A dh/dt = q and the orifice law q = C_d a sqrt(2 g h) keep their form if flows are measured in area x length / time and
+cross-sections a of pipes in area x sqrt(length) / time. All units are powers of ten, so that round numbers stay round.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription, Pump, Sensor
 
 
@@ -77,6 +78,6 @@ def _sensor(sensor: Sensor, scales: Scales) -> Sensor:
 
 def _unit_of(plant: PlantDescription, constant: str, scales: Scales) -> float:
     """Tolerances of offsets are in the reading's unit, all others are relative."""
-    name, _, field = constant.rpartition(".")
-    sensor = next((s for s in plant.sensors if s.name == name), None)
-    return scales.length if field == "offset" and sensor is not None and sensor.unit == "m" else 1.0
+    name = ParameterName.parse(constant)
+    sensor = next((s for s in plant.sensors if s.name == name.prefix), None)
+    return scales.length if name.field == "offset" and sensor is not None and sensor.unit == "m" else 1.0

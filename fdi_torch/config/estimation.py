@@ -15,7 +15,7 @@ from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
 from fdi_torch.effects import EFFECTS, all_placements, build_network, placements_for
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.names import unknown
-from fdi_torch.parameters import Parameter, ParameterSpace, display_unit
+from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 
@@ -111,10 +111,10 @@ class EstimationConfig(Strict):
 
 def full_name(name: str, plant: PlantDescription) -> str:
     """'T1.leak' -> 'T1.leak.size': an effect's name means its size. Raises ValueError for an impossible place."""
-    location, _, effect_name = name.partition(".")
-    if effect_name in {e.name for e in EFFECTS}:
-        return f"{name}.{effect_at(effect_name, location, plant).parameters(location, plant)[0].name}"
-    return name
+    at = ParameterName.of_effect(name)
+    if at.field or at.effect not in {e.name for e in EFFECTS}:
+        return name
+    return str(at.sibling(effect_at(at.effect, at.place, plant).parameters(at.place, plant)[0].name))
 
 
 def names_in_full(names: Iterable[str], plant: PlantDescription, field: str) -> list[str]:

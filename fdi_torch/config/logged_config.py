@@ -15,7 +15,7 @@ from fdi_torch.plant.description import PlantDescription
 def logged_mapping(log: LoggedRun) -> dict[str, Any]:
     """The configuration of a run as a mapping. Raises ConfigError if the log has none."""
     if "config.yaml" not in log.attachments:
-        raise ConfigError([f"{log.path}: expected a configuration in the log, got none; it cannot be run again"])
+        raise ConfigError([f"{log.path}: expected a configuration in the log, got none; the log cannot be replayed"])
     data = parse_yaml(log.attachment("config.yaml"), f"{log.path}: config.yaml")
     plant = data.get("plant")
     if isinstance(plant, str) and plant not in shipped_plants():  # a log may not name other files

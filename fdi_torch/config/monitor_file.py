@@ -12,11 +12,9 @@ from pydantic import Field, model_validator
 from fdi_torch.config.estimation import names_in_full
 from fdi_torch.config.live_source import SourceConfig
 from fdi_torch.config.loaded_recordings import separate_recordings
-from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import naming_source
 from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.config.resolved_config import resolve, values_in
-from fdi_torch.config.run_file import OutputConfig
+from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.strict import BenchSeconds, Seconds, Strict
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import GainSpecification
@@ -94,28 +92,10 @@ class MonitorConfig(Strict):
 
 
 @dataclass(frozen=True)
-class MonitorRun:
-    """A resolved monitor file.
+class MonitorRun(ResolvedFile[MonitorConfig]):
+    """A resolved monitor file. given: recordings in memory, by the name that `file` gives them."""
 
-    base: folder of relative paths. text: YAML of the same run, including the plant. given: recordings in memory, by the
-    name that `file` gives them.
-    """
-
-    config: MonitorConfig
-    plant: PlantDescription
-    base: Path
-    source: str
-    text: str
     given: Mapping[str, Recording] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        return self.config.output.name or Path(self.source).stem
-
-    @property
-    def resolved(self) -> dict[str, Any]:
-        """All values, including defaults, as plain nested values."""
-        return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
 
 
 def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:

@@ -15,6 +15,7 @@ from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Acceleration, Amount, Area, Length, Strict, quantity
 from fdi_torch.config.yaml_files import find_plant, read_yaml
 from fdi_torch.names import unknown
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, FaultPriority, PlacedEffect, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.untrusted_input import MOST_COMPONENTS
@@ -121,19 +122,18 @@ def _plant(config: PlantConfig) -> Plant:
 
 def _matter(name: str, matter: MatterConfig, plant: Plant) -> FaultPriority:
     """The priority of a fault; 'T1.leak' means the leak's size."""
-    location, _, rest = name.partition(".")
-    effect, _, field = rest.partition(".")
+    at = ParameterName.of_effect(name)
     try:
-        parameters = effect_parameters(effect, location, plant)
+        parameters = effect_parameters(at.effect, at.place, plant)
     except ValueError as error:
         raise ValueError(f"matters.{name}: {error}") from error
-    size = parameters.get(field or next(iter(parameters)))
+    size = parameters.get(at.field or next(iter(parameters)))
     if size is None:
-        raise ValueError(f"matters.{name}: {unknown('a parameter', field, parameters)}")
+        raise ValueError(f"matters.{name}: {unknown('a parameter', at.field, parameters)}")
     smallest = si_value(f"matters.{name}.smallest", matter.smallest, size.unit, quantity)
     if smallest < 0.0:
         raise ValueError(f"matters.{name}.smallest: expected no negative size, got {matter.smallest}")
-    return FaultPriority(f"{location}.{effect}.{size.name}", smallest, matter.urgency)
+    return FaultPriority(str(at.sibling(size.name)), smallest, matter.urgency)
 
 
 def _flow_component(kind: Callable[..., FlowComponent], name: str, keys: Strict) -> FlowComponent:

@@ -13,7 +13,7 @@ from torch import Tensor
 from fdi_torch.config.strict import quantity
 from fdi_torch.effects import build_network, effect, placements_for
 from fdi_torch.names import matching, unknown
-from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.parameters import Parameter, ParameterSpace, is_effect_parameter
 from fdi_torch.plant.description import (
     FLOW_KINDS,
     FaultPriority,
@@ -185,7 +185,9 @@ def tolerances_in_si(
     tolerances: dict[str, float] = {}
     for pattern, value in patterns.items():
         place = f"tolerances.{pattern}"
-        matched = [n for n in known if fnmatchcase(n, pattern) and n.count(".") == max(pattern.count("."), 1)]
+        matched = [
+            n for n in known if fnmatchcase(n, pattern) and is_effect_parameter(n) == is_effect_parameter(pattern)
+        ]
         if not matched:
             raise ValueError(f"{place}: {unknown('a constant', pattern, known)}")
         for name in matched:
@@ -212,7 +214,7 @@ def absolute_units(plant: PlantDescription) -> dict[str, str]:
 def effect_units(plant: PlantDescription) -> dict[str, str]:
     """Units of all parameters of the plant's effects, by full name."""
     return {
-        f"{e.location}.{e.effect}.{name}": parameter.unit
+        e.full_name(name): parameter.unit
         for e in plant.effects
         for name, parameter in effect_parameters(e.effect, e.location, plant).items()
     }

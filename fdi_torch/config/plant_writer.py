@@ -7,7 +7,7 @@ from typing import Any
 from fdi_torch.config.flow_sections import written_fields
 from fdi_torch.config.plant_in_code import absolute_units, effect_at, effect_parameters
 from fdi_torch.config.yaml_files import write_yaml
-from fdi_torch.parameters import parse_quantity
+from fdi_torch.parameters import ParameterName, parse_quantity
 from fdi_torch.plant.description import (
     FLOW_KINDS,
     OUTSIDE,
@@ -57,9 +57,9 @@ def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
 
 
 def _matter_mapping(matter: FaultPriority, plant: PlantDescription) -> dict[str, Any]:
-    location, effect, field = matter.fault.split(".")
-    units = {p.name: p.unit for p in effect_at(effect, location, plant).parameters(location, plant)}
-    smallest = _text(matter.smallest, units[field]) if matter.smallest else None
+    at = ParameterName.parse(matter.fault)
+    units = {p.name: p.unit for p in effect_at(at.effect, at.place, plant).parameters(at.place, plant)}
+    smallest = _text(matter.smallest, units[at.field]) if matter.smallest else None
     return _given(smallest=smallest, urgency=matter.urgency or None)
 
 

@@ -13,10 +13,8 @@ from pydantic import BeforeValidator, Field
 from fdi_torch.capacity import expect_room
 from fdi_torch.config.estimation import full_name
 from fdi_torch.config.monitor_file import WindowConfig
-from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.reading_noise import reading_noise
-from fdi_torch.config.resolved_config import resolve, values_in
-from fdi_torch.config.run_file import OutputConfig
+from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.strict import BenchSeconds, Decibel, Share, Strict, quantity
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import Fitting, set_up
@@ -98,22 +96,10 @@ Plan = FalseAlarmPlan | DetectionPlan | IsolationPlan | EstimatorComparisonPlan
 
 
 @dataclass(frozen=True)
-class Rehearsal:
-    """A resolved rehearsal file. plans: the validations to run. text: YAML of the same rehearsal."""
+class Rehearsal(ResolvedFile[RehearsalConfig]):
+    """A resolved rehearsal file. plans: the validations to run."""
 
-    config: RehearsalConfig
-    plant: PlantDescription
     plans: tuple[Plan, ...]
-    source: str
-    text: str
-
-    @property
-    def name(self) -> str:
-        return self.config.output.name or Path(self.source).stem
-
-    @property
-    def resolved(self) -> dict[str, Any]:
-        return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
 
 
 def load_rehearsal(path: str | Path, overrides: Iterable[str] = ()) -> Rehearsal:
@@ -123,7 +109,7 @@ def load_rehearsal(path: str | Path, overrides: Iterable[str] = ()) -> Rehearsal
     plans = tuple(_plans(config, plant))
     if not plans:
         raise ValueError(f"{file}: expected false_alarms, faults_found, naming or rivals, got none of them; add one")
-    return Rehearsal(config, plant, plans, str(file), text)
+    return Rehearsal(config, plant, file.parent, str(file), text, plans)
 
 
 def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:

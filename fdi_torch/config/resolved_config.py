@@ -3,19 +3,69 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from fdi_torch.config.key_reference import keys
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError, explain
-from fdi_torch.config.strict import Config, scaled_to_plant
+from fdi_torch.config.strict import Config, Strict, scaled_to_plant
 from fdi_torch.config.yaml_files import find_file, read_extended, with_overrides, write_yaml
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
+
+LONGEST_NAME = 200
+
+
+class OutputConfig(Strict):
+    folder: str = Field("logs", description="for the log and the pictures")
+    name: str = Field("", description="name of the run and its log, without ending; by default the run file's name")
+
+    @field_validator("name")
+    @classmethod
+    def _stays_in_its_folder(cls, name: str) -> str:
+        if name != Path(name).name or name == ".." or not name.isprintable() or len(name) > LONGEST_NAME:
+            raise ValueError(f"expected a file's name without folders, got '{name}'; output.folder says where it goes")
+        return name
+
+
+class _WithOutput(Protocol):
+    """What the models of run, monitor and rehearsal files share."""
+
+    @property
+    def output(self) -> OutputConfig: ...
+
+    def model_dump(self, *, mode: str) -> dict[str, Any]: ...
+
+
+AnyConfig = TypeVar("AnyConfig", bound=_WithOutput)
+
+
+@dataclass(frozen=True)
+class ResolvedFile(Generic[AnyConfig]):
+    """A run, monitor or rehearsal file with its plant.
+
+    base: folder of relative paths. source: the file's path. text: YAML of the same configuration, including the plant.
+    """
+
+    config: AnyConfig
+    plant: PlantDescription
+    base: Path
+    source: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        return self.config.output.name or Path(self.source).stem
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """All values, including defaults, as plain nested values."""
+        return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
 
 
 def values_in(path: str | Path, overrides: Iterable[str] = ()) -> tuple[dict[str, Any], Path]:

@@ -7,32 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from fdi_torch.config.estimation import EstimationConfig
 from fdi_torch.config.loaded_recordings import separate_recordings
-from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.config.resolved_config import resolve, values_in
+from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.simulation import SimulationConfig
 from fdi_torch.config.strict import Strict
 from fdi_torch.config.yaml_files import DEFAULT_RUN
-from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-
-LONGEST_NAME = 200
-
-
-class OutputConfig(Strict):
-    folder: str = Field("logs", description="for the log and the pictures")
-    name: str = Field("", description="name of the run and its log, without ending; by default the run file's name")
-
-    @field_validator("name")
-    @classmethod
-    def _stays_in_its_folder(cls, name: str) -> str:
-        if name != Path(name).name or name == ".." or not name.isprintable() or len(name) > LONGEST_NAME:
-            raise ValueError(f"expected a file's name without folders, got '{name}'; output.folder says where it goes")
-        return name
 
 
 class RunConfig(Strict):
@@ -54,28 +38,10 @@ class RunConfig(Strict):
 
 
 @dataclass(frozen=True)
-class Run:
-    """A resolved run file.
+class Run(ResolvedFile[RunConfig]):
+    """A resolved run file. given: recordings in memory, by the name that `file` gives them."""
 
-    base: folder of relative paths. text: YAML of the same run, including the plant. given: recordings in memory, by the
-    name that `file` gives them.
-    """
-
-    config: RunConfig
-    plant: PlantDescription
-    base: Path
-    source: str
-    text: str
     given: Mapping[str, Recording] = field(default_factory=dict)
-
-    @property
-    def resolved(self) -> dict[str, Any]:
-        """All values, including defaults, as plain nested values."""
-        return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
-
-    @property
-    def name(self) -> str:
-        return self.config.output.name or Path(self.source).stem
 
 
 def load_run(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Run:

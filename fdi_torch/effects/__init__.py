@@ -50,7 +50,8 @@ from fdi_torch.effects.valve_characteristic import ValveCharacteristic
 from fdi_torch.effects.valve_dead_zone import ValveDeadZone
 from fdi_torch.effects.valve_lag import ValveLag
 from fdi_torch.effects.valve_leak import ValveLeak
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.parameters import ParameterName
+from fdi_torch.plant.description import PlantDescription, with_tolerances
 from fdi_torch.plant.effect import Effect, Placement, fits
 from fdi_torch.plant.network import TankNetwork
 
@@ -140,19 +141,12 @@ def without_startup_effects(plant: PlantDescription, channels: Collection[str]) 
     """
     given = [(component.name, component.input_channel) for component in plant.flow_components()]
     running = {name for name, channel in given if channel is not None and channel[0] in channels}
-    ended = {
-        f"{e.location}.{e.effect}" for e in plant.effects if e.location in running and effect(e.effect).startup_only
-    }
-    return replace(
-        plant,
-        effects=tuple(e for e in plant.effects if f"{e.location}.{e.effect}" not in ended),
-        tolerances={n: v for n, v in plant.tolerances.items() if n.rpartition(".")[0] not in ended},
-        varying=tuple(n for n in plant.varying if n.rpartition(".")[0] not in ended),
-    )
+    ended = {e.prefix for e in plant.effects if e.location in running and effect(e.effect).startup_only}
+    effects = tuple(e for e in plant.effects if e.prefix not in ended)
+    return with_tolerances(replace(plant, effects=effects), lambda name: name.prefix not in ended)
 
 
 def placements_for(names: Iterable[str]) -> tuple[Placement, ...]:
     """The distinct effects behind parameter names such as 'T1.leak.size'; names of component constants are ignored."""
-    parts = (name.split(".") for name in names)
-    pairs = dict.fromkeys((p[1], p[0]) for p in parts if len(p) == 3)
+    pairs = dict.fromkeys((n.effect, n.place) for n in map(ParameterName.parse, names) if n.effect)
     return tuple(place(effect_name, location) for effect_name, location in pairs)

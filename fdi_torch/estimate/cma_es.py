@@ -20,15 +20,7 @@ from fdi_torch.estimate.batch_algebra import apply, dot, row_sum
 from fdi_torch.estimate.bounds import into_box
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
-from fdi_torch.estimate.strategy import (
-    Proposal,
-    SearchState,
-    check_box,
-    checked_costs,
-    pick,
-    with_first_guess,
-    with_progress_counters,
-)
+from fdi_torch.estimate.strategy import Proposal, SearchState, before_first_generation, pick, with_first_guess
 
 FIRST_STEP = 0.3  # in widths of the box (Hansen 2016, section B.1: about a quarter, so that the optimum is within 3 s)
 
@@ -93,24 +85,17 @@ class CmaEs:
     def init(
         self, low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor, first_guess: Tensor | None = None
     ) -> CmaState:
-        check_box(low, high, settings, seed)
         problems, parameters = low.shape[:-1], low.shape[-1]
         size = settings.first_population(parameters)
+        common = before_first_generation(low, high, settings, seed, size)
         guess = low.new_zeros((*problems, 0, parameters)) if first_guess is None else first_guess.to(low)
         guess = guess.clamp(low[..., None, :], high[..., None, :])
         population = with_first_guess(((low + high) / 2)[..., None, :].repeat_interleave(size, -2), guess)
         zeros = torch.zeros_like(low)
         mean = torch.full_like(low, 0.5) if first_guess is None else (guess[..., 0, :] - low) / _width(low, high)
         return CmaState(
+            **common,
             population=population,
-            cost=low.new_full((*problems, size), math.inf),
-            low=low,
-            high=high,
-            seed=seed,
-            scale=low.new_zeros(problems),
-            anchor=low.new_full(problems, math.inf),
-            waited=torch.zeros_like(seed),
-            first_population=size,
             guess=guess,
             mean=mean,
             step=low.new_full(problems, FIRST_STEP),
@@ -134,7 +119,7 @@ class CmaEs:
         return CmaTrial(candidates, normal, moved)
 
     def tell(self, state: CmaState, trial: CmaTrial, cost: Tensor, settings: EvolutionSettings) -> CmaState:
-        cost, order = torch.sort(checked_costs(state, cost), stable=True)
+        cost, order = torch.sort(state.checked(cost), stable=True)
         updated = _adapted(state, pick(trial.normal, order), pick(trial.moved, order), cost)
         population = pick(trial.candidates, order)
         # The best candidate of all is kept in the population, but takes no part in the update.
@@ -150,7 +135,7 @@ class CmaEs:
             generation=state.generation + 1,
             evaluations=state.evaluations + cost.shape[-1],
         )
-        return with_progress_counters(told, settings)
+        return told.with_progress_counters(settings)
 
 
 STRATEGY = CmaEs()

@@ -9,7 +9,7 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, common_name
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import time_scale
@@ -110,11 +110,11 @@ def diagnose(
 
 def is_fault_size(network: TankNetwork, parameter: Parameter) -> bool:
     """Whether the parameter is the size of an effect, as opposed to a shape parameter or a constant of the plant."""
-    name = parameter.name.split("@")[0]
+    name = common_name(parameter.name)
     for placement in network.placements:
-        if name.startswith(placement.prefix + "."):
+        if ParameterName.parse(name).prefix == placement.prefix:
             size = placement.effect.parameters(placement.location, network.description)[0]
-            return name == f"{placement.prefix}.{size.name}"
+            return name == placement.full_name(size.name)
     return False
 
 
@@ -127,8 +127,8 @@ def fault_flow(
     From Torricelli's law, flow = HOLE_COEFFICIENT * area * sqrt(2 g level). None where undefined.
     which: index of the fault in `space`. levels (tanks,), m; channels (channels,): actuator inputs.
     """
-    name = space.names[which].split("@")[0]
-    placement = next(p for p in network.placements if name.startswith(p.prefix + "."))
+    name = common_name(space.names[which])
+    placement = next(p for p in network.placements if ParameterName.parse(name).prefix == p.prefix)
     if placement.effect.stage not in (Stage.FLOW, Stage.BALANCE):
         return None, None
     # Initial levels of further recordings (T1.start_level@1) are not plant constants and do not affect these flows.

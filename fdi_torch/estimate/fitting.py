@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.objectives import Objective, Problem, Term
-from fdi_torch.parameters import Parameter, ParameterSpace, display_unit
+from fdi_torch.parameters import Parameter, ParameterSpace, display_unit, name_in_recording
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.inverted_sensor import levels_from_readings
@@ -156,7 +156,7 @@ def set_up(
         networks.append(build_network(replace(plant, tanks=tanks), placements))
         own_spaces.append(ParameterSpace([*common, *free]))
         columns.append(torch.tensor([*range(len(common)), *range(len(joint), len(joint) + len(free))]))
-        joint += [replace(p, name=p.name if k == 0 else f"{p.name}@{k}") for p in free]
+        joint += [replace(p, name=name_in_recording(p.name, k)) for p in free]
     return Fitting(ParameterSpace(joint), tuple(recordings), tuple(networks), tuple(own_spaces), tuple(columns), engine)
 
 

@@ -9,7 +9,6 @@ size. Leading dimensions are independent problems; the results of each are bit-f
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,15 +18,7 @@ from fdi_torch.estimate.bounds import into_box
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.shade import draw_factor, draw_rate, update_archive, update_memory
-from fdi_torch.estimate.strategy import (
-    Proposal,
-    SearchState,
-    check_box,
-    checked_costs,
-    pick,
-    with_first_guess,
-    with_progress_counters,
-)
+from fdi_torch.estimate.strategy import Proposal, SearchState, before_first_generation, pick, with_first_guess
 
 _VARIATION, _REPAIR, _ARCHIVE = range(3)  # indices of the random streams of one generation
 
@@ -64,8 +55,8 @@ def init(
     Raises ValueError for an empty or infinite box, mismatched shapes and a budget below the population size.
     """
     problems, parameters = low.shape[:-1], low.shape[-1]
-    check_box(low, high, settings, seed)
     size = settings.first_population(parameters)
+    common = before_first_generation(low, high, settings, seed, size)
     draws = uniform(stream(seed, 0, _VARIATION), size * parameters).to(low.dtype).unflatten(-1, (size, parameters))
     low_, high_ = low[..., None, :], high[..., None, :]
     population = (low_ + draws * (high_ - low_)).clamp(low_, high_)
@@ -73,20 +64,13 @@ def init(
         population = with_first_guess(population, first_guess.to(low).clamp(low_, high_))
     cells = settings.memory if settings.strategy == "l-shade" else 0
     return State(
+        **common,
         population=population,
-        cost=low.new_full((*problems, size), math.inf),
-        low=low,
-        high=high,
-        seed=seed,
         memory_f=low.new_full((*problems, cells), 0.5),
         memory_cr=low.new_full((*problems, cells), 0.5),
         memory_cell=torch.zeros_like(seed),
         archive=low.new_zeros((*problems, settings.archive_size(size), parameters)),
         archived=torch.zeros_like(seed),
-        scale=low.new_zeros(problems),
-        anchor=low.new_full(problems, math.inf),
-        waited=torch.zeros_like(seed),
-        first_population=size,
     )
 
 
@@ -181,7 +165,7 @@ def tell(state: State, trial: Trial, cost: Tensor, settings: EvolutionSettings) 
 
     cost (*problems, N): costs of the candidates; one that is not finite never replaces its parent.
     """
-    cost = checked_costs(state, cost)
+    cost = state.checked(cost)
     better = cost < state.cost
     # In L-SHADE a candidate of equal cost replaces its parent too, so that the population can cross plateaus.
     replaces = better if settings.strategy == "rand/1/bin" else (cost <= state.cost) & torch.isfinite(cost)
@@ -195,7 +179,7 @@ def tell(state: State, trial: Trial, cost: Tensor, settings: EvolutionSettings) 
         generation=state.generation + 1,
         evaluations=state.evaluations + state.cost.shape[-1],
     )
-    return with_progress_counters(_sorted_and_reduced(selected, settings), settings)
+    return _sorted_and_reduced(selected, settings).with_progress_counters(settings)
 
 
 def _with_updated_memory(state: State, trial: Trial, gain: Tensor, success: Tensor) -> State:

@@ -7,64 +7,35 @@ refinement halves it until estimates and standard errors no longer depend on it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from fdi_torch.estimate.diagnosis import Diagnosis, diagnose, lasting, sample_noise
-from fdi_torch.estimate.evolution import EvolutionResult, EvolutionSettings, Search, evolve
+from fdi_torch.estimate.evolution import EvolutionResult, Search, evolve
 from fdi_torch.estimate.fitting import Fitting
-from fdi_torch.estimate.levenberg_marquardt import Progress, RefineSettings, levenberg_marquardt
-from fdi_torch.estimate.objectives import Objective, Problem
+from fdi_torch.estimate.hybrid_settings import HybridSettings, sparing
+from fdi_torch.estimate.levenberg_marquardt import Progress
+from fdi_torch.estimate.objectives import Problem
 from fdi_torch.estimate.refined import Refined
+from fdi_torch.estimate.refinement import (
+    ADAPTIVE_STEPS,
+    distant_members,
+    refine_adaptively,
+    refine_to_convergence,
+    status_of,
+    unrefined,
+)
 from fdi_torch.estimate.uncertainty import Estimate, make_estimate
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.engine import Engine
 from fdi_torch.simulate.step_length import choose_step, probe_points
 
-# A stalled refinement counts as converged if the predicted distance to the optimum is below this, in standard errors.
-CONVERGED_WITHIN = 0.1
-# In units of the plant's time scale: the shortest integration step (below it, standard errors change less than any
-# recording can resolve), and the longest step of the first probing simulation.
-FINEST_STEP, FIRST_STEP = 0.01, 5.0
-# Tolerances of the search with a slow engine: it only has to reach the basin of attraction of the refinement.
-SLOW_PARAMETER_TOLERANCE, SLOW_COST_TOLERANCE, SLOW_SEARCH_TOLERANCE = 0.2, 1e-2, 0.1
-# Accuracies of the adaptive solver, loose then tight, as equivalent fixed steps in units of the plant's time scale.
-ADAPTIVE_STEPS = (2.0, 0.05)
-# Newton decrements at which a refinement stops: in an intermediate stage, and in the last one.
-LOOSE_DECREASE, TIGHT_DECREASE = 1e-2, 1e-4
+# The longest step of the first probing simulation, in units of the plant's time scale.
+FIRST_STEP = 5.0
 # Tanks are stable, so integration errors do not accumulate: the first samples of a long recording show their size.
 PROBE_SAMPLES = 20_000
-
-
-@dataclass(frozen=True)
-class HybridSettings:
-    """Settings of search and refinement.
-
-    objectives: objective of the search, objective of the refinement.
-    method: 'lm' refines by Levenberg-Marquardt; 'none' takes the best member of the search as the estimate.
-    search_step, refine_step: integration steps in s; None chooses them from the measured integration error.
-    search_tolerance, refine_tolerance: admissible integration error, as a fraction of the standard deviation of each
-    channel's readings over the search box.
-    starts: number of good, mutually distant members of the final population that are refined.
-    std_tolerance: admissible relative change of the standard errors when the refinement step is halved.
-    confidence: confidence level of the diagnosis. adaptive: refine with an adaptive solver instead of fixed steps.
-    """
-
-    objectives: tuple[Objective, Objective] = ("correlation", "likelihood")
-    search: EvolutionSettings = field(default_factory=EvolutionSettings)
-    method: Literal["lm", "none"] = "lm"
-    refine: RefineSettings = field(default_factory=RefineSettings)
-    search_step: float | None = None
-    refine_step: float | None = None
-    search_tolerance: float = 3e-3
-    refine_tolerance: float = 1e-5
-    starts: int = 3
-    std_tolerance: float = 5e-3
-    confidence: float = 0.95
-    adaptive: bool = False
 
 
 @dataclass(frozen=True)
@@ -115,20 +86,6 @@ def estimate_parameters(
     else:
         refinement, fine = refine_to_convergence(fitting, settings, starts, low, high, fine, on_iteration)
     return conclude(fitting, settings, result, refinement, (coarse, fine))
-
-
-def sparing(settings: HybridSettings) -> HybridSettings:
-    """Reduce the effort for an engine that evaluates every integration step in Python.
-
-    The search gets larger tolerances. The refinement uses an adaptive solver unless a step is prescribed.
-    """
-    search = replace(
-        settings.search,
-        parameter_tolerance=max(settings.search.parameter_tolerance, SLOW_PARAMETER_TOLERANCE),
-        cost_tolerance=max(settings.search.cost_tolerance, SLOW_COST_TOLERANCE),
-    )
-    rough = max(settings.search_tolerance, SLOW_SEARCH_TOLERANCE)
-    return replace(settings, search=search, search_tolerance=rough, adaptive=settings.refine_step is None)
 
 
 def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
@@ -187,126 +144,6 @@ def search(
     """Differential evolution on one problem in the box from low (P,) to high (P,), started afresh or resumed."""
     low, high = low.unsqueeze(0), high.unsqueeze(0)
     return evolve(problem.cost, low, high, settings.search, seed, on_generation=on_generation, resume=resume)
-
-
-def distant_members(search_result: EvolutionResult, low: Tensor, high: Tensor, count: int) -> Tensor:
-    """Starting points (K, P) of the refinement, K <= count, best first.
-
-    A member of the final population is selected if, in at least one parameter, it differs from every better selected
-    one by more than 5 % of the box's width.
-    """
-    population = search_result.population[0]
-    members = population[torch.isfinite(search_result.cost[0]) & torch.isfinite(population).all(-1)]
-    selected = [search_result.best[0]]
-    for member in members:
-        if len(selected) == count:
-            break
-        is_distant = [float(((member - t) / (high - low)).abs().max()) > 0.05 for t in selected]
-        if all(is_distant):
-            selected.append(member)
-    return torch.stack(selected)
-
-
-def refine_to_convergence(
-    fitting: Fitting,
-    settings: HybridSettings,
-    starts: Tensor,
-    low: Tensor,
-    high: Tensor,
-    step: float,
-    on_iteration: Callable[[Progress], None] | None,
-) -> tuple[Refined, float]:
-    """Refine from every start (K, P), take the best optimum, and halve the integration step (s) until it converges.
-
-    The step has converged when halving it changes every standard error by at most the fraction `std_tolerance` and
-    every value by at most 5 % of its standard error. Returns the optimum and the last step.
-    """
-
-    def run(theta: Tensor, at: float) -> Refined:
-        linearise = fitting.problem(at, settings.objectives[1]).linearise
-        stop = near_enough(settings, TIGHT_DECREASE) if fitting.takes_own_steps(at) else settings.refine
-        return best_of(levenberg_marquardt(linearise, theta, low, high, stop, on_iteration))
-
-    refinement = run(starts, step)
-    while settings.refine_step is None and step > 2.0 * FINEST_STEP * time_scale(fitting.plant):
-        finer = run(refinement.theta, 0.5 * step)
-        coarse_std = information_std(fitting.problem(step, "likelihood"), refinement.theta)
-        fine_std = information_std(fitting.problem(0.5 * step, "likelihood"), finer.theta)
-        determined = torch.isfinite(coarse_std) & torch.isfinite(fine_std)
-        std_change = ((fine_std - coarse_std).abs() / fine_std)[determined]
-        value_change = ((finer.theta - refinement.theta).abs()[0] / fine_std)[determined]
-        refinement, step = finer, 0.5 * step
-        if not bool((std_change > settings.std_tolerance).any() or (value_change > 0.05).any()):
-            break
-    return refinement, step
-
-
-def refine_adaptively(
-    fitting: Fitting,
-    settings: HybridSettings,
-    starts: Tensor,
-    low: Tensor,
-    high: Tensor,
-    coarse: float,
-    on_iteration: Callable[[Progress], None] | None,
-) -> Refined:
-    """Refine from every start (K, P) with coarse fixed steps (s), then from the best one with an adaptive solver.
-
-    The adaptive solver runs twice, first with a loose and then with a tight tolerance.
-    """
-
-    def run(problem: Problem, theta: Tensor, decrease: float) -> Refined:
-        stop = near_enough(settings, decrease)
-        return best_of(levenberg_marquardt(problem.linearise, theta, low, high, stop, on_iteration))
-
-    refinement = run(fitting.problem(coarse, settings.objectives[1]), starts, LOOSE_DECREASE)
-    scale = time_scale(fitting.plant)
-    for step in ADAPTIVE_STEPS:
-        problem = fitting.problem(step * scale, settings.objectives[1], adaptive=True)
-        refinement = run(problem, refinement.theta, TIGHT_DECREASE if step == ADAPTIVE_STEPS[-1] else LOOSE_DECREASE)
-    return refinement
-
-
-def unrefined(
-    fitting: Fitting, settings: HybridSettings, starts: Tensor, low: Tensor, high: Tensor, step: float
-) -> Refined:
-    """The first of the starts (K, P), unchanged, with the gradient and curvature of the cost there; `step` in s."""
-    problem = fitting.problem(step, settings.objectives[1], settings.adaptive)
-    return levenberg_marquardt(problem.linearise, starts[:1], low, high, replace(settings.refine, iterations=0))
-
-
-def near_enough(settings: HybridSettings, decrease: float) -> RefineSettings:
-    """Settings that stop the refinement as soon as the Newton decrement is below `decrease`.
-
-    For a negative log-likelihood the decrement is d^2 / 2 with d the distance to the optimum in standard errors.
-    """
-    return replace(settings.refine, decrease_tolerance=max(settings.refine.decrease_tolerance, decrease))
-
-
-def best_of(refined: Refined) -> Refined:
-    """The member of lowest cost of a flat batch, as a batch of one; members whose cost is not finite rank last."""
-    cost = torch.where(torch.isfinite(refined.cost), refined.cost, torch.inf)
-    return refined.member(int(cost.argmin()))
-
-
-def status_of(refinement: Refined) -> str:
-    """Status of a batch of one.
-
-    A member that stalled, or that was not iterated at all, counts as 'converged' if its Newton decrement places it
-    within `CONVERGED_WITHIN` standard errors of the optimum. Otherwise a member without iterations is 'not refined'.
-    """
-    status = refinement.statuses()[0]
-    near_optimum = float(refinement.promised[0]) < 0.5 * CONVERGED_WITHIN**2
-    no_iterations = status == "max_iterations" and not int(refinement.iterations[0])
-    if (status == "stalled" or no_iterations) and near_optimum:
-        return "converged"
-    return "not refined" if no_iterations else status
-
-
-def information_std(problem: Problem, theta: Tensor) -> Tensor:
-    """Standard errors (P,) from the Gauss-Newton curvature at theta (1, P); infinite for undetermined parameters."""
-    curvature = problem.linearise(theta, torch.zeros(1, dtype=torch.int64)).curvature[0]
-    return make_estimate(problem.space, theta[0], curvature).std
 
 
 def conclude(

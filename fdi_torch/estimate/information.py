@@ -100,11 +100,6 @@ def _certainty_from(covariance: Tensor, null: Tensor, scale: Tensor, held: Tenso
     return Certainty(covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt(), covariance, null, scale)
 
 
-def cramer_rao(information: Tensor, threshold: float = RELATIVE_EIGENVALUE) -> Tensor:
-    """Cramer-Rao bound: smallest standard deviation (*batch, P) of any unbiased estimator; infinite if undetermined."""
-    return certainty(information, threshold=threshold).std
-
-
 def determined_combinations(null: Tensor, scale: Tensor) -> list[tuple[list[int], Tensor]]:
     """Groups of parameters that are jointly undetermined, with the linear combinations of them that are determined.
 

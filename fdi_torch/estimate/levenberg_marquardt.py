@@ -23,12 +23,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor
 
 from fdi_torch.estimate.damped_step import Quadratic, Step, bent_step, damped_step, newton_decrement
+from fdi_torch.estimate.linearisation import AnyTrial, Linearisation, Linearise, Neighbourhood
 from fdi_torch.estimate.refined import (
     ABANDONED,
     CONVERGED,
@@ -37,7 +37,6 @@ from fdi_torch.estimate.refined import (
     RUNNING,
     STALLED,
     Refined,
-    State,
     flat_box,
     typical_size,
     unfinished,
@@ -47,75 +46,6 @@ _MOST_DAMPING, _LEAST_DAMPING = 1e14, 1e-12
 # The damping is multiplied by the first number if actual decrease / predicted decrease exceeds the second. It falls
 # fast and rises slowly at first ("delayed gratification", Transtrum and Sethna 2012, section 4.1).
 _DAMPING_REDUCTION, _GOOD_GAIN_RATIO = 0.2, 0.25
-
-
-@dataclass(frozen=True)
-class Linearisation:
-    """Quadratic model of the cost at a point: cost (L,), gradient (L, P), Gauss-Newton curvature (L, P, P).
-
-    state: data that the problem attaches to this point and receives back with it; None if there are none.
-    """
-
-    cost: Tensor
-    gradient: Tensor
-    curvature: Tensor
-    state: State | None = None
-
-    def finite(self) -> Tensor:
-        """Lanes whose cost, gradient and curvature are all finite, (L,) bool."""
-        slopes = torch.isfinite(self.gradient).all(-1) & torch.isfinite(self.curvature).all(-1).all(-1)
-        return torch.isfinite(self.cost) & slopes
-
-    def __getitem__(self, keep: Tensor) -> Linearisation:
-        state = None if self.state is None else self.state.lanes(keep)
-        return Linearisation(self.cost[keep], self.gradient[keep], self.curvature[keep], state)
-
-    def replaced(self, which: Tensor, new: Linearisation) -> Linearisation:
-        """A copy in which the k-th lane of `new` replaces lane `which[k]` (int64)."""
-        if len(which) == len(self.cost):
-            return new
-        state = self.state
-        if state is not None and new.state is not None and len(which):
-            state = state.replaced(which, new.state)
-        return Linearisation(
-            self.cost.index_copy(0, which, new.cost),
-            self.gradient.index_copy(0, which, new.gradient),
-            self.curvature.index_copy(0, which, new.curvature),
-            state,
-        )
-
-
-Linearise = Callable[[Tensor, Tensor], Linearisation]
-
-
-class Trial(Protocol):
-    """Points whose cost is known, but not their derivatives."""
-
-    @property
-    def cost(self) -> Tensor:
-        """Cost of each point, (L,)."""
-
-    def __getitem__(self, keep: Tensor) -> Self:
-        """Select lanes by index (int64)."""
-
-    def replaced(self, which: Tensor, new: Self) -> Self:
-        """A copy in which the k-th lane of `new` replaces lane `which[k]` (int64)."""
-
-
-AnyTrial = TypeVar("AnyTrial", bound=Trial)
-
-
-class Neighbourhood(Protocol[AnyTrial]):
-    """A problem that computes points from the model at a nearby point, and their derivatives only where needed."""
-
-    def attempt(self, theta: Tensor, known: Linearisation, step: Tensor, near: AnyTrial | None = None) -> AnyTrial:
-        """The points theta (L, P). `step` (L, P) leads there from the points of the model `known`, or from `near`."""
-
-    def bend(self, known: Linearisation, trial: AnyTrial, step: Tensor) -> Tensor:
-        """J'c (L, P) with c = r(theta + step) - r(theta) - J step, priors included; J is the Jacobian of `known`."""
-
-    def model(self, theta: Tensor, trial: AnyTrial) -> Linearisation:
-        """The model at the points of `trial`, theta (L, P)."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +140,7 @@ def levenberg_marquardt(
 
     `linearise(theta (L, P), lanes (L,))` returns the model at theta; `lanes` are indices into the flattened batch.
     Finished lanes drop out of later calls. With a neighbourhood, `linearise` computes the starting point only and
-    `neighbourhood.follow` all further ones. A trial whose model is not finite is refused; a lane whose start is not
+    the neighbourhood all further ones. A trial whose model is not finite is refused; a lane whose start is not
     finite has the status "failed". Raises ValueError for an empty box and for models of the wrong shape.
     """
     settings = settings or RefineSettings()

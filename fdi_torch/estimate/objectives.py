@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.levenberg_marquardt import Linearisation
+from fdi_torch.estimate.linearisation import Linearisation
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.engine import Engine, Readings
 

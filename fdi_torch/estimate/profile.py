@@ -20,8 +20,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.hybrid import CONVERGED_WITHIN, TIGHT_DECREASE
-from fdi_torch.estimate.levenberg_marquardt import Linearise, RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.linearisation import Linearise
+from fdi_torch.estimate.refinement import CONVERGED_WITHIN, TIGHT_DECREASE
 from fdi_torch.estimate.uncertainty import Estimate, plain_value
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.tables import Shown, Table

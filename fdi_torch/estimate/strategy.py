@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -50,6 +50,27 @@ class SearchState:
         chosen: dict[str, Any] = {name: value[keep] for name, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **chosen)
 
+    def checked(self, cost: Tensor) -> Tensor:
+        """The costs of the candidates, infinite where they are not finite. Raises ValueError for another shape."""
+        if cost.shape != self.cost.shape:
+            raise ValueError(
+                f"expected costs {tuple(self.cost.shape)}, got {tuple(cost.shape)}; one for each candidate"
+            )
+        return torch.where(torch.isfinite(cost), cost, torch.inf).to(self.cost.dtype)
+
+    def with_progress_counters(self, settings: EvolutionSettings) -> Self:
+        """The state with `scale`, `anchor` and `waited` of its sorted costs."""
+        best, median = self.cost[..., 0], self.cost[..., self.cost.shape[-1] // 2]
+        difference = torch.where(torch.isfinite(median), median - best, 0.0)
+        scale = torch.maximum(self.scale, difference)
+        improved = best < self.anchor - settings.cost_tolerance * scale
+        return replace(
+            self,
+            scale=scale,
+            anchor=torch.where(improved, best, self.anchor),
+            waited=torch.where(improved, 0, self.waited + 1),
+        )
+
     def to_dict(self) -> dict[str, Tensor]:
         """The state as plain tensors; `from_dict` restores it bit for bit."""
         return {name: torch.as_tensor(value) for name, value in vars(self).items()}
@@ -66,9 +87,6 @@ class Proposal:
     """Candidates to be evaluated, all within the box."""
 
     candidates: Tensor  # (*problems, N, P)
-
-
-AnyState = TypeVar("AnyState", bound=SearchState)
 
 
 class Strategy(Protocol):
@@ -108,16 +126,28 @@ def state_from_dict(tensors: dict[str, Tensor]) -> SearchState:
     raise ValueError(f"expected the state of a search, got {', '.join(sorted(tensors))}; start the search again")
 
 
-def checked_costs(state: SearchState, cost: Tensor) -> Tensor:
-    """The costs of the candidates, infinite where they are not finite. Raises ValueError for another shape."""
-    if cost.shape != state.cost.shape:
-        raise ValueError(f"expected costs {tuple(state.cost.shape)}, got {tuple(cost.shape)}; one for each candidate")
-    return torch.where(torch.isfinite(cost), cost, torch.inf).to(state.cost.dtype)
+def before_first_generation(
+    low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor, size: int
+) -> dict[str, Any]:
+    """The fields of `SearchState`, without the population of `size` members, before any cost is known.
+
+    Raises ValueError for an empty or infinite box, mismatched shapes and a budget below the population size.
+    """
+    _check_box(low, high, settings, seed, size)
+    problems = low.shape[:-1]
+    return {
+        "cost": low.new_full((*problems, size), torch.inf),
+        "low": low,
+        "high": high,
+        "seed": seed,
+        "scale": low.new_zeros(problems),
+        "anchor": low.new_full(problems, torch.inf),
+        "waited": torch.zeros_like(seed),
+        "first_population": size,
+    }
 
 
-def check_box(low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor) -> None:
-    """Raises ValueError for an empty or infinite box, mismatched shapes and a budget below the population size."""
-    size = settings.first_population(low.shape[-1])
+def _check_box(low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor, size: int) -> None:
     if low.shape != high.shape or low.shape[:-1] != seed.shape:
         raise ValueError(
             f"expected low and high (*problems, P) and seeds (*problems), got {tuple(low.shape)}, {tuple(high.shape)} "
@@ -140,20 +170,6 @@ def with_first_guess(population: Tensor, guess: Tensor) -> Tensor:
             f"expected at most {population.shape[-2]} first guesses (the population), got {guess.shape[-2]}; give fewer"
         )
     return torch.cat((guess, population[..., guess.shape[-2] :, :]), -2)
-
-
-def with_progress_counters(state: AnyState, settings: EvolutionSettings) -> AnyState:
-    """The state with `scale`, `anchor` and `waited` of its sorted costs."""
-    best, median = state.cost[..., 0], state.cost[..., state.cost.shape[-1] // 2]
-    difference = torch.where(torch.isfinite(median), median - best, 0.0)
-    scale = torch.maximum(state.scale, difference)
-    improved = best < state.anchor - settings.cost_tolerance * scale
-    return replace(
-        state,
-        scale=scale,
-        anchor=torch.where(improved, best, state.anchor),
-        waited=torch.where(improved, 0, state.waited + 1),
-    )
 
 
 def pick(rows: Tensor, index: Tensor) -> Tensor:

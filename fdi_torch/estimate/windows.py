@@ -16,6 +16,7 @@ from fdi_torch.estimate.hybrid import search_box
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.objectives import Problem, Term
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
@@ -130,7 +131,7 @@ def window_of(fitting: Fitting, std: Tensor, suspects: Collection[str], step: fl
         if parameter.name in suspects:
             size, error = float(theta[i]), float(errors[i])
             at_upper_bound = size >= parameter.high  # the true size may be larger; it has no upper limit
-            tank_empty = _is_empty(fitting, parameter.name.partition(".")[0], levels)
+            tank_empty = _is_empty(fitting, ParameterName.parse(parameter.name).place, levels)
             state: State = (
                 "cannot tell"
                 if tank_empty

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from fdi_torch.effects import effect
+from fdi_torch.parameters import ParameterName, by_prefix
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.plant.description import FLOW_KINDS, PlacedEffect, PlantDescription
 
@@ -135,21 +136,20 @@ def adopted(plant: PlantDescription, answer: Answer, constants: bool = False) ->
     if not constants:
         return replace(plant, effects=effects)
     values = {n: c["augmented"] for n, c in answer.constants.items() if n not in plant.varying}
-    fitted = with_constants(plant, {n: v for n, v in values.items() if n.count(".") == 1})
+    fitted = with_constants(plant, {n: v for n, v in values.items() if ParameterName.parse(n).is_constant})
     effects = tuple(_same_flow(_same_shape(_refitted(e, values), plant, fitted), plant, fitted) for e in effects)
     return replace(fitted, effects=effects, tolerances=plant.tolerances | _tolerances_of_causes(answer))
 
 
 def _refitted(placed: PlacedEffect, values: Mapping[str, float]) -> PlacedEffect:
     """An effect of the plant file with fitted values of its parameters that have a tolerance."""
-    prefix = f"{placed.location}.{placed.effect}"
-    return replace(placed, parameters={n: values.get(f"{prefix}.{n}", v) for n, v in placed.parameters.items()})
+    return replace(placed, parameters={n: values.get(placed.full_name(n), v) for n, v in placed.parameters.items()})
 
 
 def _tolerances_of_causes(answer: Answer) -> dict[str, float]:
     """Tolerances of the causes' parameters, within which a later diagnosis may refit them."""
     return {
-        f"{cause.location}.{cause.effect}.{name}": max(
+        str(ParameterName(cause.location, cause.effect, name)): max(
             TOLERANCE_SHARE * abs(amount.value), TOLERANCE_ERRORS * amount.std
         )
         for cause in answer.causes
@@ -176,10 +176,7 @@ def _same_flow(placed: PlacedEffect, before: PlantDescription, after: PlantDescr
 
 def with_constants(plant: PlantDescription, values: Mapping[str, float]) -> PlantDescription:
     """The plant with other constants, by full name, SI: 'P13.discharge_coefficient'."""
-    changed: dict[str, dict[str, float]] = {}
-    for name, value in values.items():
-        component, _, constant = name.partition(".")
-        changed.setdefault(component, {})[constant] = value
+    changed = by_prefix(values)
 
     def updated(parts: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(replace(part, **changed.get(part.name, {})) for part in parts)

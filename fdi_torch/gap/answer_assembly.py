@@ -28,6 +28,7 @@ from fdi_torch.gap.model_comparison import (
 from fdi_torch.gap.posterior import CauseHypothesis
 from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.remarks import remarks_on
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 
@@ -150,10 +151,10 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     causes = []
     placements = [p for p in fit.candidate.placements if (p.effect.name, p.location) in result.posterior.best.causes]
     for p in placements:
-        amounts = {}
-        for name, value in fit.effect_values.items():
-            if name.rpartition(".")[0] == p.prefix:
-                amounts[name.rpartition(".")[2]] = Amount(value, stds[name], fit.space[name].unit)
+        amounts = {
+            ParameterName.parse(name).field: Amount(value, stds[name], fit.space[name].unit)
+            for name, value in fit.values_of([p]).items()
+        }
         causes.append(Cause(p.effect.name, p.location, amounts, equivalent_causes((p.effect.name, p.location), plant)))
     if result.posterior.best.unknown_at:
         causes.append(Cause(UNKNOWN, result.posterior.best.unknown_at))

@@ -9,7 +9,7 @@ fitted together with the parameters (`trajectory_problem.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -21,12 +21,12 @@ from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, 
 from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
 from fdi_torch.gap.dataset import DataSet, RecordingPart, interpolate
 from fdi_torch.gap.trajectory_problem import FAR, FittedTrajectory, TrajectoryProblem
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.parameters import ParameterName, ParameterSpace, common_name, is_effect_parameter, name_in_recording
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
-from fdi_torch.simulate.joint_collocation import JointCollocation, name_in_recording
+from fdi_torch.simulate.joint_collocation import JointCollocation
 
 # A fit has converged if a further step is predicted to gain less than this share of the chi-square per reading, or of
 # one if that is more. Parameters are then within a tenth of a standard error, misfit included.
@@ -70,7 +70,12 @@ class Fit:
 
     @property
     def effect_values(self) -> dict[str, float]:
-        return {n: v for n, v in self.values.items() if n.count(".") == 2}
+        return {n: v for n, v in self.values.items() if is_effect_parameter(n)}
+
+    def values_of(self, placements: Iterable[Placement]) -> dict[str, float]:
+        """The fitted parameters of some of the effects, by full name."""
+        prefixes = {p.prefix for p in placements}
+        return {n: v for n, v in self.values.items() if ParameterName.parse(n).prefix in prefixes}
 
     @property
     def key(self) -> Key:
@@ -105,11 +110,11 @@ class Fitter:
         """The plant with the candidate's effects. Its parameters are the nuisance parameters and those in `free`."""
         network = self.network(candidate.placements)
         names = tuple(dict.fromkeys([*self.data.nuisance, *free]))
-        space = ParameterSpace(network.constants[n] for n in names if "@" not in n)
+        space = ParameterSpace(network.constants[n] for n in names if common_name(n) == n)
         if not self.data.further:
             return Collocation(network, space, self.data.experiment)
         parts = [Collocation(network, space, part.experiment) for part in self.data.parts]
-        return JointCollocation(parts, ParameterSpace(replace(space[n.partition("@")[0]], name=n) for n in names))
+        return JointCollocation(parts, ParameterSpace(replace(space[common_name(n)], name=n) for n in names))
 
     def network(self, placements: Sequence[Placement]) -> TankNetwork:
         """The plant with these effects added to its nominal effects, or in their place."""

@@ -10,12 +10,12 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from fdi_torch.parameters import name_in_recording
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import Experiment, lay_out
-from fdi_torch.simulate.joint_collocation import name_in_recording
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_n
 from fdi_torch.gap.problem import PLAIN, DiagnosisProblem, Settings, problem_of
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.structure_search import ExplanationPool, search
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of_all, with_simulated_levels
 from fdi_torch.recording import Recording
@@ -53,7 +54,7 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     fitter, null, quantization_steps = recalibrate(data)
     reach = with_simulated_levels(operating_range_of_all(problem.recordings, plant), plant, null.linearised.levels[0])
     progress(0.2, "which effects")
-    present = {p.prefix for p in problem.known_effects} | {name.rpartition(".")[0] for name in data.nuisance}
+    present = {p.prefix for p in problem.known_effects} | {ParameterName.parse(name).prefix for name in data.nuisance}
     options = options_of([p for p in library if not p.effect.quantizes and p.prefix not in present], fitter, reach)
     pool = ExplanationPool(fitter, null, len(library))
     result = search(pool, options, problem.most)

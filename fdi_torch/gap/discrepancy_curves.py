@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
-from fdi_torch.gap.free_form import UNIT, free_form
+from fdi_torch.gap.free_form import UNIT, free_form, is_free_coefficient
 from fdi_torch.gap.free_form_coefficients import coefficients_of, fitted_coefficients
 from fdi_torch.plant.description import OUTSIDE, Sensor, Tank
 from fdi_torch.plant.effect import Placement, Stage
@@ -84,7 +84,7 @@ def _neutral(fitter: Fitter, placements: Sequence[Placement]) -> tuple[tuple[Pla
     plant, sizes = fitter.data.plant, {}
     for p in placements:
         size = p.effect.parameters(p.location, plant)[0]
-        sizes[f"{p.prefix}.{size.name}"] = size.nominal
+        sizes[p.full_name(size.name)] = size.nominal
     return tuple(placements), sizes
 
 
@@ -116,17 +116,17 @@ def _local(
     """
     plant, linearised = fitter.data.plant, fit.linearised
     middle = 0.5 * (linearised.levels[:, 1:] + linearised.levels[:, :-1])
-    fitted_engine = fitter.engine(fit.candidate, [n for n in fit.space.names if n.count(".") == 2])
+    fitted_engine = fitter.engine(fit.candidate, list(fit.effect_values))
     theta = fit.theta.unsqueeze(0)
     placements = changed[0][0]
     prefixes = {p.prefix for p in placements}
     others = [p for p in fit.candidate.placements if p.prefix not in prefixes]
-    free = {n for n in fit.space.names if n.count(".") == 2} | {n for _, values in changed for n in values}
+    free = set(fit.effect_values) | {n for _, values in changed for n in values}
     engine = fitter.engine(Candidate((*others, *placements)), sorted(free))
     fitted = {n: v for n, v in fit.values.items() if n in engine.space}
-    base = {n: 0.0 for n in free if ".free_" in n}  # one coefficient at a time
+    base = {n: 0.0 for n in free if is_free_coefficient(n)}  # one coefficient at a time
     rows = torch.stack([engine.space.vector({**fitted, **base, **values}) for _, values in changed])
-    if ".free_" in next(iter(changed[0][1])):
+    if is_free_coefficient(next(iter(changed[0][1]))):
         before = engine.space.vector({**fitted, **base}).unsqueeze(0)
         rates, readings = engine.rates(middle, before), engine.read(linearised.levels, before)
     else:

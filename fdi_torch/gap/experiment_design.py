@@ -16,6 +16,7 @@ from torch import Tensor
 
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.dataset import data_set_of
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
@@ -115,8 +116,8 @@ def _prior_information(fitter: Fitter, fit: Fit) -> Tensor:
 
 
 def _in_one_run(fit: Fit) -> list[str]:
-    """Parameters of a fit that one recording has; '@' marks those of further recordings."""
-    return [n for n in fit.space.names if "@" not in n]
+    """Parameters of a fit that one recording has, without those of further recordings."""
+    return [n for n in fit.space.names if not ParameterName.parse(n).recording]
 
 
 def _cumulative_separation(difference: Tensor, slopes: Tensor, information: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ def log_prior_width(screening: ScreeningResult, i: int) -> float:
     """Cost of the size of an option with a uniform prior: log of its range in standard errors."""
     option = screening.options[i]
     name, start = next(iter(option.start.items()))
-    size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
+    size = next(p for p in option.parameters if option.placement.full_name(p.name) == name)
     width, unit = size.high - size.low, abs(start - size.nominal)
     if not math.isfinite(width) or unit == 0.0:
         return 0.0
@@ -44,7 +44,7 @@ def sized(option: Option, factor: float) -> dict[str, float]:
     if not option.placement.effect.smooth:
         return dict(option.start)
     name = next(iter(option.start))
-    size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
+    size = next(p for p in option.parameters if option.placement.full_name(p.name) == name)
     factor = min(max(factor, 0.1), 4.0)
     value = size.nominal + factor * (option.start[name] - size.nominal)
     return {**option.start, name: min(max(value, size.low), size.high)}

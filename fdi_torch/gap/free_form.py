@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
-from fdi_torch.parameters import Parameter
+from fdi_torch.parameters import Parameter, ParameterName
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription, Sensor
 from fdi_torch.plant.effect import Effect, Local, Memory, Placement, Stage, Values, place_kind
@@ -125,6 +125,11 @@ class FreeReading(_Free):
         return value + self.scale * (self.curve("reading", value, p) + time), memory
 
 
+def is_free_coefficient(name: str) -> bool:
+    """Whether a parameter is a coefficient of a free discrepancy."""
+    return ParameterName.parse(name).effect.startswith("free_")
+
+
 def free_form(
     place: str, plant: PlantDescription, reach: OperatingRange, periods: Sequence[float] = ()
 ) -> tuple[Placement, ...]:
@@ -138,9 +143,8 @@ def fitted_free_form(
     """Fit the free discrepancy of one place together with some effects of a fit."""
     plant = fitter.data.plant
     placements = free_form(place, plant, reach, periods)
-    start = {f"{p.prefix}.{c.name}": 0.0 for p in placements for c in p.effect.parameters(p.location, plant)}
-    prefixes = {p.prefix for p in effects}
-    start |= {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] in prefixes}
+    start = {p.full_name(c.name): 0.0 for p in placements for c in p.effect.parameters(p.location, plant)}
+    start |= fit.values_of(effects)
     return fitter.fit(Candidate((*effects, *placements), (start,)), fit)
 
 
@@ -152,11 +156,11 @@ def discrepancy_tables(fit: Fit) -> dict[str, object]:
         effect = placement.effect
         assert isinstance(effect, _Free)
         for variable, grid in effect.nodes.items():
-            share = [values[f"{placement.prefix}.{variable}_{j}"] for j in range(len(grid))]
+            share = [values[placement.full_name(f"{variable}_{j}")] for j in range(len(grid))]
             tables[f"{effect.name}.{variable}"] = {"at": grid, "share": share, "scale": effect.scale}
         if effect.periods:
             sizes = [
-                math.hypot(values[f"{placement.prefix}.sine_{j}"], values[f"{placement.prefix}.cosine_{j}"])
+                math.hypot(*(values[placement.full_name(f"{wave}_{j}")] for wave in ("sine", "cosine")))
                 for j in range(len(effect.periods))
             ]
             tables[f"{effect.name}.period"] = {"at": list(effect.periods), "share": sizes, "scale": effect.scale}

@@ -16,6 +16,7 @@ from torch import Tensor
 from fdi_torch.gap.candidate_fit import Fit, Fitter, covariance
 from fdi_torch.gap.free_form import UNIT
 from fdi_torch.gap.screening import Option, effect_columns, options_of
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import OperatingRange
 
@@ -84,7 +85,7 @@ def _without_initial_levels(fitter: Fitter, fit: Fit, columns: Tensor, residual:
     All other parameters stay as fitted: a function of a pipe's head would otherwise share its flow with the pipe's
     constant.
     """
-    initial_levels = [i for i, n in enumerate(fit.space.names) if ".start_level" in n]
+    initial_levels = [i for i, n in enumerate(fit.space.names) if ParameterName.parse(n).field == "start_level"]
     j = fitter.white(fit.linearised)[1][0][..., initial_levels].flatten(0, 1)
     q, _ = torch.linalg.qr(j / j.norm(dim=0).clamp(min=1e-300))
     c, r = columns.flatten(0, 1), residual.flatten()
@@ -93,13 +94,13 @@ def _without_initial_levels(fitter: Fitter, fit: Fit, columns: Tensor, residual:
 
 def fitted_coefficients(fitter: Fitter, fit: Fit, free: Sequence[Placement]) -> Coefficients:
     """Coefficients of a fit that contains the free form itself."""
-    prefixes = {p.prefix for p in free}
-    indices = [i for i, n in enumerate(fit.space.names) if n.rpartition(".")[0] in prefixes]
+    indices = [fit.space.index(n) for n in fit.values_of(free)]
     selected = covariance(fitter, fit)[indices][:, indices]
     return Coefficients(tuple(fit.space.names[i] for i in indices), fit.theta[indices], selected)
 
 
 def _as_fitted(fitter: Fitter, fit: Fit, placement: Placement) -> Option:
     """The placement with its fitted parameters."""
-    values = {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] == placement.prefix}
-    return Option(placement, values, placement.effect.parameters(placement.location, fitter.data.plant))
+    return Option(
+        placement, fit.values_of([placement]), placement.effect.parameters(placement.location, fitter.data.plant)
+    )

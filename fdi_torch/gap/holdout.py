@@ -18,7 +18,8 @@ from torch import Tensor
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
 from fdi_torch.gap.channel_noise import Noise, estimate_noise, with_rounding
 from fdi_torch.gap.dataset import DataSet
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.gap.free_form import is_free_coefficient
+from fdi_torch.parameters import ParameterName, ParameterSpace, is_effect_parameter
 from fdi_torch.plant.effect import Placement
 from fdi_torch.simulate.collocation import Collocation
 
@@ -112,9 +113,9 @@ def free_run(data: DataSet, noise: Noise, model: Model, guess: Tensor | None = N
     """
     values = transferable_values(model.values or {})
     fitter = Fitter(replace(data, mask=_first(data.mask)), noise)
-    network = fitter.engine(Candidate(model.placements), [n for n in values if n.count(".") == 2]).network
+    network = fitter.engine(Candidate(model.placements), [n for n in values if is_effect_parameter(n)]).network
     for name, value in values.items():
-        if name.partition("@")[0] in data.plant.varying or "@" in name:
+        if name in data.plant.varying or ParameterName.parse(name).recording:
             continue  # specific to another recording
         network.nominal[network.constants.index(name)] = value
     starts = [f"{t.name}.start_level" for t in data.plant.tanks]
@@ -135,23 +136,15 @@ def transferable_values(values: Mapping[str, float]) -> dict[str, float]:
     Of a free form's function of time its mean holds; its sinusoids are dropped, because their phase belongs to the
     recording's clock.
     """
-    courses: dict[str, list[float]] = {}
-    for name, value in values.items():
-        if _free_part(name).startswith("time_"):
-            courses.setdefault(name.rpartition(".")[0], []).append(value)
     transferable = dict(values)
-    for name in values:
-        course = courses.get(name.rpartition(".")[0], [0.0])
-        if _free_part(name).startswith("time_"):
-            transferable[name] = sum(course) / len(course)
-        elif _free_part(name).startswith(("sine_", "cosine_")):
-            transferable[name] = 0.0
+    free = [ParameterName.parse(n) for n in values if is_free_coefficient(n)]
+    for name in free:
+        if name.field.startswith("time_"):
+            course = [values[str(n)] for n in free if n.prefix == name.prefix and n.field.startswith("time_")]
+            transferable[str(name)] = sum(course) / len(course)
+        elif name.field.startswith(("sine_", "cosine_")):
+            transferable[str(name)] = 0.0
     return transferable
-
-
-def _free_part(name: str) -> str:
-    """Coefficient name of a free form, or '' for any other parameter."""
-    return name.rpartition(".")[2] if ".free_" in name else ""
 
 
 def _first(mask: Tensor) -> Tensor:

@@ -159,7 +159,7 @@ def _possible(option: Option, strength: Tensor, gap: float) -> bool:
     if float(strength) <= VISIBLE:
         return False
     name, start = next(iter(option.start.items()))
-    size = next(p for p in option.parameters if name.endswith(f".{p.name}"))
+    size = next(p for p in option.parameters if option.placement.full_name(p.name) == name)
     needed = size.nominal + (gap / float(strength)) ** 0.5 * (start - size.nominal)
     return size.low <= needed <= size.high
 

@@ -27,7 +27,7 @@ from fdi_torch.gap.free_form import free_form
 from fdi_torch.gap.free_form_coefficients import coefficients_of, without_time_course
 from fdi_torch.gap.holdout import Closure, HeldOut, Model, closure, free_run, model_of
 from fdi_torch.gap.posterior import causes_in_order
-from fdi_torch.parameters import display_unit
+from fdi_torch.parameters import ParameterName, display_unit
 from fdi_torch.plant.description import PlantDescription
 
 FROZEN = {"recalibrated": "augmented_on_recalibrated", "nominal": "augmented_on_nominal"}
@@ -49,8 +49,9 @@ def reference_models(result: DiagnosisResult) -> dict[str, Model]:
 def constants_of(fit: Fit) -> dict[str, float]:
     """Calibration constants and refitted effects of the plant file, without values specific to one recording."""
     new = {p.prefix for p in fit.candidate.placements}
-    constants = [n for n in fit.space.names if "@" not in n and not n.endswith(".start_level")]
-    return {n: fit.values[n] for n in constants if n.rpartition(".")[0] not in new}
+    names = {n: ParameterName.parse(n) for n in fit.space.names}
+    constants = [n for n, name in names.items() if not name.recording and name.field != "start_level"]
+    return {n: fit.values[n] for n in constants if names[n].prefix not in new}
 
 
 def ceiling_model(result: DiagnosisResult) -> Model:

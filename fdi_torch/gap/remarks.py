@@ -17,7 +17,7 @@ from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
 from fdi_torch.gap.model_comparison import causal_places
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
-from fdi_torch.parameters import display_unit
+from fdi_torch.parameters import ParameterName, display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recordings.check import data_warnings
 
@@ -99,10 +99,7 @@ def _nominal_values_out_of_range(plant: PlantDescription) -> list[str]:
         for p in effect(placed.effect).parameters(placed.location, plant):
             value, (unit, scale) = placed.parameters.get(p.name, p.nominal), display_unit(p.unit)
             if not p.low <= value <= p.high:
-                name, ends = (
-                    f"{placed.location}.{placed.effect}.{p.name}",
-                    f"{scale * p.low:.4g} to {scale * p.high:.4g}",
-                )
+                name, ends = placed.full_name(p.name), f"{scale * p.low:.4g} to {scale * p.high:.4g}"
                 remarks.append(
                     f"the plant file has {name} at {scale * value:.4g} {unit}".rstrip()
                     + f", outside its sensible range ({ends} {unit}".rstrip()
@@ -171,7 +168,7 @@ def _changed(result: DiagnosisResult, fitter: Fitter, refit: Fit) -> list[str]:
     distance = {
         n: abs(after[n] - before[n]) / max(math.hypot(errors[0][n], errors[1][n]), 1e-300)
         for n in after
-        if not n.endswith(".start_level")
+        if ParameterName.parse(n).field != "start_level"
     }
     names = sorted((n for n in distance if distance[n] > DIFFERENT), key=lambda n: -distance[n])
     return [f"{n} {_shown(after[n], refit, n)}, not {_shown(before[n], refit, n)}" for n in names]

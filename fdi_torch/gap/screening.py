@@ -16,7 +16,7 @@ from torch import Tensor
 
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.forcing import Forcing
-from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace
 from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.operating_range import OperatingRange
@@ -101,7 +101,7 @@ def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Operating
     """All starts of all placements."""
     plant = fitter.data.plant
     return [
-        Option(p, {f"{p.prefix}.{name}": value for name, value in start.items()}, parameters)
+        Option(p, {p.full_name(name): value for name, value in start.items()}, parameters)
         for p in placements
         for parameters in [p.effect.parameters(p.location, plant)]
         for start in p.effect.starts(p.location, plant, reach)
@@ -232,7 +232,7 @@ def _named(network: TankNetwork, values: Mapping[str, float]) -> tuple[Parameter
 def _starts(options: Sequence[Option]) -> dict[str, Tensor]:
     """Parameters of options with the same fitted names, by short name, (M, 1) each."""
     return {
-        name.rpartition(".")[2]: torch.tensor([[o.start[name]] for o in options], dtype=torch.float64)
+        ParameterName.parse(name).field: torch.tensor([[o.start[name]] for o in options], dtype=torch.float64)
         for name in options[0].start
     }
 

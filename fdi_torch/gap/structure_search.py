@@ -156,9 +156,8 @@ class ExplanationPool:
         """
         fit = explanation.fit
         placements = tuple(p for p in fit.candidate.placements if (p.effect.name, p.location) != cause)
-        prefixes = {p.prefix for p in placements}
-        start = {n: v for n, v in fit.effect_values.items() if n.rpartition(".")[0] in prefixes}
-        self.evaluate(explanation.fitter.fit(Candidate(placements, (start,)), fit), explanation.noise)
+        candidate = Candidate(placements, (fit.values_of(placements),))
+        self.evaluate(explanation.fitter.fit(candidate, fit), explanation.noise)
         return self.explanations[explanation.key - {cause}]
 
     def best_of(self, effects: int) -> list[RankedExplanation]:

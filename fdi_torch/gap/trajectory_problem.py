@@ -12,7 +12,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.levenberg_marquardt import Linearisation
+from fdi_torch.estimate.linearisation import Linearisation
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.simulate.fmu import write_fmu
@@ -27,7 +28,7 @@ def export_fmu(plant: PlantDescription | str | Path, file: str | Path, *, effect
 
 
 def _placement(name: str) -> Placement:
-    location, _, effect = name.partition(".")
-    if not effect:
+    at = ParameterName.of_effect(name)
+    if not at.effect:
         raise ValueError(f"expected an effect at a location such as T1.leak, got '{name}'; see fdi effects")
-    return place(effect, location)
+    return place(at.effect, at.place)

@@ -22,7 +22,7 @@ from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_setup import PreparedMonitor, fault_free_part, prepare_monitor
 from fdi_torch.monitor.samples import Samples, samples_of_recording
 from fdi_torch.monitor.window_monitor import WindowMonitor
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import data_warnings
@@ -189,10 +189,14 @@ class LoggedMonitor:
         present, masses = dict(event.believed), event.masses
         stds = dict(zip(event.faults, event.stds, strict=True))
         for name in dict.fromkeys([*self._ever_suspected, *present, *masses]):
-            place, _, fault = name.partition(".")
-            size = present.get(name, self.space[name].nominal)
-            numbers: dict[str, Any] = {"size": size, "size_std": stds.get(name), "unit": self.space[name].unit}
-            self.log.fault(fault, place, name in present, t=event.time, probability=masses.get(name), **numbers)
+            at = ParameterName.parse(name)
+            numbers: dict[str, Any] = {
+                "probability": masses.get(name),
+                "size": present.get(name, self.space[name].nominal),
+                "size_std": stds.get(name),
+                "unit": self.space[name].unit,
+            }
+            self.log.fault(at.at_place, at.place, name in present, t=event.time, **numbers)
         self._ever_suspected.update(dict.fromkeys([*present, *masses]))
 
     def _log_samples(self, samples: Samples) -> None:

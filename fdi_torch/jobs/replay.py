@@ -171,7 +171,10 @@ def start_levels(run: Run, count: int, path: Path) -> list[Any]:
     if run.config.simulate is not None:
         return [run.config.simulate.start_levels] * count
     if count != len(run.config.recordings):
-        raise LogError(f"{path}: expected {len(run.config.recordings)} recordings, got {count}; it cannot be run again")
+        raise LogError(
+            f"{path}: expected {len(run.config.recordings)} recordings, got {count}; "
+            "the log is incomplete and cannot be replayed"
+        )
     tanks = [tank.name for tank in run.plant.tanks]
     wanted = [recording.start_levels for recording in run.config.recordings]
     return [{t: w.get(t, "free") if isinstance(w, dict) else w for t in tanks} for w in wanted]

@@ -15,7 +15,8 @@ from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.run_file import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
-from fdi_torch.estimate.hybrid import HybridResult, HybridSettings, estimate_parameters
+from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
+from fdi_torch.estimate.hybrid_settings import HybridSettings
 from fdi_torch.estimate.levenberg_marquardt import Progress
 from fdi_torch.estimate.posterior_draws import Draws
 from fdi_torch.estimate.profile import Profile
@@ -31,7 +32,7 @@ from fdi_torch.jobs.run_setup import (
     usable_device,
 )
 from fdi_torch.logbook import DeferredTopic, Listener, RunLog, as_array
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure, save
 from fdi_torch.report.style import inline_svg
@@ -255,10 +256,10 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profile
         unidentifiable=final.undetermined,
     )
     for fault in result.diagnosis.faults:
-        location, _, effect = fault.name.partition(".")
+        name = ParameterName.parse(fault.name)
         sizes = {"size": fault.value, "size_std": fault.std, "flow": fault.flow, "hole_diameter": fault.hole}
-        present: dict[str, Any] = {name: number for name, number in sizes.items() if number is not None}
-        log.fault(effect, location, fault.present, unit=fault.unit, **present)
+        present: dict[str, Any] = {key: number for key, number in sizes.items() if number is not None}
+        log.fault(name.at_place, name.place, fault.present, unit=fault.unit, **present)
     several = len(result.predicted) > 1
     log.result_arrays(**{f"predicted_{k + 1}" if several else "predicted": p for k, p in enumerate(result.predicted)})
     more: dict[str, Any] = {"profiles": [profile.to_dict() for profile in profiles]} if profiles else {}

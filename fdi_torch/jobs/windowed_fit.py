@@ -20,6 +20,7 @@ from fdi_torch.jobs.log_paths import STARTS_OVER, free_path
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space
 from fdi_torch.jobs.train import log_recordings, origin_of
 from fdi_torch.logbook import RunLog
+from fdi_torch.parameters import is_effect_parameter
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def fit_windows(run: Run, tell: Callable[[float, str], None] = lambda share, tex
     assert length is not None
     loaded = recordings_of(run)
     space = requested_space(run)
-    suspects = {p.name for p in space if p.name.count(".") == 2}
+    suspects = {p.name for p in space if is_effect_parameter(p.name)}
     free: dict[str, StartLevel] = dict.fromkeys((t.name for t in run.plant.tanks), "free")
     path = free_path(Path(run.config.output.folder), run.name)
     with RunLog(path, "train", **origin_of(run, loaded), after_interruption=STARTS_OVER) as log:

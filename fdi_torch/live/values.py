@@ -50,7 +50,6 @@ class Inbox:
         self._items: deque[Item] = deque(maxlen=MOST_WAITING)
         self._arrived = threading.Condition()
         self._dropped = 0
-        self._error: Exception | None = None
 
     def put(self, items: Iterable[Item]) -> None:
         with self._arrived:
@@ -62,19 +61,11 @@ class Inbox:
             self._dropped += before + added - len(self._items)
             self._arrived.notify()
 
-    def fail(self, error: Exception) -> None:
-        """Let the next `take` raise this error."""
-        with self._arrived:
-            self._error = error
-            self._arrived.notify()
-
     def take(self, timeout: float) -> list[Item]:
         """All items; waits up to `timeout` s for the first."""
         with self._arrived:
-            if not self._items and self._error is None:
+            if not self._items:
                 self._arrived.wait(timeout)
-            if self._error is not None:
-                raise self._error
             items = list(self._items)
             self._items.clear()
             if self._dropped:

@@ -36,7 +36,7 @@ def encode(fields: Mapping[str, Any]) -> bytes:
 def as_it_is(message: Mapping[str, Any]) -> bytes | None:
     """Fast path of `encode` for plain numbers, texts and homogeneous flat lists; None for other messages.
 
-    The result is the same: a non-finite number would appear in the text as null.
+    The bytes are those of `encode`. A message with a non-finite number, which JSON would show as null, also gets None.
     """
     kinds = set(map(type, message.values()))
     if list in kinds:

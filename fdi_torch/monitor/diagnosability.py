@@ -18,6 +18,7 @@ from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.uncertainty import undetermined_in_words
 from fdi_torch.monitor.structural_analysis import structure_of
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import Pipe, PlantDescription, Tank
 from fdi_torch.recording import Recording
 
@@ -97,7 +98,7 @@ def diagnosability(
     length = torch.linalg.vector_norm(signatures, dim=0)
     nearest = (apart + torch.eye(count, dtype=apart.dtype)).amin(dim=1) if count > 1 else torch.ones(1)
     structural = structure_of(plant, placements_for(faults)).isolable()
-    prefixes = [name.rpartition(".")[0] for name in faults]
+    prefixes = [ParameterName.parse(name).prefix for name in faults]
     return Diagnosability(
         faults=tuple(faults),
         units=tuple(p.unit for p in fitting.space)[:count],
@@ -173,7 +174,7 @@ def _groups(plant: PlantDescription, faults: Sequence[str], apart: Tensor) -> li
 
 
 def _reason(plant: PlantDescription, members: Sequence[str]) -> str:
-    places = dict.fromkeys(name.split(".")[0] for name in members)
+    places = dict.fromkeys(ParameterName.parse(name).place for name in members)
     if len(places) == 1:
         return f"they are the same change of {next(iter(places))}"
     components = [plant.component(place) for place in places]

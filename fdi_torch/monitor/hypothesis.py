@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from fdi_torch.estimate.evidence import posterior
+from fdi_torch.parameters import ParameterName
 
 SHAPE = ("period", "phase")  # fields that describe how an oscillation looks, not how large it is
 
@@ -27,11 +28,10 @@ class Fault:
 def faults_of(names: Sequence[str]) -> list[Fault]:
     """Group parameters into faults: period and phase of an oscillation belong to its amplitude."""
     faults = []
-    for column, name in enumerate(names):
-        effect, _, field = name.rpartition(".")
-        if field not in SHAPE:
-            shape = tuple(names.index(f"{effect}.{s}") for s in SHAPE if f"{effect}.{s}" in names)
-            faults.append(Fault(column, shape))
+    for column, name in enumerate(map(ParameterName.parse, names)):
+        if name.field not in SHAPE:
+            siblings = (str(name.sibling(field)) for field in SHAPE)
+            faults.append(Fault(column, tuple(names.index(s) for s in siblings if s in names)))
     return faults
 
 
@@ -95,7 +95,7 @@ class HypothesisFit:
 
     @property
     def misfit_ratio(self) -> float:
-        """Misfit over that of noise; 1 if noise can explain it."""
+        """Misfit relative to the expected misfit of pure noise; 1 if noise alone can explain the residuals."""
         return max(2.0 * self.misfit / self.noise_level, 1.0) if 2.0 * self.misfit > self.noise_limit else 1.0
 
 

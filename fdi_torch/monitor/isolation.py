@@ -14,7 +14,8 @@ from torch import Tensor
 
 from fdi_torch.estimate.evidence import log_prior, log_volume
 from fdi_torch.estimate.information import certainty
-from fdi_torch.estimate.levenberg_marquardt import Linearisation, RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.linearisation import Linearisation
 from fdi_torch.monitor.hypothesis import NO_CHANGE, Fault, Hypothesis, HypothesisFit, with_posterior
 from fdi_torch.monitor.initial_guess import oscillation_guess, recovery_guesses, recovery_hypotheses, signature_guesses
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
@@ -25,6 +26,7 @@ from fdi_torch.monitor.oscillation import (
     with_phases_at,
     with_wrapped_phases,
 )
+from fdi_torch.parameters import ParameterName
 
 SIZE_STEP = 1e-4  # finite-difference step, as a share of a parameter's range
 ITERATIONS = 12
@@ -110,7 +112,7 @@ class Prior:
         """Log of the odds against no change. Simultaneous recoveries count as one event."""
         new = [c for c in hypothesis.sizes if c not in hypothesis.recovered]
         count = len(new) + bool(hypothesis.recovered)
-        places = len({self.names[c].partition(".")[0] for c in new}) + bool(hypothesis.recovered)
+        places = len({ParameterName.parse(self.names[c]).place for c in new}) + bool(hypothesis.recovered)
         return log_prior(count, places, max(self.single_changes, 1))
 
 

@@ -22,7 +22,7 @@ from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.observer_gain import Gain, hand_gain, start_beside_noise, timed_gain
 from fdi_torch.monitor.samples import Samples, samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
@@ -90,7 +90,7 @@ def prepare_monitor(
     values = calibration(running, fault_free, calibrate, step, start) if calibrate else {}
     space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate)])
     for name in watched:
-        if name.endswith(".phase"):  # a full turn either way, so that no fit stops at +-pi
+        if ParameterName.parse(name).field == "phase":  # a full turn either way, so that no fit stops at +-pi
             space = space.with_changes(name, low=-2.0 * math.pi, high=2.0 * math.pi)
     for name, (low, high) in (ranges or {}).items():
         space = space.with_changes(name, low=low, high=high)
@@ -140,9 +140,8 @@ def with_shapes(faults: Sequence[str], plant: PlantDescription) -> list[str]:
     constants = build_network(plant, placements_for(faults)).constants
     names = []
     for name in faults:
-        effect = name.rpartition(".")[0]
-        shape = [f"{effect}.{s}" for s in SHAPE if f"{effect}.{s}" in constants and f"{effect}.{s}" not in faults]
-        names += [name, *shape]
+        siblings = (str(ParameterName.parse(name).sibling(field)) for field in SHAPE)
+        names += [name, *(s for s in siblings if s in constants and s not in faults)]
     return names
 
 

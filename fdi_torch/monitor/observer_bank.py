@@ -14,7 +14,7 @@ from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork
 from fdi_torch.monitor.whitening import Whitening
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 
 NEVER, LONG_AGO = 1e30, -1e30  # s
@@ -101,11 +101,11 @@ class ObserverBank:
         self.network, self.space, self.gain, self.whitening = network, space, gain, whitening
         self.changing = SwitchedNetwork(network, space.names)
         self._held = _with_own_onset(network, space)
-        onsets = [f"{name.rpartition('.')[0]}.onset" for name in self._held]
+        onsets = [str(ParameterName.parse(name).sibling("onset")) for name in self._held]
         names = [*space.names, *(f"after {name}" for name in space.names), ONSET, RAMP, *onsets]
         groups: dict[str, list[int]] = {}
         for column, name in enumerate(space.names):
-            groups.setdefault(name.rpartition(".")[0], []).append(column)
+            groups.setdefault(ParameterName.parse(name).prefix, []).append(column)
         self.effects = tuple(tuple(columns) for columns in groups.values())
         self._columns = ParameterSpace(self.changing.constants[name] for name in names)
 
@@ -177,7 +177,7 @@ def _with_own_onset(network: TankNetwork, space: ParameterSpace) -> list[str]:
     named = []
     for placement in network.placements:
         size, *shape = placement.effect.parameters(placement.location, network.description)
-        name = f"{placement.prefix}.{size.name}"
+        name = placement.full_name(size.name)
         if placement.effect.memory and any(p.name == "onset" for p in shape) and name in space:
             named.append(name)
     return named

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.information import Certainty
+from fdi_torch.parameters import ParameterName
 
 # Phase change, in radians at the ends of a window, of the finite-difference step of a period.
 PHASE_STEP = 5e-3
@@ -20,8 +21,8 @@ PHASE_STEP = 5e-3
 
 def oscillation_columns(names: Sequence[str]) -> list[tuple[int, int]]:
     """The columns (period, phase) of each oscillation among parameters."""
-    effects = [(c, name.rpartition(".")[0]) for c, name in enumerate(names) if name.endswith(".phase")]
-    return [(list(names).index(f"{effect}.period"), phase) for phase, effect in effects]
+    phases = [(c, name) for c, name in enumerate(map(ParameterName.parse, names)) if name.field == "phase"]
+    return [(list(names).index(str(name.sibling("period"))), phase) for phase, name in phases]
 
 
 def with_phases_at(theta: Tensor, oscillations: Sequence[tuple[int, int]], free: Tensor, time: float) -> Tensor:

@@ -60,21 +60,6 @@ def samples_of_recording(recording: Recording, plant: PlantDescription) -> Sampl
     return Samples(recording.time, inputs, readings, recording.hold)
 
 
-def stack_recordings(recordings: Sequence[Recording], plant: PlantDescription) -> Samples:
-    """Recordings with the same sample times as one batch. Raises ValueError if the sample times differ."""
-    parts = [samples_of_recording(recording, plant) for recording in recordings]
-    if not parts:
-        raise ValueError("expected at least one recording, got none")
-    for recording, part in zip(recordings, parts, strict=True):
-        if len(part) != len(parts[0]) or not torch.equal(part.time, parts[0].time):
-            raise ValueError(
-                f"expected recordings with the same sample times, got others in {recording.source} than in "
-                f"{recordings[0].source}; monitor them one by one"
-            )
-    inputs, readings = torch.stack([p.inputs for p in parts]), torch.stack([p.readings for p in parts])
-    return Samples(parts[0].time, inputs, readings, parts[0].hold)
-
-
 def _columns(recording: Recording, wanted: Sequence[str], known: tuple[str, ...], kind: str) -> list[int]:
     for name in wanted:
         if name not in known:

@@ -21,10 +21,6 @@ class Structure:
     equations: dict[str, frozenset[str]]
     faults: dict[str, frozenset[str]]
 
-    def detectable(self) -> dict[str, bool]:
-        inside = overdetermined(self.equations)
-        return {fault: bool(violated & inside) for fault, violated in self.faults.items()}
-
     def isolable(self) -> dict[str, dict[str, bool]]:
         """[f][g]: whether f is isolable from g."""
         table: dict[str, dict[str, bool]] = {fault: {} for fault in self.faults}

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace
 from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
@@ -50,8 +50,7 @@ class SwitchedNetwork(TankNetwork):
         """Every constant at its mean over the clock's step."""
         share = clock.risen(values["change"]["onset"], values["change"]["ramp"])
         mean = {place: dict(fields) for place, fields in values.items()}
-        for name in self.names:
-            place, _, field = name.rpartition(".")
-            before = values[place][field]
-            mean[place][field] = before + (values[f"after {place}"][field] - before) * share
+        for name in map(ParameterName.parse, self.names):
+            before = values[name.prefix][name.field]
+            mean[name.prefix][name.field] = before + (values[f"after {name.prefix}"][name.field] - before) * share
         return mean

@@ -74,13 +74,6 @@ class Whitening:
         return _apply(self.whitener, own)
 
 
-def fit_whitening(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> Whitening:
-    """Whitening of the residuals (S, C) of a fault-free recording; order and mean by the Bayesian information
-    criterion.
-    """
-    return score_whitenings(residual, highest_order)[0][1]
-
-
 def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> list[tuple[float, Whitening]]:
     """(Bayesian information criterion, whitening) for all orders, with and without a mean, best first.
 

@@ -13,8 +13,9 @@ from fdi_torch.config.simulation import NoiseConfig, noise_std
 from fdi_torch.config.yaml_files import SHIPPED
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
-from fdi_torch.estimate.hybrid import estimate_parameters, information_std
+from fdi_torch.estimate.hybrid import estimate_parameters
 from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
+from fdi_torch.estimate.refinement import information_std
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space, simulated_truth
 from fdi_torch.paper.published import PARAMETERS
 

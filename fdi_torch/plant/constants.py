@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from fdi_torch.parameters import Parameter
+from fdi_torch.parameters import Parameter, ParameterName
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Sensor
 from fdi_torch.plant.flow_component import FlowComponent
 
@@ -16,7 +16,7 @@ def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
     The standard deviation comes from the plant's tolerances (infinite where there is none). A constant that must be
     positive may vary from a tenth to ten times its nominal value. Raises ValueError for a tolerance of an unknown name.
     """
-    tolerances = {name: std for name, std in plant.tolerances.items() if name.count(".") == 1}
+    tolerances = {name: std for name, std in plant.tolerances.items() if ParameterName.parse(name).is_constant}
     for tank in plant.tanks:
         yield _positive(tank.name, "area", "m^2", tank.area, tolerances)
         yield _positive(tank.name, "height", "m", tank.height, tolerances)

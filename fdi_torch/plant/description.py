@@ -5,10 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Sensor, Tank, describe
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
 from fdi_torch.plant.kinds.pipe import Pipe
@@ -48,6 +49,14 @@ class PlacedEffect:
     effect: str
     location: str
     parameters: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def prefix(self) -> str:
+        return f"{self.location}.{self.effect}"
+
+    def full_name(self, parameter: str) -> str:
+        """'T1.leak.size' for the parameter 'size' of a leak at T1."""
+        return str(ParameterName(self.location, self.effect, parameter))
 
 
 @dataclass(frozen=True)
@@ -138,6 +147,13 @@ class PlantDescription:
         for channel, unit in (pair for pair in given if pair is not None):
             units.setdefault(channel, unit)
         return units
+
+
+def with_tolerances(plant: PlantDescription, kept: Callable[[ParameterName], bool]) -> PlantDescription:
+    """The plant with those of its tolerances and varying constants whose names are kept."""
+    tolerances = {n: std for n, std in plant.tolerances.items() if kept(ParameterName.parse(n))}
+    varying = tuple(n for n in plant.varying if kept(ParameterName.parse(n)))
+    return replace(plant, tolerances=tolerances, varying=varying)
 
 
 FLOW_KINDS: tuple[type[FlowComponent], ...] = tuple(

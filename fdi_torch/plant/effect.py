@@ -13,7 +13,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
+from fdi_torch.parameters import Parameter, ParameterName
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.plant.local_conditions import Local, Values
@@ -126,6 +126,10 @@ class Placement:
     @property
     def prefix(self) -> str:
         return f"{self.location}.{self.effect.name}"
+
+    def full_name(self, parameter: str) -> str:
+        """'T1.leak.size' for the parameter 'size' of a leak at T1."""
+        return str(ParameterName(self.location, self.effect.name, parameter))
 
 
 def place_kind(plant: PlantDescription, location: str) -> str:

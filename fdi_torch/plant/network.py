@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.parameters import Parameter, ParameterSpace, by_prefix
 from fdi_torch.plant.constants import constant_parameters
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor
 from fdi_torch.plant.effect import Effect, Memory, Placement, Stage, Values, fits, place_kinds_of
@@ -72,15 +72,11 @@ class TankNetwork(nn.Module):
 
     def bind(self, space: ParameterSpace, theta: Tensor) -> PlaceValues:
         """All constants by place and field: from theta (*batch, P) where `space` names them, else nominal."""
-        values: dict[str, dict[str, Tensor]] = {}
-        for name, nominal in zip(self.constants.names, self.nominal.unbind(), strict=True):
-            place, _, field = name.rpartition(".")
-            values.setdefault(place, {})[field] = nominal
+        named = self.constants.named(self.nominal)
         for name, value in space.named(theta).items():
             self.constants.index(name)
-            place, _, field = name.rpartition(".")
-            values[place][field] = value
-        return Constants(values)
+            named[name] = value
+        return Constants(by_prefix(named))
 
     def forward(self, levels: Tensor, commands: Tensor, clock: Clock, values: PlaceValues) -> Tensor:
         """dh/dt (*batch, tanks), m/s; levels (*batch, tanks), m; commands: outputs of the actuators (*batch,
@@ -246,7 +242,7 @@ def placed_parameters(placement: Placement, plant: PlantDescription) -> list[Par
     for p in placement.effect.parameters(placement.location, plant):
         nominal = known.pop(p.name, p.nominal)
         low, high = min(p.low, nominal), max(p.high, nominal)
-        name = f"{placement.prefix}.{p.name}"
+        name = placement.full_name(p.name)
         std = plant.tolerances.get(name, p.std)
         parameters.append(replace(p, name=name, nominal=nominal, low=low, high=high, std=std))
     if known:

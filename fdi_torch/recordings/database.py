@@ -47,7 +47,8 @@ def expect_no_password(address: str) -> None:
 
 
 def write_query(address: str, target: Path, find: Callable[[str], Path]) -> None:
-    """Write the table of a query as tab-separated text. find: the path of an SQLite file by its name.
+    """Write the table of a query as tab-separated text. find: returns the path of the SQLite file
+    that an address names.
 
     Raises ValueError, without the values of environment variables, if there is no such database or query.
     """

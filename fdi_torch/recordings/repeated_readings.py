@@ -5,9 +5,10 @@ Noise of standard deviation s, quantized in steps of q, repeats a number with a 
     p = P(|e| < q / 2) = erf(q / (2 sqrt(2) s)),
 
 reached for a level in the middle of a step. Some run of L equal readings among n therefore has a probability of at most
-n p^(L - 1). If the readings scatter by less than a step, the noise cannot be separated from quantization (Widrow and
-Kollar, 2008, ch. 4: the quantization error is white and uniform while q < 2 s); p is then taken to be 1, and no run is
-too long.
+n p^(L - 1). A sensor is stuck where that bound is below BY_CHANCE.
+
+The quantization error is white and uniform only while q < 2 s (Widrow and Kollar, 2008, ch. 4). If the readings scatter
+by less than a step, s cannot be estimated; p = 1 is used then, and no sensor counts as stuck.
 """
 
 from __future__ import annotations

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
-
-from fdi_torch.recording import Hold, Recording
 
 
 @dataclass(frozen=True)
@@ -67,22 +64,6 @@ class FileSource:
     tags: TagRows | None = None
     header: bool = True
     sheet: str | None = None
-
-
-class Reader(Protocol):
-    """Reads the named channels of a file; `mapping` describes those whose names do not match, time is `t`.
-
-    Raises ValueError, naming the file, for missing or unreadable content.
-    """
-
-    def __call__(
-        self,
-        path: Path,
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        mapping: Mapping[str, ChannelSource] | None = None,
-        hold: Hold = "zero_order",
-    ) -> Recording: ...
 
 
 def file_sha256(path: Path) -> str:

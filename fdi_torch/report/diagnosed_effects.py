@@ -9,6 +9,7 @@ from typing import Any
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.verdict_words import cause_words
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import fits
 from fdi_torch.report.material import Material
@@ -59,21 +60,17 @@ def diagnosed_effects(material: Material) -> list[DiagnosedEffect]:
 def _fault(message: Mapping[str, Any]) -> DiagnosedEffect:
     size, std, flow, hole = (as_number(message.get(name)) for name in ("size", "size_std", "flow", "hole_diameter"))
     name, location, unit = (str(message.get(key, "")) for key in ("fault", "location", "unit"))
-    quantity = name.partition(".")[2] or "size"
+    fault = ParameterName.of_effect(f"{location}.{name}")
+    quantity = fault.field or "size"
     return DiagnosedEffect(
-        _effect_name(name), location, message.get("present") is True, size, std, unit, flow, hole, quantity
+        fault.effect, location, message.get("present") is True, size, std, unit, flow, hole, quantity
     )
 
 
 def fault_at(name: str) -> tuple[str, str]:
     """A parameter's full name, 'L.leak.size', as an effect in words and its place: 'leak', 'L'."""
-    place, _, fault = name.partition(".")
-    return (_effect_name(fault).replace("_", " "), place) if fault else (name, "")
-
-
-def _effect_name(name: str) -> str:
-    """'leak.size' -> 'leak', 'sensor_bias.bias' -> 'sensor_bias'."""
-    return name.partition(".")[0]
+    at = ParameterName.of_effect(name)
+    return (at.effect.replace("_", " "), at.place) if at.place else (name, "")
 
 
 def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> DiagnosedEffect:

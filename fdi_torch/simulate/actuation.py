@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from fdi_torch.parameters import by_prefix
 from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
@@ -94,9 +95,8 @@ def with_parameters(values: PlaceValues, names: Sequence[str], theta: Signals) -
     if not theta:
         return values
     replaced = {place: dict(fields) for place, fields in values.items()}
-    for name, value in zip(names, theta, strict=True):
-        place, _, field = name.rpartition(".")
-        replaced[place][field] = value
+    for prefix, fields in by_prefix(dict(zip(names, theta, strict=True))).items():
+        replaced[prefix] |= fields
     return replaced
 
 

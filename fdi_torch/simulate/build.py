@@ -158,7 +158,9 @@ def _opened(library: Path, functions: Sequence[str]) -> ctypes.CDLL:
         for name in functions:
             getattr(opened, name)
     except (OSError, AttributeError) as error:
-        raise BuildError(f"expected a library with {', '.join(functions)}, got {error}; try another CXX") from error
+        raise BuildError(
+            f"expected a compiled library with {', '.join(functions)}, got {error}; set CXX to another compiler"
+        ) from error
     return opened
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from xml.etree import ElementTree
 
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.network import TankNetwork
 
 _BASE_UNITS: dict[str, dict[str, int]] = {
@@ -55,7 +56,7 @@ def variables_of(network: TankNetwork) -> list[Variable]:
 
 
 def _variability(parameter: str) -> str:
-    return "fixed" if parameter.endswith(".start_level") else "tunable"
+    return "fixed" if ParameterName.parse(parameter).field == "start_level" else "tunable"
 
 
 def model_description(

@@ -7,14 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.parameters import ParameterSpace, name_in_recording
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.collocation import Collocation, Linearised
-
-
-def name_in_recording(name: str, recording: int) -> str:
-    """Name of a constant that differs between recordings: 'L.start_level', 'L.start_level@1' ..."""
-    return name if recording == 0 else f"{name}@{recording}"
 
 
 class JointCollocation:

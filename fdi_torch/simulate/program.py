@@ -13,6 +13,7 @@ from functools import cached_property, lru_cache
 
 from torch import Tensor
 
+from fdi_torch.parameters import by_prefix
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.elimination import Elimination, eliminate
@@ -99,14 +100,13 @@ class _Builder:
 
     def _values(self, names: tuple[str, ...]) -> dict[str, dict[str, Tensor]]:
         """As `TankNetwork.bind`, with inputs of the program in place of numbers."""
-        values: dict[str, dict[str, Tensor]] = {}
+        values: dict[str, Tensor] = {}
         for i, name in enumerate(self.network.constants.names):
             node = self.theta[names.index(name)] if name in names else self.graph.input("nominal", i, Varies.NEVER)
-            place, _, field_name = name.rpartition(".")
-            values.setdefault(place, {})[field_name] = self.tracer.tensor(node)
+            values[name] = self.tracer.tensor(node)
         for name in names:
             self.network.constants.index(name)
-        return values
+        return by_prefix(values)
 
     def program(self) -> Program:
         network = self.network

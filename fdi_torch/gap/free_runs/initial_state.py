@@ -79,7 +79,7 @@ def estimate_initial_state(segment: DataSet, starts: Sequence[Mapping[str, float
     for share in SHARES:
         inflow = UnknownInflow(seconds, parts, share)
         placements = tuple(Placement(inflow, tank.name) for tank in plant.tanks)
-        zero = {f"{p.prefix}.{q.name}": 0.0 for p in placements for q in inflow.parameters(p.location, plant)}
+        zero = {p.full_name(q.name): 0.0 for p in placements for q in inflow.parameters(p.location, plant)}
         # Without inflows, varying constants may have gone to a bound; so they also start at nominal.
         both_starts = tuple(zero | varying for varying in (fitted_values, nominal))
         fit = fitter.fit(Candidate(placements, both_starts), plain)

@@ -25,12 +25,12 @@ from fdi_torch.gap.free_runs.between_runs import DETERMINED, RunConstant
 from fdi_torch.gap.preprocess.sensor_limits import limits_of
 from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.names import matching
+from fdi_torch.parameters import ParameterName, by_prefix, common_name, name_in_recording
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.joint_collocation import name_in_recording
 
 TURNS = 3  # alternations between noise and fit
 WIDE = 0.5  # share of a range; a larger standard error means undetermined
@@ -70,8 +70,8 @@ def refit(
     """
     kept = tuple(e for e in plant.effects if e.effect not in leave_out)
     placements = [Placement(effect(e.effect), e.location, e.parameters) for e in kept]
-    prefixes = {p.prefix for p in placements}
-    tolerances = {n: v for n, v in plant.tolerances.items() if n.count(".") == 1 or n.rpartition(".")[0] in prefixes}
+    omitted = {e.prefix for e in plant.effects if e.effect in leave_out}
+    tolerances = {n: v for n, v in plant.tolerances.items() if ParameterName.parse(n).prefix not in omitted}
     held_names = set(matching("a constant of the plant to hold", hold, build_network(plant).constants.names))
     varying = dict.fromkeys([*plant.varying, *matching("a constant with a tolerance to vary", vary, tolerances)])
     held_plant = replace(
@@ -85,7 +85,7 @@ def refit(
     data = checked_data_set(held_plant, placements, recordings, step)
     start = {n: v for n, v in _initial_values(kept, plant, recordings).items() if n not in tolerances}
     start = {n: v for n, v in start.items() if n not in held_names}
-    free = [p for p in placements if any(n.startswith(f"{p.prefix}.") for n in start)]
+    free = [p for p in placements if p.prefix in by_prefix(start)]
     std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     size = 1e-2 * std if white is None else torch.full_like(std, white)
     fitter = Fitter(data, Noise(size, torch.zeros_like(std)))
@@ -130,7 +130,7 @@ def _undetermined(fitter: Fitter, fit: Fit) -> set[str]:
 def _errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
     """Values and standard errors, misfit included, of what all recordings share."""
     per_recording = set(fitter.data.per_recording)
-    return {n: each for n, each in _all_errors(fitter, fit).items() if n.partition("@")[0] not in per_recording}
+    return {n: each for n, each in _all_errors(fitter, fit).items() if common_name(n) not in per_recording}
 
 
 def _all_errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
@@ -161,7 +161,7 @@ def _initial_values(
             _is_limit_from_readings(placed, plant, r) for r in recordings
         ):
             values = {n: v for n, v in placed.parameters.items() if n in movable}
-            start |= {f"{placed.location}.{placed.effect}.{n}": v for n, v in values.items()}
+            start |= {placed.full_name(n): v for n, v in values.items()}
     return start
 
 
@@ -189,15 +189,11 @@ def _typical(run_constants: Sequence[RunConstant], fit: Fit, plant: PlantDescrip
 def _refitted_plant(plant: PlantDescription, fit: Fit, typical: dict[str, float]) -> PlantDescription:
     """The plant with fitted constants and effects, and typical values of what varies between recordings."""
     per_recording = {*plant.varying, *(f"{tank.name}.start_level" for tank in plant.tanks)}
-    common = {n: v for n, v in fit.values.items() if n.partition("@")[0] not in per_recording} | typical
-    constants = {n: v for n, v in common.items() if n.count(".") == 1}
-    effect_values = {n: v for n, v in common.items() if n.count(".") == 2}
-    effects = []
-    for placed in plant.effects:
-        prefix = f"{placed.location}.{placed.effect}"
-        fitted = {n.rpartition(".")[2]: v for n, v in effect_values.items() if n.rpartition(".")[0] == prefix}
-        effects.append(replace(placed, parameters={**placed.parameters, **fitted}))
-    return replace(with_constants(plant, constants), effects=tuple(effects))
+    common = {n: v for n, v in fit.values.items() if common_name(n) not in per_recording} | typical
+    constants = {n: v for n, v in common.items() if ParameterName.parse(n).is_constant}
+    fitted = by_prefix(common)
+    effects = tuple(replace(e, parameters={**e.parameters, **fitted.get(e.prefix, {})}) for e in plant.effects)
+    return replace(with_constants(plant, constants), effects=effects)
 
 
 def _rmse(fitter: Fitter, fit: Fit) -> dict[str, float]:

@@ -25,7 +25,7 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
 from fdi_torch.gap.preprocess.recording_fault_decision import SURE, log_odds, recording_fault
 from fdi_torch.gap.preprocess.recording_faults import RecordingFault
 from fdi_torch.parameters import display_unit
-from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerances
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 
@@ -119,13 +119,9 @@ def stuck_in(plant: PlantDescription, recording: Recording) -> tuple[StuckSegmen
 
 def without_sensors(plant: PlantDescription, names: Collection[str]) -> PlantDescription:
     """The plant without these sensors and without all that its file states of them."""
-    return replace(
-        plant,
-        sensors=tuple(s for s in plant.sensors if s.name not in names),
-        effects=tuple(e for e in plant.effects if e.location not in names),
-        tolerances={n: v for n, v in plant.tolerances.items() if n.partition(".")[0] not in names},
-        varying=tuple(n for n in plant.varying if n.partition(".")[0] not in names),
-    )
+    sensors = tuple(s for s in plant.sensors if s.name not in names)
+    effects = tuple(e for e in plant.effects if e.location not in names)
+    return with_tolerances(replace(plant, sensors=sensors, effects=effects), lambda name: name.place not in names)
 
 
 def _with_recorded_sensors(plant: PlantDescription, recording: Recording) -> PlantDescription:

@@ -25,6 +25,7 @@ from fdi_torch.gap.candidate_fit import CAP, Candidate, Fit, Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, data_set_of
 from fdi_torch.gap.trajectory_problem import corrected_trajectories
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -187,5 +188,5 @@ def _variance(blocked: BlockedRecording, residual: Tensor) -> Tensor:
 def _prior_chi_square(fit: Fit, theta: Tensor) -> float:
     """Chi-square of the constants theta (P,) against their tolerances."""
     deviation = ((theta - fit.space.nominal(theta)) / fit.space.std(theta)).nan_to_num(0.0)
-    constants = torch.tensor([n.count(".") == 1 for n in fit.space.names])
+    constants = torch.tensor([ParameterName.parse(n).is_constant for n in fit.space.names])
     return float((deviation[constants] ** 2).sum())

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.monitor.detection import CHARTS, LONGEST_WINDOW, NO_ALARM, Detector, glr, make_detector, window_lengths
-from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig, fault_free_schedule
+from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.run_length import block_maxima
@@ -40,32 +40,6 @@ def white_residuals(rig: SimulatedRig, noise: NoiseModel, samples: Samples) -> T
     """White residuals (R, S, sensors) of an observer with nominal parameters, started at the equilibrium."""
     seen = Observer(rig.network, noise.gain).run(samples, rig.levels)
     return noise.whitening(seen.steady_residual)
-
-
-@dataclass(frozen=True)
-class FalseAlarms:
-    """counted: alarms in `seconds` s of fault-free runs; expected: number by design."""
-
-    chart: str
-    counted: int
-    expected: float
-    seconds: float
-
-
-def count_false_alarms(
-    rig: SimulatedRig,
-    noise: NoiseModel,
-    charts: Sequence[Detector],
-    every: float,
-    runs: int,
-    samples: int,
-    generator: torch.Generator,
-) -> list[FalseAlarms]:
-    """Alarms of each detector in fault-free runs. every: designed mean time between false alarms, s."""
-    seen = rig.run(fault_free_schedule(rig.space, runs), samples, generator)
-    white = white_residuals(rig, noise, seen)
-    seconds = runs * (samples - 1) * rig.sampling
-    return [FalseAlarms(d.chart, int(d.alarms(white).sum()), seconds / every, seconds) for d in charts]
 
 
 @dataclass(frozen=True)

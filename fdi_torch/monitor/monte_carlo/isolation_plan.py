@@ -23,6 +23,7 @@ from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, quan
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.state_update import advance_observer
+from fdi_torch.parameters import ParameterName
 
 RUNS_PER_TASK = 10
 NAME = "naming"
@@ -75,7 +76,7 @@ class IsolationPlan:
     def _scenarios(self, monitor: Monitor) -> list[FaultScenario]:
         scenarios = []
         for fault in monitor.faults:
-            names = [self.rig.space.names[c].rpartition(".")[2] for c in fault.shape]
+            names = [ParameterName.parse(self.rig.space.names[c]).field for c in fault.shape]
             shape = tuple((c, PERIOD if n == "period" else 0.7) for c, n in zip(fault.shape, names, strict=True))
             stuck = "stuck" in self.rig.space.names[fault.size]
             manners = (False,) if shape or stuck else (False, True)

@@ -15,6 +15,7 @@ from fdi_torch.monitor.hypothesis import SHAPE, Fault
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
 from fdi_torch.monitor.samples import Samples
+from fdi_torch.parameters import ParameterName
 
 # Error rates that define an isolable size: false alarms and missed faults.
 FALSE_ALARM, MISS = 0.001, 0.05
@@ -124,7 +125,7 @@ def _result(events: Sequence[Event], onset: float) -> IsolationResult:
 
 def _sizes(event: Event) -> tuple[str, ...]:
     """The faults that an event names, without period and phase of an oscillation."""
-    return tuple(name for name in event.faults if name.rpartition(".")[2] not in SHAPE)
+    return tuple(name for name in event.faults if ParameterName.parse(name).field not in SHAPE)
 
 
 def confusions(truth: Sequence[str], named: Sequence[tuple[str, ...]], most: int = 8) -> list[tuple[str, str, int]]:

@@ -12,7 +12,7 @@ from fdi_torch.capacity import expect_room
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import PlantState, Stepper, usual_step
 from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 
 Controller = Callable[[Tensor, Tensor], Tensor]
@@ -59,7 +59,7 @@ class SimulatedRig:
         self.space, self.inputs, self.levels, self.reading_std = space, inputs, levels, reading_std
         self.sampling, self.wander, self.colour, self.controller = sampling, wander, colour, controller
         self._stepper = Stepper(self.switched, min(sampling, usual_step(network.description)))
-        onsets = [f"{name.rpartition('.')[0]}.onset" for name in space.names]
+        onsets = [str(ParameterName.parse(name).sibling("onset")) for name in space.names]
         known = [name for name in dict.fromkeys(onsets) if name in self.switched.constants]
         self._onsets = [name for name in known if self._has_memory(name)]
         names = [*(f"after {name}" for name in space.names), ONSET, RAMP, *self._onsets]
@@ -101,5 +101,5 @@ class SimulatedRig:
         return PlantState((moved.levels + self.wander * shift).clamp(min=0.0), moved.commands, moved.readings)
 
     def _has_memory(self, onset: str) -> bool:
-        prefix = onset.rpartition(".")[0]
+        prefix = ParameterName.parse(onset).prefix
         return any(p.prefix == prefix and p.effect.memory for p in self.switched.placements)

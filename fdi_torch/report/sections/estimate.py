@@ -85,7 +85,7 @@ def _decades(value: float, reach: float) -> int:
 
 def _finding(material: Material, name: str) -> Any:
     for finding in diagnosed_effects(material):
-        if name in (f"{finding.location}.{finding.effect}", f"{finding.location}.{finding.effect}.size"):
+        if name in (prefix := f"{finding.location}.{finding.effect}", f"{prefix}.size"):
             return tag("span", "present", class_="bad") if finding.present else "not found"
     return ""
 

@@ -1,0 +1,150 @@
+"""Refinement of the search's best members: integration steps are halved, or an adaptive solver is used, until estimates
+and standard errors no longer depend on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.evolution import EvolutionResult
+from fdi_torch.estimate.fitting import Fitting
+from fdi_torch.estimate.hybrid_settings import HybridSettings
+from fdi_torch.estimate.levenberg_marquardt import Progress, RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.objectives import Problem
+from fdi_torch.estimate.refined import Refined
+from fdi_torch.estimate.uncertainty import make_estimate
+from fdi_torch.plant.scales import time_scale
+
+# A stalled refinement counts as converged if the predicted distance to the optimum is below this, in standard errors.
+CONVERGED_WITHIN = 0.1
+# The shortest integration step, in units of the plant's time scale: below it, standard errors change less than any
+# recording can resolve.
+FINEST_STEP = 0.01
+# Accuracies of the adaptive solver, loose then tight, as equivalent fixed steps in units of the plant's time scale.
+ADAPTIVE_STEPS = (2.0, 0.05)
+# Newton decrements at which a refinement stops: in an intermediate stage, and in the last one.
+LOOSE_DECREASE, TIGHT_DECREASE = 1e-2, 1e-4
+
+
+def distant_members(search_result: EvolutionResult, low: Tensor, high: Tensor, count: int) -> Tensor:
+    """Starting points (K, P) of the refinement, K <= count, best first.
+
+    A member of the final population is selected if, in at least one parameter, it differs from every better selected
+    one by more than 5 % of the box's width.
+    """
+    population = search_result.population[0]
+    members = population[torch.isfinite(search_result.cost[0]) & torch.isfinite(population).all(-1)]
+    selected = [search_result.best[0]]
+    for member in members:
+        if len(selected) == count:
+            break
+        is_distant = [float(((member - t) / (high - low)).abs().max()) > 0.05 for t in selected]
+        if all(is_distant):
+            selected.append(member)
+    return torch.stack(selected)
+
+
+def refine_to_convergence(
+    fitting: Fitting,
+    settings: HybridSettings,
+    starts: Tensor,
+    low: Tensor,
+    high: Tensor,
+    step: float,
+    on_iteration: Callable[[Progress], None] | None,
+) -> tuple[Refined, float]:
+    """Refine from every start (K, P), take the best optimum, and halve the integration step (s) until it converges.
+
+    The step has converged when halving it changes every standard error by at most the fraction `std_tolerance` and
+    every value by at most 5 % of its standard error. Returns the optimum and the last step.
+    """
+
+    def run(theta: Tensor, at: float) -> Refined:
+        linearise = fitting.problem(at, settings.objectives[1]).linearise
+        stop = near_enough(settings, TIGHT_DECREASE) if fitting.takes_own_steps(at) else settings.refine
+        return best_of(levenberg_marquardt(linearise, theta, low, high, stop, on_iteration))
+
+    refinement = run(starts, step)
+    while settings.refine_step is None and step > 2.0 * FINEST_STEP * time_scale(fitting.plant):
+        finer = run(refinement.theta, 0.5 * step)
+        coarse_std = information_std(fitting.problem(step, "likelihood"), refinement.theta)
+        fine_std = information_std(fitting.problem(0.5 * step, "likelihood"), finer.theta)
+        determined = torch.isfinite(coarse_std) & torch.isfinite(fine_std)
+        std_change = ((fine_std - coarse_std).abs() / fine_std)[determined]
+        value_change = ((finer.theta - refinement.theta).abs()[0] / fine_std)[determined]
+        refinement, step = finer, 0.5 * step
+        if not bool((std_change > settings.std_tolerance).any() or (value_change > 0.05).any()):
+            break
+    return refinement, step
+
+
+def refine_adaptively(
+    fitting: Fitting,
+    settings: HybridSettings,
+    starts: Tensor,
+    low: Tensor,
+    high: Tensor,
+    coarse: float,
+    on_iteration: Callable[[Progress], None] | None,
+) -> Refined:
+    """Refine from every start (K, P) with coarse fixed steps (s), then from the best one with an adaptive solver.
+
+    The adaptive solver runs twice, first with a loose and then with a tight tolerance.
+    """
+
+    def run(problem: Problem, theta: Tensor, decrease: float) -> Refined:
+        stop = near_enough(settings, decrease)
+        return best_of(levenberg_marquardt(problem.linearise, theta, low, high, stop, on_iteration))
+
+    refinement = run(fitting.problem(coarse, settings.objectives[1]), starts, LOOSE_DECREASE)
+    scale = time_scale(fitting.plant)
+    for step in ADAPTIVE_STEPS:
+        problem = fitting.problem(step * scale, settings.objectives[1], adaptive=True)
+        refinement = run(problem, refinement.theta, TIGHT_DECREASE if step == ADAPTIVE_STEPS[-1] else LOOSE_DECREASE)
+    return refinement
+
+
+def unrefined(
+    fitting: Fitting, settings: HybridSettings, starts: Tensor, low: Tensor, high: Tensor, step: float
+) -> Refined:
+    """The first of the starts (K, P), unchanged, with the gradient and curvature of the cost there; `step` in s."""
+    problem = fitting.problem(step, settings.objectives[1], settings.adaptive)
+    return levenberg_marquardt(problem.linearise, starts[:1], low, high, replace(settings.refine, iterations=0))
+
+
+def near_enough(settings: HybridSettings, decrease: float) -> RefineSettings:
+    """Settings that stop the refinement as soon as the Newton decrement is below `decrease`.
+
+    For a negative log-likelihood the decrement is d^2 / 2 with d the distance to the optimum in standard errors.
+    """
+    return replace(settings.refine, decrease_tolerance=max(settings.refine.decrease_tolerance, decrease))
+
+
+def best_of(refined: Refined) -> Refined:
+    """The member of lowest cost of a flat batch, as a batch of one; members whose cost is not finite rank last."""
+    cost = torch.where(torch.isfinite(refined.cost), refined.cost, torch.inf)
+    return refined.member(int(cost.argmin()))
+
+
+def status_of(refinement: Refined) -> str:
+    """Status of a batch of one.
+
+    A member that stalled, or that was not iterated at all, counts as 'converged' if its Newton decrement places it
+    within `CONVERGED_WITHIN` standard errors of the optimum. Otherwise a member without iterations is 'not refined'.
+    """
+    status = refinement.statuses()[0]
+    near_optimum = float(refinement.promised[0]) < 0.5 * CONVERGED_WITHIN**2
+    no_iterations = status == "max_iterations" and not int(refinement.iterations[0])
+    if (status == "stalled" or no_iterations) and near_optimum:
+        return "converged"
+    return "not refined" if no_iterations else status
+
+
+def information_std(problem: Problem, theta: Tensor) -> Tensor:
+    """Standard errors (P,) from the Gauss-Newton curvature at theta (1, P); infinite for undetermined parameters."""
+    curvature = problem.linearise(theta, torch.zeros(1, dtype=torch.int64)).curvature[0]
+    return make_estimate(problem.space, theta[0], curvature).std
