@@ -59,7 +59,7 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     pool = ExplanationPool(fitter, null, len(library))
     result = search(pool, options, problem.most)
     progress(0.6, "where")
-    posterior = posterior_of(pool, result, plant, possible_places(plant), problem.named_only)
+    posterior = posterior_of(pool, result, options, plant, possible_places(plant), problem.named_only)
     credible_set = posterior.credible_set(CONTENT)
     from_readings = [
         ("sensor_quantization", s.name) for s, step in zip(plant.sensors, quantization_steps, strict=True) if step > 0.0

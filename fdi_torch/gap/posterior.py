@@ -3,9 +3,8 @@
     log weight(S)    = log evidence of S + log prior of its random flows
     log weight(S, p) = log weight(S) + gain of a free discrepancy at p + log odds of an unknown there
 
-each under its most likely disturbance noise (`marginal_likelihood.py`, `localization/localize.py`). An unknown is a law
-that no library has: if effects at the same place predict as well by Akaike's criterion, its weight goes to them. No
-library has the exact law of a rig (Brynjarsdottir and O'Hagan, 2014). A discrepancy at a place where S has an effect,
+each under its most likely disturbance noise (`marginal_likelihood.py`, `localization/localize.py`). No library
+has the exact law of a rig (Brynjarsdottir and O'Hagan, 2014). A discrepancy at a place where S has an effect,
 and small compared with it, is therefore attributed to the effect, and its weight goes to S. A large one means that the
 law there is a different one: then the effects at that place are part of the unknown.
 """
@@ -14,13 +13,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fdi_torch.estimate.evidence import ODDS, RARE, posterior
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.library import canonical, tanks_of
 from fdi_torch.gap.localization.localize import LocalizedDiscrepancy, localize
+from fdi_torch.gap.marginal_likelihood import with_disturbances
+from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, SearchResult
 from fdi_torch.plant.description import PlantDescription
 
@@ -72,11 +73,17 @@ class Posterior:
 
 
 def posterior_of(
-    pool: ExplanationPool, result: SearchResult, plant: PlantDescription, places: Sequence[str], named_only: bool
+    pool: ExplanationPool,
+    result: SearchResult,
+    options: Sequence[Option],
+    plant: PlantDescription,
+    places: Sequence[str],
+    named_only: bool,
 ) -> Posterior:
     """Posterior over the explanations of a search, with and without an unknown discrepancy at each place.
 
-    pool: pool of the evaluated explanations, which may grow. named_only: without unknown discrepancies.
+    pool: pool of the evaluated explanations, which may grow. options: effects that are fitted before something at their
+    place is called unknown. named_only: without unknown discrepancies.
     """
 
     def weight(explanation: RankedExplanation) -> float:
@@ -88,6 +95,7 @@ def posterior_of(
         for explanation in {e.key: e for e in (likeliest, result.best, result.null)}.values():
             hypotheses += _with_unknowns(pool, result, explanation, places, len(places), _likeliest(hypotheses))
         hypotheses += _with_fewer_effects(pool, result, _likeliest(hypotheses), len(places))
+        hypotheses = _after_fits_at_unknowns(pool, hypotheses, options)
         least = _likeliest(hypotheses).weight + math.log(RARE)
         hypotheses += [
             _about_predicted_levels(h.explanation) for h in hypotheses if h.place is None and h.weight > least
@@ -105,6 +113,36 @@ def posterior_of(
 
 def _likeliest(hypotheses: Sequence[CauseHypothesis]) -> CauseHypothesis:
     return max(hypotheses, key=lambda h: h.weight)
+
+
+def _after_fits_at_unknowns(
+    pool: ExplanationPool, hypotheses: Sequence[CauseHypothesis], options: Sequence[Option]
+) -> list[CauseHypothesis]:
+    """The hypotheses after the effects of the library were fitted at the place of each unknown that is relevant.
+
+    An unknown is a law that no library has: its weight goes to effects at the same place that predict as well by
+    Akaike's criterion.
+    """
+    least, before = _likeliest(hypotheses).weight + math.log(RARE), set(pool.explanations)
+    for h in hypotheses:
+        if h.place and h.weight > least:
+            under = with_disturbances(h.explanation.fitter, h.fit, replace(h.place.noise, wander=None))
+            pool.extend_at(h.explanation, h.place.location, under, options)
+    added = [e for key, e in pool.explanations.items() if key not in before]
+    named = [CauseHypothesis(e, causes_in_order(e.fit), e.log_weight) for e in added]
+    return [*named, *(_as_known(h, pool.explanations.values()) for h in hypotheses)]
+
+
+def _as_known(h: CauseHypothesis, explanations: Iterable[RankedExplanation]) -> CauseHypothesis:
+    """The hypothesis, or that of effects at the place of its unknown which predict as well."""
+    if h.place is None:
+        return h
+    key = h.explanation.key
+    for known in explanations:
+        same_place = {at for _, at in known.key - key} == {h.place.location}
+        if known.key > key and same_place and _fitness(known, h.explanation) >= h.place.fitness:
+            return CauseHypothesis(known, causes_in_order(known.fit), h.weight)
+    return h
 
 
 def _about_predicted_levels(explanation: RankedExplanation) -> CauseHypothesis:
@@ -140,10 +178,6 @@ def _with_unknown(
     if here and _is_small(fitter, result, explanation, place, here):
         return CauseHypothesis(explanation, causes, weight)
     weight += math.log(ODDS.unknown / places)
-    for known in result.explanations:
-        same_place = {at for _, at in known.key - explanation.key} == {place.location}
-        if known.key > explanation.key and same_place and _fitness(known, explanation) >= place.fitness:
-            return CauseHypothesis(known, causes_in_order(known.fit), weight)
     return CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight, place)
 
 

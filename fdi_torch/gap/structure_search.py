@@ -189,6 +189,16 @@ class ExplanationPool:
         for fit in sorted(fits, key=lambda f: len(f.key)):
             self.evaluate(fit, parent.noise)
 
+    def extend_at(self, parent: RankedExplanation, place: str, under: Fitter, options: Sequence[Option]) -> None:
+        """Extend an explanation by each effect at one place. under: fitter with the noise that an unknown there left.
+
+        Its own noise absorbs what it does not explain, and hides effects of which none was fitted.
+        """
+        here = [o for o in options if o.placement.location == place and o.cause not in parent.key]
+        candidates = self._extensions(parent, screen(under, parent.fit, here), own=False)
+        for fit in self._fitted(under, replace(parent.fit, cost=under.cost(parent.fit)), candidates)[:EVALUATED]:
+            self.evaluate(fit, parent.noise)
+
     def _fitted(
         self, fitter: Fitter, base: Fit, candidates: Sequence[Candidate], rivals: Iterable[float] = ()
     ) -> list[Fit]:
