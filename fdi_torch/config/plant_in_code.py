@@ -41,7 +41,7 @@ class Plant(PlantDescription):
     start level or a parameter of an effect in its unit. varying: patterns of the constants that differ between
     recordings. effects: the plant's known effects. further: components of the other kinds of `FLOW_KINDS`, such as
     weirs=[Weir(...)] and transfers=[Transfer(...)]. matters: least reported size and urgency of faults for a monitor,
-    SI.
+    SI. units: units for display by SI unit or channel, such as {"m": "mm", "m^3/s": "l/min"}.
 
     `dump_plant` writes it as a plant file, which `load_plant` reads as an equal plant. Raises ValueError naming
     component and field, with the expected and the given value.
@@ -68,6 +68,7 @@ class Plant(PlantDescription):
         varying: Iterable[str] = (),
         gravity: float | str = 9.81,
         matters: Iterable[FaultPriority] = (),
+        units: Mapping[str, str] | None = None,
         name: str = "plant",
         **further: Iterable[FlowComponent],
     ) -> None:
@@ -88,13 +89,14 @@ class Plant(PlantDescription):
             tuple(matters),
             without_effects.gravity,
             **flows,
+            units=dict(units or {}),
         )
 
     def __eq__(self, other: object) -> bool:
         """Equality of all fields with any `PlantDescription`."""
         if not isinstance(other, PlantDescription):
             return NotImplemented
-        return all(getattr(self, f.name) == getattr(other, f.name) for f in fields(PlantDescription))
+        return all(getattr(self, f.name) == getattr(other, f.name) for f in fields(PlantDescription) if f.compare)
 
     __hash__ = None  # type: ignore[assignment]
 

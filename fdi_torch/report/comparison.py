@@ -24,7 +24,12 @@ CURVES = {
 
 
 def comparison_section(compared: Comparison, runs: Sequence[Material]) -> Section:
-    """The section about all runs, given in the order of the comparison."""
+    """The section about all runs, given in the order of the comparison, in the units of the first run's plant."""
+    with runs[0].in_its_units():
+        return _section(compared, runs)
+
+
+def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
     blocks: list[Any] = [tag("p", sentence) for sentence in in_words(compared)]
     if compared.results:
         header = ["parameter", "unit", *compared.labels, "p", "agree"]
@@ -89,7 +94,7 @@ def _residuals(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
             continue
         residual = np.where(recording.mask, recording.outputs - model, np.nan)
         for i, name in enumerate(recording.output_names):
-            unit, scale = shown_unit(recording.output_units[i])
+            unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
             lines.setdefault((name, unit), []).append(Line(label, recording.time, scale * residual[:, i], colour))
     return [
         signals(

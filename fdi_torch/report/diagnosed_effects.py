@@ -12,7 +12,7 @@ from fdi_torch.gap.verdict_words import cause_words
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import fits
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, shown_unit, with_error
+from fdi_torch.report.numbers import amount, shown_unit, with_error
 
 NAN = float("nan")
 
@@ -46,7 +46,7 @@ class DiagnosedEffect:
         value = with_error(scale * self.size, scale * self.std)
         size = f"{self.quantity.replace('_', ' ')} {value}" if unit in ("", "1") else f"{value} {unit}"
         sizes = [size] if math.isfinite(self.size) else []
-        sizes += [f"{number(1e6 * self.flow, 3)} cm³/s"] if math.isfinite(self.flow) else []
+        sizes += [f"{amount(self.flow, 'm^3/s', 3)}"] if math.isfinite(self.flow) else []
         return f"{self.words} ({', '.join(sizes)})" if sizes else self.words
 
 

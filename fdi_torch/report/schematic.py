@@ -16,7 +16,7 @@ from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder, Sketch
 from fdi_torch.report.html import short
 from fdi_torch.report.line_geometry import Point, arrow_head, direction, longest_piece
-from fdi_torch.report.numbers import percent
+from fdi_torch.report.numbers import percent, shown_unit
 from fdi_torch.report.rig_layout import tank_places
 from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
 
@@ -148,7 +148,7 @@ class _Drawing:
             place = height + (0.05 if height < 0.3 else -0.24)
             free = TALL - 0.08 - LINE * len(self.lines(tank.name, WITHIN)) - 0.22  # below the words of the tank
             place = max(min(place, free), 0.04)
-            self.axes.text(x, y + place, f"{100 * level:.1f} cm", ha="center", color=INK, fontsize=9.0, zorder=6)
+            self.axes.text(x, y + place, level_text(level), ha="center", color=INK, fontsize=9.0, zorder=6)
         walls = [(x - 0.5, y + TALL), (x - 0.5, y), (x + 0.5, y), (x + 0.5, y + TALL)]
         self.axes.plot(*np.array(walls).T, color=self.colour(tank.name), lw=2.0, zorder=5, solid_joinstyle="miter")
         self.words(tank.name, (x, y + TALL - 0.08), "center", "top", width=WITHIN)
@@ -291,3 +291,9 @@ class _Drawing:
 def strength(share: float) -> float:
     """Opacity of a location by its probability (0 to 1); cubic, so that certain locations stand out."""
     return 0.3 * share**3
+
+
+def level_text(level: float) -> str:
+    """A level to about one millimetre."""
+    unit, scale = shown_unit("m")
+    return f"{scale * level:.{max(0, 3 - int(np.log10(scale)))}f} {unit}"
