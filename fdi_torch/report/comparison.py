@@ -9,6 +9,7 @@ import numpy as np
 
 from fdi_torch.logbook import Comparison, align
 from fdi_torch.report.chart import Chart, Line
+from fdi_torch.report.comparison_headline import comparison_headline
 from fdi_torch.report.html import folded, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit, with_error
@@ -30,7 +31,8 @@ def comparison_section(compared: Comparison, runs: Sequence[Material]) -> Sectio
 
 
 def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
-    blocks: list[Any] = [tag("p", sentence) for sentence in in_words(compared)]
+    first, *others = comparison_headline(compared, runs)
+    blocks: list[Any] = [tag("h3", first), *(tag("p", sentence) for sentence in (*others, *in_words(compared)))]
     if compared.results:
         header = ["parameter", "unit", *compared.labels, "p", "agree"]
         blocks.append(table(header, result_rows(compared), left=2))
@@ -45,15 +47,12 @@ def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
 
 
 def in_words(compared: Comparison) -> list[str]:
-    """The result of the comparison, one sentence each."""
-    if compared.same_content:
-        return ["All logs have the same content, message by message."]
-    differing = ", ".join(compared.differences)
-    words = [f"Differences in: {differing}." if differing else "Configuration, versions and data are the same."]
+    """Agreement of the estimates, one sentence each."""
+    words = []
     apart = [result.name for result in compared.results if result.agree is False]
     if any(result.agree is not None for result in compared.results):
         words.append(f"At 95 % these differ: {', '.join(apart)}." if apart else "At 95 % the results agree.")
-    if compared.same_data:
+    if compared.same_data and words:
         words.append("All runs read the same data, so their errors are not independent.")
     return words
 
