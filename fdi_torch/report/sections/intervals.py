@@ -18,6 +18,7 @@ from fdi_torch.report.sections.estimate import last_estimate
 from fdi_torch.report.style import MODEL, OTHER
 
 MOST_PANELS = 12
+FARTHEST = 6  # ratio that is drawn, in units of the ratio at the limits
 TAIL = 0.025  # of the draws on either side of a 95 % interval
 
 
@@ -79,8 +80,10 @@ def _column(
 ) -> Column:
     pictures: list[Picture] = []
     if profile is not None:
-        line = Line(name, scale * as_vector(profile.get("x")), as_vector(profile.get("ratio")), MODEL)
         level = chi_square_quantile(as_float(profile.get("confidence")))
+        x, ratio = scale * as_vector(profile.get("x")), as_vector(profile.get("ratio"))
+        near = ratio <= FARTHEST * level
+        line = Line("likelihood ratio", x[near], ratio[near], MODEL)
         chart = Chart(name, axis(name, unit), "likelihood ratio", [line], level=level, from_zero=True)
         pictures.append(signals(f"profile_{k + 1}", chart, f"profile likelihood of {name}"))
     if draws is not None and len(draws):
