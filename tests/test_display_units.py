@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from fdi_torch import Pipe, Plant, Pump, Sensor, Tank
 from fdi_torch.cli import main
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.plant_file import build_plant, load_plant
@@ -56,6 +57,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_plant_file_decides_the_units() -> None:
     units = build_plant(yaml.safe_load(PLANT), "plant.yaml").units
     assert units == {"m": "mm", "m^2": "mm^2", "m^3/s": "l/min", "1/m": "%/m", "p": "%"}
+
+
+def test_a_plant_in_code_is_displayed_as_it_was_written() -> None:
+    tank = Tank("A", area="16000 mm^2", height="500 mm", leak_reference="OUT")
+    pipe = Pipe("OUT", "A", "outside", area="60 mm^2", discharge_coefficient=0.6)
+    sensors = [Sensor("h", "A"), Sensor("p", "A", gain="200 %/m", channel="LI7")]
+    rig = Plant([tank], [pipe], [Pump("Q", "A", max_flow="6 l/min")], sensors)
+    assert rig.units == {"m": "mm", "m^2": "mm^2", "m^3/s": "l/min", "1/m": "%/m", "LI7": "%"}
+    assert replace(rig, name="other").units == rig.units
+    assert Plant([Tank("A", 0.02, 0.6)], sensors=[Sensor("h", "A")]).units == {}
+    assert Plant([tank], [pipe], sensors=sensors, units={"m": "in"}).units == {"m": "in"}
 
 
 def test_the_key_units_overrides_what_is_written() -> None:
