@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, TypeVar
@@ -236,10 +238,53 @@ def si_unit_of(unit: str) -> str:
     )
 
 
-def display_unit(si_unit: str) -> tuple[str, float]:
-    """The unit for display, and the value of one SI unit in it: 'm' -> ('cm', 100.0)."""
-    unit = _SHOWN.get(si_unit, si_unit)
+def display_unit(si_unit: str, name: str = "") -> tuple[str, float]:
+    """The unit for display, and the value of one SI unit in it: 'm' -> ('cm', 100.0).
+
+    It is the unit set by `display_in` for that kind of quantity; name: a channel or sensor, which may have its own. A
+    quotient without a unit of its own is displayed in the units of its parts.
+    """
+    chosen = _DISPLAYED.get()
+    unit = _in_chosen_unit(si_unit, chosen)
+    if name in chosen:
+        with suppress(ValueError):  # the channel of that name may be of another recording
+            return chosen[name], 1.0 / unit_factor(chosen[name], si_unit)
     return ("" if unit == "1" else unit), 1.0 if unit == si_unit else 1.0 / unit_factor(unit, si_unit)
+
+
+def quantity_text(value: float, si_unit: str, digits: int = 4, name: str = "") -> str:
+    """An SI value as text in the unit for display, such as '4.2 cm'; name: as for `display_unit`."""
+    unit, scale = display_unit(si_unit, name)
+    return f"{scale * value:.{digits}g} {unit}".rstrip()
+
+
+def display_in(units: Mapping[str, str]) -> None:
+    """Set the units for display in this context: SI unit, or name of a channel or sensor -> unit."""
+    _DISPLAYED.set(dict(units))
+
+
+def display_also_in(units: Mapping[str, str]) -> None:
+    """Add units for display to those of this context."""
+    _DISPLAYED.set({**_DISPLAYED.get(), **units})
+
+
+@contextmanager
+def displayed_in(units: Mapping[str, str]) -> Iterator[None]:
+    """Context within which quantities are displayed in these units, as `display_in` sets them."""
+    token = _DISPLAYED.set(dict(units))
+    try:
+        yield
+    finally:
+        _DISPLAYED.reset(token)
+
+
+def _in_chosen_unit(si_unit: str, chosen: Mapping[str, str]) -> str:
+    if unit := chosen.get(si_unit) or _DEFAULT_UNITS.get(si_unit):
+        return unit
+    quantity, divided, by = si_unit.rpartition("/")
+    if divided and (quantity in _DEFAULT_UNITS or by in _DEFAULT_UNITS):
+        return f"{_in_chosen_unit(quantity, chosen)}/{_in_chosen_unit(by, chosen)}"
+    return si_unit
 
 
 @lru_cache(maxsize=1024)
@@ -267,16 +312,5 @@ def _bracketed(header: str) -> tuple[str, str] | None:
     return (header[:place].rstrip(" \t_"), header[place + 1 : -1].strip()) if place > 0 else None
 
 
-_SHOWN = {
-    "m": "cm",
-    "m^2": "cm^2",
-    "m^3": "cm^3",
-    "m^3/s": "cm^3/s",
-    "m^3/s/V": "cm^3/s/V",
-    "m^3/s/A": "cm^3/s/mA",
-    "V/m": "V/cm",
-    "Pa": "mbar",
-    "Pa/m": "mbar/cm",
-    "A": "mA",
-    "A/m": "mA/cm",
-}
+_DEFAULT_UNITS = {"m": "cm", "m^2": "cm^2", "m^3": "cm^3", "m^3/s": "cm^3/s", "Pa": "mbar", "A": "mA"}
+_DISPLAYED: ContextVar[Mapping[str, str]] = ContextVar("units for display", default=_DEFAULT_UNITS)

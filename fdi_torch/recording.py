@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -27,7 +27,7 @@ class Recording(Shown):
     `known_segments` cuts the recording there. hold: course of the inputs between samples. began: time 0 as seconds
     since 1970, if known. notes: corrections by the reader, as sentences. ran: inputs that were, or may have been, on
     before the first sample, according to the recording from which this one was cut. trusted: whether checks for wrong
-    units, swapped channels and clock errors are skipped.
+    units, swapped channels and clock errors are skipped. written: the unit of each channel in its file.
     """
 
     time: Tensor
@@ -45,6 +45,7 @@ class Recording(Shown):
     notes: tuple[str, ...] = ()
     began: float | None = None
     trusted: bool = False
+    written: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.mask is None:
@@ -157,6 +158,11 @@ class Recording(Shown):
         """The recording with its tensors on a device."""
         tensors = {name: getattr(self, name).to(device) for name in ("time", "inputs", "outputs", "mask")}
         return replace(self, **tensors)
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """What a log says of the recording's file: path, hash, and the unit of each channel in it."""
+        return {"path": self.source, "sha256": self.sha256} | {f"unit.{n}": u for n, u in self.written.items()}
 
     def selected(self, inputs: Sequence[str], outputs: Sequence[str]) -> Recording:
         """The recording with these channels only, in this order. Raises ValueError for a missing one."""

@@ -27,6 +27,7 @@ for _short, _long in {"gpm": "gallon / minute", "gph": "gallon / hour", "lpm": "
     _registry.define(f"{_short} = {_long}")
 
 _SIGNS = {"%": "percent", "‰": "permille"}
+_HEADER_WORDS = {"pct": "%", "percent": "%", "lps": "l/s", "lpm": "l/min", "lph": "l/h", "gpm": "gal/min"}
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 _NAME = r"[A-Za-zµμΩΩ°][A-Za-zµμ0-9_]*|[%‰]"
 _POWER = r"(?:\^|\*\*)\s*(?P<power>[+-]?[0-9])(?![0-9])|(?P<super>⁻?[¹²³⁴⁵⁶⁷⁸⁹])"
@@ -57,6 +58,11 @@ def is_unit(text: str) -> bool:
     except UnitError:
         return False
     return True
+
+
+def spelled(text: str) -> str:
+    """A unit from a header as people write it: 'cm3_s' -> 'cm^3/s', 'pct' -> '%'."""
+    return _CUBE.sub(r"^\1", _VOLUME_A_TIME.sub(r"\1/\2", _HEADER_WORDS.get(text, text)))
 
 
 @lru_cache(maxsize=4096)

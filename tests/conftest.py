@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from fdi_torch.parameters import displayed_in
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     told = "how long the slow test draws files that a person or an attacker could write"
     parser.addoption("--fuzz-minutes", type=float, default=2.0, help=told)
     parser.addoption("--kills", type=int, default=6, help="how often the slow test kills each of four jobs")
+
+
+@pytest.fixture(autouse=True)
+def _default_units() -> Iterator[None]:
+    """Units for display that a test sets end with it."""
+    with displayed_in({}):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -108,3 +108,11 @@ def test_numbers_have_ascii_digits_and_no_underscores(tmp_path: Path, cell: str)
 def test_stamps_have_ascii_digits(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="row 2, column time: expected a time stamp"):
         read(tmp_path, STAMPED.format("२९.3.2026 00:30:00", "29.3.2026 00:30:05", "29.3.2026 00:30:10"))
+
+
+@pytest.mark.parametrize("row", ["0,0\t1,5\t294,17", "0;1.5;2e-3", "2026-11-23 12:00:00,1.5,2"])
+def test_a_file_without_a_header_is_told_how_to_be_read(tmp_path: Path, row: str) -> None:
+    path = tmp_path / "lab.txt"
+    path.write_text(f"{row}\n{row}\n")
+    with pytest.raises(ValueError, match=r"row 1: expected a header line .* got numbers; .* write header: false"):
+        read_csv(path, ("Q1",), ("h1",))

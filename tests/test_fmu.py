@@ -222,11 +222,13 @@ def test_a_name_for_two_variables_is_refused(tmp_path: Path) -> None:
 
 def test_the_command_tells_the_variables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "rig.fmu"
-    assert cli.main(["export", "three_tank", "--fmu", str(file), "--effect", "T1.leak", "--json"]) == cli.DONE
+    assert (
+        cli.main(["export", "--plant", "three_tank", "--fmu", str(file), "--effect", "T1.leak", "--json"]) == cli.DONE
+    )
     shown = json.loads(capsys.readouterr().out)
     leak = {"name": "T1.leak.size", "causality": "parameter", "variability": "tunable", "unit": "1", "start": 0.0}
     assert leak in shown["variables"]
-    assert cli.main(["export", "three_tank", "--fmu", str(file), "--effect", "leak"]) == cli.MISUSE
+    assert cli.main(["export", "--plant", "three_tank", "--fmu", str(file), "--effect", "leak"]) == cli.MISUSE
     assert "such as T1.leak" in capsys.readouterr().err
 
 

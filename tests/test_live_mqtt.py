@@ -217,6 +217,10 @@ def test_one_topic_per_value_without_a_clock_gives_a_row_per_period(tmp_path: Pa
         ({"url": "mqtt://127.0.0.1:PORT/rig"}, "expected an MQTT broker at 127.0.0.1:PORT, got none"),
         ({"url": "http://127.0.0.1/rig"}, "source.url: expected a URL of the kind mqtt://HOST"),
         ({"url": "mqtt://me:secret@127.0.0.1/rig"}, "expected a URL without user and password"),
+        (
+            {"clock": {"tag": "all:t", "unit": "s"}},
+            "clock.tag: expected a field of the same JSON object, got 'all:t'; write 't'",
+        ),
         ({"url": "mqtt://127.0.0.1:PORT/rig/#"}, "expected a topic without the wildcards # and +"),
         ({"tags": {"h9": {"tag": "h9", "unit": "cm"}}}, "source: tags.h9: expected a channel of the plant"),
         ({"tags": {"Q1": {"tag": "q", "unit": "cm"}}}, "Q1: expected a unit of the kind m^3/s"),

@@ -221,7 +221,7 @@ def test_what_if_writes_a_new_log_with_its_parent(trained: Path, capsys: pytest.
     assert cli.main(["replay", str(trained), "--set", "seed=5", "--quiet"]) == cli.DONE
     child = read_run(trained.with_name(f"{trained.stem}.what_if.mcap"))
     assert child.metadata["fdi_torch.run"]["parent_run_id"] == read_run(trained).metadata["fdi_torch.run"]["run_id"]
-    assert "Differences in: " in capsys.readouterr().out
+    assert "They differ in seed (" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

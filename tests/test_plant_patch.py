@@ -75,7 +75,7 @@ BEFORE = read(TEXT)
             "  drain: {source: B, area: 0.5 cm^2, discharge_coefficient: 0.62}",
             "  drain: {source: B, area: 0.5 cm^2, discharge_coefficient: 0.6123457}",
         ),
-        ({"hA.offset": 0.0021}, "  hA: {tank: A}", "  hA: {tank: A, offset: 0.21 cm}"),
+        ({"hA.offset": 0.0021}, "  hA: {tank: A}", "  hA: {tank: A, offset: 2.1 mm}"),
     ],
 )
 def test_a_constant_changes_its_line_in_its_own_unit(constants: dict[str, float], gone: str, come: str) -> None:
@@ -85,7 +85,7 @@ def test_a_constant_changes_its_line_in_its_own_unit(constants: dict[str, float]
 
 def test_a_key_that_was_not_there_comes_at_the_end_of_its_block() -> None:
     changed, kept = patched_plant(TEXT, BEFORE, with_constants(BEFORE, {"pB.offset": 250.0, "B.start_level": 0.2}))
-    assert kept and lines_changed(TEXT, changed) == ([], ["    start_level: 20 cm", "    offset: 2.5 mbar"])
+    assert kept and lines_changed(TEXT, changed) == ([], ["    start_level: 200 mm", "    offset: 2.5 mbar"])
     assert changed.index("start_level") < changed.index("# B has no leak")
 
 
@@ -99,7 +99,7 @@ def test_effects_and_tolerances_are_added_and_wildcards_stay() -> None:
     assert come == [
         "  B.leak.size: 0.04",
         "- {effect: pump_lag, location: Q, parameters: {time_constant: 750 ms}}",
-        "- {effect: leak, location: B, parameters: {size: 0.2045469, height: 10 cm}}",
+        "- {effect: leak, location: B, parameters: {size: 0.2045469, height: 100 mm}}",
     ]
     assert changed.endswith("# the end\n") and '"*.discharge_coefficient": 3 %  # all of them' in changed
 

@@ -138,6 +138,16 @@ def test_level_above_the_rim_and_below_the_floor() -> None:
     )
 
 
+def test_level_at_the_rim_is_told_with_its_times() -> None:
+    levels = healthy().outputs[:, 0].clone()
+    levels[100:140] = 1.0 + 1e-3 * torch.randn(40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    channel, text = found(check_recording(with_h1(levels), PLANT), "rim")
+    assert channel == "h1"
+    assert text == "within 2% of the rim of T1 (100 cm) in 40 samples between 100 s and 139 s: water may overflow there"
+    levels[100:140] -= 0.05
+    assert not [f for f in check_recording(with_h1(levels), PLANT).findings if f.kind == "rim"]
+
+
 @pytest.mark.parametrize("factor", [100.0, 0.01])
 def test_level_in_the_wrong_unit(factor: float) -> None:
     assert "a wrong unit" in found(check_recording(with_h1(healthy().outputs[:, 0] * factor), PLANT), "unit")[1]

@@ -15,6 +15,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from contextvars import copy_context
 from types import ModuleType
 from typing import NoReturn
 
@@ -103,7 +104,7 @@ def _overview() -> str:
 def _run(name: str, words: list[str]) -> int:
     try:
         catch_signals()
-        return _carried_out(name, words)
+        return copy_context().run(_carried_out, name, words)  # its units for display end with it
     except (KeyboardInterrupt, Terminated) as error:  # also while libraries load
         sys.stderr.write(f"fdi {name}: {ending(error)}\n")
         return TERMINATED if isinstance(error, Terminated) else INTERRUPTED

@@ -21,7 +21,7 @@ from fdi_torch.blind.scaling import Scales
 from fdi_torch.blind.score_tables import misses, sheets
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.library import STANDARD as LIBRARY
 from fdi_torch.gap.one_at_a_time import one_at_a_time
@@ -98,7 +98,7 @@ def _rig(arguments: argparse.Namespace) -> Rig | Networks:
         raise ValueError(f"--tanks: expected --plant {NETWORK} with it; add that or leave --tanks out")
     if arguments.plant == NETWORK:
         return _networks(arguments.tanks) if arguments.tanks else Networks()
-    return _rig_like(load_plant(arguments.plant)) if arguments.plant else RIGS[arguments.rig or "three_tank"]()
+    return _rig_like(chosen_plant(arguments.plant)) if arguments.plant else RIGS[arguments.rig or "three_tank"]()
 
 
 def _networks(tanks: str) -> Networks:

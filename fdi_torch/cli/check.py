@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.recording_config import RecordingConfig, config_of
 from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.preprocess.acquisition import examined
@@ -62,7 +62,7 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
     if arguments.plant is None:
         raise ValueError("expected --plant, a recording and --plant, or --config; see fdi check --help")
     named = [] if arguments.recording is None else [config_of(arguments.recording)]
-    return load_plant(arguments.plant), named, Path.cwd()
+    return chosen_plant(arguments.plant), named, Path.cwd()
 
 
 def _show_plant(plant: PlantDescription, screen: Screen) -> None:
@@ -89,7 +89,7 @@ def _show(check: RecordingCheck, screen: Screen) -> None:
 
 
 def _row(channel: ChannelSummary) -> list[str]:
-    unit, scale = display_unit(channel.unit)
+    unit, scale = display_unit(channel.unit, channel.name)
     numbers = (channel.low, channel.high, channel.mean, channel.resolution)
     shown = [f"{scale * number:.5g}" for number in numbers]
     return [channel.name, channel.role, unit or "share", *shown, str(channel.missing), str(channel.masked)]

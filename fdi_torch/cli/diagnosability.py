@@ -10,7 +10,7 @@ import torch
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.estimation import full_name
 from fdi_torch.config.loaded_recordings import read_recording
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
 from fdi_torch.monitor.monitor_setup import usual_faults
@@ -21,7 +21,7 @@ from fdi_torch.recording import Recording
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
-    plant = load_plant(arguments.plant)
+    plant = chosen_plant(arguments.plant)
     named = [full_name(name.strip(), plant) for name in (arguments.faults or "").split(",") if name.strip()]
     faults = named or usual_faults(plant)
     recording, constant = _inputs(arguments, plant)

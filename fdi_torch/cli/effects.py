@@ -8,13 +8,13 @@ from typing import Any
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.effects.catalogue import Entry, effects
 from fdi_torch.parameters import Parameter, display_unit
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
-    catalogue = effects(load_plant(arguments.plant) if arguments.plant else None)
+    catalogue = effects(chosen_plant(arguments.plant) if arguments.plant else None)
     entries = [catalogue[name] for name in arguments.names] or list(catalogue.entries)
     if arguments.names:
         for entry in entries:

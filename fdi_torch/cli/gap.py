@@ -14,7 +14,7 @@ from fdi_torch.cli.gap_text import next_steps, show
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import named_recordings
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.disk import write_text
 from fdi_torch.gap.answer import UNKNOWN, Answer, adopted
 from fdi_torch.gap.diagnose import Settings
@@ -29,7 +29,7 @@ from fdi_torch.recordings.csv_files import write_csv
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     keep_memory()
-    plant = load_plant(arguments.plant)
+    plant = chosen_plant(arguments.plant)
     recordings = named_recordings(arguments.recording, plant, Path.cwd())
     holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
     for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):

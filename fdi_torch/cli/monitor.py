@@ -13,7 +13,7 @@ from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.events import FORMAT, Event
 from fdi_torch.monitor.monitor_setup import PreparedMonitor
-from fdi_torch.parameters import display_unit
+from fdi_torch.parameters import quantity_text
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -50,7 +50,7 @@ def _show_setup(prepared: PreparedMonitor, screen: Screen) -> None:
     """Print the noise model, the detector and the calibrated constants."""
     noise, detector = prepared.noise, prepared.monitor.detector
     stds = ", ".join(
-        f"{sensor.name} {display_unit(sensor.unit)[1] * std:.3g} {display_unit(sensor.unit)[0]}".rstrip()
+        f"{sensor.name} {quantity_text(std, sensor.unit, 3, sensor.column)}"
         for sensor, std in zip(prepared.monitor.network.description.sensors, noise.reading_std.tolist(), strict=True)
     )
     process = "" if noise.ratio != noise.ratio else f", process noise per sample {noise.ratio:.2g} times that"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.templates import template
 from fdi_torch.disk import named_errors
 
@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     path = Path(arguments.out or f"{arguments.kind}.yaml")
     if path.suffix not in (".yaml", ".yml"):
         raise ValueError(f"--out: expected a file that ends in .yaml, got {path}; rename it")
-    text = template(arguments.kind, load_plant(arguments.plant), arguments.plant, path.stem)
+    text = template(arguments.kind, chosen_plant(arguments.plant), arguments.plant, path.stem)
     if path.exists():
         raise ValueError(f"{path}: expected a new file, but it exists; choose another name with --out")
     with named_errors(path), path.open("x", encoding="utf-8") as file:

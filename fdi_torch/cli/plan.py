@@ -9,7 +9,7 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import named_recordings
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.gap.identifiability import Identifiability, planned_identifiability
 from fdi_torch.jobs.gap import one_thread
 
@@ -17,7 +17,7 @@ from fdi_torch.jobs.gap import one_thread
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     if not arguments.noise > 0.0:
         raise ValueError(f"--noise: expected a positive standard deviation, got {arguments.noise:g}")
-    plant = load_plant(arguments.plant)
+    plant = chosen_plant(arguments.plant)
     planned = named_recordings(arguments.recording, plant, Path.cwd())[0]
     for note in planned.notes:
         screen.note(note)

@@ -13,11 +13,11 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.channels import missing_inputs
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import chosen_plant, load_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.yaml_files import find_data
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
-from fdi_torch.parameters import display_unit
+from fdi_torch.parameters import display_unit, quantity_text
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_header
@@ -27,7 +27,7 @@ from fdi_torch.report.style import save
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     torch.set_num_threads(1)
-    plant = load_plant(arguments.plant)
+    plant = chosen_plant(arguments.plant)
     names = [*arguments.recordings, *arguments.recording]
     if not names:
         raise ValueError("expected a recording, got none; name a CSV, MCAP or YAML file")
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             "recording",
             "from, s",
             "to, s",
-            *(f"{s.name}, {display_unit(s.unit)[0] or 'share'}" for s in plant.sensors),
+            *(f"{s.name}, {display_unit(s.unit, s.column)[0] or 'share'}" for s in plant.sensors),
             "start at",
         ),
         [_row(plant, recording, prediction) for recording, prediction in predictions],
@@ -127,8 +127,8 @@ def _expect_inputs(name: str, plant: PlantDescription, columns: Collection[str])
 
 
 def _row(plant: PlantDescription, recording: Recording, prediction: Prediction) -> list[str]:
-    errors = [f"{display_unit(s.unit)[1] * prediction.rmse[s.name]:.4g}" for s in plant.sensors]
-    levels = ", ".join(f"{tank} {100 * level:.1f} cm" for tank, level in prediction.start_levels.items())
+    errors = [f"{display_unit(s.unit, s.column)[1] * prediction.rmse[s.name]:.4g}" for s in plant.sensors]
+    levels = ", ".join(f"{tank} {quantity_text(level, 'm')}" for tank, level in prediction.start_levels.items())
     times = (f"{float(recording.time[i]):g}" for i in (0, -1))
     return [Path(recording.source).name, *times, *errors, levels]
 

@@ -11,7 +11,7 @@ from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import named_recordings
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.effects import build_network
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import LeftOutRun, leave_one_file_out
@@ -23,7 +23,7 @@ from fdi_torch.recording import Recording
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
-    plant = load_plant(arguments.plant)
+    plant = chosen_plant(arguments.plant)
     recordings = named_recordings(arguments.recording, plant, Path.cwd())
     holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
     for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def _show(result: Refit, screen: Screen) -> None:
     rows = []
     for sensor in result.plant.sensors:
-        unit, scale = display_unit(sensor.unit)
+        unit, scale = display_unit(sensor.unit, sensor.column)
         rows.append([sensor.name, *(f"{scale * of[sensor.name]:.4g}" for of in (result.before, result.rmse)), unit])
     screen.table("error", ("sensor", "constants fitted", "effects too", "unit"), rows)
     constants = build_network(result.plant).constants
@@ -106,12 +106,12 @@ def _show_run_specific(result: Refit, screen: Screen) -> None:
 
 def _show_trials(trials: Sequence[LeftOutRun], plant: PlantDescription, screen: Screen) -> None:
     """One line per free run: error of the plant file, and of the plant refitted without the run's file."""
+    units = {s.name: display_unit(s.unit, s.column) for s in plant.sensors}
     header = ["run", "from, s", "to, s"]
-    header += [f"{s.name} {of}, {display_unit(s.unit)[0]}" for of in ("as is", "refitted") for s in plant.sensors]
+    header += [f"{name} {of}, {unit}" for of in ("as is", "refitted") for name, (unit, _) in units.items()]
     rows = []
     for trial in trials:
-        errors = [
-            f"{display_unit(s.unit)[1] * of[s.name]:.3g}" for of in (trial.as_is, trial.refitted) for s in plant.sensors
-        ]
+        both = (trial.as_is, trial.refitted)
+        errors = [f"{scale * of[name]:.3g}" for of in both for name, (_, scale) in units.items()]
         rows.append([Path(trial.source).name, f"{trial.start:g}", f"{trial.stop:g}", *errors])
     screen.table("root mean square error of free runs; refitted: without the file of the run", header, rows)

@@ -53,7 +53,7 @@ def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
         repeat_run(read_run(source), target, arguments.set, arguments.trial, advance)
         advance(1.0)
     compared = compare([source, target])
-    comparing.show(compared, screen)
+    comparing.show(compared, [source, target], screen)
     screen.say(f"log: {target}")
     screen.result({"format": "fdi_torch.replay/1", "log": str(target), "comparison": compared})
     return DONE

@@ -13,7 +13,7 @@ from fdi_torch.cli.windows import show_windows
 from fdi_torch.config.run_file import load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windowed_fit import fit_windows
-from fdi_torch.parameters import display_unit
+from fdi_torch.parameters import display_unit, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import data_warnings
 
@@ -108,9 +108,9 @@ def in_words(done: TrainResult) -> list[str]:
         )
         lines.append(f"{diagnosis.kind}: {present}")
     for fault in diagnosis.present:
-        parts = [f"{fault.value:.4g} instead of {fault.nominal:g}"]
+        parts = [f"{quantity_text(fault.value, fault.unit)} instead of {quantity_text(fault.nominal, fault.unit)}"]
         if fault.flow is not None:
-            parts.append(f"{1e6 * fault.flow:.3g} cm^3/s at the mean levels")
+            parts.append(f"{quantity_text(fault.flow, 'm^3/s', 3)} at the mean levels")
         if fault.hole is not None:
             parts.append(f"equivalent to a sharp-edged hole of {1e3 * fault.hole:.3g} mm")
         lines.append(f"- {fault.name}: " + ", ".join(parts))

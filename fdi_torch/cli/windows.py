@@ -20,11 +20,11 @@ def show_windows(fit: WindowedFit, screen: Screen) -> None:
         "windows (?: not determined, for example in an empty tank)", ["from, s", "to, s", *names], rows, left=0
     )
     screen.say()
-    rows = []
+    rows, (flow_unit, flow_scale) = [], display_unit("m^3/s")
     for s in fit.stretches:
-        flow = "" if s.flow is None else f"{1e6 * s.flow:.3g}"
+        flow = "" if s.flow is None else f"{flow_scale * s.flow:.3g}"
         rows.append([_name(s), f"{s.start:g}", f"{s.stop:g}", *_size(s, "> "), flow])
-    screen.table("present", ("fault", "from, s", "to, s", "size", "std error", "flow, cm^3/s"), rows)
+    screen.table("present", ("fault", "from, s", "to, s", "size", "std error", f"flow, {flow_unit}"), rows)
     screen.say(f"step of the simulation: {fit.step:g} s")
     screen.say(f"log: {fit.log}")
     screen.result(

@@ -185,6 +185,9 @@ def _connection(config: SourceConfig, address: Address, tags: list[str]) -> Conn
     if address.scheme.startswith("mqtt"):
         if any(mark in text for text in (config.url, *tags) for mark in "#+"):
             raise ValueError(f"url: expected a topic without the wildcards # and +, got '{config.url}'; give each tag")
+        if name is not None and any(mark in name for mark in ":/"):
+            field = name.rpartition(":")[2].rpartition("/")[2]
+            raise ValueError(f"clock.tag: expected a field of the same JSON object, got '{name}'; write '{field}'")
         from fdi_torch.live.mqtt import MqttSource
 
         return MqttSource(address, tags, name, second, dated, config.session)

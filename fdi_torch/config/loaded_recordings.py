@@ -18,6 +18,7 @@ from fdi_torch.config.recording_config import FileConfig, RecordingConfig, Start
 from fdi_torch.config.yaml_files import find_data, find_file, read_extended
 from fdi_torch.logbook import LogError
 from fdi_torch.names import unknown
+from fdi_torch.parameters import display_also_in
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv_files
@@ -109,6 +110,7 @@ def read_recording(
 ) -> Recording:
     """The plant's inputs and outputs in a recording, cropped, masked and decimated; unknown inputs are NaN.
 
+    From now on its channels are displayed in the units that its file has for them.
     config: the recording's entry in a run file, or the name of the file. base: folder of relative paths. given:
     recordings in memory, by the name that `file` gives them. Raises ConfigError naming file, row and column.
     """
@@ -131,6 +133,7 @@ def read_recording(
         stop = math.inf if config.stop is None else in_seconds(config.stop, recording, config)
         masks = [(in_seconds(a, recording, config), in_seconds(b, recording, config)) for a, b in config.mask]
         selected = recording.window(start, stop).masked(masks).every(config.every)
+        display_also_in(recording.written)
         return replace(selected, trusted=config.trusted)
     except (ValueError, LogError) as error:
         raise ConfigError([str(error)]) from error

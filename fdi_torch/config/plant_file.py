@@ -13,10 +13,11 @@ from fdi_torch.config.flow_sections import flow_sections
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Acceleration, Amount, Area, Length, Strict, quantity
+from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import find_plant, read_yaml
 from fdi_torch.names import unknown
-from fdi_torch.parameters import ParameterName
-from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, FaultPriority, PlacedEffect, Sensor, Tank
+from fdi_torch.parameters import SI_UNITS, ParameterName, display_in, unit_factor
+from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, READING_UNITS, FaultPriority, PlacedEffect, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.untrusted_input import MOST_COMPONENTS
 
@@ -75,6 +76,10 @@ class PlantConfig(flow_sections(_NamedPlant)):  # type: ignore[misc]
     matters: dict[str, MatterConfig] = Field(
         default_factory=dict, description="least reported size and urgency of faults by name, such as T1.leak"
     )
+    units: dict[str, str] = Field(
+        default_factory=dict,
+        description="units for display by SI unit or output channel, such as m: mm; by default the units of this file",
+    )
 
 
 def load_plant(name: str | Path, base: Path | None = None) -> Plant:
@@ -84,6 +89,13 @@ def load_plant(name: str | Path, base: Path | None = None) -> Plant:
     return build_plant({"name": path.stem, **data}, str(path))
 
 
+def chosen_plant(name: str | Path) -> Plant:
+    """The plant that a command is about; from now on quantities are displayed in its units. Raises ConfigError."""
+    plant = load_plant(name)
+    display_in(plant.units)
+    return plant
+
+
 def build_plant(data: dict[str, Any], source: str) -> Plant:
     """The plant in a mapping. Raises ConfigError, naming `source` and the field."""
     try:
@@ -91,9 +103,24 @@ def build_plant(data: dict[str, Any], source: str) -> Plant:
     except ValidationError as error:
         raise explain(error, source) from None
     try:
-        return _plant(config)
+        plant = _plant(config)
+        return replace(plant, units=written_units(data) | _valid_units(config.units, plant))
     except ValueError as error:
         raise ConfigError([f"{source}: {error}"]) from error
+
+
+def _valid_units(units: dict[str, str], plant: Plant) -> dict[str, str]:
+    """The key `units`. Raises ValueError for an unknown key, and for a unit of another kind than its key."""
+    sensors = {sensor.column: sensor.unit for sensor in plant.sensors}
+    kinds = dict.fromkeys((*SI_UNITS, *READING_UNITS))
+    for key, unit in units.items():
+        if key not in sensors and key not in kinds:
+            raise ValueError(f"units: {unknown('an output channel or an SI unit', key, (*sensors, *kinds))}")
+        try:
+            unit_factor(unit, sensors.get(key, key))
+        except ValueError as error:
+            raise ValueError(f"units.{key}: {error}") from error
+    return units
 
 
 def _plant(config: PlantConfig) -> Plant:

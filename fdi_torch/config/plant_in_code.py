@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.config.strict import quantity
+from fdi_torch.config.written_units import written_units
 from fdi_torch.effects import build_network, effect, placements_for
 from fdi_torch.names import matching, unknown
 from fdi_torch.parameters import Parameter, ParameterSpace, is_effect_parameter
@@ -41,7 +42,7 @@ class Plant(PlantDescription):
     start level or a parameter of an effect in its unit. varying: patterns of the constants that differ between
     recordings. effects: the plant's known effects. further: components of the other kinds of `FLOW_KINDS`, such as
     weirs=[Weir(...)] and transfers=[Transfer(...)]. matters: least reported size and urgency of faults for a monitor,
-    SI.
+    SI. units: units for display by SI unit or channel, such as {"m": "mm", "m^3/s": "l/min"}; by default as written.
 
     `dump_plant` writes it as a plant file, which `load_plant` reads as an equal plant. Raises ValueError naming
     component and field, with the expected and the given value.
@@ -68,6 +69,7 @@ class Plant(PlantDescription):
         varying: Iterable[str] = (),
         gravity: float | str = 9.81,
         matters: Iterable[FaultPriority] = (),
+        units: Mapping[str, str] | None = None,
         name: str = "plant",
         **further: Iterable[FlowComponent],
     ) -> None:
@@ -88,13 +90,14 @@ class Plant(PlantDescription):
             tuple(matters),
             without_effects.gravity,
             **flows,
+            units=_units_as_written(with_effects) if units is None else dict(units),
         )
 
     def __eq__(self, other: object) -> bool:
         """Equality of all fields with any `PlantDescription`."""
         if not isinstance(other, PlantDescription):
             return NotImplemented
-        return all(getattr(self, f.name) == getattr(other, f.name) for f in fields(PlantDescription))
+        return all(getattr(self, f.name) == getattr(other, f.name) for f in fields(PlantDescription) if f.compare)
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -124,6 +127,13 @@ class Plant(PlantDescription):
         from fdi_torch.report.style import inline_svg
 
         return str(inline_svg(schematic(self), f"plant-{self.name}", f"plant {self.name}"))
+
+
+def _units_as_written(plant: PlantDescription) -> dict[str, str]:
+    """Units for display, from the quantities of the components that were given as text."""
+    listed = {"tanks": plant.tanks, "sensors": plant.sensors, "flows": plant.flow_components()}
+    texts = {part: {c.name: c.written for c in components} for part, components in listed.items()}
+    return written_units(texts | {"sensors": {s.column: s.written for s in plant.sensors}})
 
 
 def si_value(place: str, value: float | str, unit: str, read: Read | None = None) -> float:

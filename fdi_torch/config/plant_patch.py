@@ -13,6 +13,7 @@ from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.plant_writer import dump_plant, plant_mapping
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.yaml_files import compose_yaml, parse_yaml
+from fdi_torch.parameters import display_unit, displayed_in, si_unit_of
 from fdi_torch.plant.description import FLOW_KINDS, PlacedEffect, PlantDescription
 from fdi_torch.units import UnitError, in_unit, number_and_unit
 
@@ -30,10 +31,11 @@ def patched_plant(text: str, before: PlantDescription, after: PlantDescription) 
     the changes cannot be located in the text (anchors shared by several components), the file is written anew.
     """
     edits = _Edits(text)
-    for path, value in _changes(before, after):
-        edits.set(path, value)
-    for placed in _new_effects(before, after):
-        edits.append(("effects",), _rounded(placed, after))
+    with displayed_in(after.units):
+        for path, value in _changes(before, after):
+            edits.set(path, value)
+        for placed in _new_effects(before, after):
+            edits.append(("effects",), _rounded(placed, after))
     changed = edits.applied()
     try:
         kept = _equal(build_plant({"name": after.name, **parse_yaml(changed.encode(), "patched")}, "patched"), after)
@@ -70,7 +72,7 @@ def _new_effects(before: PlantDescription, after: PlantDescription) -> list[Plac
 def _rounded(placed: PlacedEffect, plant: PlantDescription) -> dict[str, Any]:
     """The mapping of the effect in a plant file."""
     mapping: dict[str, Any] = plant_mapping(plant)["effects"][plant.effects.index(placed)]
-    return mapping | {"parameters": {n: _in_unit_of(v, None) for n, v in mapping["parameters"].items()}}
+    return mapping | {"parameters": {n: _in_display_unit(v) for n, v in mapping["parameters"].items()}}
 
 
 class _Edits:
@@ -90,7 +92,7 @@ class _Edits:
             new = f"{quote}{_in_unit_of(value, node.value)}{quote}"
             self._replaced.append((node.start_mark.index, node.end_mark.index, new))
         else:
-            self._added.setdefault(path[:-1], []).append(_flow({path[-1]: _in_unit_of(value, None)})[1:-1])
+            self._added.setdefault(path[:-1], []).append(_flow({path[-1]: _in_display_unit(value)})[1:-1])
 
     def append(self, path: Path, item: Mapping[str, Any]) -> None:
         """Add an item to a list."""
@@ -148,6 +150,13 @@ def _flow(value: Any) -> str:
     return str(yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6)).strip()
 
 
+def _in_display_unit(value: str | float) -> Any:
+    """A quantity with `DIGITS` digits, in the unit for display if it has one."""
+    unit = number_and_unit(str(value))[1]
+    shown = display_unit(si_unit_of(unit))[0] if unit != "1" else ""
+    return _in_unit_of(value, f"1 {shown}" if shown else None)
+
+
 def _in_unit_of(value: str | float, written: str | None) -> Any:
     """A quantity with `DIGITS` digits, in the unit of `written`; a bare number stays one."""
     number, unit = number_and_unit(str(value))
@@ -168,7 +177,7 @@ def _equal(one: PlantDescription, other: PlantDescription) -> bool:
 
 def _plain(plant: PlantDescription) -> dict[str, Any]:
     plain = asdict(plant)
-    return plain | {"effects": sorted(plain["effects"], key=lambda e: (e["effect"], e["location"]))}
+    return plain | {"units": {}, "effects": sorted(plain["effects"], key=lambda e: (e["effect"], e["location"]))}
 
 
 def _nearly_equal(one: Any, other: Any) -> bool:

@@ -6,8 +6,9 @@ from typing import Any
 
 from fdi_torch.config.flow_sections import written_fields
 from fdi_torch.config.plant_in_code import absolute_units, effect_at, effect_parameters
+from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import write_yaml
-from fdi_torch.parameters import ParameterName, parse_quantity
+from fdi_torch.parameters import ParameterName, display_unit, displayed_in, parse_quantity
 from fdi_torch.plant.description import (
     FLOW_KINDS,
     OUTSIDE,
@@ -42,18 +43,20 @@ def dump_plant(plant: PlantDescription) -> str:
 
 
 def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
-    """The description as the mapping that `build_plant` reads."""
-    data: dict[str, Any] = {"name": plant.name, "gravity": _text(plant.gravity, "m/s^2")}
-    data["tanks"] = {t.name: _tank_mapping(t) for t in plant.tanks}
-    for kind in FLOW_KINDS:
-        data[kind.part()] = {c.name: _flow_mapping(c) for c in getattr(plant, kind.part())}
-    data["sensors"] = {s.name: _sensor_mapping(s) for s in plant.sensors}
-    units = absolute_units(plant)
-    data["tolerances"] = {name: _text(v, units.get(name, "1")) for name, v in plant.tolerances.items()}
-    data["varying"] = list(plant.varying)
-    data["effects"] = [_effect_mapping(placed, plant) for placed in plant.effects]
-    data["matters"] = {m.fault: _matter_mapping(m, plant) for m in plant.matters}
-    return {key: value for key, value in data.items() if value}
+    """The description as the mapping that `build_plant` reads, in the plant's units where these are exact."""
+    with displayed_in(plant.units):
+        data: dict[str, Any] = {"name": plant.name, "gravity": _text(plant.gravity, "m/s^2")}
+        data["tanks"] = {t.name: _tank_mapping(t) for t in plant.tanks}
+        for kind in FLOW_KINDS:
+            data[kind.part()] = {c.name: _flow_mapping(c) for c in getattr(plant, kind.part())}
+        data["sensors"] = {s.name: _sensor_mapping(s) for s in plant.sensors}
+        units = absolute_units(plant)
+        data["tolerances"] = {name: _text(v, units.get(name, "1")) for name, v in plant.tolerances.items()}
+        data["varying"] = list(plant.varying)
+        data["effects"] = [_effect_mapping(placed, plant) for placed in plant.effects]
+        data["matters"] = {m.fault: _matter_mapping(m, plant) for m in plant.matters}
+    data = {key: value for key, value in data.items() if value}
+    return data | ({"units": plant.units} if plant.units and written_units(data) != plant.units else {})
 
 
 def _matter_mapping(matter: FaultPriority, plant: PlantDescription) -> dict[str, Any]:
@@ -115,12 +118,12 @@ def _given(**fields: Any) -> dict[str, Any]:
 
 
 def _text(value: float, unit: str) -> str | float:
-    """'160 cm^2': the first customary unit in which the number is short and reads back exactly, else SI with all
-    digits.
+    """'160 cm^2': the unit for display, or else the first customary unit, in which the number is short and reads back
+    exactly, else SI with all digits.
     """
     if unit == "1":
         return value
-    for shown in (*_UNITS.get(unit, ()), unit):
+    for shown in (display_unit(unit)[0], *_UNITS.get(unit, ()), unit):
         short = f"{value / parse_quantity(f'1 {shown}', unit):.9g} {shown}"
         if parse_quantity(short, unit) == value:
             return short

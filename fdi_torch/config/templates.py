@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fdi_torch.names import unknown
+from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recordings.csv_files import header_of
 
@@ -144,7 +145,7 @@ def _inputs(plant: PlantDescription) -> str:
             lines.append(f"    {channel}: 1")
             continue
         high, unit = full_commands[channel]
-        levels = [f"{share * high:.3g}{'' if unit == '1' else ' ' + unit}" for share in (0.4, 0.5, 0.3)]
+        levels = [quantity_text(share * high, unit, 3) for share in (0.4, 0.5, 0.3)]
         steps = ", ".join(f"[{t} s, {level}]" for t, level in zip((0, 200, 400), levels, strict=True))
         lines.append(f"    {channel}: {{steps: [{steps}]}}")
     return "\n".join(lines)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.objectives import Objective, Problem, Term
-from fdi_torch.parameters import Parameter, ParameterSpace, display_unit, name_in_recording
+from fdi_torch.parameters import Parameter, ParameterSpace, name_in_recording, quantity_text
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.inverted_sensor import levels_from_readings
@@ -226,8 +226,7 @@ def _expect_variation(recording: Recording, plant: PlantDescription) -> None:
         column = recording.output_names.index(sensor.column)
         readings = recording.outputs[recording.mask[:, column], column]
         if len(readings) and bool((readings == readings[0]).all()):
-            unit, scale = display_unit(sensor.unit)
-            value = f"{scale * float(readings[0]):g} {unit}"
+            value = quantity_text(float(readings[0]), sensor.unit, 6, sensor.column)
             raise ValueError(
                 f"{recording.source}: {sensor.column}: expected readings that vary, got {value} "
                 "throughout, whose correlation is undefined; set estimate.objective.search to likelihood, or leave "

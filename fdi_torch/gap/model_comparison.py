@@ -105,8 +105,8 @@ class _Scales:
 
     @classmethod
     def of(cls, plant: PlantDescription) -> _Scales:
-        arranged = {s.name: display_unit(s.unit) for s in plant.sensors}
-        one_unit = len({s.unit for s in plant.sensors}) == 1
+        arranged = {s.name: display_unit(s.unit, s.column) for s in plant.sensors}
+        one_unit = len(set(arranged.values())) == 1
         unit, scale = next(iter(arranged.values())) if one_unit else ("noise levels", 1.0)
         return cls(unit, scale, {n: u for n, (u, _) in arranged.items()}, {n: x for n, (_, x) in arranged.items()})
 

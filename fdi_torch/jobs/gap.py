@@ -36,7 +36,7 @@ def run_gap(
     settings = replace(settings, trusted=settings.trusted or any(r.trusted for r in every))
     with one_thread():
         case = problem_of(plant, recordings, holdouts, settings)
-    sources = [{"path": r.source, "sha256": r.sha256} for r in every]
+    sources = [r.origin for r in every]
     config = {"settings": asdict(settings), "recordings": len(recordings)}
     text = dump_plant(plant)
     with RunLog(

@@ -13,6 +13,7 @@ def logged_recording(log: LoggedRun, group: str, number: int) -> Recording:
     """A logged recording with name and hash of its original file."""
     signals, about = own_signals(log, group), log.metadata.get("fdi_torch.data", {})
     time, inputs, outputs = (torch.as_tensor(a) for a in (signals.time, signals.inputs, signals.outputs))
+    names = (*signals.input_names, *signals.output_names)
     return Recording(
         time=time,
         inputs=inputs,
@@ -25,4 +26,5 @@ def logged_recording(log: LoggedRun, group: str, number: int) -> Recording:
         hold=signals.hold,  # type: ignore[arg-type]
         source=about.get(f"{number}.path", str(log.path)),
         sha256=about.get(f"{number}.sha256", ""),
+        written={name: about[f"{number}.unit.{name}"] for name in names if f"{number}.unit.{name}" in about},
     )

@@ -86,7 +86,7 @@ def origin_of(run: MonitorRun, whole: Recording | None) -> dict[str, Any]:
         "config_text": run.text,
         "config": run.resolved,
         "seeds": {"seed": run.config.seed},
-        "data": [] if whole is None else [{"path": whole.source, "sha256": whole.sha256}],
+        "data": [] if whole is None else [whole.origin],
     }
 
 

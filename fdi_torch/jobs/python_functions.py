@@ -13,7 +13,7 @@ from typing import Any
 
 from fdi_torch.config.loaded_recordings import named_recordings, read_recording
 from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.gap.answer import Answer, adopted
@@ -30,6 +30,7 @@ from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
+from fdi_torch.parameters import display_in
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.report.free_run_figure import free_run_figure
@@ -260,8 +261,11 @@ def study(
 
 
 def plant_of(plant: AnyPlant) -> PlantDescription:
-    """The plant itself, or the plant of a file or of a shipped name."""
-    return plant if isinstance(plant, PlantDescription) else load_plant(plant)
+    """The plant itself, or the plant of a file or of a shipped name; its units are those for display."""
+    if not isinstance(plant, PlantDescription):
+        return chosen_plant(plant)
+    display_in(plant.units)
+    return plant
 
 
 def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDescription) -> list[Recording]:

@@ -143,7 +143,7 @@ def origin_of(run: Run, loaded: Sequence[LoadedRecording]) -> dict[str, Any]:
         "config_text": run.text,
         "config": run.resolved,
         "seeds": {"seed": run.config.seed},
-        "data": [{"path": part.recording.source, "sha256": part.recording.sha256} for part in loaded],
+        "data": [part.recording.origin for part in loaded],
     }
 
 

@@ -18,7 +18,7 @@ from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
 from fdi_torch.monitor.observer_gain import kalman_gain, start_uncertainty
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.whitening import Whitening
-from fdi_torch.parameters import ParameterSpace, display_unit
+from fdi_torch.parameters import ParameterSpace, quantity_text
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import TankNetwork
 
@@ -62,8 +62,7 @@ def residual_warnings(
     white, smallest = noise.whitening, max(OFFSET, SIGNIFICANT * noise.whitening.samples**-0.5)
     for sensor, mean, offset in zip(plant.sensors, white.mean.tolist(), white.offset.tolist(), strict=True):
         if abs(offset) > smallest:
-            unit, scale = display_unit(sensor.unit)
-            off = f"{sensor.name} lies {scale * mean:.3g} {unit} off the observer throughout"
+            off = f"{sensor.name} lies {quantity_text(mean, sensor.unit, 3, sensor.column)} off the observer throughout"
             warnings.append(f"in the fault-free part {off}; this is taken for the plant's own: calibrate a constant")
     return warnings
 

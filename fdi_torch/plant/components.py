@@ -58,6 +58,12 @@ class Component:
             if "unit" in each.metadata:
                 self._convert(each.name, [each.metadata["unit"]])
 
+    @property
+    def written(self) -> dict[str, str]:
+        """Quantities that were given as text, by field; a copy of the component has none."""
+        texts: dict[str, str] = self.__dict__.setdefault("_written", {})
+        return texts
+
     def _convert(self, field_name: str, units: Sequence[str]) -> str | None:
         """Convert a text field to SI by the first unit that fits; return that unit, or None for a number."""
         text = getattr(self, field_name)
@@ -70,6 +76,7 @@ class Component:
                 continue
             if abs(number) <= LARGEST_QUANTITY:
                 object.__setattr__(self, field_name, number)
+                self.written[field_name] = text
                 return unit
         place = f"{type(self).__name__.lower()}s.{self.name}.{field_name}"
         raise ValueError(f"{place}: expected a quantity in {' or '.join(units)}, got '{text}'")

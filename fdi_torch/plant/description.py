@@ -79,7 +79,8 @@ class PlantDescription:
     tolerances: prior standard deviations, of a constant ('P13.discharge_coefficient') relative to its value, of an
     offset, a start level or an effect's parameter ('Q1.pump_lag.time_constant') in its unit. varying: constants that
     differ between recordings, such as the offset of a sensor that is zeroed before each run. matters: least
-    reported size and urgency of single faults; the monitor reports any other fault at any size.
+    reported size and urgency of single faults; the monitor reports any other fault at any size. units: units for
+    display, see `fdi_torch.parameters.display_in`; they do not count for equality.
     """
 
     name: str
@@ -94,6 +95,7 @@ class PlantDescription:
     gravity: float = 9.81
     weirs: tuple[Weir, ...] = _flows(Weir)
     transfers: tuple[Transfer, ...] = _flows(Transfer)
+    units: dict[str, str] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         _check_names(self)

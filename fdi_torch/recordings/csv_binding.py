@@ -26,7 +26,7 @@ TIME_NAMES = (
 class Bound:
     """A channel bound to a column: position (None for a constant), factor into SI, SI unit, and the rule of its cells.
 
-    stamps: whether its cells are time stamps. plus: further columns that are added to it.
+    stamps: whether its cells are time stamps. plus: further columns that are added to it. unit: as written.
     """
 
     name: str
@@ -38,6 +38,7 @@ class Bound:
     stamps: bool = False
     rule: Rule | None = None
     plus: tuple[Bound, ...] = ()
+    unit: str = ""
 
 
 def bind_clock(path: Path, header: Sequence[str], source: ChannelSource | None) -> Bound:
@@ -71,7 +72,7 @@ def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | N
         raise ValueError(f"{path}: column {column}: {error}") from error
     rule = _rule(path, header, name, source)
     plus = tuple(bind(path, header, name, replace(source, column=each, plus=()), si_unit) for each in source.plus)
-    return Bound(name, column, header.index(column), factor, si_unit, rule=rule, plus=plus)
+    return Bound(name, column, header.index(column), factor, si_unit, rule=rule, plus=plus, unit=unit)
 
 
 def column_of(path: Path, header: Sequence[str], column: str) -> str:

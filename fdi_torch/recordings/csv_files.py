@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from fdi_torch.disk import replacing
-from fdi_torch.parameters import header_unit, unit_factor
+from fdi_torch.parameters import display_unit, header_unit, unit_factor
 from fdi_torch.recording import Hold, Recording
 from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
@@ -29,6 +29,7 @@ from fdi_torch.recordings.csv_text import heading_of, open_csv
 from fdi_torch.recordings.sheets import Sheet, in_order, informative_rows, merge_sheets
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, file_sha256
 from fdi_torch.recordings.time_stamps import from_zone
+from fdi_torch.units import spelled
 
 LINES_PER_BLOCK = 1 << 16
 SINCE_1970 = 1e8  # s; larger times are taken to be seconds since 1970
@@ -36,10 +37,11 @@ SINCE_1970 = 1e8  # s; larger times are taken to be seconds since 1970
 
 @dataclass(frozen=True)
 class Read:
-    """The requested channels of one file: sheets, SI units, constants, and notes on corrections."""
+    """The requested channels of one file: sheets, SI units, units in the file, constants, and notes on corrections."""
 
     sheets: Sequence[Sheet]
     units: Mapping[str, str]
+    written: Mapping[str, str]
     constants: Mapping[str, float]
     stamps: bool
     notes: Sequence[str]
@@ -96,6 +98,7 @@ def read_csv_files(
         sha256=_sha256([file.path for file in files]),
         began=float(seconds[0]) if since_1970 else None,
         notes=tuple(note for p in parts for note in p.notes),
+        written={name: unit for p in parts for name, unit in p.written.items()},
     )
 
 
@@ -160,9 +163,10 @@ def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
     return Read(sheets, *_units_and_constants(bounds), clock.stamps, notes)
 
 
-def _units_and_constants(bounds: Sequence[Bound]) -> tuple[dict[str, str], dict[str, float]]:
-    """SI units of the channels, and the values of constant ones."""
-    return {b.name: b.si_unit for b in bounds}, {b.name: b.constant for b in bounds if b.position is None}
+def _units_and_constants(bounds: Sequence[Bound]) -> tuple[dict[str, str], dict[str, str], dict[str, float]]:
+    """SI units of the channels, their units in the file, and the values of constant ones."""
+    written = {b.name: spelled(b.unit) for b in bounds if b.unit}
+    return {b.name: b.si_unit for b in bounds}, written, {b.name: b.constant for b in bounds if b.position is None}
 
 
 def _columns(whole: Sheet, names: Sequence[str], constants: Mapping[str, float]) -> np.ndarray:
@@ -275,17 +279,16 @@ def _numbers(table: np.ndarray, columns: Columns, bound: Bound) -> np.ndarray:
 
 
 def write_csv(recording: Recording, path: Path) -> Path:
-    """Write the recording as CSV whose headers need no mapping: t_s, Q1_cm3_s, h1_cm ... Masked readings become empty
-    cells.
+    """Write the recording as CSV whose headers need no mapping: t_s, Q1_cm3_s, h1_cm ..., in the units for display.
+    Masked readings become empty cells.
     """
-    units = [_FILE_UNITS.get(unit, unit) for unit in (*recording.input_units, *recording.output_units)]
-    si_units = (*recording.input_units, *recording.output_units)
-    factors = [unit_factor(si, unit) for si, unit in zip(si_units, units, strict=True)]
+    inputs = dict(zip(recording.input_names, recording.input_units, strict=True))
+    outputs = dict(zip(recording.output_names, recording.output_units, strict=True))
+    factors = [unit_factor(si, _file_unit(name, si)) for name, si in (*inputs.items(), *outputs.items())]
     readings = torch.where(recording.mask, recording.outputs, torch.nan)
     table = torch.cat([recording.inputs, readings], dim=1).numpy() * np.asarray(factors)
     with replacing(path) as new, new.open("w", encoding="utf-8", newline="") as handle:
-        inputs = dict(zip(recording.input_names, recording.input_units, strict=True))
-        handle.write(header_of(inputs, dict(zip(recording.output_names, recording.output_units, strict=True))) + "\n")
+        handle.write(header_of(inputs, outputs) + "\n")
         for t, row in zip(recording.time.tolist(), table, strict=True):
             cells = ("" if np.isnan(value) else f"{value:.12g}" for value in row.tolist())
             handle.write(f"{t:.12g}," + ",".join(cells) + "\n")
@@ -294,8 +297,14 @@ def write_csv(recording: Recording, path: Path) -> Path:
 
 def header_of(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> str:
     """A header that needs no mapping, from names and SI units of channels: t_s,Q1_cm3_s,h1_cm."""
-    named = (*inputs.items(), *outputs.items())
-    return ",".join(["t_s", *(f"{name}_{_FILE_UNITS.get(unit, unit)}" for name, unit in named)])
+    named = [(name, _file_unit(name, si_unit)) for name, si_unit in (*inputs.items(), *outputs.items())]
+    return ",".join(["t_s", *(f"{n}_{u}" if header_unit(f"{n}_{u}") == (n, u) else f"{n} [{u}]" for n, u in named)])
 
 
-_FILE_UNITS = {"m": "cm", "m^3/s": "cm3_s", "Pa": "mbar", "A": "mA", "1/s": "Hz", "1": "pct"}
+def _file_unit(name: str, si_unit: str) -> str:
+    """The unit of a channel in a file: the unit for display, spelled as is usual in headers."""
+    unit = display_unit(si_unit, name)[0] or "1"
+    return _IN_HEADERS.get(unit, unit)
+
+
+_IN_HEADERS = {"cm^3/s": "cm3_s", "1/s": "Hz", "1": "pct", "%": "pct"}

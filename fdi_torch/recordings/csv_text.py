@@ -6,6 +6,7 @@ import codecs
 import csv
 import gzip
 import io
+import re
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -133,6 +134,11 @@ def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[H
         elif line.strip() and not line.startswith("#"):
             delimiter = delimiter or _delimiter(line, header)
             names = _cells(path, line, delimiter, number - 1)
+            if header and _ALL_NUMBERS.fullmatch(line):
+                raise ValueError(
+                    f"{path}: row {number}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got numbers; for a file "
+                    "without one, write header: false, and number the columns: columns: {h1: {column: 4, unit: mm}}"
+                )
             if not header:
                 numbers = tuple(str(k + 1) for k in range(len(names)))
                 return Heading(numbers, delimiter, number - 1), chain([line], remaining)
@@ -143,6 +149,9 @@ def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[H
                 )
             return _with_units(path, names, delimiter, number, remaining)
     raise ValueError(f"{path}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got an empty file")
+
+
+_ALL_NUMBERS = re.compile(r"(?=.*\d)[\d\s.,;:+\-eE]+", re.DOTALL)  # also time stamps
 
 
 def _delimiter(line: str, header: bool) -> str:

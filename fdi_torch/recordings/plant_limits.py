@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.recording import Recording
@@ -22,7 +23,8 @@ def plant_limit_findings(recording: Recording, plant: PlantDescription) -> Itera
     for sensor in plant.sensors:
         if sensor.column in recording.output_names:
             column = recording.output_names.index(sensor.column)
-            yield from _level_findings(sensor, plant, recording.outputs[recording.mask[:, column], column])
+            valid = recording.mask[:, column]
+            yield from _level_findings(sensor, plant, recording.outputs[valid, column], recording.time[valid])
     for pump in plant.metered_flows():
         if pump.channel in recording.input_names:
             yield from _pump_findings(pump, recording.inputs[:, recording.input_names.index(pump.channel)])
@@ -31,23 +33,38 @@ def plant_limit_findings(recording: Recording, plant: PlantDescription) -> Itera
             yield from _valve_findings(valve, recording.inputs[:, recording.input_names.index(valve)])
 
 
-def _level_findings(sensor: Sensor, plant: PlantDescription, readings: Tensor) -> Iterator[ChannelFinding]:
+def _level_findings(
+    sensor: Sensor, plant: PlantDescription, readings: Tensor, time: Tensor
+) -> Iterator[ChannelFinding]:
+    """Findings about the valid readings (K,) of a sensor at the times (K,) s."""
     rim = next(tank.height for tank in plant.tanks if tank.name == sensor.tank)
     levels = (readings - sensor.offset) / sensor.gain
     if not len(levels):
         return
     low, high = float(levels.min()), float(levels.max())
+    near = levels >= (1 - RIM_MARGIN) * rim
     if high > 10 * rim or high < SMALL_SHARE * rim:
-        text = f"highest level {100 * high:.3g} cm, rim {100 * rim:.3g} cm: a wrong unit, or empty throughout?"
+        text = f"highest level {_level(high)}, rim {_level(rim)}: a wrong unit, or empty throughout?"
         yield ChannelFinding("unit", sensor.column, text, {"high": high, "rim": rim})
     elif high > (1 + RIM_MARGIN) * rim:
         above = int((levels > (1 + RIM_MARGIN) * rim).sum())
-        text = f"{above} readings lie above the rim of {sensor.tank} ({100 * high:.4g} cm of {100 * rim:.4g} cm)"
+        text = f"{above} readings lie above the rim of {sensor.tank} ({_level(high)} of {_level(rim)})"
         yield ChannelFinding("range", sensor.column, text, {"high": high, "rim": rim, "count": above})
+    elif bool(near.any()):
+        start, stop, count = float(time[near][0]), float(time[near][-1]), int(near.sum())
+        text = (
+            f"within {RIM_MARGIN:.0%} of the rim of {sensor.tank} ({_level(rim)}) in {count} samples between "
+            f"{start:g} s and {stop:g} s: water may overflow there"
+        )
+        yield ChannelFinding("rim", sensor.column, text, {"rim": rim, "start": start, "stop": stop, "count": count})
     if low < -RIM_MARGIN * rim:
         below = int((levels < -RIM_MARGIN * rim).sum())
-        text = f"{below} readings lie below the floor of {sensor.tank}, down to {100 * low:.4g} cm: an offset?"
+        text = f"{below} readings lie below the floor of {sensor.tank}, down to {_level(low)}: an offset?"
         yield ChannelFinding("range", sensor.column, text, {"low": low, "count": below})
+
+
+def _level(value: float) -> str:
+    return quantity_text(value, "m")
 
 
 def _pump_findings(pump: MeteredFlow, command: Tensor) -> Iterator[ChannelFinding]:
@@ -55,16 +72,15 @@ def _pump_findings(pump: MeteredFlow, command: Tensor) -> Iterator[ChannelFindin
     if not len(flow):
         return
     low, high = float(flow.min()), float(flow.max())
+    lowest, highest, limit = (quantity_text(each, "m^3/s") for each in (low, high, pump.max_flow))
     if high > 10 * pump.max_flow or 0 < high < SMALL_SHARE * pump.max_flow:
-        text = f"its highest flow is {1e6 * high:.3g} cm^3/s of {1e6 * pump.max_flow:.3g} cm^3/s: is its unit right?"
+        text = f"its highest flow is {highest} of {limit}: is its unit right?"
         yield ChannelFinding("unit", pump.channel, text, {"high": high, "limit": pump.max_flow})
     elif high > (1 + 1e-6) * pump.max_flow:
-        text = (
-            f"asks for up to {1e6 * high:.4g} cm^3/s of {pump.name}, which delivers {1e6 * pump.max_flow:.4g} at most"
-        )
+        text = f"asks for up to {highest} of {pump.name}, which delivers {limit} at most"
         yield ChannelFinding("range", pump.channel, text, {"high": high, "limit": pump.max_flow})
     if low < 0:
-        text = f"asks for a negative flow of {pump.name}, down to {1e6 * low:.4g} cm^3/s: it delivers none"
+        text = f"asks for a negative flow of {pump.name}, down to {lowest}: it delivers none"
         yield ChannelFinding("range", pump.channel, text, {"low": low})
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import display_unit
+from fdi_torch.parameters import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.repeated_readings import resolution
@@ -90,8 +90,7 @@ def _quantised(name: str, values: Tensor, unit: str) -> Iterator[ChannelFinding]
 
 
 def _shown(value: Tensor | float, unit: str) -> str:
-    label, scale = ("%", 100.0) if unit == "1" else display_unit(unit)
-    return f"{scale * float(value):.4g} {label}"
+    return f"{100 * float(value):.4g} %" if unit == "1" else quantity_text(float(value), unit)
 
 
 def _repeats(values: Tensor) -> tuple[Tensor, Tensor]:

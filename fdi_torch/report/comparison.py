@@ -9,6 +9,7 @@ import numpy as np
 
 from fdi_torch.logbook import Comparison, align
 from fdi_torch.report.chart import Chart, Line
+from fdi_torch.report.comparison_headline import comparison_headline
 from fdi_torch.report.html import folded, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit, with_error
@@ -24,8 +25,14 @@ CURVES = {
 
 
 def comparison_section(compared: Comparison, runs: Sequence[Material]) -> Section:
-    """The section about all runs, given in the order of the comparison."""
-    blocks: list[Any] = [tag("p", sentence) for sentence in in_words(compared)]
+    """The section about all runs, given in the order of the comparison, in the units of the first run's plant."""
+    with runs[0].in_its_units():
+        return _section(compared, runs)
+
+
+def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
+    first, *others = comparison_headline(compared, runs)
+    blocks: list[Any] = [tag("h3", first), *(tag("p", sentence) for sentence in (*others, *in_words(compared)))]
     if compared.results:
         header = ["parameter", "unit", *compared.labels, "p", "agree"]
         blocks.append(table(header, result_rows(compared), left=2))
@@ -40,15 +47,12 @@ def comparison_section(compared: Comparison, runs: Sequence[Material]) -> Sectio
 
 
 def in_words(compared: Comparison) -> list[str]:
-    """The result of the comparison, one sentence each."""
-    if compared.same_content:
-        return ["All logs have the same content, message by message."]
-    differing = ", ".join(compared.differences)
-    words = [f"Differences in: {differing}." if differing else "Configuration, versions and data are the same."]
+    """Agreement of the estimates, one sentence each."""
+    words = []
     apart = [result.name for result in compared.results if result.agree is False]
     if any(result.agree is not None for result in compared.results):
         words.append(f"At 95 % these differ: {', '.join(apart)}." if apart else "At 95 % the results agree.")
-    if compared.same_data:
+    if compared.same_data and words:
         words.append("All runs read the same data, so their errors are not independent.")
     return words
 
@@ -89,7 +93,7 @@ def _residuals(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
             continue
         residual = np.where(recording.mask, recording.outputs - model, np.nan)
         for i, name in enumerate(recording.output_names):
-            unit, scale = shown_unit(recording.output_units[i])
+            unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
             lines.setdefault((name, unit), []).append(Line(label, recording.time, scale * residual[:, i], colour))
     return [
         signals(

@@ -13,7 +13,7 @@ from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import fits
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, shown_unit, with_error
+from fdi_torch.report.numbers import amount, shown_unit, with_error
 
 NAN = float("nan")
 
@@ -47,7 +47,7 @@ class DiagnosedEffect:
         value = with_error(scale * self.size, scale * self.std)
         size = f"{self.quantity.replace('_', ' ')} {value}" if unit in ("", "1") else f"{value} {unit}"
         sizes = [size] if math.isfinite(self.size) else []
-        sizes += [f"{number(1e6 * self.flow, 3)} cm³/s"] if math.isfinite(self.flow) else []
+        sizes += [f"{amount(self.flow, 'm^3/s', 3)}"] if math.isfinite(self.flow) else []
         return f"{self.words} ({', '.join(sizes)})" if sizes else self.words
 
 

@@ -31,7 +31,7 @@ def fit_figure(recording: Recording, predicted: Tensor, title: str) -> Figure:
 
 
 def _draw_sensor(upper: Axes, lower: Axes, recording: Recording, predicted: Tensor, i: int) -> None:
-    unit, scale = shown_unit(recording.output_units[i])
+    unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
     counted, outputs = recording.mask[:, i].cpu().numpy(), recording.outputs[:, i].cpu().numpy()
     read = scale * np.where(counted, outputs, np.nan)
     model = scale * predicted[:, i].detach().cpu().numpy()

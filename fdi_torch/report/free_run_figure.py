@@ -35,7 +35,7 @@ def free_run_figure(recording: Recording, columns: list[str], runs: Mapping[str,
 
 
 def _draw(upper: Axes, lower: Axes, recording: Recording, i: int, runs: Mapping[str, Tensor]) -> None:
-    unit, scale = shown_unit(recording.output_units[i])
+    unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
     counted, outputs = recording.mask[:, i].cpu().numpy(), recording.outputs[:, i].cpu().numpy()
     read = scale * np.where(counted, outputs, np.nan)
     time = recording.time.cpu().numpy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -11,6 +12,7 @@ import orjson
 
 from fdi_torch.gap.verdict_words import FORMAT_1
 from fdi_torch.logbook import Inspection, LogError, Run, Signals, arrays, inspect_log, own_signals, series
+from fdi_torch.parameters import displayed_in
 from fdi_torch.plant.description import PlantDescription
 
 # Only these topics are kept as messages; signals and search populations are read as arrays when needed.
@@ -117,6 +119,12 @@ class Material:
             self.trouble.append("/gap/verdict: the answer is not a JSON object")
             return {}
         return answer
+
+    def in_its_units(self) -> AbstractContextManager[None]:
+        """Context within which quantities are displayed in the units of the run's plant and of its recordings."""
+        written = (key.partition(".unit.") for key in self.about("data"))
+        channels = {name: self.about("data")[f"{k}.unit.{name}"] for k, divided, name in written if divided}
+        return displayed_in({**(self.plant.units if self.plant else {}), **channels})
 
     @property
     def meaning_of_shares(self) -> str:

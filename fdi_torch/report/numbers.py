@@ -9,10 +9,12 @@ from fdi_torch.parameters import display_unit
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
-def shown_unit(si_unit: str) -> tuple[str, float]:
-    """'m^3/s' -> ('cm³/s', 1e6): display unit and scale factor from SI; unknown units are unchanged."""
+def shown_unit(si_unit: str, name: str = "") -> tuple[str, float]:
+    """'m^3/s' -> ('cm³/s', 1e6): display unit and scale factor from SI; unknown units are unchanged. name: of a channel
+    or sensor, which may have a unit of its own.
+    """
     try:
-        unit, scale = display_unit(si_unit)
+        unit, scale = display_unit(si_unit, name)
     except ValueError:
         unit, scale = si_unit, 1.0
     return raised(unit), scale
@@ -25,6 +27,12 @@ def raised(unit: str) -> str:
         digits = len(part) - len(part.lstrip("0123456789-"))
         head += part[:digits].translate(_RAISED) + part[digits:]
     return head
+
+
+def amount(value: float, si_unit: str, digits: int = 4) -> str:
+    """An SI value in its display unit, such as '33.1 cm³/s'."""
+    unit, scale = shown_unit(si_unit)
+    return f"{number(scale * value, digits)} {unit}".rstrip()
 
 
 def axis(name: str, unit: str) -> str:

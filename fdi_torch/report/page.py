@@ -33,7 +33,8 @@ class RunReport:
 
 def report_of(material: Material, makers: Sequence[Maker] = SECTIONS) -> RunReport:
     """All sections for which the log has content. An error in a log affects its section only."""
-    made = (_made(maker, material) for maker in makers)
+    with material.in_its_units():
+        made = [_made(maker, material) for maker in makers]
     return RunReport(material, tuple(section for section in made if section is not None))
 
 

@@ -42,29 +42,41 @@ def progress_of(material: Material) -> Progress:
     return Progress(str(said[-1].get("message", "")) if said else "started")
 
 
-def residual_size(material: Material) -> tuple[float, str]:
-    """Root mean square of read - estimate over all sensors and recordings, and its SI unit.
+@dataclass(frozen=True)
+class SensorResidual:
+    """Root mean square of a sensor's residuals over all recordings, its SI unit, and the number of readings."""
 
-    The estimate is the run's prediction, or the observer's in a monitor. NaN if the log has none, or if its sensors
+    rms: float
+    unit: str
+    readings: int
+
+
+def sensor_residuals(material: Material) -> dict[str, SensorResidual]:
+    """Residuals read - estimate of each sensor that the log has them for.
+
+    The estimate is the run's prediction, or the observer's in a monitor.
+    """
+    squares: dict[tuple[str, str], list[np.ndarray]] = {}
+    for k, (group, recording) in enumerate(zip(material.groups, material.recordings, strict=True)):
+        model = predicted(material.arrays, k, len(material.groups) > 1, recording.outputs.shape, group)
+        residual = None if model is None else np.where(recording.mask, recording.outputs - model, np.nan)
+        for i, key in enumerate(zip(recording.output_names, recording.output_units, strict=True)):
+            column = material.residuals.get(key[0]) if residual is None else residual[:, i]
+            if column is not None:
+                squares.setdefault(key, []).append(np.asarray(column)[np.isfinite(column)] ** 2)
+    joined = {key: np.concatenate(parts) for key, parts in squares.items()}
+    return {n: SensorResidual(float(np.sqrt(s.mean())), u, len(s)) for (n, u), s in joined.items() if len(s)}
+
+
+def residual_size(material: Material) -> tuple[float, str]:
+    """Root mean square of the residuals of all sensors, and its SI unit. NaN if the log has none, or if its sensors
     have different units.
     """
-    squares: list[np.ndarray] = []
-    units: set[str] = set()
-    for k, (group, recording) in enumerate(zip(material.groups, material.recordings, strict=True)):
-        shape = recording.outputs.shape
-        model = predicted(material.arrays, k, len(material.groups) > 1, shape, group)
-        if model is not None:
-            squares.append(np.where(recording.mask, recording.outputs - model, np.nan).ravel() ** 2)
-            units.update(recording.output_units)
-        elif material.residuals:
-            columns = [(n, u) for n, u in zip(recording.output_names, recording.output_units, strict=True)]
-            squares += [material.residuals[name] ** 2 for name, _ in columns if name in material.residuals]
-            units.update(unit for _, unit in columns)
-    values = np.concatenate(squares) if squares else np.zeros(0)
-    values = values[np.isfinite(values)]
-    if not len(values) or len(units) != 1:
+    sensors = sensor_residuals(material).values()
+    if len({sensor.unit for sensor in sensors}) != 1:
         return math.nan, ""
-    return float(np.sqrt(values.mean())), units.pop()
+    readings = sum(sensor.readings for sensor in sensors)
+    return math.sqrt(sum(s.readings * s.rms**2 for s in sensors) / readings), next(iter(sensors)).unit
 
 
 def _number(value: object) -> str:

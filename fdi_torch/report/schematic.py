@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from textwrap import wrap
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,30 +11,19 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
-from fdi_torch.plant.flow_component import FlowComponent, FlowOrder, Sketch
+from fdi_torch.plant.flow_component import FlowComponent, Sketch
 from fdi_torch.report.html import short
 from fdi_torch.report.line_geometry import Point, arrow_head, direction, longest_piece
-from fdi_torch.report.numbers import percent
 from fdi_torch.report.rig_layout import tank_places
+from fdi_torch.report.rig_overlay import Overlay, level_text, strength
 from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
+from fdi_torch.report.text_blocks import LINE, POINTS, Box, LetterStyle, TextBlock, separated, text_width
 
 INCH = 0.8  # per unit of the drawing; a tank is one unit wide
-TALL = 1.4
-COLUMN, ROW = 1.95, 3.1
+POINTS_PER_UNIT = 72 * INCH
+TALL = 1.4  # least height of a tank
+COLUMN, BETWEEN = 1.95, 1.7  # least distance from a tank's middle to the next one's; least free height between two rows
 ASIDE, LANE = 0.68, 0.36  # from a tank's middle to a line beside its left wall, and on to the next one
-LETTER = 0.1  # largest width of a letter beside a sensor
-LINE, WITHIN = 0.2, 9  # height of a line; letters per line within a tank and between tanks
-
-
-@dataclass(frozen=True)
-class Overlay:
-    """The diagnosis to draw. levels: tank -> m. marks: location -> texts of diagnosed effects. probabilities: location
-    -> probability of a discrepancy there (0 to 1), drawn as strength of colour.
-    """
-
-    levels: Mapping[str, float] = field(default_factory=dict)
-    marks: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    probabilities: Mapping[str, float] = field(default_factory=dict)
 
 
 def schematic(plant: PlantDescription, overlay: Overlay | None = None) -> Figure:
@@ -52,25 +39,16 @@ class _Drawing:
         self.plant, self.overlay = plant, overlay
         self.places = tank_places(plant)
         self.crossings = self.besides = 0
-        rows = 1 + max(row for row, _ in self.places.values())
-        columns = 1 + max(column for _, column in self.places.values())
-        longest = max((len(words) for name in plant.locations() for words in self.diagnosis(name)), default=0)
-        margin = max(1.0, 0.058 * longest)
-        beside = max((len(words) for s in plant.sensors for words, *_ in self.lines(s.name, WITHIN)), default=0)
-        beside_left = [len(short(c.name, 16)) for c in plant.flow_components() if c.order > FlowOrder.BY_LEVELS]
-        aside = ASIDE + LANE * len(beside_left) + LETTER * max(beside_left) if beside_left else 0.0
-        left, right = -max(margin, aside), (columns - 1) * COLUMN + max(margin, 0.8 + LETTER * beside)
-        flows = list(plant.flow_components())
-        above, below = (
-            LINE * max((len(self.diagnosis(c.name)) for c in flows if (c.source == OUTSIDE) is outside), default=0)
-            for outside in (True, False)
-        )
-        bottom, top = -(rows - 1) * ROW - 0.85 - below, TALL + 1.05 + above
-        self.figure = Figure(figsize=((right - left) * INCH, (top - bottom) * INCH))
+        self.blocks: list[TextBlock] = []
+        counts = {c.name: len(self.lines(c.name)) for c in plant.components()}
+        self.tall = max(TALL, 0.4 + LINE * max(counts[t.name] for t in plant.tanks))
+        most = max((counts[c.name] for c in plant.flow_components()), default=1)
+        self.row = self.tall + BETWEEN + LINE * max(0, 2 * most - 4)  # words below a tank and above the next row
+        beside = max((text_width(t, w) for x in plant.sensors for t, _, w in self.lines(x.name)), default=0.0)
+        self.column = max(COLUMN, 1.24 + beside / POINTS_PER_UNIT)
+        self.figure = Figure()
         FigureCanvasAgg(self.figure)
         self.axes: Axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        self.axes.set_xlim(left, right)
-        self.axes.set_ylim(bottom, top)
         self.axes.set_axis_off()
 
     def draw(self) -> None:
@@ -87,37 +65,50 @@ class _Drawing:
             self.flow(component)
         for sensor in self.plant.sensors:
             self.sensor(sensor)
+        self.write()
+
+    def write(self) -> None:
+        """Write all texts, moved apart, and choose the limits of the drawing such that everything is in it."""
+        tanks = [self.tank_box(tank.name) for tank in self.plant.tanks]
+        blocks = separated(self.blocks, tanks)
+        for block in blocks:
+            self.write_lines(block)
+        boxes = [*tanks, *(block.box for block in blocks)]
+        drawn = self.axes.dataLim
+        left, bottom = min(drawn.x0, *(b[0] for b in boxes)) - 0.15, min(drawn.y0, *(b[1] for b in boxes)) - 0.15
+        right, top = max(drawn.x1, *(b[2] for b in boxes)) + 0.15, max(drawn.y1, *(b[3] for b in boxes)) + 0.15
+        self.figure.set_size_inches((right - left) * INCH, (top - bottom) * INCH)
+        self.axes.set_xlim(left, right)
+        self.axes.set_ylim(bottom, top)
+
+    def write_lines(self, block: TextBlock) -> None:
+        va = "top" if block.down else "bottom"
+        for (x, y), (text, colour, weight) in block.placed_lines():
+            self.axes.text(x, y, text, ha=block.ha, va=va, color=colour, weight=weight, fontsize=POINTS, zorder=6)
+
+    def tank_box(self, tank: str) -> Box:
+        x, y = self.corner(tank)
+        return x - 0.5, y, x + 0.5, y + self.tall
 
     def corner(self, tank: str) -> Point:
         """Middle of a tank's floor."""
         row, column = self.places[tank]
-        return column * COLUMN, -row * ROW
+        return column * self.column, -row * self.row
 
     def colour(self, name: str, plain: str = INK) -> str:
         return MARK if name in self.overlay.marks else plain
 
-    def diagnosis(self, name: str) -> list[str]:
-        """Texts of the diagnosis at a component."""
-        share = self.overlay.probabilities.get(name, 0.0)
-        marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
-        return [*marks, percent(share)] if share >= 0.005 else marks
-
-    def lines(self, name: str, width: int) -> list[tuple[str, str, str]]:
-        """Text, colour and weight of each line at a component."""
-        marks = [short(text, 26) for text in self.overlay.marks.get(name, ())]
-        shares = self.diagnosis(name)[len(marks) :]
-        marks = [line for text in marks for line in wrap(text, width, break_long_words=False)]
+    def lines(self, name: str) -> list[LetterStyle]:
+        """The lines at a component: its name and below it the diagnosis."""
         tinted = name in self.places and self.overlay.probabilities.get(name, 0.0) > 0.0
-        lines = [(short(name, 16), INK, "normal"), *((text, INK if tinted else MARK, "bold") for text in marks)]
-        return [*lines, *((text, INK, "bold") for text in shares)]
+        return [(short(name, 16), INK, "normal"), *self.overlay.lines(name, INK if tinted else MARK)]
 
-    def words(self, name: str, point: Point, ha: str, va: str, width: int = 26) -> None:
-        """Write a component's name and below it the diagnosis, in lines of `width` letters."""
-        x, y = point
-        step = LINE if va == "top" else -LINE
-        lines = self.lines(name, width)
-        for k, (text, colour, weight) in enumerate(lines if va == "top" else reversed(lines)):
-            self.axes.text(x, y - k * step, text, ha=ha, va=va, color=colour, weight=weight, fontsize=9.0, zorder=6)
+    def block(self, name: str, point: Point, ha: str, down: bool = True) -> TextBlock:
+        return TextBlock(self.lines(name), point, ha, down, POINTS_PER_UNIT)
+
+    def words(self, name: str, point: Point, ha: str, va: str) -> None:
+        """Have a component's lines written at a point; they move from it if other texts stand there."""
+        self.blocks.append(self.block(name, point, ha, va == "top"))
 
     def line(self, name: str, points: Sequence[Point], arrow: bool = False) -> None:
         """Draw a line along points, highlighted if it has a discrepancy."""
@@ -133,36 +124,38 @@ class _Drawing:
     def tank(self, tank: Tank) -> None:
         x, y = self.corner(tank.name)
         probability = self.overlay.probabilities.get(tank.name, 0.0)
-        self.axes.add_patch(Rectangle((x - 0.5, y), 1.0, TALL, facecolor=PAPER, edgecolor="none", zorder=3))
+        self.axes.add_patch(Rectangle((x - 0.5, y), 1.0, self.tall, facecolor=PAPER, edgecolor="none", zorder=3))
         if probability > 0.0:
             fill = Rectangle(
-                (x - 0.5, y), 1.0, TALL, facecolor=MARK, alpha=strength(probability), edgecolor="none", zorder=3
+                (x - 0.5, y), 1.0, self.tall, facecolor=MARK, alpha=strength(probability), edgecolor="none", zorder=3
             )
             self.axes.add_patch(fill)
         level = self.overlay.levels.get(tank.name, float("nan"))
         if np.isfinite(level):
-            height = TALL * min(max(level / tank.height, 0.0), 1.0)
+            height = self.tall * min(max(level / tank.height, 0.0), 1.0)
             water = Rectangle((x - 0.5, y), 1.0, height, facecolor=MODEL, alpha=0.22, edgecolor="none", zorder=3)
             self.axes.add_patch(water)
             self.axes.plot([x - 0.5, x + 0.5], [y + height] * 2, color=MODEL, lw=1.2, zorder=4)
             place = height + (0.05 if height < 0.3 else -0.24)
-            free = TALL - 0.08 - LINE * len(self.lines(tank.name, WITHIN)) - 0.22  # below the words of the tank
+            free = self.tall - 0.08 - LINE * len(self.lines(tank.name)) - 0.22  # below the words of the tank
             place = max(min(place, free), 0.04)
-            self.axes.text(x, y + place, f"{100 * level:.1f} cm", ha="center", color=INK, fontsize=9.0, zorder=6)
-        walls = [(x - 0.5, y + TALL), (x - 0.5, y), (x + 0.5, y), (x + 0.5, y + TALL)]
+            self.axes.text(x, y + place, level_text(level), ha="center", color=INK, fontsize=9.0, zorder=6)
+        walls = [(x - 0.5, y + self.tall), (x - 0.5, y), (x + 0.5, y), (x + 0.5, y + self.tall)]
         self.axes.plot(*np.array(walls).T, color=self.colour(tank.name), lw=2.0, zorder=5, solid_joinstyle="miter")
-        self.words(tank.name, (x, y + TALL - 0.08), "center", "top", width=WITHIN)
+        self.write_lines(self.block(tank.name, (x, y + self.tall - 0.08), "center"))
 
     def sensor(self, sensor: Sensor) -> None:
         x, y = self.corner(sensor.tank)
-        same = [s.name for s in self.plant.sensors if s.tank == sensor.tank]
-        centre = (x + 0.5, y + 0.85 - 0.4 * same.index(sensor.name))
+        names = [s.name for s in self.plant.sensors if s.tank == sensor.tank]
+        heights = [max(0.4, LINE * len(self.lines(name)) + 0.1) for name in names]
+        first = min(max(0.85, sum(heights) + 0.2), self.tall - 0.1)
+        centre = (x + 0.5, y + first - sum(heights[: names.index(sensor.name)]))
         probability = self.overlay.probabilities.get(sensor.name, 0.0)
         if probability > 0.0:
             self.axes.add_patch(Circle(centre, 0.2, facecolor=MARK, alpha=strength(probability), zorder=6))
         colour = self.colour(sensor.name)
         self.axes.add_patch(Circle(centre, 0.085, facecolor=PAPER, edgecolor=colour, lw=1.6, zorder=7))
-        self.words(sensor.name, (centre[0] + 0.12, centre[1] + 0.1), "left", "top", width=WITHIN)
+        self.words(sensor.name, (centre[0] + 0.12, centre[1] + 0.1), "left", "top")
 
     def flow(self, component: FlowComponent) -> None:
         """Draw a flow component as its `sketch` declares: a line along its route with its symbol."""
@@ -176,7 +169,11 @@ class _Drawing:
         if sketch.symbol:
             self.symbol(component.name, sketch, middle, direction(start, end))
         if sketch.route == "from_above":
-            self.words(component.name, (middle[0], middle[1] + sketch.round + 0.08), "center", "bottom")
+            top = middle[1] + sketch.round + 0.08
+            if self.fed_from_above(component.target):  # beside the flow from above
+                self.words(component.name, (middle[0] + 2 * sketch.round, top), "right", "bottom")
+            else:
+                self.words(component.name, (middle[0], top), "center", "bottom")
         elif component.target == OUTSIDE:
             self.words(component.name, (points[-1][0], points[-1][1] - 0.06), "center", "top")
         elif middle[0] < self.corner(component.source)[0] - 0.5:
@@ -192,7 +189,7 @@ class _Drawing:
         if sketch.route == "from_above":
             return self.route_from_above(component, sketch)
         x, y = self.corner(component.source)
-        rise = TALL * min(sketch.height / self.tank_height(component.source), 0.9)
+        rise = self.tall * min(sketch.height / self.tank_height(component.source), 0.9)
         if sketch.route == "over_wall":
             return self.route_over_wall(component, rise)
         flows = [c for c in self.plant.flow_components() if c.sketch().route == sketch.route]
@@ -203,11 +200,11 @@ class _Drawing:
         to_x, to_y = self.corner(component.target)
         if component.falls:
             to_x += 0.22
-            return [(x + 0.22, y), (x + 0.22, y - 0.3), (to_x, y - 0.3), (to_x, to_y + TALL + 0.06)]
+            return [(x + 0.22, y), (x + 0.22, y - 0.3), (to_x, y - 0.3), (to_x, to_y + self.tall + 0.06)]
         side = 0.5 if to_x > x else -0.5
         same = [c.name for c in flows if {c.source, c.target} == {component.source, component.target}]
         rise += 0.12 + 0.28 * same.index(component.name)
-        if y == to_y and abs(to_x - x) <= COLUMN:
+        if y == to_y and abs(to_x - x) <= self.column:
             return [(x + side, y + rise), (to_x - side, to_y + rise)]
         if x == to_x and sketch.arrow:
             return self.route_beside((x - 0.5, y + rise), to_x, to_y)
@@ -221,7 +218,7 @@ class _Drawing:
         same = [c.name for c in self.plant.flow_components() if c.source == OUTSIDE and c.target == component.target]
         fed = 0.22 if self.fed_from_above(component.target) else 0.0
         x += (same.index(component.name) - (len(same) - 1) / 2) * 0.7 - fed
-        return [(x, y + TALL + 0.55 - sketch.round), (x, y + TALL + 0.06)]
+        return [(x, y + self.tall + 0.55 - sketch.round), (x, y + self.tall + 0.06)]
 
     def route_over_wall(self, component: FlowComponent, rise: float) -> list[Point]:
         """Over a wall of the source at the height `rise`: down outside it, or into the target."""
@@ -237,9 +234,9 @@ class _Drawing:
     def route_beside(self, start: Point, to_x: float, to_y: float) -> list[Point]:
         """From the left wall of a tank past it to the rim of a tank in another row."""
         self.besides += 1
-        lane, above = start[0] + 0.5 - ASIDE - LANE * (self.besides - 1), to_y + TALL + 0.14 + 0.1 * self.besides
+        lane, above = start[0] + 0.5 - ASIDE - LANE * (self.besides - 1), to_y + self.tall + 0.14 + 0.1 * self.besides
         end = to_x - 0.2 - 0.12 * self.besides
-        return [start, (lane, start[1]), (lane, above), (end, above), (end, to_y + TALL + 0.06)]
+        return [start, (lane, start[1]), (lane, above), (end, above), (end, to_y + self.tall + 0.06)]
 
     def symbol(self, name: str, sketch: Sketch, middle: Point, direction: Point) -> None:
         """Draw a component's symbol at the middle of its line, turned into the direction of the flow."""
@@ -262,10 +259,10 @@ class _Drawing:
             return
         (x, y), (to_x, to_y) = self.corner(tank.name), self.corner(tank.overflow_to)
         path = [
-            (x - 0.5, y + TALL),
-            (x - 0.68, y + TALL),
-            (x - 0.68, to_y + TALL + 0.2),
-            (to_x - 0.3, to_y + TALL + 0.2),
+            (x - 0.5, y + self.tall),
+            (x - 0.68, y + self.tall),
+            (x - 0.68, to_y + self.tall + 0.2),
+            (to_x - 0.3, to_y + self.tall + 0.2),
         ]
         self.axes.plot(*np.array(path).T, color=SOFT, lw=1.0, ls=":", zorder=1)
 
@@ -286,8 +283,3 @@ class _Drawing:
 
     def tank_height(self, name: str) -> float:
         return next(t.height for t in self.plant.tanks if t.name == name)
-
-
-def strength(share: float) -> float:
-    """Opacity of a location by its probability (0 to 1); cubic, so that certain locations stand out."""
-    return 0.3 * share**3

@@ -42,9 +42,10 @@ def headline(material: Material) -> str:
         study_words,
     )
     warning = f"{UNRELIABLE}. " if material.about("result").get("explained") == "false" else ""
-    for words in (of(material) for of in (*sentences, windows_words)):
-        if words:
-            return warning + words
+    with material.in_its_units():
+        for words in (of(material) for of in (*sentences, windows_words)):
+            if words:
+                return warning + words
     return material.about("status").get("status", "did not end").replace("_", " ").capitalize()
 
 

@@ -7,8 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from fdi_torch.jobs.report import plant_of
 from fdi_torch.logbook import being_written, read_run
 from fdi_torch.report.material import gather
+from fdi_torch.report.numbers import amount
 from fdi_torch.report.progress import Progress, progress_of, residual_size
 from fdi_torch.report.verdict import headline, kind_words
 
@@ -22,8 +24,8 @@ UNSHOWN = (KeyError, IndexError, TypeError, ValueError, OverflowError, OSError)
 class Entry:
     """One log. name: its path below the folder. verdict: its result in one sentence, or why it cannot be read.
 
-    error: root mean square of the residuals in `unit` (SI), NaN if unknown. state: status of the run, or `RUNNING`,
-    `NO_END` or `UNREADABLE`. started: UTC, as text.
+    error: root mean square of the residuals in SI, NaN if unknown; error_text: in the plant's units. state: status of
+    the run, or `RUNNING`, `NO_END` or `UNREADABLE`. started: UTC, as text.
     """
 
     name: str
@@ -31,7 +33,7 @@ class Entry:
     kind: str
     verdict: str
     error: float
-    unit: str
+    error_text: str
     state: str
     started: str
     progress: Progress
@@ -77,12 +79,16 @@ class LogList:
 
 def _read(name: str, path: Path, running: bool) -> Entry:
     try:
-        material = gather(read_run(path, salvage=True))
+        log = read_run(path, salvage=True)
+        material = gather(log, plant_of(log, []))
         error, unit = residual_size(material)
+        with material.in_its_units():
+            error_text = amount(error, unit, 3) if error == error else ""
         status = material.about("status").get("status", NO_END).replace("_", " ")
         started = material.about("run").get("started", "")[:19].replace("T", " ")
         state, verdict = (RUNNING, progress_of(material).text) if running else (status, headline(material))
-        return Entry(name, path, kind_words(material), verdict, error, unit, state, started, progress_of(material))
+        kind, progress = kind_words(material), progress_of(material)
+        return Entry(name, path, kind, verdict, error, error_text, state, started, progress)
     except UNSHOWN as problem:
         return _unreadable(name, path, str(problem), running)
 

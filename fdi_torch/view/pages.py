@@ -9,7 +9,7 @@ from urllib.parse import urlencode
 
 from fdi_torch.report.html import Markup, clean, folded, join, table, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, shown_unit
+from fdi_torch.report.numbers import number
 from fdi_torch.report.page import document
 from fdi_torch.report.progress import Progress
 from fdi_torch.view.log_list import RUNNING, SORTS, UNREADABLE, Entry
@@ -76,7 +76,7 @@ def _filter(kinds: Sequence[str], query: Query) -> Markup:
 def _choice(entries: Sequence[Entry], query: Query) -> Markup:
     """The table of logs, with a box to tick in each row."""
     header = ["", *(_sorting(key, name, query) for key, name in COLUMNS.items()), _sorting("error", "error", query)]
-    rows = [[_box(entry), _link(entry), *_texts(entry), error_text(entry)] for entry in entries]
+    rows = [[_box(entry), _link(entry), *_texts(entry), entry.error_text] for entry in entries]
     return tag(
         "form",
         tag("button", "Compare the ticked logs"),
@@ -110,14 +110,6 @@ def _texts(entry: Entry) -> list[Markup | str]:
     elif entry.state != "completed":
         state = tag("span", entry.state, class_="bad")
     return [entry.started, entry.kind, state, entry.verdict]
-
-
-def error_text(entry: Entry) -> str:
-    """The size of the residuals in the unit in which people read it; empty if unknown."""
-    if math.isnan(entry.error):
-        return ""
-    unit, scale = shown_unit(entry.unit)
-    return f"{number(scale * entry.error, 3)} {unit}".strip()
 
 
 def _bar(progress: Progress) -> Markup:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import pytest
@@ -50,7 +50,7 @@ def test_circles_of_pipes_and_of_falls_are_drawn_too() -> None:
 def test_guilty_components_and_shares_stand_on_the_drawing() -> None:
     overlay = Overlay({"T1": 0.5}, {"Q1": ["pump lag 8 s"], "T1-T2": ["cross flow"]}, {"P13": 0.62})
     svg = inline_svg(schematic(load_plant("three_tank"), overlay), "rig", "")
-    assert all(f">{words}<" in svg for words in ("50.0 cm", "pump lag 8 s", "cross flow", "62 %"))
+    assert all(f">{words}<" in svg for words in ("50.0 cm", "pump lag", "8 s", "cross", "flow", "62 %"))
     assert svg.count("var(--mark)") > inline_svg(schematic(load_plant("three_tank")), "rig", "").count("var(--mark)")
 
 
@@ -66,3 +66,24 @@ def test_no_word_within_a_tank_stands_on_another(level: float) -> None:
     assert len(boxes) == 5
     for lower, upper in pairwise(boxes):
         assert lower.y1 - upper.y0 < 0.25 * lower.height, "letters overlap"
+
+
+@pytest.mark.parametrize("effects", [1, 3])
+@pytest.mark.parametrize("name", PLANTS)
+def test_no_text_stands_on_another_with_effects_everywhere(name: str, effects: int) -> None:
+    plant = load_plant(name)
+    texts = ["laminar flow 49.8 ± 9.5 mm", "outlet drop 12 mm", "plugging 0.31 ± 0.04"][:effects]
+    names = [component.name for component in plant.components()]
+    overlay = Overlay(
+        {t.name: 0.5 * t.height for t in plant.tanks}, dict.fromkeys(names, texts), dict.fromkeys(names, 0.5)
+    )
+    figure = schematic(plant, overlay)
+    figure.canvas.draw()
+    boxes = [(t.get_text(), t.get_window_extent()) for t in figure.axes[0].texts if t.get_text()]
+    assert sum(text.startswith("outlet") or text == "• outlet" for text, _ in boxes) == (effects == 3) * len(names)
+    for (one, a), (other, b) in combinations(boxes, 2):
+        across = min(a.x1, b.x1) - max(a.x0, b.x0)
+        along = min(a.y1, b.y1) - max(a.y0, b.y0)
+        assert across < 1.0 or along < 0.25 * min(a.height, b.height), f"{one} stands on {other}"
+    for text, box in boxes:
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height, text

@@ -10,13 +10,13 @@ import argparse
 
 EXAMPLES = """
 examples:
-  fdi export rig.yaml --fmu rig.fmu                              the plant with the effects in its file
-  fdi export three_tank --fmu rig.fmu --effect T1.leak           with a leak whose size is 0 until it is set
+  fdi export --plant rig.yaml --fmu rig.fmu                         the plant with the effects in its file
+  fdi export --plant three_tank --fmu rig.fmu --effect T1.leak      with a leak whose size is 0 until it is set
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("plant", metavar="PLANT", help="a shipped plant, or a plant file")
+    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
     parser.add_argument("--fmu", metavar="FILE", required=True, help="FMU to write")
     parser.add_argument(
         "--effect",

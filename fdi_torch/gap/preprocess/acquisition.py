@@ -24,7 +24,7 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
 )
 from fdi_torch.gap.preprocess.recording_fault_decision import SURE, log_odds, recording_fault
 from fdi_torch.gap.preprocess.recording_faults import RecordingFault
-from fdi_torch.parameters import display_unit
+from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerances
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
@@ -53,12 +53,9 @@ class StuckSegment:
 
     @property
     def text(self) -> str:
-        unit, scale = display_unit(self.sensor.unit)
         until = "on" if self.for_good else f"to {self.stop:g} s"
-        return (
-            f"{self.sensor.column} is stuck at {scale * self.value:.4g} {unit} from {self.start:g} s {until}: "
-            "these readings do not count"
-        )
+        value = quantity_text(self.value, self.sensor.unit, name=self.sensor.column)
+        return f"{self.sensor.column} is stuck at {value} from {self.start:g} s {until}: these readings do not count"
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from fdi_torch.report.sections.gap import causes_section, disturbances_section, 
 from fdi_torch.report.sections.gap_closure import closure_section, constants_section, errors_section
 from fdi_torch.report.sections.gap_curves import curves_section, shape_section
 from fdi_torch.report.sections.gap_next import limits_section, next_input_section
+from fdi_torch.report.sections.intervals import intervals_section
 from fdi_torch.report.sections.isolation import isolation_section
 from fdi_torch.report.sections.monitor import event_section, residual_section, statistic_section
 from fdi_torch.report.sections.origin import configuration_section, health_section, provenance_section
@@ -47,6 +48,7 @@ SECTIONS: tuple[Maker, ...] = (
     trials_section,
     fit_section,
     inputs_section,
+    intervals_section,
     posterior_section,
     search_section,
     refinement_section,

@@ -35,7 +35,7 @@ def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
     arrays, recording, pictures = material.arrays, material.recordings[0], []
     time, read, title = arrays[f"{prefix}_time"], arrays[f"{prefix}_read"], prefix.replace("holdout", "hold-out")
     for i, name in enumerate(recording.output_names):
-        unit, scale = shown_unit(recording.output_units[i])
+        unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
         lines: list[Line] = []
         for model in ("recalibrated", "augmented"):
             predicted = arrays.get(f"{prefix}_{model}")
@@ -95,13 +95,14 @@ def _variables(material: Material, recording: Signals) -> Iterator[tuple[str, st
     """Title, axis label and values (T,) of each variable that the gap may depend on."""
     yield "By time", "time, s", recording.time
     for i, name in enumerate(recording.output_names):
-        unit, scale = shown_unit(recording.output_units[i])
+        unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
         yield f"By {name}", axis(f"{name} measured", unit), scale * recording.outputs[:, i]
     for i, name in enumerate(recording.input_names):
-        unit, scale = shown_unit(recording.input_units[i])
+        unit, scale = shown_unit(recording.input_units[i], recording.input_names[i])
         yield f"By {name}", axis(f"{name} commanded", unit), scale * recording.inputs[:, i]
     for name, head in _heads(material, recording):
-        yield f"By the flow in {name}", "head along the pipe, cm", 100.0 * head
+        unit, scale = shown_unit("m")
+        yield f"By the flow in {name}", axis("head along the pipe", unit), scale * head
 
 
 def _heads(material: Material, recording: Signals) -> Iterator[tuple[str, np.ndarray]]:

@@ -10,7 +10,7 @@ import numpy as np
 from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import number, shown_unit, with_error
+from fdi_torch.report.numbers import amount, number, shown_unit, with_error
 from fdi_torch.report.panels import ellipse_panel
 from fdi_torch.report.section import Picture, Section
 
@@ -95,7 +95,7 @@ def _water(material: Material) -> list[Any]:
     lines = []
     for finding in diagnosed_effects(material):
         if finding.present and np.isfinite(finding.flow):
-            text = f"{finding.words} moves {number(1e6 * finding.flow, 3)} cm³/s"
+            text = f"{finding.words} moves {amount(finding.flow, 'm^3/s', 3)}"
             if np.isfinite(finding.hole):
                 text += f", as a sharp-edged hole of {number(1e3 * finding.hole, 3)} mm would"
             lines.append(tag("li", text))

@@ -28,7 +28,7 @@ def next_input_section(material: Material) -> Section | None:
     units, end = proposal["input"].get("unit") or {}, as_float(proposal["input"].get("duration"))
     pictures = []
     for k, (name, channel) in enumerate(steps.items()):
-        unit, scale = shown_unit(str(units.get(name, "")))
+        unit, scale = shown_unit(str(units.get(name, "")), name)
         time, values = as_vector(channel["at"]), scale * as_vector(channel["value"])
         line = Line("command", np.append(time, end), np.append(values, values[-1:]), MODEL, steps=True)
         chart = Chart(name, "time, s", axis("command", unit), [line], clock="next")

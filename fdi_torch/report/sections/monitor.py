@@ -22,7 +22,7 @@ def residual_section(material: Material) -> Section | None:
         return None
     alarms, pictures = _alarms(material), []
     for k, name in enumerate(name for name in columns if name != "t" and not name.endswith(_SUFFIXES)):
-        unit, scale = shown_unit(material.unit(RESIDUAL, name))
+        unit, scale = shown_unit(material.unit(RESIDUAL, name), name)
         line, label = Line("measured − predicted", time, scale * columns[name], MODEL), axis("residual", unit)
         chart = Chart(name, "time, s", label, [line], level=0.0, events=alarms, clock="monitor", height=2.1)
         pictures.append(signals(f"observer_residual_{k + 1}", chart))

@@ -40,7 +40,7 @@ def inputs_section(material: Material) -> Section | None:
         suffix = f"_{k + 1}" if several else ""
         pictures, constant = [], []
         for i, name in enumerate(recording.input_names):
-            unit, scale = shown_unit(recording.input_units[i])
+            unit, scale = shown_unit(recording.input_units[i], recording.input_names[i])
             values = scale * recording.inputs[:, i]
             if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
                 constant.append(f"{name} at {number(float(np.nanmax(values)))} {unit}".rstrip())
@@ -77,7 +77,7 @@ def _output_panels(recording: Signals, model: np.ndarray | None, suffix: str, cl
     readings = np.where(recording.mask, recording.outputs, np.nan)
     time = recording.time
     for i, name in enumerate(recording.output_names):
-        unit, scale = shown_unit(recording.output_units[i])
+        unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
         lines = [Line("measured", time, scale * readings[:, i], SOFT, wide=model is not None)]
         if model is not None:
             lines.append(Line("estimate", time, scale * model[:, i], MODEL))
@@ -96,7 +96,7 @@ def _misfit_table(recording: Signals, model: np.ndarray) -> str:
     """Root mean square, mean, largest residual, and Pearson correlation of each sensor."""
     rows = []
     for i, name in enumerate(recording.output_names):
-        unit, scale = shown_unit(recording.output_units[i])
+        unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
         counted = recording.mask[:, i] & np.isfinite(model[:, i])
         read, estimate = scale * recording.outputs[counted, i], scale * model[counted, i]
         residual = read - estimate

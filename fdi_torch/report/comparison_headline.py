@@ -1,0 +1,137 @@
+"""The result of a comparison in words: which run explains the recording best, by how much, and what differs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+
+from fdi_torch.logbook import Comparison
+from fdi_torch.parameters import quantity_text
+from fdi_torch.report.html import short
+from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import percent
+from fdi_torch.report.progress import SensorResidual, sensor_residuals
+from fdi_torch.report.verdict import headline
+
+MOST_LISTED, MOST_LETTERS = 4, 60
+AT_95 = 1.96
+VERSIONS = ("env", "git")
+NOT_IN_WORDS = ("sha256", "output.name", "output.folder")
+
+
+def comparison_headline(compared: Comparison, runs: Sequence[Material]) -> list[str]:
+    """Sentences: the better run, runs whose model fails, and the differences of recordings, settings and versions."""
+    if compared.same_content and not compared.differences:
+        return ["All logs have the same content, message by message."]
+    failing = [n for n, run in zip(compared.labels, runs, strict=True) if _is_unexplained(run)]
+    words = [_better(compared, runs)]
+    if failing:
+        words.append(f"Unreliable: {_listed(failing)} (the model does not explain the recording).")
+    return [*words, _differences(compared, runs)]
+
+
+def _is_unexplained(run: Material) -> bool:
+    return run.about("result").get("explained") == "false"
+
+
+def _better(compared: Comparison, runs: Sequence[Material]) -> str:
+    """The run with the smallest residuals; the verdicts, if the runs have no residuals of one recording.
+
+    A run's size is the geometric mean of its sensors' root mean squares. Two sizes from N independent readings differ
+    by chance by up to 1.96 / sqrt(N) of them at 95 %: the relative variance of each is 1 / (2 N).
+    """
+    residuals = [sensor_residuals(run) for run in runs]
+    common = [name for name in residuals[0] if all(name in each and each[name].rms > 0.0 for each in residuals)]
+    same = _same_readings(runs)
+    if not same or not common:
+        verdicts = "; ".join(f"{label}: {headline(run)}" for label, run in zip(compared.labels, runs, strict=True))
+        reason = "" if same else " They read different recordings, so their residuals do not rank them."
+        return f"{verdicts}.{reason}"
+    sizes = [float(np.mean([math.log(each[name].rms) for name in common])) for each in residuals]
+    first, second = np.argsort(sizes, kind="stable")[:2]
+    smaller = 1.0 - math.exp(sizes[first] - sizes[second])
+    chance = AT_95 / math.sqrt(max(sum(residuals[first][name].readings for name in common), 1))
+    best, next_best = compared.labels[first], compared.labels[second]
+    if smaller <= chance:
+        by = percent(smaller) if smaller >= 1e-3 else "less than 0.1 %"
+        return f"{best} and {next_best} explain the recording equally well: residuals differ by {by}."
+    errors = _listed([_both(name, residuals[first][name], residuals[second][name]) for name in common])
+    return (
+        f"{best} explains the recording best: its residuals are {percent(smaller)} smaller than those of {next_best} "
+        f"({errors})."
+    )
+
+
+def _same_readings(runs: Sequence[Material]) -> bool:
+    """Whether all runs have the same readings at the same times."""
+    first, *others = ([array for r in run.recordings for array in (r.time, r.outputs)] for run in runs)
+    return all(
+        len(first) == len(other)
+        and all(np.array_equal(a, b, equal_nan=True) for a, b in zip(first, other, strict=True))
+        for other in others
+    )
+
+
+def _both(name: str, one: SensorResidual, other: SensorResidual) -> str:
+    texts = (quantity_text(each.rms, each.unit, 3, name) for each in (one, other))
+    return f"{name} " + " against ".join(texts)
+
+
+def _differences(compared: Comparison, runs: Sequence[Material]) -> str:
+    """What differs in the inputs: recordings, settings, versions."""
+    parts = []
+    if not _same_readings(runs):
+        parts.append(f"the recording ({'; '.join(_recordings(run) for run in runs)})")
+    settings = setting_differences(compared)
+    parts += [f"{key} ({'; '.join(texts)})" for key, texts in list(settings.items())[:MOST_LISTED]]
+    if len(settings) > MOST_LISTED:
+        parts.append(f"{len(settings) - MOST_LISTED} more settings")
+    if any(compared.differences.get(section) for section in VERSIONS):
+        parts.append("versions of the software")
+    return f"They differ in {_listed(parts)}." if parts else "Recording, settings and versions are the same."
+
+
+def setting_differences(compared: Comparison) -> dict[str, tuple[str, ...]]:
+    """Settings and seeds that differ, in words: key -> one text per run."""
+    found = compared.differences.get("config", {}) | compared.differences.get("seeds", {})
+    kept = {key: texts for key, texts in found.items() if key not in NOT_IN_WORDS}
+    in_words = {key: tuple(plain_text(text) for text in texts) for key, texts in kept.items()}
+    return {key: texts for key, texts in in_words.items() if len(set(texts)) > 1}
+
+
+def plain_text(text: str) -> str:
+    """The text of a setting; a JSON list or mapping in words, and 'none' for a missing one."""
+    if text[:1] in ("[", "{"):
+        with suppress(ValueError):
+            text = _in_words(orjson.loads(text))
+    return short(text, MOST_LETTERS) if text not in ("", "null") else "none"
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(_in_words(each) for each in value)
+    if isinstance(value, dict) and {"effect", "location"} <= value.keys():
+        return f"{value['effect']} at {value['location']}"
+    if isinstance(value, dict):
+        given = {key: each for key, each in value.items() if each is not None}
+        return ", ".join(
+            _in_words(each) if key == "name" else f"{key} {_in_words(each)}" for key, each in given.items()
+        )
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _recordings(run: Material) -> str:
+    data = run.about("data")
+    names = dict.fromkeys(Path(path).name for key, path in data.items() if key.endswith(".path"))
+    return ", ".join(names) or "simulated"
+
+
+def _listed(texts: Sequence[str]) -> str:
+    shown = [*texts[:MOST_LISTED], *([f"{len(texts) - MOST_LISTED} more"] if len(texts) > MOST_LISTED else [])]
+    return ", ".join(shown[:-1]) + (" and " if len(shown) > 1 else "") + shown[-1]
