@@ -93,5 +93,3 @@ def _remaining_delay(fit: BlockwiseFit, late: list[int]) -> float:
     residual = torch.where(mask, blocked.data.readings[:, late] - model, 0.0)
     slope = torch.where(mask, slope, 0.0)
     return -float((residual * slope * weight).sum() / (slope * slope * weight).sum().clamp(min=1e-300))
-
-
