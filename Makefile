@@ -10,7 +10,10 @@ COMPILER := $(shell command -v g++ || command -v c++ || command -v clang++)
 TESTS = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(shell nproc) --dist worksteal
 comma := ,
 LOWEST = tests/test_units.py tests/test_yaml_files.py tests/test_config_plant.py tests/test_config_run.py \
-	tests/test_recording_csv.py tests/test_hostile_files.py tests/test_command_line.py tests/logbook/test_reader.py
+	tests/test_recording_csv.py tests/test_hostile_files.py tests/test_command_line.py tests/logbook/test_reader.py \
+	tests/test_recording_tables.py tests/test_recording_sheets.py tests/test_recording_database.py tests/test_live_outlets.py \
+	tests/test_live_rows.py tests/test_live_mqtt.py tests/test_live_modbus.py tests/test_live_opcua.py
+LOWEST_EXTRAS := parquet,excel,hdf5,sql,influx,mqtt,opcua,modbus,prometheus
 EXTRAS := test$(if $(COMPILER),,$(comma)compiler)
 
 .PHONY: run test slow longest lint paper docs lowest clean
@@ -43,7 +46,7 @@ docs: $(STAMP)
 # The quickest tests of every reader and writer, on the lowest versions that pyproject.toml allows.
 lowest:
 	$(PYTHON) -m venv .venv-lowest
-	.venv-lowest/bin/python -m pip install --quiet --constraint constraints-lowest.txt --editable . pytest hypothesis
+	.venv-lowest/bin/python -m pip install --quiet --constraint constraints-lowest.txt --editable '.[$(LOWEST_EXTRAS)]' pytest hypothesis
 	OMP_NUM_THREADS=1 .venv-lowest/bin/python -m pytest $(LOWEST)
 
 $(STAMP): pyproject.toml constraints.txt

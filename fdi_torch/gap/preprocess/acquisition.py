@@ -23,7 +23,7 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     thinned,
 )
 from fdi_torch.gap.preprocess.recording_fault_decision import SURE, log_odds, recording_fault
-from fdi_torch.gap.preprocess.recording_faults import RecordingFault
+from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault
 from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerances
 from fdi_torch.recording import Recording

@@ -24,7 +24,10 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     noise_of,
     thinned,
 )
-from fdi_torch.gap.preprocess.recording_faults import DECADES, FaultHypotheses, RecordingFault, WeightedFault
+from fdi_torch.gap.preprocess.channel_assignment import DECADES
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, WeightedFault
+from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault
+from fdi_torch.gap.preprocess.recording_faults import weighted_faults
 from fdi_torch.gap.screening import Option, options_of, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import operating_range_of_all, with_simulated_levels
@@ -54,7 +57,7 @@ def recording_fault(
     prior = math.log(FAULT_PROBABILITY / (len(DECADES) * count + math.comb(count, 2) + 2 * len(plant.sensors) + 1))
     if as_is.most + prior < as_is.log_likelihood + log_odds(SURE):
         return None  # even a perfect fit of a corrected recording would not reach 95 %
-    faults = list(FaultHypotheses(plant, recording, as_is, constant, prior).each())
+    faults = list(weighted_faults(CorrectedFits(plant, recording, as_is, prior), constant))
     rivals = [as_is.log_likelihood]
     if not faults or not _surely_faulty(faults, rivals):
         return None

@@ -1,0 +1,63 @@
+"""A fault of a recording, and the sentence that says what to do about each kind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fdi_torch.plant.description import Sensor
+
+
+@dataclass(frozen=True)
+class RecordingFault:
+    """A fault of the recording: its channels, and a sentence that says what to do.
+
+    silent: the channels are sensors whose readings do not depend on their levels. physical: a delay of the sensor
+    itself would look the same, so that the gap diagnosis must accept the recording.
+    """
+
+    channels: tuple[str, ...]
+    text: str
+    silent: bool = False
+    physical: bool = False
+
+
+def wrong_unit(channel: str, decade: int) -> RecordingFault:
+    """The values of a channel are 10^decade times the true ones."""
+    times = f"{10 ** abs(decade)} times too {'large' if decade > 0 else 'small'}"
+    fix = f"columns: {{{channel}: {{unit: ...}}}}"
+    return RecordingFault(
+        (channel,), f"{channel}: its unit seems wrong: its values are {times}; state the unit under {fix}"
+    )
+
+
+def swapped(a: str, b: str) -> RecordingFault:
+    """Two channels have each other's values."""
+    fix = f"columns: {{{a}: {{column: {b}}}, {b}: {{column: {a}}}}}"
+    return RecordingFault((a, b), f"{a} and {b} seem to be swapped; assign the columns, as in {fix}")
+
+
+def clock_offset(columns: tuple[str, ...], delay: float, everything: bool) -> RecordingFault:
+    """Readings are `delay` seconds late. everything: all of them, against the inputs."""
+    what = "the readings" if everything else ", ".join(columns)
+    reference = "the inputs" if everything else "the other channels"
+    text = (
+        f"{what}: the clock seems to run {abs(delay):.3g} s {'behind' if delay > 0 else 'ahead of'} that of "
+        f"{reference}; "
+        "state the shift of each file under columns: {t: {shift: ...}}"
+    )
+    return RecordingFault(("all",) if everything else columns, text, physical=delay > 0 and not everything)
+
+
+def unrelated(sensor: Sensor) -> RecordingFault:
+    """The readings of a sensor scatter about a mean and do not depend on the level."""
+    text = (
+        f"{sensor.column}: its readings do not follow the level of {sensor.tank}: they scatter by more than the level "
+        "moves; check its wiring, or leave the sensor out of the plant file"
+    )
+    return RecordingFault((sensor.column,), text, True)
+
+
+def stuck(columns: Sequence[str]) -> RecordingFault:
+    """Sensors that never move."""
+    return RecordingFault(tuple(columns), f"{', '.join(columns)}: stuck throughout", True)
