@@ -40,11 +40,12 @@ class Effect:
 
     name: as in configurations and results. stage: the stage whose hook it overrides. places: the kinds of component at
     which it can be placed, of 'pump', 'pipe', 'outlet', 'valve', 'tank', 'tank_pair', 'sensor'; a flow component can
-    accept further effects (`FlowComponent.accepts`). memory: number of its
-    memory states, which depend on the signal of a COMMAND or READING effect alone. states: number of states of a FLOW
-    effect that are integrated together with the levels, each in m and of the order of a level. smooth: whether the gradient with respect to its size is non-zero at nominal. mistaken_for: effects
-    that explain nearly the same data. delays: whether it adds dead time to its signal. quantizes: whether it rounds
-    the reading. startup_only: whether it acts only until its component has run for the first time.
+    accept further effects (`FlowComponent.accepts`). memory: number of its memory states, for a COMMAND or READING
+    effect whose output depends on the past of its signal alone. states: number of its integrated states, for a FLOW
+    effect coupled to the levels; each is in m and of the order of a level, since one tolerance holds for all. smooth:
+    whether the gradient with respect to its size is non-zero at nominal. mistaken_for: effects that explain nearly the
+    same data. delays: whether it adds dead time to its signal. quantizes: whether it rounds the reading. startup_only:
+    whether it acts only until its component has run for the first time.
 
     The first parameter is the effect's size: at its nominal value the effect is absent. The others are its shape; their
     nominal values are typical ones, or those that keep the effect simple (onset 0, ramp 0).

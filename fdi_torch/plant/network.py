@@ -18,8 +18,8 @@ from fdi_torch.plant.constants import constant_parameters
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor
 from fdi_torch.plant.effect import Memory, Placement, Stage, Values, fits, place_kinds_of
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
-from fdi_torch.plant.operating_point import Constants, OperatingPoint, PlaceValues
 from fdi_torch.plant.local_conditions import Local
+from fdi_torch.plant.operating_point import Constants, OperatingPoint, PlaceValues
 from fdi_torch.plant.orifice import limit_emptying, weir_flow
 from fdi_torch.plant.signal_chain import SignalChain
 from fdi_torch.plant.signals import Clock
@@ -106,34 +106,45 @@ class TankNetwork(nn.Module):
         """
         point = self.operating_point(state, commands, clock, values)
         net = self.net_inflows(point, self.flows(point))
-        return [*self.level_rates(point, self.less_overflow(point, net)), *self.state_rates(point)]
+        states = (rate for rates in self.state_rates(point).values() for rate in rates)
+        return [*self.level_rates(point, self.less_overflow(point, net)), *states]
 
     def operating_point(
         self, state: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> OperatingPoint:
         """The argument of the stages: the state as in `rates`, and outputs (*batch) of the actuators."""
+        levels, states = self.split(state)
+        point = OperatingPoint.of(self.description, levels, self._actuator_names, commands, clock, values)
+        return replace(point, states=states) if states else point
+
+    def split(self, state: Sequence[Tensor]) -> tuple[Sequence[Tensor], dict[str, tuple[Tensor, ...]]]:
+        """The tanks' levels, and the states of each effect by its prefix; none for a state of levels alone."""
         tanks = len(self.description.tanks)
-        point = OperatingPoint.of(self.description, state[:tanks], self._actuator_names, commands, clock, values)
+        if len(state) not in (tanks, self.order):
+            raise ValueError(f"expected {tanks} levels or a state of {self.order} numbers, got {len(state)}")
         first, states = tanks, {}
         for placement in self._with_states if len(state) > tanks else ():
             states[placement.prefix] = tuple(state[first : first + placement.effect.states])
             first += placement.effect.states
-        return replace(point, states=states) if states else point
+        return state[:tanks], states
 
     def with_steady_states(
         self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> list[Tensor]:
         """The state: these levels of the tanks (*batch), m, and the steady states of the effects there."""
         point = self.operating_point(levels, commands, clock, values)
-        return [*levels, *(state for _, _, local in self._at_states(point) for state in local.states)]
+        return [*levels, *(state for states in self.steady_states(point).values() for state in states)]
 
-    def state_rates(self, point: OperatingPoint) -> list[Tensor]:
-        """Rate of change of the effects' states, m/s."""
-        return [
-            rate
+    def steady_states(self, point: OperatingPoint) -> dict[str, tuple[Tensor, ...]]:
+        """States of each effect, m, by its prefix: those of the point, else those in steady state there."""
+        return {placement.prefix: local.states for placement, _, local in self._at_states(point)}
+
+    def state_rates(self, point: OperatingPoint) -> dict[str, tuple[Tensor, ...]]:
+        """Rates of change of each effect's states, m/s, by its prefix, in the order of the state vector."""
+        return {
+            placement.prefix: placement.effect.state_rates(flow, local, point.values[placement.prefix])
             for placement, flow, local in self._at_states(point)
-            for rate in placement.effect.state_rates(flow, local, point.values[placement.prefix])
-        ]
+        }
 
     def _at_states(self, point: OperatingPoint) -> list[FlowBefore]:
         """Each effect with states, the flow before it and its conditions, in the order of the state vector."""

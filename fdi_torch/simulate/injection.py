@@ -17,8 +17,8 @@ class Injection:
     """After each sample: state <- state + gain (reading - prediction), with no level below zero.
 
     gains (S, order, sensors) for all lanes, or (lanes, S, order, sensors), m per unit of the reading. start: initial
-    state (lanes, order), m, or initial levels (lanes, tanks) with the effects in steady state. memory (lanes, M): initial memory of the actuators and then of the sensors; steady state
-    if None.
+    state (lanes, order), m, or initial levels (lanes, tanks) with the effects in steady state. memory (lanes, M):
+    initial memory of the actuators and then of the sensors; steady state if None.
     """
 
     gains: Tensor

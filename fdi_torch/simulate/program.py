@@ -28,8 +28,9 @@ class Program:
 
     prepare: level (of the tanks at t = 0), command_delay, reading_delay. settle_commands, settle_readings: the initial
     memories in steady state; settle_commands also holds the level of the other states. A 'level' is any entry of the
-    state vector, of which there are `order`, the `tanks` first. act: action, next_command_memory. stages: stage k's levels and then its rates ('slope'), four of each
-    in turn. advance: level. end: slope at the end of the step. read: reading, next_reading_memory.
+    state vector, of which there are `order`, the `tanks` first. act: action, next_command_memory. stages: stage k's
+    levels and then its rates ('slope'), four of each in turn. advance: level. end: slope at the end of the step. read:
+    reading, next_reading_memory.
 
     adaptive: each lane divides the steps of the grid, see `implicit.py`. unrolled: there are stages, advance and end,
     which share common subexpressions. If not, there is `law`, evaluated at every stage: the rates ('slope') with their
