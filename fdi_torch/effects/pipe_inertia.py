@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -14,19 +15,20 @@ from fdi_torch.plant.effect import Effect, Local, Stage, Values
 from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.plant.scales import time_scale
 
+NO_FLOW = 1e-3  # share of the smoothed root's flow at its width, below which ratios of flows are not formed
 SLOWEST, STARTS = 60.0, (1.0, 6.0)  # time constants at the full head, in units of the plant's time scale
 
 
 class PipeInertia(Effect):
-    """L/(g a) dQ/dt = x - k Q|Q|, the rigid water column (Wylie & Streeter, 1993, "Fluid Transients in Systems", ch. 1;
-    Chaudhry, 2014, "Applied Hydraulic Transients", ch. 1), with k of the orifice, 1/(C_d o a)^2/2g. Around the quasi-
-    static flow q, this is tau dQ/dt = q - Q with tau = L C_d^2 o^2 2 a / (|q| + |Q|). Time constants below the time
-    resolution r of the integration have the same delay in first order, Q = q - tau dQ'/dt with r dQ'/dt = q - Q', and
-    the length 0 is the quasi-static law.
+    """L/(g a) dQ/dt = x - Q|Q|/K^2, the rigid water column under the head x (Wylie & Streeter, 1993, "Fluid Transients
+    in Systems", ch. 1; Chaudhry, 2014, "Applied Hydraulic Transients", ch. 1), where the pipe with its other effects
+    carries the flow K sqrt(x) in steady state. This is a lag of the flow with the time constant L K^2 / (g a (q + Q))
+    behind its steady value q. A time constant below the integrator's resolution r delays the flow by the same time: Q =
+    q + (tau / r) (Q_r - q) with r dQ_r/dt = q - Q_r. At length 0 the flow is the steady one.
 
     L: length of a column with the pipe's cross-section a, the sum of L_i a / a_i over the sections of the pipe.
-    Typical: a time constant of 0.1 to 5 s; two tanks that a wide pipe joins oscillate (U-tube). Nearly the same as a
-    delay of the levels if tau is far below the tanks' time constants.
+    Typical: a time constant of 0.1 to 5 s. Levels of two tanks that a wide pipe joins oscillate (U-tube). Nearly the
+    same as a lag of the readings if the time constant is far below those of the tanks.
     """
 
     name = "pipe_inertia"
@@ -47,36 +49,63 @@ class PipeInertia(Effect):
         return (flow / _flow_of_unit_state(local),)
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
-        delayed = local.states[0] * _flow_of_unit_state(local)
-        time_constant = _time_constant(flow, delayed, local, p)
-        return flow + _share(time_constant, local) * (delayed - flow)
+        column = _Column.of(flow, local, p)
+        time_constant = column.time_constant
+        share = time_constant / torch.maximum(time_constant, local.clock.resolution)
+        return flow + share * (column.delayed - flow)
 
     def state_rates(self, flow: Tensor, local: Local, p: Values) -> tuple[Tensor, ...]:
-        unit = _flow_of_unit_state(local)
-        delayed = local.states[0] * unit
-        time_constant = _time_constant(flow, delayed, local, p)
-        return ((flow - delayed) / unit / torch.maximum(time_constant, local.clock.resolution),)
+        column, resolution = _Column.of(flow, local, p), local.clock.resolution
+        rate = (flow - column.delayed) / torch.maximum(column.time_constant, resolution)
+        return ((rate + column.unsmoothed(flow, local)) / _flow_of_unit_state(local),)
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A moving water column, all (*batch).
+
+    delayed: its flow Q, m^3/s. inertia: L K^2/(g a), m^3. friction: (q|q| - Q|Q|) / (q - Q), m^3/s, which is |q| + |Q|
+    where both have one sign. least: friction of the smoothed root at zero head, K sqrt(w), m^3/s.
+    """
+
+    delayed: Tensor
+    inertia: Tensor
+    friction: Tensor
+    least: Tensor
+    squared_capacity: Tensor
+
+    @classmethod
+    def of(cls, flow: Tensor, local: Local, p: Values) -> _Column:
+        delayed = local.states[0] * _flow_of_unit_state(local)
+        nominal, least = local.capacity * local.command, local.capacity * torch.sqrt(local.width)
+        at_rest = NO_FLOW * least
+        unchanged = nominal * local.root(local.head)
+        changed = (flow * flow + at_rest * at_rest) / (unchanged * unchanged + at_rest * at_rest)
+        squared_capacity = nominal * nominal * changed
+        inertia = p["length"] * squared_capacity / (local.gravity * local.constants["area"])
+        squares = flow * flow + delayed * delayed + 2.0 * torch.clamp(flow * delayed, min=0.0)
+        friction = squares / (torch.abs(flow) + torch.abs(delayed) + at_rest)
+        return cls(delayed, inertia, friction, least, squared_capacity)
+
+    @property
+    def time_constant(self) -> Tensor:
+        return self.inertia / (self.friction + self.least)
+
+    def unsmoothed(self, flow: Tensor, local: Local) -> Tensor:
+        """Further rate of change of the flow without the smoothing of the root, m^3/s^2.
+
+        A column that the integrator resolves needs no smoothing: its head acts on the rate, and the rate is finite.
+        """
+        smallest = local.clock.resolution * self.least
+        resolved = torch.clamp(self.inertia - smallest, min=0.0) / torch.maximum(self.inertia, smallest)
+        missing = self.squared_capacity * local.head - flow * torch.abs(flow) - self.least * (flow - self.delayed)
+        driven = flow * local.head > 0.0  # an outlet above the level has a negative head and no flow
+        return torch.where(driven, resolved * missing, 0.0) / torch.maximum(self.inertia, smallest)
 
 
 def _flow_of_unit_state(local: Local) -> Tensor:
     """Flow per unit of the state, m^2/s: the state is the tank's height where the flow is that of the full tank."""
     return local.capacity / torch.sqrt(local.height)
-
-
-def _time_constant(flow: Tensor, delayed: Tensor, local: Local, p: Values) -> Tensor:
-    """tau = L c^2 / (g a s), s, with c = C_d o a sqrt(2 g) and s = (q|q| - Q|Q|) / (q - Q).
-
-    s is |q| + |Q|, or (q^2 + Q^2) / (|q| + |Q|) if the signs differ. Near zero flow it is that of the root's smoothing.
-    """
-    least = local.capacity * torch.sqrt(local.width)
-    squares = flow * flow + delayed * delayed + 2.0 * torch.clamp(flow * delayed, min=0.0)
-    slope = squares / (torch.abs(flow) + torch.abs(delayed) + least) + least
-    open_capacity = local.capacity * local.command
-    return p["length"] * open_capacity * open_capacity / (local.gravity * local.constants["area"] * slope)
-
-
-def _share(time_constant: Tensor, local: Local) -> Tensor:
-    return time_constant / torch.maximum(time_constant, local.clock.resolution)
 
 
 def _length_per_second(plant: PlantDescription, place: str) -> float:

@@ -176,7 +176,8 @@ class Fitter:
         """
         constant = engine.constant_guess(theta)
         measured = torch.cat([self._measured_levels(part) for part in self.data.parts])
-        first = engine.converge(theta, torch.where(measured.isfinite(), measured, constant))
+        levels = constant[..., : measured.shape[-1]]
+        first = engine.converge(theta, torch.where(measured.isfinite(), measured, levels))
         lost = (~(first.defect <= self.far)).nonzero().flatten()
         if not len(lost):
             return first.levels

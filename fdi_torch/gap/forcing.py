@@ -31,7 +31,8 @@ NEWTON_ROUNDS = 12
 class Forcing:
     """A trajectory of a fitted plant, states (n, K+1) m at the nodes, along which effects are tried.
 
-    union: the fitted plant with every effect that may be tried. present: prefixes of the effects that act. values: the plant's constants, bound to one lane.
+    union: the fitted plant with every effect that may be tried. present: prefixes of the effects that act. values: the
+    plant's constants, bound to one lane.
 
     Attributes at the middle of each step: levels (1, K) m of each tank; commands of each actuator; flows (m^3/s) and
     heads (m): of each flow component by its name; still: level rates without the effect that is tried, m/s. The n rates
