@@ -169,7 +169,7 @@ def test_the_monitor_runs_beside_it_and_finds_a_leak(placement: Placement) -> No
     free = noisy(recording_of(plant))
     leak = ParameterSpace(network.constants[n] for n in names)
     experiment = lay_out(free, plant.channels(), STEP)
-    leaking = make_engine(network, leak, experiment, "traced").readings(torch.tensor([0.3, 200.0], dtype=torch.float64))
+    leaking = make_engine(network, leak, experiment, "traced").readings(torch.tensor([0.3, 80.0], dtype=torch.float64))
     run = noisy(replace(free, outputs=leaking), 3)
     noise, seen = learn_noise(network, samples_of_recording(free, plant), space, space.nominal(), longest_step=0.25)
     assert seen.levels.shape[-1] == 2 and noise.gain.steady.shape == (network.order, 2)
@@ -182,7 +182,7 @@ def test_the_monitor_runs_beside_it_and_finds_a_leak(placement: Placement) -> No
         state, news = monitor.advance(state, samples.segment(first, min(first + 20, len(samples))))
         events += news
     assert [event.kind for event in events][:2] == ["alarm", "isolated"]
-    assert 200.0 <= events[0].time < 240.0
+    assert 80.0 <= events[0].time < 120.0
     assert events[1].faults == ("B.leak.size",) and abs(events[1].sizes[0] - 0.3) < 4.0 * events[1].stds[0]
 
 

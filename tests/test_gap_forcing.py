@@ -39,7 +39,7 @@ def test_an_effect_forces_the_levels_and_moves_the_readings_as_the_whole_plant_s
         engine = Collocation(network, space, experiment)
         none, with_it = space.nominal().unsqueeze(0), space.vector(start).unsqueeze(0)
         values = network.bind(ParameterSpace(()), torch.zeros(1, 1, 0, dtype=torch.float64))
-        forcing = Forcing(network, (), values, levels, experiment)
+        forcing = Forcing(network, network, (), values, levels, experiment)
         short = {n.rpartition(".")[2]: torch.tensor([[v]], dtype=torch.float64) for n, v in start.items()}
         if placement.effect.stage is Stage.READING:
             expected = engine.read(levels.T.unsqueeze(0), with_it) - engine.read(levels.T.unsqueeze(0), none)
