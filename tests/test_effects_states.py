@@ -85,6 +85,7 @@ def test_there_are_such_effects_and_they_have_states_in_a_network() -> None:
     assert network.order == 2 + sum(p.effect.states for p in PLACES)
 
 
+@pytest.mark.slow
 @each_place
 @pytest.mark.parametrize("kind", ["traced", "compiled"])
 def test_adaptive_steps_agree_with_short_fixed_steps(placement: Placement, kind: str) -> None:
@@ -129,6 +130,7 @@ def test_the_ode_is_that_of_the_engines(placement: Placement) -> None:
     assert float(rates[2:].abs().max()) < 1e-14  # in steady state at the start, up to rounding
 
 
+@pytest.mark.slow
 @each_place
 def test_training_recovers_its_size(placement: Placement) -> None:
     truth = start_of(placement)
@@ -231,6 +233,9 @@ def test_two_joined_tanks_oscillate_with_the_period_of_a_u_tube() -> None:
 def test_states_are_refused_where_nothing_integrates_them() -> None:
     class Chamber(type(PLACES[0].effect)):  # type: ignore[misc]
         name, places = "chamber", ("pump",)
+
+        def parameters(self, place: str, plant: PlantDescription) -> tuple[()]:
+            return ()
 
     with pytest.raises(ValueError, match=r"P\.chamber: expected states only in a FLOW effect"):
         build_network(PLANT, [Placement(Chamber(), "P")])
