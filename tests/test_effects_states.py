@@ -22,7 +22,7 @@ from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.monitor.samples import samples_of_recording
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
@@ -232,13 +232,13 @@ def test_two_joined_tanks_oscillate_with_the_period_of_a_u_tube() -> None:
 
 def test_states_are_refused_where_nothing_integrates_them() -> None:
     class Chamber(type(PLACES[0].effect)):  # type: ignore[misc]
-        name, places = "chamber", ("pump",)
+        name, stage, places = "chamber", Stage.BALANCE, ("tank",)
 
         def parameters(self, place: str, plant: PlantDescription) -> tuple[()]:
             return ()
 
-    with pytest.raises(ValueError, match=r"P\.chamber: expected states only in a FLOW effect"):
-        build_network(PLANT, [Placement(Chamber(), "P")])
+    with pytest.raises(ValueError, match=r"A\.chamber: expected states only in a FLOW effect"):
+        build_network(PLANT, [Placement(Chamber(), "A")])
     network = build_network(PLANT, PLACES[:1])
     with pytest.raises(ValueError, match="expected 2 levels or a state of 3 numbers, got 4"):
         network.split([torch.zeros(())] * 4)
