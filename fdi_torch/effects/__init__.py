@@ -20,6 +20,7 @@ from fdi_torch.effects.net_outlet import NetOutlet
 from fdi_torch.effects.openness import Openness
 from fdi_torch.effects.outlet_drop import OutletDrop
 from fdi_torch.effects.overflow import Overflow
+from fdi_torch.effects.pipe_inertia import PipeInertia
 from fdi_torch.effects.plugging import Plugging
 from fdi_torch.effects.pump_back_pressure import PumpBackPressure
 from fdi_torch.effects.pump_curve import PumpCurve
@@ -82,6 +83,7 @@ EFFECTS: tuple[Effect, ...] = (
     Plugging(),
     NetOutlet(),
     Openness(),
+    PipeInertia(),
     CrossFlow(),
     Leak(),
     UnmeteredFlow(),

@@ -1,7 +1,7 @@
 """Kalman filter and smoother for random flow disturbances and sensor noise, linearised about a simulated trajectory.
 
-The deviation x of the levels from the trajectory, the flow disturbances w, the sensor noise v and the residuals y of
-the readings obey, from sample s to the next,
+The deviation x of the state (levels, and states of effects) from the trajectory, the flow disturbances w of the tanks,
+the sensor noise v and the residuals y of the readings obey, from sample s to the next,
 
     x_{s+1} = A_s x_s + B_s w_s
     w_{s+1} = exp(-dt / tau) w_s + q_s          var(w_i) = intensity_i^2
@@ -13,7 +13,8 @@ process like v. The filter turns residuals, and their derivatives by parameters,
 (Särkkä, 2013, "Bayesian filtering and smoothing", chapter 4). The disturbances model waves, pulsation and splashing,
 which occur on every real rig and are not faults.
 
-S: samples, C: sensors (channels), n: tanks, d: states of the filter, M: columns that are filtered together.
+S: samples, C: sensors (channels), n: states (levels and states of effects), d: states of the filter, M: columns that
+are filtered together.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ SCATTER = math.log(2.0)
 class StateNoise:
     """Parameters of the noise model.
 
-    intensity (n,): standard deviation of the random flow into each tank, m^3/s.
+    intensity (tanks,): standard deviation of the random flow into each tank, m^3/s; none acts on other states.
     correlation_time: of these flows, s; 0: white, with an independent value in each sampling interval.
     scale (C,): factor on the standard deviation of each sensor's noise. wander: drift of one sensor, if any.
     apart: index of a tank whose random flow is not of the same order as the others', if any.
@@ -108,7 +109,7 @@ class KalmanFilter:
 
     def __init__(self, propagation: Propagation, sensors: SensorNoise) -> None:
         p = propagation
-        self.samples, self.channels, self.tanks = p.output.shape
+        self.samples, self.channels, self.order = p.output.shape
         self.sensors, self.interval = sensors, p.interval
         self.correlated = bool((sensors.correlation != 0.0).any())
         self.matrices = tuple(x.contiguous() for x in (p.transition, p.forcing, p.output))
@@ -133,7 +134,9 @@ class Filtered:
     def __init__(self, kalman_filter: KalmanFilter, noise: StateNoise) -> None:
         self.own, self.wanders = kalman_filter, noise.wander is not None
         of_sensors, zeros = (noise.scale * kalman_filter.sensors.std) ** 2, torch.zeros_like(noise.scale)
-        processes = [(torch.full_like(noise.intensity, kalman_filter.kept(noise.correlation_time)), noise.intensity**2)]
+        self.flows = len(noise.intensity)
+        flows = torch.cat([noise.intensity**2, noise.intensity.new_zeros(kalman_filter.order - self.flows)])
+        processes = [(torch.full_like(flows, kalman_filter.kept(noise.correlation_time)), flows)]
         processes += [(kalman_filter.sensors.correlation, of_sensors)] if kalman_filter.correlated else []
         self.r = zeros if kalman_filter.correlated else of_sensors
         if (wander := noise.wander) is not None:
@@ -141,10 +144,10 @@ class Filtered:
             processes.append((torch.full_like(zeros, kalman_filter.kept(wander.correlation_time)), of_wander))
         decay, variance = (torch.cat(parts) for parts in zip(*processes, strict=True))
         self.keep, self.q = decay, (1.0 - decay**2) * variance
-        self.p0 = torch.cat([variance.new_zeros(kalman_filter.tanks), variance])
+        self.p0 = torch.cat([variance.new_zeros(kalman_filter.order), variance])
         tensors = (*kalman_filter.matrices, self.keep, self.q, self.r, self.p0, *kalman_filter.flags)
         self._model = _Model(*(t.data_ptr() for t in tensors))
-        self._library = _library(kalman_filter.tanks, kalman_filter.channels, len(processes) - 1)
+        self._library = _library(kalman_filter.order, kalman_filter.channels, len(processes) - 1)
         self.gain = variance.new_empty(kalman_filter.samples, len(self.p0), kalman_filter.channels)
         self.white = variance.new_empty(kalman_filter.samples, kalman_filter.channels, kalman_filter.channels)
         self.log_det = float(self._run("kalman_gains", self.gain, self.white))
@@ -172,23 +175,23 @@ class Filtered:
 
     def _by_deviation(self, by_q: Tensor, by_r: Tensor, by_p0: Tensor) -> Tensor:
         """Derivatives by log standard deviations from derivatives by variances: df/dlog(s) = 2 s^2 df/d(s^2)."""
-        tanks, channels = self.own.tanks, self.own.channels
-        decaying = 2.0 * (by_q * self.q + by_p0[tanks:] * self.p0[tanks:])
-        of_sensors = decaying[tanks : tanks + channels] if self.own.correlated else 2.0 * by_r * self.r
+        order, channels = self.own.order, self.own.channels
+        decaying = 2.0 * (by_q * self.q + by_p0[order:] * self.p0[order:])
+        of_sensors = decaying[order : order + channels] if self.own.correlated else 2.0 * by_r * self.r
         wander = decaying[-channels:].sum().reshape(1) if self.wanders else decaying[:0]
-        return torch.cat([decaying[:tanks], of_sensors, wander])
+        return torch.cat([decaying[: self.flows], of_sensors, wander])
 
     def smoothed(self, residual: Tensor) -> Tensor:
         """Smoothed deviation of the levels from the trajectory, (S, n) m, given all residuals (S, C)."""
         shocks = self.score(self.innovations(residual.unsqueeze(-1)).squeeze(-1)).shocks
-        levels = residual.new_empty(self.own.samples, self.own.tanks)
+        levels = residual.new_empty(self.own.samples, self.own.order)
         self._run("kalman_levels", shocks, levels)
         return levels
 
     def predicted(self, residual: Tensor) -> Tensor:
         """Deviation of the levels from the trajectory, (S, n) m, predicted for each sample from the residuals (S, C) of
         all earlier ones."""
-        levels = residual.new_empty(self.own.samples, self.own.tanks)
+        levels = residual.new_empty(self.own.samples, self.own.order)
         self._run("kalman_predictions", self.gain, residual.contiguous(), levels)
         return levels
 

@@ -170,7 +170,8 @@ class Fitter:
         theta = torch.stack(rows)
         if base is None:
             return theta, self.first_trajectory(engine, theta)
-        return theta, base.linearised.levels.expand(len(starts), -1, -1)
+        levels = base.linearised.levels[..., : len(self.data.plant.tanks)]  # the effects' states may be other ones
+        return theta, levels.expand(len(starts), -1, -1)
 
     def first_trajectory(self, engine: Collocation | JointCollocation, theta: Tensor) -> Tensor:
         """The model's levels (L, K+1, n) at theta (L, P), found from the levels that the sensors show.
@@ -180,7 +181,8 @@ class Fitter:
         """
         constant = engine.constant_guess(theta)
         measured = torch.cat([self._measured_levels(part) for part in self.data.parts])
-        first = engine.converge(theta, torch.where(measured.isfinite(), measured, constant))
+        levels = constant[..., : measured.shape[-1]]
+        first = engine.converge(theta, torch.where(measured.isfinite(), measured, levels))
         lost = (~(first.defect <= self.far)).nonzero().flatten()
         if not len(lost):
             return first.levels

@@ -138,9 +138,12 @@ def _planned_run(planned_fitter: Fitter, fit: Fit) -> tuple[Tensor, Tensor, Tens
     engine = planned_fitter.engine(fit.candidate, list(fit.effect_values))
     values = {n: v for n, v in fit.values.items() if n in engine.space}
     theta = engine.space.vector(values).unsqueeze(0)
-    linearised = engine.converge(theta, engine.constant_guess(theta), rounds=30)
+    linearised, tanks = (
+        engine.converge(theta, engine.constant_guess(theta), rounds=30),
+        len(planned_fitter.data.plant.tanks),
+    )
     columns = [engine.space.index(n) for n in _in_one_run(fit)]
-    return linearised.readings[0], linearised.jacobian[0][..., columns], linearised.levels[0]
+    return linearised.readings[0], linearised.jacobian[0][..., columns], linearised.levels[0, :, :tanks]
 
 
 def planned_recording(table: Mapping[str, Any], plant: PlantDescription) -> Recording:

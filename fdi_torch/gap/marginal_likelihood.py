@@ -80,7 +80,7 @@ def estimate_disturbances(
 
 
 def predicted_levels(fitter: Fitter, fit: Fit) -> Tensor:
-    """Levels (1, K+1, tanks) of all recordings: the fitted trajectory plus the effect of the disturbances, predicted
+    """States (1, K+1, n) of all recordings: the fitted trajectory plus the effect of the disturbances, predicted
     from earlier readings.
 
     An innovation is independent of all that follows from earlier readings (Ljung, 1999, "System identification",
@@ -97,7 +97,8 @@ def predicted_levels(fitter: Fitter, fit: Fit) -> Tensor:
         at_nodes = [interpolate(nodes, part.experiment.sample_times, x) for x in correction[rows].unbind(1)]
         levels[0, first : first + len(nodes)] += torch.stack(at_nodes, dim=1)
         first += len(nodes)
-    return levels.clamp(min=0.0)
+    tanks = len(data.plant.tanks)
+    return torch.cat([levels[..., :tanks].clamp(min=0.0), levels[..., tanks:]], dim=-1)
 
 
 def about_predicted_levels(fitter: Fitter, fit: Fit) -> tuple[Fitter, Fit]:
@@ -129,7 +130,8 @@ def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagat
 
 def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised, areas: Tensor) -> Sequence[Tensor]:
     """Transition (S, n, n), forcing (S, n, n) and output (S, C, n) between the samples of one recording."""
-    experiment, n = engine.experiment, len(areas)
+    experiment, n = engine.experiment, engine.network.order
+    areas = torch.cat([areas, areas.new_full((n - len(areas),), torch.inf)])  # no random flow acts on other states
     node = experiment.sample_step + experiment.sample_share.round().to(torch.int64)
     next_node = torch.cat([node[1:], node[-1:]])
     identity = torch.eye(n, dtype=torch.float64)

@@ -50,7 +50,7 @@ def detection_time(fitter: Fitter) -> float:
         return math.inf
     propagation, noise = fitter.whitening.propagation, fitter.whitening.noise
     areas = torch.tensor([t.area for t in fitter.data.plant.tanks], dtype=torch.float64)
-    sensitivity = propagation.output.abs().amax(dim=0)
+    sensitivity = propagation.output.abs().amax(dim=0)[:, : len(areas)]
     std = fitter.noise.std * noise.scale
     level_noise = (std.unsqueeze(1) / sensitivity).amin(dim=0)
     shortest = float(((level_noise * areas * math.sqrt(propagation.interval) / noise.intensity) ** (2 / 3)).min())

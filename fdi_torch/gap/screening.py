@@ -200,7 +200,12 @@ def _columns(
     theta = theta.reshape(1, -1)
     present = {p.prefix for p in engine.network.placements} - tried.keys()
     forcing_model = Forcing(
-        union, present, union.bind(*_named(union, constants)), linearised.levels[0].T.contiguous(), experiment
+        engine.network,
+        union,
+        present,
+        union.bind(*_named(union, constants)),
+        linearised.levels[0].T.contiguous(),
+        experiment,
     )
     groups = _groups(options)
     moving = [i for group in groups if options[group[0]].placement.effect.stage is not Stage.READING for i in group]

@@ -35,8 +35,12 @@ class JointModel:
     """Levels and parameters as one state z = (x, theta) with constant parameters."""
 
     def __init__(self, network: TankNetwork, space: ParameterSpace, longest_step: float | None = None) -> None:
-        if network.command_memory() or network.reading_memory():
-            raise ValueError("expected a plant without memory in actuators and sensors; leave such effects out")
+        with_states = [p.prefix for p in network.placements if p.effect.memory or p.effect.states]
+        if with_states:
+            raise ValueError(
+                f"expected effects without memory and states in joint estimation, got {', '.join(with_states)}; leave "
+                "them out"
+            )
         self.stepper, self.network, self.space = Stepper(network, longest_step), network, space
         self.tanks = len(network.description.tanks)
 

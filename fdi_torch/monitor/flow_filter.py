@@ -22,7 +22,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.kalman import Propagation, SensorNoise, StateNoise
 from fdi_torch.estimate.state_noise import estimate_state_noise
-from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, riccati
+from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, riccati, with_effects
 from fdi_torch.simulate.build import load_library
 
 FIRST_UNIT = 0.1  # initial flow per sample of the optimisation, in standard deviations of a level's measurement noise
@@ -32,7 +32,9 @@ FIRST_UNIT = 0.1  # initial flow per sample of the optimisation, in standard dev
 class FlowFilter:
     """The Kalman filter for one observer.
 
-    linear: transition A (tanks, tanks) and output C (sensors, tanks). noise: intensities in m per sample. reading_std
+    n: the network's states, the levels of the tanks first; only tanks receive flows, the others' are 0.
+
+    linear: transition A (n, n) and output C (sensors, n). noise: intensities of the tanks in m per sample. reading_std
     (sensors,): measurement noise. observer: the observer's gain. start_std (tanks,): of the initial levels, m.
     interval: s. intensity_error: standard error of ln of the flows' intensities, root mean square over the tanks.
     """
@@ -47,7 +49,7 @@ class FlowFilter:
 
     @cached_property
     def transition(self) -> Tensor:
-        """F (2 tanks, 2 tanks) of levels and flows."""
+        """F (2 n, 2 n) of states and flows."""
         a, keep = self.linear.transition, self.keep
         flows = keep * torch.eye(len(a), dtype=a.dtype)
         return torch.cat([torch.cat([a, forcing(a)], 1), torch.cat([torch.zeros_like(a), flows], 1)])
@@ -58,26 +60,31 @@ class FlowFilter:
         return math.exp(-self.interval / self.noise.correlation_time) if self.noise.correlation_time else 0.0
 
     @property
+    def flow_std(self) -> Tensor:
+        """Standard deviation of each flow, (n,) m per sample."""
+        return with_effects(self.noise.intensity, len(self.linear.transition))
+
+    @property
     def process_std(self) -> Tensor:
-        """Standard deviation of the shocks of levels and flows in one interval, (2 tanks,) m."""
-        sigma = self.noise.intensity
+        """Standard deviation of the shocks of states and flows in one interval, (2 n,) m."""
+        sigma = self.flow_std
         return torch.cat([0.0 * sigma, math.sqrt(1.0 - self.keep**2) * sigma])
 
     @property
     def joint(self) -> Linear:
-        """Levels and flows together."""
+        """States and flows together."""
         c = self.linear.output
         return Linear(self.transition, torch.cat([c, torch.zeros_like(c)], 1))
 
     @cached_property
     def gain(self) -> Gain:
-        """Kalman gain of levels and flows, with its transient from unknown levels."""
-        start = torch.cat([self.start_std, self.noise.intensity])
+        """Kalman gain of states and flows, with its transient from unknown levels."""
+        start = torch.cat([with_effects(self.start_std, len(self.linear.transition)), self.flow_std])
         return kalman_gain(self.joint, self.process_std, self.reading_std, start)
 
     @cached_property
     def covariance(self) -> Tensor:
-        """Steady covariance of the predicted levels and flows, (2 tanks, 2 tanks) m^2."""
+        """Steady covariance of the predicted states and flows, (2 n, 2 n) m^2."""
         return riccati(self.joint, torch.diag(self.process_std**2), torch.diag(self.reading_std**2))
 
     @cached_property
@@ -104,28 +111,28 @@ class FlowFilter:
         return transition, total
 
     def __call__(self, residual: Tensor, number: int = 0, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Innovations (*batch, S, sensors) in the readings' units, and the filter's state (*batch, S, 2 tanks) after
+        """Innovations (*batch, S, sensors) in the readings' units, and the filter's state (*batch, S, 2 n) after
         each sample.
 
         residual (*batch, S, sensors): scaled to the steady variance (`Observation.steady_residual`). number: samples
-        of the run before the first. memory (*batch, 2 tanks): state before the first sample, 0 at the start of a run.
+        of the run before the first. memory (*batch, 2 n): state before the first sample, 0 at the start of a run.
         """
         batch, (count, channels) = residual.shape[:-2], residual.shape[-2:]
-        tanks, lanes = len(self.noise.intensity), batch.numel()
+        n, lanes = len(self.linear.transition), batch.numel()
         raw = (residual * self.observer.spread(number, count)).reshape(lanes, count, channels).contiguous()
-        state = raw.new_zeros(2 * tanks) if memory is None else memory
-        state = state.expand(*batch, 2 * tanks).reshape(lanes, -1).contiguous()
-        out, path = torch.empty_like(raw), raw.new_empty(lanes, count, 2 * tanks)
+        state = raw.new_zeros(2 * n) if memory is None else memory
+        state = state.expand(*batch, 2 * n).reshape(lanes, -1).contiguous()
+        out, path = torch.empty_like(raw), raw.new_empty(lanes, count, 2 * n)
         tables = [self.gain.table(number, count).contiguous(), self.observer.table(number, count).contiguous()]
         fixed = [self.transition.contiguous(), self.linear.output.contiguous()]
         pointers = [ctypes.c_void_p(x.data_ptr()) for x in (*fixed, *tables, raw, state, out, path)]
-        _library(tanks, channels).flow_filter(ctypes.c_int64(lanes), ctypes.c_int64(count), *pointers)
+        _library(n, channels).flow_filter(ctypes.c_int64(lanes), ctypes.c_int64(count), *pointers)
         out = out.reshape(residual.shape) / self.gain.spread(number, count)
-        return out, path.reshape(*batch, count, 2 * tanks)
+        return out, path.reshape(*batch, count, 2 * n)
 
 
 def forcing(transition: Tensor) -> Tensor:
-    """Levels after one interval by flows held over it, (tanks, tanks): the trapezoidal rule for the mean of A(t)."""
+    """States after one interval by flows held over it, (n, n): the trapezoidal rule for the mean of A(t)."""
     return 0.5 * (torch.eye(len(transition), dtype=transition.dtype) + transition)
 
 
@@ -145,7 +152,7 @@ def estimate_flow_filter(
     metres = reading_std / torch.linalg.vector_norm(linear.output, dim=-1)
     unit = FIRST_UNIT * metres.median() * torch.ones_like(start_std)
     ones = torch.ones_like(start_std)
-    by_levels = _by_initial_levels(linear, count) * start_std
+    by_levels = _by_initial_levels(linear, count)[..., : len(start_std)] * start_std
     likely = estimate_state_noise(propagation, sensors, free, by_levels, ones, 0.0 * ones, unit)
     error = (0.5 / likely.determined[: len(ones)]).mean().sqrt()
     return FlowFilter(linear, likely.noise, likely.noise.scale * reading_std, observer, start_std, interval, error)
@@ -165,7 +172,7 @@ def _free_residual(linear: Linear, observer: Gain, residual: Tensor) -> Tensor:
 
 
 def _by_initial_levels(linear: Linear, count: int) -> Tensor:
-    """Derivatives of the readings by the initial levels, C A^k, (S, sensors, tanks)."""
+    """Derivatives of the readings by the initial states, C A^k, (S, sensors, n)."""
     power, path = torch.eye(len(linear.transition), dtype=linear.transition.dtype), []
     for _ in range(count):
         path.append(linear.output @ power)
@@ -174,9 +181,9 @@ def _by_initial_levels(linear: Linear, count: int) -> Tensor:
 
 
 @lru_cache
-def _library(tanks: int, channels: int) -> ctypes.CDLL:
+def _library(n: int, channels: int) -> ctypes.CDLL:
     """flow_filter.hpp compiled for these sizes."""
     source = Path(__file__).with_name("flow_filter.hpp").read_text(encoding="utf-8")
-    library = load_library(f"#define N {tanks}\n#define C {channels}\n{source}", "flow_filter")
+    library = load_library(f"#define N {n}\n#define C {channels}\n{source}", "flow_filter")
     library.flow_filter.restype = None
     return library

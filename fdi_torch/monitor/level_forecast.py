@@ -64,7 +64,7 @@ def forecast_limits(
     before, changes = _drawn_parameters(observer, change, fits, now, horizon, generator)
     paths, start = observer.run(window, before, changes)[0][..., :tanks], state.state[-1, :tanks]
     levels = torch.cat([start.expand(DRAWS, 1, tanks), paths], dim=1)
-    levels[:, 1:] += _random_flows(observer.whitening.flows, state, horizon / POINTS, generator)
+    levels[:, 1:] += _random_flows(observer.whitening.flows, state, horizon / POINTS, generator)[..., :tanks]
     limits = []
     for index, tank in enumerate(observer.network.description.tanks):
         path = levels[..., index]
@@ -102,7 +102,7 @@ def _drawn_parameters(
 
 
 def _random_flows(flows: FlowFilter | None, state: MonitorState, span: float, generator: torch.Generator) -> Tensor:
-    """Deviations of the levels by random flows (DRAWS, POINTS, tanks) m, from their present estimate and its error.
+    """Deviations of the states by random flows (DRAWS, POINTS, order) m, from their present estimate and its error.
 
     span: s between the points.
     """

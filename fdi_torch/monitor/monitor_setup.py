@@ -126,7 +126,9 @@ def _specified_gain(
     specification: GainSpecification,
 ) -> Gain:
     if specification.by_hand:
-        return hand_gain(torch.tensor(specification.by_hand, dtype=network.nominal.dtype))
+        matrix = torch.tensor(specification.by_hand, dtype=network.nominal.dtype)
+        effects = matrix.new_zeros(network.order - len(network.description.tanks), matrix.shape[-1])
+        return hand_gain(torch.cat([matrix, effects]))  # states of effects follow the levels
     linear = operating_point(network, samples, space, believed, step)
     unit = torch.linalg.vector_norm(linear.output, dim=-1)
     span = float(torch.diff(samples.time).median())

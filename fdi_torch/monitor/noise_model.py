@@ -18,6 +18,7 @@ from fdi_torch.monitor.observer_gain import (
     riccati,
     start_beside_noise,
     start_uncertainty,
+    with_effects,
 )
 from fdi_torch.monitor.samples import Samples, usual_interval
 from fdi_torch.monitor.stepper import Stepper
@@ -133,7 +134,8 @@ def _noise(network: TankNetwork, linear: Linear, best: _Candidate) -> NoiseModel
     """Both noises from the innovations' covariance, H P H' + R, at the best ratio."""
     unit, ratio = torch.linalg.vector_norm(linear.output, dim=-1), network.nominal.new_tensor(10.0**best.exponent)
     tanks = len(network.description.tanks)
-    predicted = riccati(linear, torch.diag_embed(ratio.expand(tanks) ** 2), torch.diag(unit**2))
+    process = with_effects(ratio.expand(tanks), network.order)
+    predicted = riccati(linear, torch.diag_embed(process**2), torch.diag(unit**2))
     variance = torch.diagonal(linear.output @ predicted @ linear.output.mT) + unit**2
     reading_std = torch.sqrt(best.seen.steady_residual.square().nanmean(dim=0) / variance) * unit
     process_std = ratio * (reading_std / unit).mean().expand(tanks)

@@ -25,7 +25,8 @@ DECAYED, DIVERGED = 1e-4, 1e3  # shares of that change at which the stability ch
 class Observation:
     """States and residuals of an observer.
 
-    state (*batch, S, tanks + M) after each correction: levels in m, then the memory of actuators and sensors. residual
+    state (*batch, S, order + M) after each correction: the network's states in m, of which the levels of the tanks are
+    the first, then the memory of actuators and sensors. residual
     (*batch, S, sensors): reading minus prediction, NaN where a reading is missing. inflation (S, *batch or 1, sensors):
     see `Gain`.
     """
@@ -114,7 +115,7 @@ class Observer:
         return Observation(samples.time, state, residual, seen[0].inflation, seen[0].tanks)
 
     def _gains(self, count: int, lanes: torch.Size) -> Tensor:
-        """Gains (S, tanks, sensors), or (L, S, tanks, sensors) if they differ by batch member."""
+        """Gains (S, order, sensors), or (L, S, order, sensors) if they differ by batch member."""
         table = self.gain.table(0, count)
         if table.dim() == 3:
             return table
@@ -152,10 +153,10 @@ class Observer:
         return torch.broadcast_shapes(samples.batch, self.gain.steady.shape[:-2], *values)
 
     def _expect_shape(self, network: TankNetwork) -> None:
-        shape = (len(network.description.tanks), len(network.description.sensors))
+        shape = (network.order, len(network.description.sensors))
         if tuple(self.gain.steady.shape[-2:]) != shape:
             got = tuple(self.gain.steady.shape[-2:])
-            raise ValueError(f"expected a gain of {shape[0]} tanks x {shape[1]} sensors, got {got[0]} x {got[1]}")
+            raise ValueError(f"expected a gain of {shape[0]} states x {shape[1]} sensors, got {got[0]} x {got[1]}")
 
 
 def bind_parameters(network: TankNetwork, space: ParameterSpace | None, theta: Tensor | None) -> PlaceValues:

@@ -53,7 +53,7 @@ def no_change(believed: Tensor) -> ChangeHypotheses:
 class ObserverWindow:
     """A time window in which a change is searched for.
 
-    samples: the first one only sets the start; `state` (tanks + M,) is the observer's state after its correction,
+    samples: the first one only sets the start; `state` (order + M,) is the observer's state after its correction,
     `number` the count of samples that the observer had processed by then, and `memory` the state of the flow filter
     (None: zero). The later samples are compared. state and memory may have a lane for each hypothesis.
     """
@@ -122,7 +122,7 @@ class ObserverBank:
         return [changes.subset(first, first + size) for first in range(0, len(changes), size)]
 
     def run(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> tuple[Tensor, Tensor]:
-        """States (L, S, tanks + M) after each sample, and residuals (L, S, sensors) scaled to the steady variance."""
+        """States (L, S, order + M) after each sample, and residuals (L, S, sensors) scaled to the steady variance."""
         samples, count = window.samples, len(window)
         ran = run_observers(
             self.changing,
@@ -137,7 +137,7 @@ class ObserverBank:
         return ran.state, (samples.readings[1:] - ran.expected) / self.gain.spread(window.number, count)
 
     def first_state(self, samples: Samples, believed: Tensor, levels: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """State (tanks + M,) after the first sample and the residual there. levels: from the readings if None."""
+        """State (order + M,) after the first sample and the residual there. levels: from the readings if None."""
         first = samples.segment(0, 1)
         if levels is None:
             levels = initial_levels(self.network, samples, self.network.bind(self.space, believed))

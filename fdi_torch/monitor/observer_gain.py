@@ -23,9 +23,9 @@ START_SHARE = 1.0
 class Gain:
     """Observer gain at every sample, m per unit of the reading.
 
-    steady (*batch, tanks, sensors). opening (K, *batch, tanks, sensors): larger gains of the first K samples, while the
-    initial levels are uncertain. inflation (K, *batch, sensors): standard deviation of the residuals during these
-    samples over the steady one.
+    steady (*batch, order, sensors), for each state of the network. opening (K, *batch, order, sensors): larger gains of
+    the first K samples, while the initial levels are uncertain. inflation (K, *batch, sensors): standard deviation of
+    the residuals during these samples over the steady one.
     """
 
     steady: Tensor
@@ -49,8 +49,8 @@ class Gain:
 
 @dataclass(frozen=True)
 class Linear:
-    """Linearised plant over one sampling interval: transition (*batch, tanks, tanks), output
-    (*batch, sensors, tanks).
+    """Linearised plant over one sampling interval: transition (*batch, order, order), output
+    (*batch, sensors, order), for each state of the network.
     """
 
     transition: Tensor
@@ -58,7 +58,9 @@ class Linear:
 
 
 def linearised(stepper: Stepper, levels: Tensor, inputs: Tensor, span: float, values: PlaceValues) -> Linear:
-    """The plant linearised about levels (*batch, tanks) under inputs (*batch, channels) held for `span` s."""
+    """The plant linearised about levels (*batch, tanks), with the effects in steady state, under inputs (*batch,
+    channels) held for `span` s.
+    """
 
     def moved(x: Tensor) -> Tensor:
         return stepper.advance(stepper.start(x, inputs, values), lambda share: inputs, 0.0, span, values).levels
@@ -66,16 +68,20 @@ def linearised(stepper: Stepper, levels: Tensor, inputs: Tensor, span: float, va
     def read(x: Tensor) -> Tensor:
         return stepper.read(stepper.start(x, inputs, values), span, span, values)[0]
 
-    return Linear(slopes(moved, levels), slopes(read, levels))
+    state = stepper.start(levels, inputs, values).levels
+    return Linear(slopes(moved, state), slopes(read, state))
 
 
 def kalman_gain(linear: Linear, process_std: Tensor, reading_std: Tensor, start_std: Tensor) -> Gain:
     """Kalman gain with its initial transient.
 
     process_std (*batch, tanks) m per sample, reading_std (*batch, sensors) and start_std (tanks) m: standard deviations
-    of process noise, readings and initial levels; only their ratios matter. The steady gain solves the discrete
+    of process noise, readings and initial levels; only their ratios matter. The states of effects have no noise of
+    their own, and are in steady state at first. The steady gain solves the discrete
     algebraic Riccati equation. Raises ValueError if a level is not observable.
     """
+    order = linear.transition.shape[-1]
+    process_std, start_std = with_effects(process_std, order), with_effects(start_std, order)
     process, reading = torch.diag_embed(process_std**2), torch.diag_embed(reading_std**2)
     steady = riccati(linear, process, reading)
     final, final_std = _filter_gain(linear, steady, reading)
@@ -93,6 +99,11 @@ def kalman_gain(linear: Linear, process_std: Tensor, reading_std: Tensor, start_
     opening = torch.stack(gains) if gains else final.new_zeros(0, *final.shape)
     inflation = torch.stack(stds) if stds else final_std.new_zeros(0, *final_std.shape)
     return Gain(final, opening, inflation)
+
+
+def with_effects(std: Tensor, order: int) -> Tensor:
+    """Standard deviations (*batch, tanks) of levels -> (*batch, order), 0 for the states of effects."""
+    return torch.cat([std, std.new_zeros(*std.shape[:-1], order - std.shape[-1])], dim=-1)
 
 
 def riccati(linear: Linear, process: Tensor, reading: Tensor) -> Tensor:
@@ -119,7 +130,7 @@ def riccati(linear: Linear, process: Tensor, reading: Tensor) -> Tensor:
 
 
 def hand_gain(matrix: Tensor) -> Gain:
-    """A constant gain (tanks, sensors): K_obv of eq. 14 times the sampling interval."""
+    """A constant gain (order, sensors): K_obv of eq. 14 times the sampling interval."""
     return Gain(matrix, matrix.new_zeros(0, *matrix.shape), matrix.new_zeros(0, matrix.shape[-1]))
 
 

@@ -20,8 +20,8 @@ from fdi_torch.simulate.traced_engine import TracedEngine
 
 @dataclass(frozen=True)
 class ObserverRun:
-    """Result at each sample: state (L, S, tanks + M) after the correction, levels in m, then memory of actuators and
-    sensors; expected (L, S, sensors): predicted readings before the correction.
+    """Result at each sample: state (L, S, order + M) after the correction, the network's states in m, then memory of
+    actuators and sensors; expected (L, S, sensors): predicted readings before the correction.
     """
 
     state: Tensor
@@ -40,7 +40,7 @@ def run_observers(
 ) -> ObserverRun:
     """Run L observers in parallel.
 
-    theta (L, P), start (L, tanks) or (L, tanks + M), gains (S', tanks, sensors) or (L, S', tanks, sensors). samples:
+    theta (L, P), start (L, tanks) or (L, order + M), gains (S', order, sensors) or (L, S', order, sensors). samples:
     inputs (T, channels), readings (T, sensors) or (L, T, sensors), NaN where missing. from_first: True if `start` is
     the state before the correction at the first sample (S' = T), False if after it (S' = T - 1).
     """
@@ -50,9 +50,8 @@ def run_observers(
     kind = CompiledEngine if _compiles(network, space.names) else TracedEngine
     data = Readings(readings, torch.isfinite(readings).to(readings.dtype))
     lane_theta = theta.unsqueeze(-2) if readings.dim() > 2 else theta
-    tanks = len(network.description.tanks)
-    memory = start[:, tanks:] if start.shape[1] > tanks else None
-    injection = Injection(gains, start[:, :tanks], memory)
+    memory = start[:, network.order :] if start.shape[1] > network.order else None
+    injection = Injection(gains, start[:, : network.order], memory)
     out = kind(network, space, experiment).observe(lane_theta, data, injection)
     out = out.reshape(len(theta), *out.shape[-2:])
     split = out.shape[-1] - len(network.description.sensors)

@@ -130,7 +130,7 @@ def _run(
     """Run the observer along a window at the end of the samples, and replace the stored results there.
 
     The parameters change from `before` to `state.believed` at `onset` s. starts: the window, with the state of the
-    observer in the first row (1 + E, tanks + M), and below it those of the parallel observers that each lack one
+    observer in the first row (1 + E, order + M), and below it those of the parallel observers that each lack one
     effect; these give the effect of each known fault. Its memory likewise.
     """
     first, active = len(state.samples) - len(starts), state.active_effects(observer)

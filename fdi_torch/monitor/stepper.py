@@ -29,7 +29,9 @@ def usual_step(plant: PlantDescription) -> float:
 
 @dataclass(frozen=True)
 class PlantState:
-    """Levels (*batch, tanks) in m, and the memory of actuators and sensors."""
+    """The network's integrated states (*batch, order) in m, the tanks' levels first, and the memory of actuators and
+    sensors.
+    """
 
     levels: Tensor
     commands: Memory = ()
@@ -54,11 +56,17 @@ class Stepper:
         self.network, self.longest = network, longest
 
     def start(self, levels: Tensor, inputs: Tensor, values: PlaceValues) -> PlantState:
-        """The state at these levels with actuators and sensors settled under constant inputs (*batch, channels)."""
+        """The state at these levels (*batch, tanks) with effects, actuators and sensors in steady state under constant
+        inputs (*batch, channels); levels (*batch, order) have the effects' states already.
+        """
         clock = self._clock(levels, 0.0, self.longest, self.longest)
         channels = self._channels(inputs)
         seen = self._seen(levels)
         commands = self.network.steady_command_memory(channels, clock, values) if channels else ()
+        if levels.shape[-1] < self.network.order:
+            actual, _ = self.network.commands(channels, commands, clock, values)
+            state = self.network.with_steady_states(levels.unbind(-1), actual, clock, values)
+            levels = torch.stack(torch.broadcast_tensors(*state), dim=-1)
         return PlantState(levels, commands, self.network.steady_reading_memory(seen, clock, values))
 
     def advance(

@@ -32,9 +32,9 @@ class SwitchedNetwork(TankNetwork):
         self.register_buffer("nominal", self.constants.nominal())
 
     def rates(
-        self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
+        self, state: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> list[Tensor]:
-        return super().rates(levels, commands, clock, self.values_at(values, clock))
+        return super().rates(state, commands, clock, self.values_at(values, clock))
 
     def commands(
         self, channels: Sequence[Tensor], memory: Memory, clock: Clock, values: PlaceValues

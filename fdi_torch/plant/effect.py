@@ -40,10 +40,12 @@ class Effect:
 
     name: as in configurations and results. stage: the stage whose hook it overrides. places: the kinds of component at
     which it can be placed, of 'pump', 'pipe', 'outlet', 'valve', 'tank', 'tank_pair', 'sensor'; a flow component can
-    accept further effects (`FlowComponent.accepts`). memory: number of its
-    memory states. smooth: whether the gradient with respect to its size is non-zero at nominal. mistaken_for: effects
-    that explain nearly the same data. delays: whether it adds dead time to its signal. quantizes: whether it rounds
-    the reading. startup_only: whether it acts only until its component has run for the first time.
+    accept further effects (`FlowComponent.accepts`). memory: number of its memory states, for a COMMAND or READING
+    effect whose output depends on the past of its signal alone. states: number of its integrated states, for a FLOW
+    effect coupled to the levels; each is in m and of the order of a level, since one tolerance holds for all. smooth:
+    whether the gradient with respect to its size is non-zero at nominal. mistaken_for: effects that explain nearly the
+    same data. delays: whether it adds dead time to its signal. quantizes: whether it rounds the reading. startup_only:
+    whether it acts only until its component has run for the first time.
 
     The first parameter is the effect's size: at its nominal value the effect is absent. The others are its shape; their
     nominal values are typical ones, or those that keep the effect simple (onset 0, ramp 0).
@@ -53,6 +55,7 @@ class Effect:
     stage: ClassVar[Stage]
     places: ClassVar[tuple[str, ...]]
     memory: ClassVar[int] = 0
+    states: ClassVar[int] = 0
     smooth: ClassVar[bool] = True
     delays: ClassVar[bool] = False
     quantizes: ClassVar[bool] = False
@@ -93,6 +96,16 @@ class Effect:
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
         """FLOW: the flow of a pump, pipe or outlet, m^3/s, positive from source to target."""
         return flow
+
+    def steady_states(self, flow: Tensor, local: Local, p: Values) -> tuple[Tensor, ...]:
+        """FLOW: its states in steady state, m, where the flow before the effect has been `flow` (m^3/s) for a long
+        time.
+        """
+        return ()
+
+    def state_rates(self, flow: Tensor, local: Local, p: Values) -> tuple[Tensor, ...]:
+        """FLOW: rate of change of each of its states `local.states`, m/s; flow (m^3/s) is the one before the effect."""
+        return ()
 
     def inflow(self, local: Local, p: Values) -> Tensor:
         """BALANCE: additional net inflow of a tank, m^3/s; at a tank pair 'A-B', the flow from A to B."""

@@ -22,7 +22,8 @@ class Local:
     the flow; capacity: flow at 1 m of head (tank: through its leak reference), m^2.5/s, weir m^1.5/s; command: of the
     pump or transfer, or opening of the valve; net: net inflow of the tank so far, m^3/s (BALANCE, and flows that depend
     on it; elsewhere 0); width: head below which square roots are smoothed, m; height: of the tank, floor to rim, m;
-    area: of the tank, m^2; gravity: m/s^2; constants: the component's constants by field name.
+    area: of the tank, m^2; gravity: m/s^2; constants: the component's constants by field name; states: of the effect
+    that is evaluated, m (see `Effect.states`).
     """
 
     clock: Clock
@@ -37,6 +38,7 @@ class Local:
     area: Tensor
     gravity: Tensor
     constants: Values
+    states: tuple[Tensor, ...] = ()
 
     def root(self, head: Tensor) -> Tensor:
         """Regularised signed square root of a head, sgn(x) sqrt(|x|), m^0.5 (see `signed_root`)."""

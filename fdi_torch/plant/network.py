@@ -16,19 +16,24 @@ from torch import Tensor, nn
 from fdi_torch.parameters import Parameter, ParameterSpace, by_prefix
 from fdi_torch.plant.constants import constant_parameters
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor
-from fdi_torch.plant.effect import Effect, Memory, Placement, Stage, Values, fits, place_kinds_of
+from fdi_torch.plant.effect import Memory, Placement, Stage, Values, fits, place_kinds_of
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
+from fdi_torch.plant.local_conditions import Local
 from fdi_torch.plant.operating_point import Constants, OperatingPoint, PlaceValues
 from fdi_torch.plant.orifice import limit_emptying, weir_flow
 from fdi_torch.plant.signal_chain import SignalChain
 from fdi_torch.plant.signals import Clock
+
+FlowBefore = tuple[Placement, Tensor, Local]
+"""An effect with states, the flow before it (m^3/s), and its conditions with the states."""
 
 
 class TankNetwork(nn.Module):
     """The right-hand side and the sensor equations of a plant.
 
     description: the rig. placements: its faults and unmodelled effects; each is absent while its size is nominal.
-    constants: every number that can be estimated, of components and effects.
+    constants: every number that can be estimated, of components and effects. order: number of integrated states; the
+    state vector holds the level of each tank and then the states of the effects that have some, all in m.
     """
 
     nominal: Tensor
@@ -59,6 +64,8 @@ class TankNetwork(nn.Module):
         self._by_place: dict[tuple[str, Stage], list[Placement]] = {}
         for placement in placements:
             self._by_place.setdefault((placement.location, placement.effect.stage), []).append(placement)
+        self._with_states = [p for p in placements if p.effect.states]
+        self.order = len(self.description.tanks) + sum(p.effect.states for p in self._with_states)
         sensors = [sensor.name for sensor in self.description.sensors]
         self._actuator_names = [name for name, _ in self.actuators()]
         self._command_chain = SignalChain(Stage.COMMAND, self._actuator_names, placements)
@@ -78,26 +85,69 @@ class TankNetwork(nn.Module):
             named[name] = value
         return Constants(by_prefix(named))
 
-    def forward(self, levels: Tensor, commands: Tensor, clock: Clock, values: PlaceValues) -> Tensor:
-        """dh/dt (*batch, tanks), m/s; levels (*batch, tanks), m; commands: outputs of the actuators (*batch,
-        actuators).
+    def forward(self, state: Tensor, commands: Tensor, clock: Clock, values: PlaceValues) -> Tensor:
+        """Rate of change of the state (*batch, order), m/s; state: as in `rates`, last dimension; commands: outputs of
+        the actuators (*batch, actuators).
         """
-        rates = self.rates(levels.unbind(-1), commands.unbind(-1), clock, values)
+        rates = self.rates(state.unbind(-1), commands.unbind(-1), clock, values)
         return torch.stack(torch.broadcast_tensors(*rates), dim=-1)
 
     def rates(
-        self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
+        self, state: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> list[Tensor]:
-        """dh/dt of each tank (*batch), m/s: flows, balances, transfers, weirs and overflow, storage."""
-        point = self.operating_point(levels, commands, clock, values)
+        """Rate of change of each entry of the state (*batch), m/s: flows, balances, transfers, weirs and overflow,
+        storage, and the states of effects.
+
+        state: `order` numbers (*batch), or the tanks' levels alone, with the effects in steady state.
+        """
+        point = self.operating_point(state, commands, clock, values)
         net = self.net_inflows(point, self.flows(point))
-        return self.level_rates(point, self.less_overflow(point, net))
+        states = (rate for rates in self.state_rates(point).values() for rate in rates)
+        return [*self.level_rates(point, self.less_overflow(point, net)), *states]
 
     def operating_point(
-        self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
+        self, state: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> OperatingPoint:
-        """The argument of the stages: levels (*batch) of the tanks, m, and outputs (*batch) of the actuators."""
-        return OperatingPoint.of(self.description, levels, self._actuator_names, commands, clock, values)
+        """The argument of the stages: the state as in `rates`, and outputs (*batch) of the actuators."""
+        levels, states = self.split(state)
+        point = OperatingPoint.of(self.description, levels, self._actuator_names, commands, clock, values)
+        return replace(point, states=states) if states else point
+
+    def split(self, state: Sequence[Tensor]) -> tuple[Sequence[Tensor], dict[str, tuple[Tensor, ...]]]:
+        """The tanks' levels, and the states of each effect by its prefix; none for a state of levels alone."""
+        tanks = len(self.description.tanks)
+        if len(state) not in (tanks, self.order):
+            raise ValueError(f"expected {tanks} levels or a state of {self.order} numbers, got {len(state)}")
+        first, states = tanks, {}
+        for placement in self._with_states if len(state) > tanks else ():
+            states[placement.prefix] = tuple(state[first : first + placement.effect.states])
+            first += placement.effect.states
+        return state[:tanks], states
+
+    def with_steady_states(
+        self, levels: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
+    ) -> list[Tensor]:
+        """The state: these levels of the tanks (*batch), m, and the steady states of the effects there."""
+        point = self.operating_point(levels, commands, clock, values)
+        return [*levels, *(state for states in self.steady_states(point).values() for state in states)]
+
+    def steady_states(self, point: OperatingPoint) -> dict[str, tuple[Tensor, ...]]:
+        """States of each effect, m, by its prefix: those of the point, else those in steady state there."""
+        return {placement.prefix: local.states for placement, _, local in self._at_states(point)}
+
+    def state_rates(self, point: OperatingPoint) -> dict[str, tuple[Tensor, ...]]:
+        """Rates of change of each effect's states, m/s, by its prefix, in the order of the state vector."""
+        return {
+            placement.prefix: placement.effect.state_rates(flow, local, point.values[placement.prefix])
+            for placement, flow, local in self._at_states(point)
+        }
+
+    def _at_states(self, point: OperatingPoint) -> list[FlowBefore]:
+        """Each effect with states, the flow before it and its conditions, in the order of the state vector."""
+        places = {p.location for p in self._with_states}
+        components = [component for component in self._first_flows if component.name in places]
+        found = [each for component in components for each in self._through_effects(point, component)[1]]
+        return sorted(found, key=lambda each: self._with_states.index(each[0]))
 
     def commands(
         self, channels: Sequence[Tensor], memory: Memory, clock: Clock, values: PlaceValues
@@ -122,14 +172,25 @@ class TankNetwork(nn.Module):
 
         net: inflow of its source by the flows that are computed before it, m^3/s.
         """
+        return self._through_effects(point, component, net)[0]
+
+    def _through_effects(
+        self, point: OperatingPoint, component: FlowComponent, net: Tensor | None = None
+    ) -> tuple[Tensor, list[FlowBefore]]:
+        """FLOW of one component, and what its effects with states see."""
         local = point.at_flow(component, net)
-        effects = self._effects(component.name, Stage.FLOW, point)
-        for effect, p in effects:
-            local = replace(local, head=effect.head(local.head, local, p))
+        effects, before = self._effects(component.name, Stage.FLOW, point), []
+        for placement, p in effects:
+            local = replace(local, head=placement.effect.head(local.head, local, p))
         flow = component.law(local)
-        for effect, p in effects:
-            flow = effect.flow(flow, local, p)
-        return component.limited(flow, local)
+        for placement, p in effects:
+            own = local
+            if placement.effect.states:
+                states = point.states.get(placement.prefix) or placement.effect.steady_states(flow, local, p)
+                own = replace(local, states=states)
+                before.append((placement, flow, own))
+            flow = placement.effect.flow(flow, own, p)
+        return component.limited(flow, local), before
 
     def net_inflows(self, point: OperatingPoint, flows: Mapping[str, Tensor]) -> list[Tensor]:
         """BALANCE of each tank before transfers, weirs and overflow: `flows` and BALANCE effects, m^3/s."""
@@ -166,8 +227,8 @@ class TankNetwork(nn.Module):
         rates = []
         for tank, inflow in zip(self.description.tanks, net, strict=True):
             area = point.values[tank.name]["area"]
-            for effect, p in self._effects(tank.name, Stage.STORAGE, point):
-                area = effect.area(area, point.at_tank(tank.name), p)
+            for placement, p in self._effects(tank.name, Stage.STORAGE, point):
+                area = placement.effect.area(area, point.at_tank(tank.name), p)
             rates.append(limit_emptying(inflow / area, point.levels[tank.name], point.clock.resolution))
         return rates
 
@@ -210,8 +271,8 @@ class TankNetwork(nn.Module):
         constants = [values[sensor.name] for sensor in self.description.sensors]
         return [c["gain"] * level + c["offset"] for c, level in zip(constants, levels, strict=True)]
 
-    def _effects(self, location: str, stage: Stage, point: OperatingPoint) -> list[tuple[Effect, Values]]:
-        return [(p.effect, point.values[p.prefix]) for p in self._by_place.get((location, stage), ())]
+    def _effects(self, location: str, stage: Stage, point: OperatingPoint) -> list[tuple[Placement, Values]]:
+        return [(p, point.values[p.prefix]) for p in self._by_place.get((location, stage), ())]
 
     def transfer(self, net: list[Tensor], source: str, target: str, flow: Tensor) -> None:
         """Subtract a flow (m^3/s) from the source's net inflow and add it to the target's, in place."""
@@ -255,3 +316,13 @@ def _expect_fit(plant: PlantDescription, placement: Placement) -> None:
     if not fits(placement.effect, plant, placement.location):
         kinds = " or ".join(place_kinds_of(placement.effect))
         raise ValueError(f"{placement.prefix}: expected a place of kind {kinds}, got {placement.location}")
+    component = plant.component(placement.location) if placement.effect.states else None
+    if component is not None and not (
+        placement.effect.stage is Stage.FLOW
+        and isinstance(component, FlowComponent)
+        and component.order <= FlowOrder.BY_LEVELS
+    ):
+        raise ValueError(
+            f"{placement.prefix}: expected states only in a FLOW effect of a component whose flow depends on levels "
+            f"and commands alone, got {placement.effect.stage.name} at {placement.location}"
+        )

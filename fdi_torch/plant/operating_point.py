@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -42,13 +42,17 @@ class Constants(dict[str, Values]):
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Levels (m) of the tanks and commands after the actuators' effects, in one step of the clock; all (*batch), SI."""
+    """Levels (m) of the tanks and commands after the actuators' effects, in one step of the clock; all (*batch), SI.
+
+    states: of each effect with states, by its prefix ('P12.pipe_inertia'), m.
+    """
 
     plant: PlantDescription
     levels: Mapping[str, Tensor]
     commands: Mapping[str, Tensor]
     clock: Clock
     values: Constants
+    states: Mapping[str, tuple[Tensor, ...]] = field(default_factory=dict)
 
     @classmethod
     def of(

@@ -23,6 +23,7 @@ from fdi_torch.capacity import expect_room
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.scales import length_scale
+from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.actuation import Actuation, with_parameters
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.midpoint import newton_step
@@ -39,10 +40,10 @@ CONVERGED, ONE_CONVERGED = 1e-7, 1e-5
 class Linearised:
     """A trajectory, its readings and their first derivatives.
 
-    levels (L, K+1, tanks) m: the corrected trajectory; slopes (L, K+1, tanks, P): its sensitivity. readings (L, S, C)
-    and jacobian (L, S, C, P): the same at the sensors. transition (L, K, tanks, tanks) and gain (L, K, tanks, tanks): a
-    disturbance w of the rates over step k adds gain_k w to the next level, and transition propagates it. defect (L,):
-    the largest correction of a level, m.
+    levels (L, K+1, n) m: the corrected trajectory of the n = `network.order` states, the tanks' levels first; slopes
+    (L, K+1, n, P): its sensitivity. readings (L, S, C) and jacobian (L, S, C, P): the same at the sensors. transition
+    (L, K, n, n) and gain (L, K, n, n): a disturbance w of the rates over step k adds gain_k w to the next state, and
+    transition propagates it. defect (L,): the largest correction of a state, m.
     """
 
     levels: Tensor
@@ -75,6 +76,7 @@ class Collocation:
         self._moving = [j for j in range(len(space)) if j not in self._start_columns]
         self._without_overflow = network.without_overflow()
         self._rims = [t.height for t in network.description.tanks]
+        self._effect_states = network.order - len(tanks)
         self._length = length_scale(network.description)
         self._names = [space.names[j] for j in self._moving]
         self._actuation = Actuation(network, experiment, self._names)
@@ -82,11 +84,18 @@ class Collocation:
         self._fixed_commands: list[Tensor] | None = None
 
     def linearise(self, theta: Tensor, levels: Tensor) -> Linearised:
-        """One Newton step from the trajectories levels (L, K+1, tanks), with derivatives; theta (L, P)."""
-        lanes, nodes, tanks = levels.shape
+        """One Newton step from the trajectories levels (L, K+1, n), with derivatives; theta (L, P).
+
+        A trajectory of the tanks' levels alone (n = tanks) is completed by the steady states of the effects.
+        """
+        lanes, nodes, _ = levels.shape
         what = f"{lanes} trajectories of {nodes:.3g} steps with {len(self.space)} sensitivities each"
-        expect_room(float(levels.numel()) * (tanks + len(self.space)), what, "choose a longer step")
-        path = levels.movedim(1, 2).contiguous()
+        expect_room(
+            float(lanes * nodes * self.network.order) * (self.network.order + len(self.space)),
+            what,
+            "choose a longer step",
+        )
+        path = self._path(theta, levels)
         middle = 0.5 * (path[..., :-1] + path[..., 1:])
         values = self.network.bind(self.space, theta.unsqueeze(-2))
         rates, by_level, by_theta = self._rate_slopes(middle, values, self._columns(theta), len(self.space))
@@ -108,10 +117,10 @@ class Collocation:
 
     def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
         """The levels and defect of `linearise` without derivatives, at a fraction of the cost."""
-        path = levels.movedim(1, 2).contiguous()
+        path = self._path(theta, levels)
         values = self.network.bind(self.space, theta.unsqueeze(-2))
         rates, by_level, by_theta = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), values, [], 0)
-        start = self._start(theta, values)[0]
+        start = self._start(theta, values, slopes=False)[0]
         none = start.new_empty(*start.shape, 0)
         corrected, _, _, _, defect = newton_step(self.experiment.steps, path, rates, by_level, by_theta, start, none)
         return corrected.movedim(2, 1), defect
@@ -129,7 +138,7 @@ class Collocation:
         """Simulate one tank with the levels of all others given: levels (L, K+1, tanks) m, with that tank's
         replaced.
         """
-        levels = levels.clone()
+        levels = self._path(theta, levels).movedim(1, 2).clone()
         for _ in range(rounds):
             path = levels.movedim(1, 2)
             values = self.network.bind(self.space, theta.unsqueeze(-2))
@@ -165,21 +174,65 @@ class Collocation:
         return self._output_map.look(levels.movedim(1, 2), values, self._columns(theta))
 
     def constant_guess(self, theta: Tensor) -> Tensor:
-        """Trajectories that stay at their start levels, (L, K+1, tanks)."""
-        start, _ = self._start(theta, self.network.bind(self.space, theta.unsqueeze(-2)))
+        """Trajectories that stay at their start, (L, K+1, n)."""
+        start, _ = self._start(theta, self.network.bind(self.space, theta.unsqueeze(-2)), slopes=False)
         return start.unsqueeze(1).expand(-1, len(self.experiment.nodes), -1).clone()
 
     def _columns(self, theta: Tensor) -> list[Tensor]:
         """The parameters other than start levels, each (L, 1)."""
         return [theta[:, j, None] for j in self._moving]
 
-    def _start(self, theta: Tensor, values: PlaceValues) -> tuple[Tensor, Tensor]:
-        """Start levels (L, tanks) and their slopes (L, tanks, P)."""
-        start = torch.cat([h.expand(len(theta), 1) for h in self.network.start_levels(values)], dim=1)
-        slopes = theta.new_zeros(*start.shape, theta.shape[-1])
+    def _path(self, theta: Tensor, levels: Tensor) -> Tensor:
+        """Trajectories (L, n, K+1) from levels (L, K+1, n) or (L, K+1, tanks)."""
+        path = levels.movedim(1, 2).contiguous()
+        if path.shape[1] == self.network.order:
+            return path
+        values, tanks = self.network.bind(self.space, theta.unsqueeze(-2)), len(self._rims)
+        held = [torch.cat([c, c[:, -1:]], dim=1) for c in self._commands(values, [], len(theta))[0]]
+        clock, last = self._actuation.clock, slice(-1, None)
+        clock = Clock(self.experiment.nodes, torch.cat([clock.step, clock.step[last]]), clock.resolution)
+        state = self.network.with_steady_states(path[:, :tanks].unbind(1), held, clock, values)
+        return torch.stack([x.expand(path[:, 0].shape) for x in state], dim=1)
+
+    def _start(self, theta: Tensor, values: PlaceValues, slopes: bool = True) -> tuple[Tensor, Tensor]:
+        """The state at the start (L, n) and its slopes (L, n, P), or zeros instead of them."""
+        lanes = len(theta)
+        start = torch.cat([h.expand(lanes, 1) for h in self.network.start_levels(values)], dim=1)
+        by_theta = theta.new_zeros(*start.shape, theta.shape[-1])
         for column, tank in self._start_columns.items():
-            slopes[:, tank, column] = 1.0
-        return start, slopes
+            by_theta[:, tank, column] = 1.0
+        if not self._effect_states:
+            return start, by_theta
+        return self._steady_start(start, by_theta, values, self._columns(theta) if slopes else [])
+
+    def _steady_start(
+        self, start: Tensor, by_theta: Tensor, values: PlaceValues, moving: Sequence[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Complete the levels at the start (L, tanks) and their slopes by those of effects in steady state."""
+        lanes, tanks = start.shape
+        commands, command_slopes, columns = self._commands(values, moving, lanes)
+        clock = Clock(self.experiment.nodes[:1], self.experiment.steps[:1], self.experiment.resolution)
+        count = tanks + len(commands)
+
+        def steady(x: list[Tensor]) -> list[Tensor]:
+            bound = with_parameters(values, self._names, x[count:])
+            return self.network.with_steady_states(x[:tanks], x[tanks:count], clock, bound)[tanks:]
+
+        inputs = [*start.unsqueeze(-1).unbind(1), *(c[:, :1] for c in commands), *moving]
+        states, rows = partials(steady, inputs, (lanes, 1))
+        slopes = [torch.zeros_like(by_theta[:, 0]) for _ in rows]
+        for row, slope in zip(rows, slopes, strict=True):
+            for tank in range(tanks):
+                if (by_level := row[tank]) is not None:
+                    slope += by_level * by_theta[:, tank]
+            for q, direct in enumerate(row[count:]):
+                if direct is not None:
+                    slope[:, self._moving[q]] += direct[:, 0]
+            for by_command, course in zip(row[tanks:count], command_slopes, strict=True):
+                if by_command is not None and course is not None:
+                    for q, column in enumerate(columns):
+                        slope[:, self._moving[column]] += by_command[:, 0] * course[:, q, 0]
+        return torch.cat([start, *states], dim=1), torch.cat([by_theta, torch.stack(slopes, dim=1)], dim=1)
 
     def _jacobian(self, look: LinearisedOutputs, slopes: Tensor) -> Tensor:
         """Slopes of the levels (L, tanks, P, K+1) -> slopes of the readings (L, C, P, S)."""
@@ -197,7 +250,7 @@ class Collocation:
         """
         lanes, n, steps = middle.shape
         shape = (lanes, steps)
-        reaches_rim = bool((middle >= middle.new_tensor(self._rims).unsqueeze(-1)).any())
+        reaches_rim = bool((middle[:, : len(self._rims)] >= middle.new_tensor(self._rims).unsqueeze(-1)).any())
         network = self.network if reaches_rim else self._without_overflow
         commands, command_slopes, columns = self._commands(values, moving, lanes)
         driven = [i for i, slopes in enumerate(command_slopes) if slopes is not None]

@@ -21,8 +21,8 @@ from fdi_torch.simulate.injection import Injection, expect_injectable
 from fdi_torch.simulate.program import Program, build_program
 
 _INTEGERS = (
-    "lanes", "lanes_per_problem", "steps", "samples", "signal_samples", "mode", "threads", "gain_stride", "out_bytes",
-    "jacobian_bytes",
+    "lanes", "lanes_per_problem", "steps", "samples", "signal_samples", "mode", "threads", "gain_stride",
+    "start_width", "out_bytes", "jacobian_bytes",
 )  # fmt: skip
 _ARRAYS = (
     "theta", "nominal", "lifted", "resolution", "starts", "spans", "means", "first_sample", "sample_times",
@@ -33,7 +33,7 @@ _STEP_CONTROL = ("tolerance", "slope_tolerance", "shortest")
 _MODES = {"levels": 0, "readings": 1, "moments": 2, "linearise": 3, "gram": 4, "observe": 5}
 _REALS = {torch.float64: "double", torch.float32: "float"}
 VALUE_LANES, TANGENT_LANES = 32, 16
-# Steps of plants with up to this many tanks are unrolled, which is faster but takes longer to compile.
+# Steps of plants with up to this many states are unrolled, which is faster but takes longer to compile.
 MOST_UNROLLED = 6
 
 
@@ -109,7 +109,7 @@ class CompiledEngine:
     def observe(self, theta: Tensor, data: Readings, injection: Injection) -> Tensor:
         expect_no_gradient(self, theta, "observe")
         memory = self.network.command_memory() + self.network.reading_memory()
-        out = self._empty(theta, len(self.network.description.tanks) + memory + self._sensors)
+        out = self._empty(theta, self.network.order + memory + self._sensors)
         expect_injectable(self.experiment, injection, memory)
         self._run("observe", theta, out, data=data, injection=injection)
         return out
@@ -166,6 +166,7 @@ class CompiledEngine:
             "mode": _MODES[mode],
             "threads": torch.get_num_threads(),
             "gain_stride": 0 if injection is None else injection.stride,
+            "start_width": 0 if injection is None else injection.start.shape[-1],
             "out_bytes": out.nbytes,
             "jacobian_bytes": 0 if jacobian is None else jacobian.nbytes,
         }
@@ -231,7 +232,7 @@ def _source(network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptiv
 
 
 def _program(network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool) -> Program:
-    return build_program(network, names, tangent, adaptive, len(network.description.tanks) <= MOST_UNROLLED)
+    return build_program(network, names, tangent, adaptive, network.order <= MOST_UNROLLED)
 
 
 @lru_cache(maxsize=128)

@@ -46,6 +46,7 @@ def emit(program: Program, inner_samples: bool, real: str, lanes: int | str) -> 
         "COLUMNS": columns,
         "WIDTH": columns + 3,
         "PAIRS": (columns + 3) * (columns + 4) // 2,
+        "ORDER": program.order,
         "TANKS": program.tanks,
         "SENSORS": program.sensors,
         "ACTUATORS": program.actuators,

@@ -30,7 +30,7 @@ def equilibrium(network: TankNetwork, inputs: Tensor, start: Tensor | None = Non
     commands = torch.stack(list(outputs)) if outputs else inputs.new_zeros(0)
 
     def rates(levels: Tensor) -> Tensor:
-        return network(levels, commands, clock, values)
+        return network(levels, commands, clock, values)[: len(plant.tanks)]  # effects with states are in steady state
 
     heights = inputs.new_tensor([tank.height for tank in plant.tanks])
     levels = 0.5 * heights if start is None else start.clone()

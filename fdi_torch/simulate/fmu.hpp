@@ -78,7 +78,7 @@ static std::vector<real> rows_after(const Plant &plant, double span) {
     first[steps] = samples;
     const real times[2] = {plant.has_begun ? now + span : now, now + span}, intervals[2] = {span, span};
     const real shares[2] = {plant.has_begun ? 1.0 : 0.0, 1}, resolution = RESOLUTION;
-    const std::vector<real> none(2 * std::max<int>(TANKS, 1) * SOME(SENSORS), 0);
+    const std::vector<real> none(2 * std::max<int>(ORDER, 1) * SOME(SENSORS), 0);
     std::vector<real> rows(samples * ROW);
     Job job = {};
     job.lanes = job.lanes_per_problem = job.threads = 1;
@@ -100,7 +100,8 @@ static std::vector<real> rows_after(const Plant &plant, double span) {
     job.sample_shares = shares;
     job.values = job.weights = job.centres = job.gains = none.data();
     job.start = plant.has_begun ? plant.row : nullptr;
-    job.start_memory = plant.has_begun && MEMORY ? plant.row + TANKS : nullptr;
+    job.start_width = ORDER;
+    job.start_memory = plant.has_begun && MEMORY ? plant.row + ORDER : nullptr;
     job.out = rows.data();
     job.python = &NO_PYTHON;
     run(&job);

@@ -64,7 +64,7 @@ class ImplicitStep:
         """Advance the levels by step (L,) s.
 
         Returns the error estimate of the levels relative to the tolerance (m), infinite where a stage has no solution,
-        (L,); and the error estimate of the slopes by theta, one tensor (P, L) per tank, in their units.
+        (L,); and the error estimate of the slopes by theta, one tensor (P, L) per state, in their units.
         """
         p, start = self.program, self._levels()
         start_slopes = self._changes() if p.tangent else []
@@ -124,31 +124,31 @@ class ImplicitStep:
         """Slopes of the rates by theta at the start of the step, (P, L) each."""
         if not self.program.tangent:
             return []
-        total = [self.full(self.state.changes.get(("slope", i))) for i in range(self.program.tanks)]
+        total = [self.full(self.state.changes.get(("slope", i))) for i in range(self.program.order)]
         for e, (row, column) in enumerate(self.program.pattern):
             total[row] = total[row] + self.state.values["by_level", e] * level_slopes[column]
         return total
 
     def _levels(self) -> Numbers:
-        return [level for level, _ in self.state.group("level", self.program.tanks)]
+        return [level for level, _ in self.state.group("level", self.program.order)]
 
     def _changes(self) -> Numbers:
-        return [self.full(change) for _, change in self.state.group("level", self.program.tanks)]
+        return [self.full(change) for _, change in self.state.group("level", self.program.order)]
 
     def _put(self, levels: Numbers) -> None:
         self.state.values.update({("level", i): level for i, level in enumerate(levels)})
 
     def _slopes(self, like: Tensor) -> Numbers:
-        return [self.state.values["slope", i].expand_as(like) for i in range(self.program.tanks)]
+        return [self.state.values["slope", i].expand_as(like) for i in range(self.program.order)]
 
 
 def _error(step: Tensor, slopes: Sequence[Numbers]) -> Numbers:
-    """Error estimate of a step for each tank."""
+    """Error estimate of a step for each state."""
     return [e.abs() for e in _along([torch.zeros_like(k) for k in slopes[0]], step, ERROR, slopes)]
 
 
 def _along(start: Sequence[Tensor], step: Tensor, weights: Sequence[float], slopes: Sequence[Numbers]) -> Numbers:
-    """begun + step x sum of weights x slopes, for each tank."""
+    """begun + step x sum of weights x slopes, for each state."""
     levels = []
     for i, h in enumerate(start):
         total = weights[0] * slopes[0][i]

@@ -14,11 +14,11 @@ from fdi_torch.simulate.experiment import Experiment
 
 @dataclass(frozen=True)
 class Injection:
-    """After each sample: level <- max(level + gain (reading - prediction), 0).
+    """After each sample: state <- state + gain (reading - prediction), with no level below zero.
 
-    gains (S, tanks, sensors) for all lanes, or (lanes, S, tanks, sensors), m per unit of the reading. start (lanes,
-    tanks): initial levels, m. memory (lanes, M): initial memory of the actuators and then of the sensors; steady state
-    if None.
+    gains (S, order, sensors) for all lanes, or (lanes, S, order, sensors), m per unit of the reading. start: initial
+    state (lanes, order), m, or initial levels (lanes, tanks) with the effects in steady state. memory (lanes, M):
+    initial memory of the actuators and then of the sensors; steady state if None.
     """
 
     gains: Tensor

@@ -19,7 +19,7 @@
 #define SOME(n) ((n) > 0 ? (n) : 1)
 
 enum Mode { LEVELS, READINGS, MOMENTS, LINEARISE, GRAM, OBSERVE };
-enum { MEMORY = COMMAND_MEMORY + READING_MEMORY, STATE = TANKS + MEMORY };
+enum { MEMORY = COMMAND_MEMORY + READING_MEMORY, STATE = ORDER + MEMORY };
 
 // How the calling thread lets Python's other threads run, and whether a signal's handler has raised an exception.
 struct Python {
@@ -30,7 +30,7 @@ struct Python {
 
 struct Job {
     int64_t lanes, lanes_per_problem, steps, samples, signal_samples, mode, threads, gain_stride;
-    int64_t out_bytes, jacobian_bytes;
+    int64_t start_width, out_bytes, jacobian_bytes;          // start_width: TANKS or ORDER
     double tolerance, slope_tolerance, shortest;             // of a lane's own steps: m, a share, s
     const real *theta, *nominal, *lifted, *resolution;
     const real *starts, *spans, *means;                      // (K), (K), (K, CHANNELS)
@@ -38,7 +38,7 @@ struct Job {
     const real *sample_times, *sample_intervals, *sample_shares;
     const real *signal_times, *signal_integral, *signal_slopes;  // (T), (T, CHANNELS), (T + 1, CHANNELS)
     const real *values, *weights, *centres, *memory;         // (problems, S, SENSORS) twice, (problems, SENSORS) twice
-    const real *gains, *start, *start_memory;                // (lanes or 1, S, TANKS, SENSORS), (lanes, TANKS), (lanes, MEMORY)
+    const real *gains, *start, *start_memory;                // (lanes or 1, S, ORDER, SENSORS), (lanes, start_width), (lanes, MEMORY)
     real *out, *jacobian;
     const Python *python;
 };
@@ -74,7 +74,7 @@ using Lane = real[LANES];
 struct Block {
     alignas(64) Lane theta[SOME(COLUMNS)];
     Lane lane[SOME(LANE_CONSTANTS)], steady[SOME(STEADY)];
-    Lane level[TANKS], before[TANKS], sample[TANKS], slope_left[TANKS], slope_right[TANKS];
+    Lane level[ORDER], before[ORDER], sample[ORDER], slope_left[ORDER], slope_right[ORDER];
     Lane action[SOME(ACTUATORS)], command_memory[SOME(COMMAND_MEMORY)], late_channel[SOME(LATE_ACTUATORS)];
     Lane integral[SOME(LATE_ACTUATORS)], late_slope[SOME(LATE_ACTUATORS)];   // of late channels, so far
     Lane command_delay[SOME(LATE_ACTUATORS)], reading_delay[SOME(LATE_SENSORS)];
@@ -83,22 +83,22 @@ struct Block {
     Lane squares[SENSORS][3];
 #if WITHIN
     Lane part[2], pace, gone, failed;                        // each lane's own step: its clock, its length, how far it is
-    Lane base[TANKS], move[TANKS], error[TANKS];
-    Lane factor[ENTRIES], inverse[TANKS];                    // of 1 - g df/dh
+    Lane base[ORDER], move[ORDER], error[ORDER];
+    Lane factor[ENTRIES], inverse[ORDER];                    // of 1 - g df/dh
 #if TANGENT
-    Lane d_error[COLUMNS][TANKS], d_size[COLUMNS];
+    Lane d_error[COLUMNS][ORDER], d_size[COLUMNS];
 #endif
 #endif
 #if !UNROLLED
-    Lane slope[TANKS], by_level[SOME(SLOPES_BY_LEVEL)], stage[STAGES + 1][TANKS];
+    Lane slope[ORDER], by_level[SOME(SLOPES_BY_LEVEL)], stage[STAGES + 1][ORDER];
 #if TANGENT
-    Lane d_slope[COLUMNS][TANKS], d_stage[STAGES + 1][COLUMNS][TANKS];
+    Lane d_slope[COLUMNS][ORDER], d_stage[STAGES + 1][COLUMNS][ORDER];
 #endif
 #endif
 #if TANGENT
     Lane row[SOME(ROWS)][COLUMNS];                           // what theta alone does to each output
-    Lane d_level[COLUMNS][TANKS], d_before[COLUMNS][TANKS], d_sample[COLUMNS][TANKS];
-    Lane d_slope_left[COLUMNS][TANKS], d_slope_right[COLUMNS][TANKS], d_action[COLUMNS][SOME(ACTUATORS)];
+    Lane d_level[COLUMNS][ORDER], d_before[COLUMNS][ORDER], d_sample[COLUMNS][ORDER];
+    Lane d_slope_left[COLUMNS][ORDER], d_slope_right[COLUMNS][ORDER], d_action[COLUMNS][SOME(ACTUATORS)];
     Lane d_command_memory[COLUMNS][SOME(COMMAND_MEMORY)], d_late_channel[COLUMNS][SOME(LATE_ACTUATORS)];
     Lane d_command_delay[COLUMNS][SOME(LATE_ACTUATORS)], d_reading_delay[COLUMNS][SOME(LATE_SENSORS)];
     Lane d_seen[COLUMNS][SENSORS], d_reading[COLUMNS][SENSORS], d_reading_memory[COLUMNS][SOME(READING_MEMORY)];
@@ -201,7 +201,7 @@ static void interpolate(Lane *out, const Lane *left, const Lane *right, const La
                         real span, real share) {
     const real rest = 1 - share, bend_left = share * rest * rest, bend_right = share * share * rest;
     const real blend = share * share * (3 - 2 * share);
-    for (int i = 0; i < TANKS; ++i)
+    for (int i = 0; i < ORDER; ++i)
         EACH_LANE out[i][l] = left[i][l] + blend * (right[i][l] - left[i][l])
                               + span * (bend_left * slope_left[i][l] - bend_right * slope_right[i][l]);
 }
@@ -301,8 +301,8 @@ static void write(const Job &job, Block &b, const Rows &rows, int64_t s) {
 #endif
 }
 
-// An observer at a sample: level += gain (value - reading) where something was read, never below zero. Writes the state
-// after it and the reading that it expected.
+// An observer at a sample: state += gain (value - reading) where something was read, no level below zero. Writes the
+// state after it and the reading that it expected.
 static void correct(const Job &job, Block &b, const Rows &rows, int64_t s) {
     Lane error[SENSORS];
     for (int c = 0; c < SENSORS; ++c) {
@@ -311,24 +311,24 @@ static void correct(const Job &job, Block &b, const Rows &rows, int64_t s) {
     }
     for (int64_t l = 0; l < LANES; ++l) {
         const int64_t lane = rows.first + (l < rows.count ? l : rows.count - 1);
-        const real *gain = job.gains + lane * job.gain_stride + s * TANKS * SENSORS;
-        for (int i = 0; i < TANKS; ++i) {
+        const real *gain = job.gains + lane * job.gain_stride + s * ORDER * SENSORS;
+        for (int i = 0; i < ORDER; ++i) {
             real move = 0;
             for (int c = 0; c < SENSORS; ++c) move += *gain++ * error[c][l];
             const real level = b.level[i][l] + move;
-            b.level[i][l] = level < 0 ? 0 : level;
+            b.level[i][l] = i < TANKS && level < 0 ? 0 : level;
         }
     }
     for (int64_t l = 0; l < rows.count; ++l) {
         real *out = job.out + ((rows.first + l) * job.samples + s) * (STATE + SENSORS);
-        for (int i = 0; i < TANKS; ++i) *out++ = b.level[i][l];
+        for (int i = 0; i < ORDER; ++i) *out++ = b.level[i][l];
         for (int i = 0; i < COMMAND_MEMORY; ++i) *out++ = b.command_memory[i][l];
         for (int i = 0; i < READING_MEMORY; ++i) *out++ = b.reading_memory[i][l];
         for (int c = 0; c < SENSORS; ++c) *out++ = b.reading[c][l];
     }
 }
 
-// What a run begins with, where it is told: levels, and what actuators and sensors remember.
+// What a run begins with, where it is told: levels or the whole state, and what actuators and sensors remember.
 static void begin_with(Lane *into, const real *from, int width, int first, int count, const Rows &rows) {
     if (!from) return;
     for (int64_t l = 0; l < LANES; ++l) {
@@ -432,7 +432,7 @@ static void take_rates(Block &b, const real *clock, const real *channel, int s) 
 // The levels of stage s of RK4 by the 3/8 rule, or for s = 4 those after the step; in the order of runge_kutta.py.
 static inline void move_on(Lane *level, const Lane *before, Lane *k, int stride, real step, int s) {
     const real third = real(1.0 / 3.0);
-    for (int i = 0; i < TANKS; ++i) EACH_LANE {
+    for (int i = 0; i < ORDER; ++i) EACH_LANE {
         const real k1 = k[i][l], k2 = k[stride + i][l], k3 = k[2 * stride + i][l], k4 = k[3 * stride + i][l];
         const real change = s == 1 ? k1 * step * third
                             : s == 2 ? (k2 - k1 * third) * step
@@ -447,10 +447,10 @@ static void step(Block &b, const real *clock, const real *channel) {
     remember_levels(b);
     for (int s = 0; s < 4; ++s) {
         take_rates(b, clock, channel, s);
-        move_on(b.level, b.before, b.stage[0], TANKS, clock[1], s + 1);
+        move_on(b.level, b.before, b.stage[0], ORDER, clock[1], s + 1);
 #if TANGENT
         for (int p = 0; p < COLUMNS; ++p)
-            move_on(b.d_level[p], b.d_before[p], b.d_stage[0][p], TANKS * COLUMNS, clock[1], s + 1);
+            move_on(b.d_level[p], b.d_before[p], b.d_stage[0][p], ORDER * COLUMNS, clock[1], s + 1);
 #endif
     }
 }
@@ -491,7 +491,7 @@ static void eliminate(Block &b) {
             const Vec slope = GIVEN[e] < 0 ? Vec{} : Vec(AT(b.by_level[GIVEN[e]]));
             AT(b.factor[e]) = real(ENTRY_ROW[e] == ENTRY_COLUMN[e]) - g * slope;
         }
-        for (int n = 0, r = 0, u = 0; n < TANKS; ++n) {
+        for (int n = 0, r = 0, u = 0; n < ORDER; ++n) {
             const Vec inverse = real(1) / AT(b.factor[PIVOT[n]]);
             AT(b.inverse[PIVOT[n]]) = inverse;
             for (; r < ELIMINATIONS && MULTIPLIED[r] == PIVOT[n]; ++r) {
@@ -507,7 +507,7 @@ static void solve(Block &b, Lane *x) {
     EACH_VECTOR {
         for (int r = 0; r < ELIMINATIONS; ++r)
             AT(x[ENTRY_ROW[MULTIPLIER[r]]]) -= AT(b.factor[MULTIPLIER[r]]) * AT(x[MULTIPLIED[r]]);
-        for (int n = TANKS - 1; n >= 0; --n) {
+        for (int n = ORDER - 1; n >= 0; --n) {
             Vec sum = AT(x[PIVOT[n]]);
             for (int u = n ? BEYOND_UNTIL[n - 1] : 0; u < BEYOND_UNTIL[n]; ++u)
                 sum -= AT(b.factor[BEYOND[u]]) * AT(x[ENTRY_COLUMN[BEYOND[u]]]);
@@ -539,14 +539,14 @@ static void solve_stage(const Job &job, Block &b, const real *clock, const real 
     for (int round = 0, open = 1; round < NEWTON_ROUNDS && open; ++round) {
         rates(b, clock, channel);
         eliminate(b);
-        for (int i = 0; i < TANKS; ++i) EACH_VECTOR {
+        for (int i = 0; i < ORDER; ++i) EACH_VECTOR {
             const Vec g = real(DIAGONAL) * AT(b.part[1]);
             AT(b.move[i]) = AT(b.base[i]) + g * AT(b.slope[i]) - AT(b.level[i]);
         }
         solve(b, b.move);
         Lane size, rounding;
         EACH_LANE size[l] = rounding[l] = 0;
-        for (int i = 0; i < TANKS; ++i) EACH_LANE {
+        for (int i = 0; i < ORDER; ++i) EACH_LANE {
             const real move = std::fabs(b.move[i][l]);
             size[l] = move > size[l] ? move : size[l];
             b.level[i][l] += active[l] != 0 ? b.move[i][l] : 0;
@@ -569,35 +569,35 @@ static void step(const Job &job, Block &b, const real *clock, const real *channe
     EACH_LANE b.failed[l] = 0;
     take_rates(b, clock, channel, 0);
     for (int s = 1; s <= STAGES; ++s) {
-        for (int i = 0; i < TANKS; ++i) EACH_VECTOR {
+        for (int i = 0; i < ORDER; ++i) EACH_VECTOR {
             const Vec own = AT(b.part[1]);
-            AT(b.base[i]) = AT(b.before[i]) + own * weighted(STAGE[s - 1], &b.stage[0][i], TANKS, s, l);
+            AT(b.base[i]) = AT(b.before[i]) + own * weighted(STAGE[s - 1], &b.stage[0][i], ORDER, s, l);
             AT(b.level[i]) = AT(b.base[i]) + real(DIAGONAL) * own * AT(b.stage[s - 1][i]);
         }
         solve_stage(job, b, clock, channel);
-        for (int i = 0; i < TANKS; ++i) EACH_VECTOR
+        for (int i = 0; i < ORDER; ++i) EACH_VECTOR
             AT(b.stage[s][i]) = (AT(b.level[i]) - AT(b.base[i])) / (real(DIAGONAL) * AT(b.part[1]));
 #if TANGENT
         rates(b, clock, channel);
         eliminate(b);
         for (int p = 0; p < COLUMNS; ++p) {
-            for (int i = 0; i < TANKS; ++i) EACH_VECTOR {
+            for (int i = 0; i < ORDER; ++i) EACH_VECTOR {
                 const Vec own = AT(b.part[1]);
                 const Vec rest = AT(b.d_before[p][i])
-                                 + own * weighted(STAGE[s - 1], &b.d_stage[0][p][i], TANKS * COLUMNS, s, l);
+                                 + own * weighted(STAGE[s - 1], &b.d_stage[0][p][i], ORDER * COLUMNS, s, l);
                 AT(b.base[i]) = rest;
                 AT(b.d_level[p][i]) = rest + real(DIAGONAL) * own * AT(b.d_slope[p][i]);
             }
             solve(b, b.d_level[p]);
-            for (int i = 0; i < TANKS; ++i) EACH_VECTOR
+            for (int i = 0; i < ORDER; ++i) EACH_VECTOR
                 AT(b.d_stage[s][p][i]) = (AT(b.d_level[p][i]) - AT(b.base[i])) / (real(DIAGONAL) * AT(b.part[1]));
         }
 #endif
     }
-    for (int i = 0; i < TANKS; ++i) {
-        error_of(b, b.error[i], &b.stage[0][i], TANKS);
+    for (int i = 0; i < ORDER; ++i) {
+        error_of(b, b.error[i], &b.stage[0][i], ORDER);
 #if TANGENT
-        for (int p = 0; p < COLUMNS; ++p) error_of(b, b.d_error[p][i], &b.d_stage[0][p][i], TANKS * COLUMNS);
+        for (int p = 0; p < COLUMNS; ++p) error_of(b, b.d_error[p][i], &b.d_stage[0][p][i], ORDER * COLUMNS);
 #endif
     }
 }
@@ -608,7 +608,7 @@ static void keep_or_undo(const Job &job, Block &b, real span) {
     Lane kept, error;
     EACH_LANE {
         real largest = 0;
-        for (int i = 0; i < TANKS; ++i) largest = b.error[i][l] > largest ? b.error[i][l] : largest;
+        for (int i = 0; i < ORDER; ++i) largest = b.error[i][l] > largest ? b.error[i][l] : largest;
         error[l] = b.failed[l] != 0 ? INFINITY : largest / tolerance;
     }
 #if TANGENT
@@ -616,7 +616,7 @@ static void keep_or_undo(const Job &job, Block &b, real span) {
     for (int p = 0; p < COLUMNS; ++p) EACH_LANE {
         real wrong = 0;
         size[p][l] = b.d_size[p][l];
-        for (int i = 0; i < TANKS; ++i) {
+        for (int i = 0; i < ORDER; ++i) {
             wrong = b.d_error[p][i][l] > wrong ? b.d_error[p][i][l] : wrong;
             size[p][l] = std::fabs(b.d_level[p][i][l]) > size[p][l] ? std::fabs(b.d_level[p][i][l]) : size[p][l];
         }
@@ -634,11 +634,11 @@ static void keep_or_undo(const Job &job, Block &b, real span) {
         b.pace[l] = !is_open ? pace : next < shortest ? shortest : next;
         b.gone[l] = kept[l] == 0 ? b.gone[l] : span - b.gone[l] <= own ? span : b.gone[l] + own;
     }
-    for (int i = 0; i < TANKS; ++i) EACH_LANE b.level[i][l] = kept[l] != 0 ? b.level[i][l] : b.before[i][l];
+    for (int i = 0; i < ORDER; ++i) EACH_LANE b.level[i][l] = kept[l] != 0 ? b.level[i][l] : b.before[i][l];
 #if TANGENT
     for (int p = 0; p < COLUMNS; ++p) {
         EACH_LANE b.d_size[p][l] = kept[l] != 0 ? size[p][l] : b.d_size[p][l];
-        for (int i = 0; i < TANKS; ++i)
+        for (int i = 0; i < ORDER; ++i)
             EACH_LANE b.d_level[p][i][l] = kept[l] != 0 ? b.d_level[p][i][l] : b.d_before[p][i][l];
     }
 #endif
@@ -659,7 +659,7 @@ static void step_within(const Job &job, Block &b, const real *clock, const real 
 static void run_block(const Job &job, Block &b, const Rows &rows) {
     load(job, b, rows);
     prepare(b, nullptr, nullptr);
-    begin_with(b.level, job.start, TANKS, 0, TANKS, rows);
+    begin_with(b.level, job.start, job.start_width, 0, job.start_width, rows);
     for (int64_t k = 0; k < job.steps; ++k) {
         if (is_interrupted(b)) return;
         const real clock[2] = {job.starts[k], job.spans[k]};
@@ -670,6 +670,7 @@ static void run_block(const Job &job, Block &b, const Rows &rows) {
         if (k == 0) {
             settle_commands(b, clock, channel);
             begin_with(b.command_memory, job.start_memory, MEMORY, 0, COMMAND_MEMORY, rows);
+            begin_with(b.level, job.start, job.start_width, 0, job.start_width, rows);
         }
         for (; s < stop && job.sample_shares[s] <= 0; ++s) {
             copy_levels(b, false);

@@ -21,11 +21,13 @@ Inputs = Recording | Tensor | Callable[[Tensor], Tensor]
 
 
 class PlantOde(nn.Module):
-    """dh/dt = f(t, h) in m/s: levels h (*batch, tanks) in m at the time t () in s, as `torchdiffeq.odeint` calls it.
+    """dx/dt = f(t, x) in m/s: the state x (*batch, order) in m at the time t () in s, as `torchdiffeq.odeint` calls it.
+
+    The state holds the tanks' levels and then the states of effects, such as the flow of a pipe with inertia.
 
     network: the plant. space, theta (*batch, P): constants and effects that differ from their nominal values. inputs:
     SI, one per input channel of the plant, in its order. resolution: time scale of the smoothing of square roots and
-    rims, s. Gradients flow to theta and h through every call; a new theta needs a new PlantOde.
+    rims, s. Gradients flow to theta and x through every call; a new theta needs a new PlantOde.
 
     Raises ValueError for an actuator with memory or dead time, whose output is not a function of t alone.
     """
@@ -56,19 +58,24 @@ class PlantOde(nn.Module):
 
     @property
     def start(self) -> Tensor:
-        """The plant's start levels (*batch, tanks), m."""
-        return torch.stack(torch.broadcast_tensors(*self.network.start_levels(self._values)), dim=-1)
+        """The state at t = 0 (*batch, order), m: the plant's start levels, and the effects in steady state."""
+        levels = self.network.start_levels(self._values)
+        state = self.network.with_steady_states(levels, *self._driven(levels[0].new_zeros(())), self._values)
+        return torch.stack(torch.broadcast_tensors(*state), dim=-1)
 
-    def forward(self, t: Tensor, levels: Tensor) -> Tensor:
-        instant = torch.as_tensor(t).to(levels)
-        clock = Clock(instant - 0.5 * INSTANT, torch.full_like(instant, INSTANT), self._resolution.to(levels))
+    def forward(self, t: Tensor, state: Tensor) -> Tensor:
+        commands, clock = self._driven(torch.as_tensor(t).to(state))
+        expanded = [c.expand(state.shape[:-1]) if c.dim() <= state.dim() - 1 else c for c in commands]
+        stacked = torch.stack(expanded, dim=-1) if expanded else state.new_zeros(*state.shape[:-1], 0)
+        rates: Tensor = self.network(state, stacked, clock, self._values)
+        return rates
+
+    def _driven(self, instant: Tensor) -> tuple[list[Tensor], Clock]:
+        """Outputs of the actuators at an instant, s, and the clock there."""
+        clock = Clock(instant - 0.5 * INSTANT, torch.full_like(instant, INSTANT), self._resolution.to(instant))
         channels = self._inputs(instant).unbind(-1)
         actuator_inputs = [channels[channel] for _, channel in self.network.actuators()]
-        commands, _ = self.network.commands(actuator_inputs, (), clock, self._values)
-        expanded = [c.expand(levels.shape[:-1]) if c.dim() <= levels.dim() - 1 else c for c in commands]
-        stacked = torch.stack(expanded, dim=-1) if expanded else levels.new_zeros(*levels.shape[:-1], 0)
-        rates: Tensor = self.network(levels, stacked, clock, self._values)
-        return rates
+        return self.network.commands(actuator_inputs, (), clock, self._values)[0], clock
 
 
 def _function_of_time(inputs: Inputs, network: TankNetwork, like: Tensor) -> Callable[[Tensor], Tensor]:

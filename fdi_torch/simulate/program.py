@@ -27,14 +27,16 @@ from fdi_torch.simulate.tracer import Tracer
 class Program:
     """The sections of a simulation, each a tuple of outputs.
 
-    prepare: level (at t = 0), command_delay, reading_delay. settle_commands, settle_readings: the initial memories in
-    steady state. act: action, next_command_memory. stages: stage k's levels and then its rates ('slope'), four of each
-    in turn. advance: level. end: slope at the end of the step. read: reading, next_reading_memory.
+    prepare: level (of the tanks at t = 0), command_delay, reading_delay. settle_commands, settle_readings: the initial
+    memories in steady state; settle_commands also holds the level of the other states. A 'level' is any entry of the
+    state vector, of which there are `order`, the `tanks` first. act: action, next_command_memory. stages: stage k's
+    levels and then its rates ('slope'), four of each in turn. advance: level. end: slope at the end of the step. read:
+    reading, next_reading_memory.
 
     adaptive: each lane divides the steps of the grid, see `implicit.py`. unrolled: there are stages, advance and end,
     which share common subexpressions. If not, there is `law`, evaluated at every stage: the rates ('slope') with their
-    direct changes by theta and the actions, and their slopes by the levels ('by_level'), one output per (tank, tank) of
-    `pattern`. late_actuators, late_sensors: indices of those with dead time, in the order of the delays.
+    direct changes by theta and the actions, and their slopes by the levels ('by_level'), one output per (row, column)
+    of `pattern`. late_actuators, late_sensors: indices of those with dead time, in the order of the delays.
     """
 
     graph: Graph
@@ -42,6 +44,7 @@ class Program:
     adaptive: bool
     unrolled: bool
     columns: int
+    order: int
     tanks: int
     actuators: int
     sensors: int
@@ -70,7 +73,7 @@ class Program:
     @cached_property
     def elimination(self) -> Elimination:
         """The elimination for the levels of an implicit step."""
-        return eliminate(self.tanks, self.pattern)
+        return eliminate(self.order, self.pattern)
 
 
 @lru_cache(maxsize=64)
@@ -121,6 +124,7 @@ class _Builder:
             adaptive=self.adaptive,
             unrolled=self.unrolled,
             columns=len(self.theta),
+            order=network.order,
             tanks=len(network.description.tanks),
             actuators=len(network.actuators()),
             sensors=len(network.description.sensors),
@@ -156,7 +160,7 @@ class _Builder:
         return tuple(outputs), tuple(commands), tuple(readings)
 
     def _commands(self, late: Sequence[int]) -> tuple[Section, Section]:
-        """Sections of the initial actuator memories, and of the actuators' outputs and new memories."""
+        """Sections of the initial memories and states, and of the actuators' outputs and new memories."""
         graph, network, tensor = self.graph, self.network, self.tracer.tensor
         late_inputs = self._inputs("late_channel", len(late))
         channels = [
@@ -164,8 +168,11 @@ class _Builder:
             for i, (_, channel) in enumerate(network.actuators())
         ]
         memory = self._inputs("command_memory", network.command_memory())
+        levels = self._inputs("level", len(network.description.tanks))
         with self.tracer:
             steady = network.steady_command_memory([tensor(c) for c in channels], self.clock, self.values)
+            first_actions, _ = network.commands([tensor(c) for c in channels], steady, self.clock, self.values)
+            state = network.with_steady_states([tensor(h) for h in levels], first_actions, self.clock, self.values)
             actions, new_memory = network.commands(
                 [tensor(c) for c in channels], tuple(tensor(m) for m in memory), self.clock, self.values
             )
@@ -173,9 +180,11 @@ class _Builder:
         first, following = [node(s) for s in steady], [node(k) for k in new_memory]
         moving = {n: ("late_channel", j) for j, n in enumerate(late_inputs)}
         settle = self._outputs("command_memory", first, moving)
+        beside = moving | {n: ("level", i) for i, n in enumerate(levels)}
+        rest = self._outputs("level", [node(x) for x in state], beside)[len(levels) :]
         changing = self._changing_inputs(memory, first, following, moving, "command_memory")
         act = self._outputs("action", [node(a) for a in actions], changing)
-        return tuple(settle), (*act, *self._outputs("next_command_memory", following, changing))
+        return (*settle, *rest), (*act, *self._outputs("next_command_memory", following, changing))
 
     def _rates(self, act: Section) -> tuple[tuple[Section, ...], Section, Section]:
         """The stages of a step, the levels after it, and the slopes there."""
@@ -185,7 +194,7 @@ class _Builder:
             graph.input("action", a, Varies.BOTH if graph.nodes[n].varies & Varies.LANE else Varies.STEP)
             for a, n in enumerate(actions)
         ]
-        levels = self._inputs("level", len(self.network.description.tanks))
+        levels = self._inputs("level", self.network.order)
         moving: dict[int, Place] = {n: ("level", i) for i, n in enumerate(levels)}
         moving |= {held[o.place[1]]: o.place for o in act if o.place[0] == "action" and o.row}
         law = self._outputs("slope_right", self._network_rates(levels, held, self.clock), moving)
@@ -195,7 +204,7 @@ class _Builder:
 
     def _law(self, act: Section) -> tuple[Section, tuple[tuple[int, int], ...]]:
         """The rates, their slopes by the levels, and the pattern of these slopes."""
-        levels = self._inputs("level", len(self.network.description.tanks))
+        levels = self._inputs("level", self.network.order)
         held = self._inputs("action", len(self.network.actuators()))
         rates = self._network_rates(levels, held, self._step_clock() if self.adaptive else self.clock)
         moving = {held[o.place[1]]: o.place for o in act if o.place[0] == "action" and o.row}

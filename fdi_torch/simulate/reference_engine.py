@@ -62,7 +62,8 @@ class ReferenceEngine:
     def levels(self, theta: Tensor) -> Tensor:
         """theta (*batch, P) -> tank levels at the samples (*batch, S, tanks), m."""
         lanes = theta.reshape(theta.shape[:-1].numel(), theta.shape[-1])
-        levels = self._sample(*self._integrate(self.network.bind(self.space, lanes), len(lanes)))
+        states = self._sample(*self._integrate(self.network.bind(self.space, lanes), len(lanes)))
+        levels = states[..., : len(self.network.description.tanks)]
         return levels.movedim(1, 0).reshape(*theta.shape[:-1], *levels.shape[::2])
 
     def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
@@ -114,15 +115,15 @@ class ReferenceEngine:
         return Clock(start, step, self.experiment.resolution)
 
     def _integrate(self, values: PlaceValues, lanes: int) -> tuple[Tensor, Tensor, PlaceValues]:
-        """Levels at the nodes (K+1, L, tanks), actuator outputs over the steps (K, L, actuators), and the bound
+        """States at the nodes (K+1, L, order), actuator outputs over the steps (K, L, actuators), and the bound
         values.
         """
         e = self.experiment
         with self.arithmetic:
             commands = self._commands(values, lanes)
-            start, slopes = value_and_slope(
-                torch.stack([h.expand(lanes) for h in self.network.start_levels(values)], dim=-1)
-            )
+            levels, first = self.network.start_levels(values), self._clock(e.nodes[0], e.steps[0])
+            state = self.network.with_steady_states(levels, commands[0].unbind(-1), first, values)
+            start, slopes = value_and_slope(torch.stack([x.expand(lanes) for x in state], dim=-1))
         instants = e.nodes.detach()
         edges, held = instants.tolist(), commands.unbind()
         clocks = [self._clock(begin, step) for begin, step in zip(e.nodes[:-1].unbind(), e.steps.unbind(), strict=True)]
@@ -145,8 +146,7 @@ class ReferenceEngine:
         states = torchdiffeq.odeint(
             rates, initial, instants, method=self.method, rtol=self.rtol, atol=self.atol, options=options
         )
-        levels = states if slopes is None else with_slope(*states.unbind(1))
-        return levels, commands, values
+        return states if slopes is None else with_slope(*states.unbind(1)), commands, values
 
     def _commands(self, values: PlaceValues, lanes: int) -> Tensor:
         """Output of each pump and valve over each step, (K, L, actuators)."""
@@ -180,7 +180,7 @@ class ReferenceEngine:
         return torch.stack(rows)
 
     def _sample(self, levels: Tensor, commands: Tensor, values: PlaceValues) -> Tensor:
-        """Levels at the samples (S, L, tanks): those at the nodes, or a cubic Hermite interpolation within a step."""
+        """States at the samples (S, L, order): those at the nodes, or a cubic Hermite interpolation within a step."""
         e = self.experiment
         left, right = levels[e.sample_step], levels[e.sample_step + 1]
         inside = (e.sample_share > 0.0) & (e.sample_share < 1.0)
@@ -196,7 +196,7 @@ class ReferenceEngine:
         return torch.where(inside.reshape(-1, 1, 1), cubic, exact)
 
     def _read(self, levels: Tensor, values: PlaceValues) -> Tensor:
-        """Tank levels at the samples (S, L, tanks) -> readings (S, L, sensors)."""
+        """States at the samples (S, L, order) -> readings (S, L, sensors)."""
         measured = [levels[..., tank] for tank in self.network.sensor_tanks()]
         for i, delay in self.network.reading_delays(values).items():
             measured[i] = late(measured[i], self.experiment.sample_times, delay)

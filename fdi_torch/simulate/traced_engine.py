@@ -75,6 +75,7 @@ class TracedEngine:
         )
         rows = [run.levels() if levels else run.read(s) for s in run.samples()]
         lanes = len(run.lanes)
+        rows = [row[: program.tanks] for row in rows] if levels else rows
         values = torch.stack([torch.stack([v.expand(lanes) for v, _ in row], dim=-1) for row in rows], dim=1)
         values = values.reshape(*theta.shape[:-1], *values.shape[1:])
         if not tangent:
@@ -109,13 +110,13 @@ class _Run:
         firsts = torch.searchsorted(e.sample_step, torch.arange(len(e.nodes))).tolist()
         shares = e.sample_share.tolist()
         self.compute(p.prepare)
-        if self.injection is not None:
-            self._set_state("level", self.injection.start)
+        self._restore_levels()
         for k in range(len(e.nodes) - 1):
             self._begin_step(k)
             if k == 0:
                 self.compute(p.settle_commands)
                 self._restore_memory("command_memory", 0, p.command_memory)
+                self._restore_levels()
             due = list(range(firsts[k], firsts[k + 1]))
             for s in [s for s in due if shares[s] <= 0.0]:
                 state.put("sample", self._levels())
@@ -130,7 +131,7 @@ class _Run:
                 yield s
 
     def levels(self) -> list[tuple[Tensor, Change]]:
-        return self.state.group("sample", self.program.tanks)
+        return self.state.group("sample", self.program.order)
 
     def read(self, s: int) -> list[tuple[Tensor, Change]]:
         p, times = self.program, self.experiment.sample_times
@@ -146,7 +147,7 @@ class _Run:
         return self.state.group("reading", p.sensors)
 
     def correct(self, s: int, values: Tensor, weight: Tensor) -> Tensor:
-        """The observer's correction at sample s: levels, memories and the predicted reading, (L, n + M + C)."""
+        """The observer's correction at sample s: state, memories and the predicted reading, (L, n + M + C)."""
         assert self.injection is not None
         lanes = len(self.lanes)
         expected = torch.stack([value.expand(lanes) for value, _ in self.read(s)], dim=-1)
@@ -154,14 +155,18 @@ class _Run:
         gain = self.injection.gains[..., s, :, :]
         correction = sum(gain[..., c] * error[..., c : c + 1] for c in range(error.shape[-1]))
         levels = torch.stack([level.expand(lanes) for level, _ in self._levels()], dim=-1) + correction
-        self._set_state("level", torch.clamp(levels, min=0.0))
         p, state = self.program, self.state
-        kinds = (("level", p.tanks), ("command_memory", p.command_memory), ("reading_memory", p.reading_memory))
+        self._set_state("level", torch.cat([torch.clamp(levels[:, : p.tanks], min=0.0), levels[:, p.tanks :]], dim=-1))
+        kinds = (("level", p.order), ("command_memory", p.command_memory), ("reading_memory", p.reading_memory))
         state_values = [value.expand(lanes) for kind, count in kinds for value, _ in state.group(kind, count)]
         return torch.cat([torch.stack(state_values, dim=-1), expected], dim=-1)
 
     def _set_state(self, kind: str, values: Tensor) -> None:
         self.state.put(kind, [(value, None) for value in values.unbind(-1)])
+
+    def _restore_levels(self) -> None:
+        if self.injection is not None:
+            self._set_state("level", self.injection.start)
 
     def _restore_memory(self, kind: str, first: int, count: int) -> None:
         if self.injection is not None and self.injection.memory is not None:
@@ -209,7 +214,7 @@ class _Run:
         return level, None if both else torch.where(yes, self.full(x[1]), self.full(y[1]))
 
     def _levels(self) -> list[tuple[Tensor, Change]]:
-        return self.state.group("level", self.program.tanks)
+        return self.state.group("level", self.program.order)
 
     def _set_clock(self, start: Tensor, step: Tensor) -> None:
         self.state.values["clock", 0], self.state.values["clock", 1] = start.to(self.lanes), step.to(self.lanes)
@@ -239,8 +244,8 @@ class _Run:
         after = self._levels()
         if share >= 1.0:
             return after
-        step, tanks = self.experiment.steps[k], self.program.tanks
-        left, right = self.state.group("slope1", tanks), self.state.group("slope_right", tanks)
+        step, order = self.experiment.steps[k], self.program.order
+        left, right = self.state.group("slope1", order), self.state.group("slope_right", order)
         rows = list(zip(before, after, left, right, strict=True))
         levels = [hermite(h0[0], h1[0], k0[0], k1[0], step, share) for h0, h1, k0, k1 in rows]
         if not self.program.tangent:

@@ -93,7 +93,7 @@ class RecordingLinearisation:
         return 0.5 * (nodes[1:] + nodes[:-1])
 
     def to_readings(self, rates: Tensor) -> Tensor:
-        """Map changes of the level rates (tanks, M, K) to changes of the readings (S, C, M)."""
+        """Map changes of the rates (n, M, K) to changes of the readings (S, C, M)."""
         gain, transition = self.linearised.gain.permute(0, 2, 3, 1), self.linearised.transition.permute(0, 2, 3, 1)
         initial = rates.new_zeros(1, *rates.shape[:2])
         paths = scan_in_time(transition, rates.unsqueeze(0), initial, gain)
@@ -102,9 +102,9 @@ class RecordingLinearisation:
         )
 
     def to_rates(self, weights: Tensor) -> Tensor:
-        """The transpose of `to_readings`: weights (S, C, M) of the readings -> weights of the rates (tanks, M, K)."""
-        tanks, columns = self.linearised.gain.shape[-1], weights.shape[-1]
-        paths = weights.new_zeros(1, tanks, columns, self.linearised.levels.shape[1], requires_grad=True)
+        """The transpose of `to_readings`: weights (S, C, M) of the readings -> weights of the rates (n, M, K)."""
+        order, columns = self.linearised.gain.shape[-1], weights.shape[-1]
+        paths = weights.new_zeros(1, order, columns, self.linearised.levels.shape[1], requires_grad=True)
         readings = self.engine.look(self.linearised.levels, self.theta).along(paths, [-1] * columns)
         (by_path,) = torch.autograd.grad(readings, paths, weights.permute(1, 2, 0).unsqueeze(0))
         back, gain = self.linearised.transition.permute(0, 3, 2, 1).flip(-1), self.linearised.gain.permute(0, 3, 2, 1)
@@ -163,7 +163,7 @@ class DiscrepancyRegression:
         return columns
 
     def _influence_of_areas(self, place: str, recording: int, areas: Tensor) -> Tensor:
-        rates = areas.new_zeros(len(self.fitter.data.plant.tanks), *areas.shape)
+        rates = areas.new_zeros(self.engine.network.order, *areas.shape)
         rates[self.tank(place)] = areas
         return self.pieces[recording].to_readings(rates)
 
@@ -179,7 +179,7 @@ class DiscrepancyRegression:
             values = engine.network.bind(engine.space, theta.unsqueeze(-2))
             present = [p.prefix for p in engine.network.placements]
             path = linearised_part.levels[0].T.contiguous()
-            forcing = Forcing(engine.network, present, values, path, engine.experiment)
+            forcing = Forcing(engine.network, engine.network, present, values, path, engine.experiment)
             pieces.append(RecordingLinearisation(engine, theta, linearised_part, forcing, rows))
         return pieces
 
@@ -218,7 +218,7 @@ class DiscrepancyRegression:
         return regressors, self.engine.linearise(self.theta, levels)
 
     def _rate_changes(self, piece: RecordingLinearisation, component: DiscrepancyModel, flows: Tensor) -> Tensor:
-        """Map flows (M, K) from source to target to changes of the level rates (tanks, M, K)."""
+        """Map flows (M, K) from source to target to changes of the rates (n, M, K)."""
         inflows: list[Tensor | None] = [None] * len(self.fitter.data.plant.tanks)
         for end, sign in ((component.source, -1.0), (component.target, 1.0)):
             if end != OUTSIDE:

@@ -97,8 +97,12 @@ class SimulatedRig:
         moved = self._stepper.advance(state, lambda share: inputs, time, self.sampling, values)  # type: ignore[arg-type]
         if not self.wander:
             return moved
-        shift = torch.randn(moved.levels.shape, generator=generator, dtype=moved.levels.dtype)
-        return PlantState((moved.levels + self.wander * shift).clamp(min=0.0), moved.commands, moved.readings)
+        levels, effects = moved.levels.split(
+            [self.levels.shape[-1], moved.levels.shape[-1] - self.levels.shape[-1]], -1
+        )
+        shift = torch.randn(levels.shape, generator=generator, dtype=levels.dtype)
+        wandered = torch.cat([(levels + self.wander * shift).clamp(min=0.0), effects], dim=-1)
+        return PlantState(wandered, moved.commands, moved.readings)
 
     def _has_memory(self, onset: str) -> bool:
         prefix = ParameterName.parse(onset).prefix
