@@ -45,7 +45,7 @@ class Recording(Shown):
     notes: tuple[str, ...] = ()
     began: float | None = None
     trusted: bool = False
-    written: Mapping[str, str] = field(default_factory=dict)
+    written: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if self.mask is None:

@@ -123,7 +123,7 @@ def test_a_gain_that_lets_errors_stand_is_refused() -> None:
 
 
 def test_a_gain_of_the_wrong_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected a gain of 3 tanks x 3 sensors, got 2 x 3"):
+    with pytest.raises(ValueError, match="expected a gain of 3 states x 3 sensors, got 2 x 3"):
         Observer(NETWORK, hand_gain(torch.zeros(2, 3, dtype=torch.float64)))
 
 

@@ -145,7 +145,7 @@ def without_startup_effects(plant: PlantDescription, channels: Collection[str]) 
     running = {name for name, channel in given if channel is not None and channel[0] in channels}
     ended = {e.prefix for e in plant.effects if e.location in running and effect(e.effect).startup_only}
     effects = tuple(e for e in plant.effects if e.prefix not in ended)
-    return with_tolerances(replace(plant, effects=effects), lambda name: name.prefix not in ended)
+    return replace(with_tolerances(plant, lambda name: name.prefix not in ended), effects=effects)
 
 
 def placements_for(names: Iterable[str]) -> tuple[Placement, ...]:
