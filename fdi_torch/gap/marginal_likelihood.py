@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -99,20 +99,6 @@ def predicted_levels(fitter: Fitter, fit: Fit) -> Tensor:
         first += len(nodes)
     tanks = len(data.plant.tanks)
     return torch.cat([levels[..., :tanks].clamp(min=0.0), levels[..., tanks:]], dim=-1)
-
-
-def about_predicted_levels(fitter: Fitter, fit: Fit) -> tuple[Fitter, Fit]:
-    """A fit linearised about the levels that are predicted from earlier readings, and the fitter along these.
-
-    Where a cause is missing, its own trajectory is far from the true levels, and effects act elsewhere on it.
-    """
-    if fitter.whitening is None:
-        return fitter, fit
-    engine = fitter.engine(fit.candidate, list(fit.effect_values))
-    linearised = engine.linearise(fit.theta.unsqueeze(0), predicted_levels(fitter, fit))
-    along = with_disturbances(fitter, fit, fitter.whitening.noise, linearised)
-    finite = bool(linearised.readings.isfinite().all() and linearised.jacobian.isfinite().all())
-    return (along, replace(fit, linearised=linearised)) if finite else (fitter, fit)
 
 
 def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagation:

@@ -110,11 +110,18 @@ def options_of(placements: Sequence[Placement], fitter: Fitter, reach: Operating
 
 def screen(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> ScreeningResult:
     """Screen all options about a fit."""
-    regression, parts = _ProjectedRegression.of(fitter, fit), []
+    return screen_under_each([fitter], fit, options)[0]
+
+
+def screen_under_each(fitters: Sequence[Fitter], fit: Fit, options: Sequence[Option]) -> list[ScreeningResult]:
+    """Screen all options about a fit under the noise of each fitter."""
+    regressions = [_ProjectedRegression.of(fitter, fit) for fitter in fitters]
+    sums = torch.zeros(len(fitters), 2, len(options), dtype=fit.theta.dtype)
     for k in range(0, len(options), BATCH):
-        parts.append(torch.stack(regression.screened(effect_columns(fitter, fit, options[k : k + BATCH]))))
-    score, strength = torch.cat([fit.theta.new_zeros(2, 0), *parts], dim=1)
-    return ScreeningResult(tuple(options), score, strength)
+        columns = effect_columns(fitters[0], fit, options[k : k + BATCH])
+        for regression, of_all in zip(regressions, sums, strict=True):
+            of_all[:, k : k + BATCH] = torch.stack(regression.screened(columns))
+    return [ScreeningResult(tuple(options), score, strength) for score, strength in sums]
 
 
 def pairs_of(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> Pairs:

@@ -23,9 +23,9 @@ from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import BEHIND, SHARE, Candidate, Fit, Fitter, Key
 from fdi_torch.gap.extensions import ExpectedGain, best_pairs, extended, log_prior_width
-from fdi_torch.gap.marginal_likelihood import about_predicted_levels, log_evidence, log_prior, with_estimated_noise
+from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
 from fdi_torch.gap.onsets import fine_onsets
-from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen
+from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
 
 # DEEPEST, BEAM, FITTED, STARTS, EVALUATED, TURNS and PAIRS are budgets of computing. An extension that FITTED,
 # EVALUATED and TURNS leave out keeps its share of the posterior, `SearchResult.unexamined`.
@@ -80,8 +80,7 @@ class SearchResult:
 def search(pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST) -> SearchResult:
     """Search from the recalibrated plant. most: effects in one explanation."""
     base = pool.evaluate(pool.null)
-    alarm = screen(*about_predicted_levels(base.fitter, base.fit), options)
-    of_sensors = screen(pool.fitter, base.fit, options)
+    alarm, of_sensors = screen_under_each([base.fitter, pool.fitter], base.fit, options)
     pool.extend(base, alarm, of_sensors)
     frontier = pool.best_of(1)[:BEAM]
     for depth in range(2, most + 1):
@@ -98,9 +97,10 @@ def search(pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST
     explanations = sorted(pool.explanations.values(), key=lambda e: -e.log_evidence)
     if pool.explanations[base.key] is not base:
         base = pool.explanations[base.key]
-        alarm = screen(*about_predicted_levels(base.fitter, base.fit), options)
-    likeliest = about_predicted_levels(explanations[0].fitter, base.fit)
-    shown = pairs_of(*likeliest, screen(*likeliest, options))
+        alarm = screen(base.fitter, base.fit, options)
+    likeliest = explanations[0].fitter
+    screening = alarm if likeliest is base.fitter else screen(likeliest, base.fit, options)
+    shown = pairs_of(likeliest, base.fit, screening)
     return SearchResult(base, tuple(explanations), alarm, shown, pool.unexamined())
 
 
@@ -167,7 +167,7 @@ class ExplanationPool:
     def extend_by(self, parent: RankedExplanation, options: Sequence[Option]) -> None:
         """Extend an explanation by one effect, screened under its own noise."""
         further = [o for o in options if o.cause not in parent.key]
-        self.extend(parent, screen(*about_predicted_levels(parent.fitter, parent.fit), further))
+        self.extend(parent, screen(parent.fitter, parent.fit, further))
 
     def extend(
         self, parent: RankedExplanation, own_noise: ScreeningResult, sensor_noise: ScreeningResult | None = None
@@ -177,7 +177,7 @@ class ExplanationPool:
         own_noise: screening under its own noise. sensor_noise: screening under sensor noise alone.
         """
         if further := fine_onsets(own_noise.promising(FITTED), parent.fitter):
-            own_noise += screen(*about_predicted_levels(parent.fitter, parent.fit), further)
+            own_noise += screen(parent.fitter, parent.fit, further)
         relevant = [c for c in self._extensions(parent, own_noise, own=True) if self._relevant(parent, c.key)]
         fits = self._fitted(parent.fitter, parent.fit, relevant)[:EVALUATED]
         if sensor_noise:
