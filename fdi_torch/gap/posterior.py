@@ -12,7 +12,7 @@ law there is a different one: then the effects at that place are part of the unk
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from fdi_torch.estimate.evidence import ODDS, RARE, posterior
@@ -20,7 +20,7 @@ from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.library import canonical, tanks_of
 from fdi_torch.gap.localization.localize import LocalizedDiscrepancy, localize
-from fdi_torch.gap.marginal_likelihood import with_disturbances
+from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, SearchResult
 from fdi_torch.plant.description import PlantDescription
@@ -44,7 +44,7 @@ class CauseHypothesis:
 
     @property
     def fit(self) -> Fit:
-        return self.explanation.fit
+        return self.place.fit if self.place else self.explanation.fit
 
 
 @dataclass(frozen=True)
@@ -93,13 +93,16 @@ def posterior_of(
     if not named_only:
         likeliest = _likeliest(hypotheses).explanation
         for explanation in {e.key: e for e in (likeliest, result.best, result.null)}.values():
-            hypotheses += _with_unknowns(pool, result, explanation, places, len(places), _likeliest(hypotheses))
-        hypotheses += _with_fewer_effects(pool, result, _likeliest(hypotheses), len(places))
+            hypotheses += _with_unknowns(pool, explanation, places, len(places), _likeliest(hypotheses))
+        hypotheses += _with_fewer_effects(pool, _likeliest(hypotheses), len(places))
         hypotheses = _after_fits_at_unknowns(pool, hypotheses, options)
+        hypotheses += _with_more_effects(pool, _likeliest(hypotheses), options, len(places))
+        hypotheses += _from_unknown_alone(pool, result.null, _likeliest(hypotheses), options, len(places))
         least = _likeliest(hypotheses).weight + math.log(RARE)
         hypotheses += [
             _about_predicted_levels(h.explanation) for h in hypotheses if h.place is None and h.weight > least
         ]
+        hypotheses += [law for h in hypotheses if h.weight > least for law in _with_inexact_laws(pool, h, options)]
     best: dict[tuple[frozenset[CauseName], str | None], CauseHypothesis] = {}
     for h in hypotheses:
         key = frozenset(canonical(c, plant) for c in h.causes), h.unknown_at
@@ -153,29 +156,29 @@ def _about_predicted_levels(explanation: RankedExplanation) -> CauseHypothesis:
 
 def _with_unknowns(
     pool: ExplanationPool,
-    result: SearchResult,
     explanation: RankedExplanation,
     at: Sequence[str],
     places: int,
-    best: CauseHypothesis,
+    best: CauseHypothesis | None = None,
 ) -> list[CauseHypothesis]:
     """An explanation with an unknown discrepancy at each of some places, as far as relevant against the best."""
-    needed = best.weight + math.log(RARE) - explanation.log_weight - math.log(ODDS.unknown / places)
+    odds = math.log(ODDS.unknown / places)
+    needed = best.weight + math.log(RARE) - explanation.log_weight - odds if best else -math.inf
     found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed)
     itself = CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + found.itself)
-    return [itself, *(_with_unknown(pool.fitter, result, explanation, d, places) for d in found.discrepancies)]
+    return [itself, *(_with_unknown(pool, explanation, d, places) for d in found.discrepancies)]
 
 
 def _with_unknown(
-    fitter: Fitter, result: SearchResult, explanation: RankedExplanation, place: LocalizedDiscrepancy, places: int
+    pool: ExplanationPool, explanation: RankedExplanation, place: LocalizedDiscrepancy, places: int
 ) -> CauseHypothesis:
     """An explanation with a discrepancy at one place, which is attributed to an effect there if it is small."""
     causes = causes_in_order(explanation.fit)
     # A random flow into a tank may stand for the error of any flow there.
-    plant, flow = fitter.data.plant, place.noise.apart is not None
+    plant, flow = pool.fitter.data.plant, place.noise.apart is not None
     here = [c for c in causes if c[1] == place.location or (flow and place.location in tanks_of(c[1], plant))]
     weight = explanation.log_weight + place.gain
-    if here and _is_small(fitter, result, explanation, place, here):
+    if here and _is_small(pool, explanation, place.size, here):
         return CauseHypothesis(explanation, causes, weight)
     weight += math.log(ODDS.unknown / places)
     return CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight, place)
@@ -190,27 +193,39 @@ def _fitness(known: RankedExplanation, alone: RankedExplanation) -> float:
     return likelihood(known) - likelihood(alone)
 
 
-def _is_small(
-    fitter: Fitter,
-    result: SearchResult,
-    explanation: RankedExplanation,
-    place: LocalizedDiscrepancy,
-    here: Sequence[CauseName],
-) -> bool:
-    """Whether a discrepancy is small compared with the influence of the explanation's effects `here`, at its place."""
+def _is_small(pool: ExplanationPool, explanation: RankedExplanation, size: float, here: Collection[CauseName]) -> bool:
+    """Whether a discrepancy of this size is small compared with the influence of the effects `here`, at its place."""
     elsewhere = explanation.key - set(here)
-    without = min((e for e in result.explanations if e.key <= elsewhere), key=lambda e: _cost(fitter, e.fit))
-    reduction = _cost(fitter, without.fit) - _cost(fitter, explanation.fit)
-    return place.size < ODDS.discrepancy * math.sqrt(max(reduction, 0.0))
+    least = min(_cost(pool.fitter, e.fit) for e in pool.explanations.values() if e.key <= elsewhere)
+    return size < ODDS.discrepancy * math.sqrt(max(least - _cost(pool.fitter, explanation.fit), 0.0))
 
 
 def _cost(fitter: Fitter, fit: Fit) -> float:
     return float(fitter.white(fit.linearised)[0].square().sum())
 
 
-def _with_fewer_effects(
-    pool: ExplanationPool, result: SearchResult, best: CauseHypothesis, places: int
-) -> list[CauseHypothesis]:
+def _with_inexact_laws(pool: ExplanationPool, h: CauseHypothesis, options: Sequence[Option]) -> list[CauseHypothesis]:
+    """The hypothesis without effects that are small compared with others at their place.
+
+    Such an effect describes the error of the other's law. It costs its selection among all effects there instead of the
+    prior odds of one more cause.
+    """
+    explained: list[CauseHypothesis] = []
+    for cause in h.causes:
+        others = {c for c in h.causes if c[1] == cause[1]} - {cause}
+        if not others:
+            continue
+        reduced = pool.without(h.explanation, cause)
+        size = math.sqrt(max(_cost(pool.fitter, reduced.fit) - _cost(pool.fitter, h.explanation.fit), 0.0))
+        if _is_small(pool, h.explanation, size, others | {cause}):
+            odds = log_prior(reduced.key, pool.choices) - log_prior(h.explanation.key, pool.choices)
+            weight = h.weight + odds - math.log(len({o.cause for o in options if o.cause[1] == cause[1]}))
+            law = CauseHypothesis(reduced, tuple(c for c in h.causes if c != cause), weight, h.place)
+            explained += [law, *_with_inexact_laws(pool, law, options)]
+    return explained
+
+
+def _with_fewer_effects(pool: ExplanationPool, best: CauseHypothesis, places: int) -> list[CauseHypothesis]:
     """Hypotheses with fewer effects: an effect may only have compensated the unknown, or a wrong law of another."""
     accepted: list[CauseHypothesis] = []
     while len(best.fit.key) > (0 if best.place else 1):
@@ -218,12 +233,42 @@ def _with_fewer_effects(
         for cause in best.fit.key:
             reduced = pool.without(best.explanation, cause)
             at = [best.place.location] if best.place else list(dict.fromkeys(place for _, place in reduced.key))
-            trials += _with_unknowns(pool, result, reduced, at, places, best)
+            trials += _with_unknowns(pool, reduced, at, places, best)
         accepted += trials
         if not trials or _likeliest(trials).weight <= best.weight:
             break
         best = _likeliest(trials)
     return accepted
+
+
+def _with_more_effects(
+    pool: ExplanationPool, best: CauseHypothesis, options: Sequence[Option], places: int
+) -> list[CauseHypothesis]:
+    """Hypotheses with further effects beside the unknown of the best one, which hid them."""
+    accepted: list[CauseHypothesis] = []
+    while best.place:
+        under = with_disturbances(best.explanation.fitter, best.fit, best.place.noise)
+        beside = pool.extend_beside(best.explanation, best.place.explained, under, options)
+        trials = [h for e in beside for h in _with_unknowns(pool, e, [best.place.location], places, best)]
+        accepted += trials
+        if not trials or _likeliest(trials).weight <= best.weight:
+            break
+        best = _likeliest(trials)
+    return accepted
+
+
+def _from_unknown_alone(
+    pool: ExplanationPool,
+    null: RankedExplanation,
+    best: CauseHypothesis,
+    options: Sequence[Option],
+    places: int,
+) -> list[CauseHypothesis]:
+    """Hypotheses with effects beside the unknown of the best one, without those that were found before the unknown."""
+    if best.place is None or not best.explanation.key:
+        return []
+    alone = [h for h in _with_unknowns(pool, null, [best.place.location], places) if h.place]
+    return [further for h in alone for further in (h, *_with_more_effects(pool, h, options, places))]
 
 
 def _marginals(

@@ -17,6 +17,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import StateNoise
@@ -32,7 +33,7 @@ from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, sc
 DEEPEST = 4  # effects in one explanation
 BEAM = 2  # explanations of one size that are extended
 FITTED = 8  # effects fitted about each explanation and noise, by first-order gain
-STARTS = 2  # initial values of one effect
+STARTS = 8  # initial values of one effect, by first-order gain
 EVALUATED = 3  # of these fits, the best whose evidence is computed
 CONVERGED = 0.1  # nats; a smaller gain ends the alternation between noise and fit
 TURNS = 4  # rounds in which further unfitted candidates are fitted
@@ -190,25 +191,50 @@ class ExplanationPool:
             self.evaluate(fit, parent.noise)
 
     def extend_at(self, parent: RankedExplanation, place: str, under: Fitter, options: Sequence[Option]) -> None:
-        """Extend an explanation by each effect at one place. under: fitter with the noise that an unknown there left.
+        """Extend an explanation by the effects at one place. under: fitter with the noise that an unknown there left.
 
         Its own noise absorbs what it does not explain, and hides effects of which none was fitted.
         """
-        here = [o for o in options if o.placement.location == place and o.cause not in parent.key]
-        candidates = self._extensions(parent, screen(under, parent.fit, here), own=False)
-        for fit in self._fitted(under, replace(parent.fit, cost=under.cost(parent.fit)), candidates)[:EVALUATED]:
-            self.evaluate(fit, parent.noise)
+        here = [o for o in options if o.placement.location == place]
+        self._extend_under(under, parent.fit, parent, here)
+
+    def extend_beside(
+        self, parent: RankedExplanation, explained: Tensor, under: Fitter, options: Sequence[Option]
+    ) -> list[RankedExplanation]:
+        """Extend an explanation by effects beside an unknown, and return the extensions that were evaluated.
+
+        explained: part of the readings (S, C) that the unknown explains. under: fitter with the noise that it left.
+        """
+        data = replace(under.data, readings=under.data.readings - explained)
+        beside = Fitter(data, under.noise, under.whitening)
+        return self._extend_under(beside, beside.fit(parent.fit.candidate, parent.fit), parent, options)
+
+    def _extend_under(
+        self, fitter: Fitter, base: Fit, parent: RankedExplanation, options: Sequence[Option]
+    ) -> list[RankedExplanation]:
+        """Evaluate the most promising extensions of `base`, a fit of the parent's effects, under another noise."""
+        further = [o for o in options if o.cause not in parent.key]
+        candidates = self._extensions(parent, screen(fitter, base, further), own=False)
+        fits = self._fitted(fitter, replace(base, cost=fitter.cost(base)), candidates, again=True)[:EVALUATED]
+        noise = replace(fitter.whitening.noise, wander=None) if fitter.whitening else parent.noise
+        return [self.evaluate(fit, noise) for fit in fits]
 
     def _fitted(
-        self, fitter: Fitter, base: Fit, candidates: Sequence[Candidate], rivals: Iterable[float] = ()
+        self,
+        fitter: Fitter,
+        base: Fit,
+        candidates: Sequence[Candidate],
+        rivals: Iterable[float] = (),
+        again: bool = False,
     ) -> list[Fit]:
         """Fits of the candidates from `base`, the best first. A fit that is worse than `base` has failed.
 
-        rivals: costs of other fits under the same noise.
+        rivals: costs of other fits under the same noise. again: also of those that were evaluated before, under other
+        noise.
         """
         cost, fits, least = fitter.cost(base), list[Fit](), min(rivals, default=math.inf)
         for candidate in candidates:
-            if candidate.key not in self.explanations:
+            if again or candidate.key not in self.explanations:
                 fit = fitter.fit(candidate, base, least)
                 least = min(least, fit.cost)
                 if fit.cost < cost:

@@ -24,7 +24,7 @@ from torch import Tensor
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import SCATTER, StateNoise, Wander
 from fdi_torch.estimate.state_noise import CORRELATION_TIMES, LOG_BOUND
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate_fit import SHARE, Candidate, Fit, Fitter
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression, WhitenedDiscrepancy
 from fdi_torch.gap.localization.fine_positions import with_best_position
 from fdi_torch.gap.localization.regressors import dominant_period
@@ -35,8 +35,8 @@ from fdi_torch.simulate.collocation import Linearised
 
 HARMONICS = 3  # of a dominant period of the residual
 STEPS = 120  # step functions of time
-MOST_TURNS = 12  # alternations between the disturbance noise and one more regressor
-CONVERGED = 0.1  # nats; a smaller gain ends the alternation
+MOST_TURNS = 12  # alternations between the disturbance noise, one more regressor, and the parameters of the fit
+CONVERGED = 0.1  # nats; a smaller gain ends the alternation, as does one below SHARE of what is still needed
 CALIBRATION_PLACES = 3  # places always evaluated; they show by how much first-order gains are too low
 
 
@@ -45,16 +45,18 @@ class LocalizedDiscrepancy:
     """A discrepancy at one component, in addition to a fit.
 
     gain: in log evidence against the fit alone, without prior odds. fitness: log likelihood less one nat for each
-    parameter of the discrepancy (Akaike, 1974), over that of the fit alone. size: norm of its influence on the
-    readings, in units of the sensor noise. periods: of its harmonics, s. noise: most likely disturbance noise with the
-    discrepancy.
+    parameter of the discrepancy (Akaike, 1974), over that of the fit alone. explained: its influence on the readings
+    (S, C); none of a random process. size: norm of its influence, in units of the sensor noise. periods: of its
+    harmonics, s. fit, noise: the fit refitted, and the most likely disturbance noise, with the discrepancy.
     """
 
     location: str
     gain: float
     fitness: float
+    explained: Tensor
     size: float
     periods: tuple[float, ...]
+    fit: Fit
     noise: StateNoise
 
 
@@ -75,7 +77,7 @@ def localize(
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
     there are none in the result if none can reach it.
     """
-    base = _likelihood(fitter, fit, fit.linearised) + noise.log_prior()
+    data, base = fitter.data, _likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     period = dominant_period(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
     periods = tuple(period / k for k in range(1, HARMONICS + 1)) if period else ()
     regression = DiscrepancyRegression(fitter, fit, periods, STEPS)
@@ -89,45 +91,69 @@ def localize(
     starts = (likely, _nearly_without_disturbances(likely))
     first_order = _first_order_gains(regression, starts, fit, places, base)
 
-    def evaluate(discrepancy: Discrepancy, place: str, noise: StateNoise) -> _EvaluatedDiscrepancy:
+    def evaluate(
+        regression: DiscrepancyRegression, discrepancy: Discrepancy, place: str, noise: StateNoise
+    ) -> _EvaluatedDiscrepancy:
+        fit = regression.fit
         under = with_disturbances(fitter, fit, noise, discrepancy.linearised)
         costs = column_costs(discrepancy.choices, largest)
         regressed = WhitenedDiscrepancy(under, fit, discrepancy).sparse_fit(costs)
         without = _likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - base
-        return _EvaluatedDiscrepancy(place, noise, under, discrepancy, regressed, without)
+        return _EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, regressed, without)
 
     def with_likely_noise(known: _EvaluatedDiscrepancy, climb: bool) -> _EvaluatedDiscrepancy:
         at, used = known.discrepancy, known.regressed.used
         further = LinearParameters(at.columns[..., used], torch.sqrt(known.regressed.precision[used]))
-        likely = estimate_disturbances(fitter, fit, at.linearised, further, known.noise, climb).noise
-        return evaluate(at, known.location, likely)
+        likely = estimate_disturbances(fitter, known.regression.fit, at.linearised, further, known.noise, climb).noise
+        return evaluate(known.regression, at, known.location, likely)
 
     def with_finer_position(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
-        used = known.regressed.used
-        finer = with_best_position(regression, known.location, known.under, fit, known.discrepancy, used, generator)
-        return evaluate(finer, known.location, known.noise) if finer else known
+        used, regression = known.regressed.used, known.regression
+        finer = with_best_position(
+            regression, known.location, known.under, regression.fit, known.discrepancy, used, generator
+        )
+        return evaluate(regression, finer, known.location, known.noise) if finer else known
+
+    def refitted(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
+        """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
+        fit, corrected = known.regression.fit, replace(data, readings=data.readings - known.explained)
+        beside = Fitter(corrected, fitter.noise, known.under.whitening)
+        new = beside.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
+        of_levels = Fitter(corrected if regression.sensor(known.location) is not None else data, fitter.noise)
+        along = with_disturbances(of_levels, new, noise) if fitter.whitening else of_levels
+        again = DiscrepancyRegression(along, new, periods, STEPS)
+        return evaluate(again, again.of(known.location), known.location, known.noise)
 
     localized: list[LocalizedDiscrepancy] = []
-    # Largest differences seen so far: gain less its first-order estimate, and gain from further noise and positions.
-    excess, further_gain = -math.inf, 0.0
+    excess = -math.inf  # largest difference seen so far between a gain and its first-order estimate
     for place in sorted(places, key=lambda p: -first_order[p]):
         if len(localized) >= CALIBRATION_PLACES and first_order[place] + excess < needed:
             break
         start = regression.of(place)
-        best = first = max((evaluate(start, place, each) for each in starts), key=_gain)
+        best = first = max((evaluate(regression, start, place, each) for each in starts), key=_gain)
         for turn in range(MOST_TURNS):
-            if len(localized) >= CALIBRATION_PLACES and best.gain + further_gain < needed:
-                break
             before, best = best, max(best, with_likely_noise(best, turn == 0), key=_gain)
             best = max(best, with_finer_position(best), key=_gain)
-            if best.gain < before.gain + CONVERGED:
+            if best.gain < SHARE * (needed - best.gain):
                 break
-        itself = max(itself, first.without, best.without)
-        excess, further_gain = max(excess, best.gain - first_order[place]), max(further_gain, best.gain - first.gain)
+            best = max(best, refitted(best), key=_gain)
+            if best.gain - before.gain < max(CONVERGED, SHARE * (needed - best.gain)):
+                break
+        itself = max(itself, first.without, best.without if best.regression is regression else 0.0)
+        excess = max(excess, best.gain - first_order[place])
         if not _is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
             needed = max(needed, best.gain + math.log(RARE))
             localized.append(
-                LocalizedDiscrepancy(place, best.gain, best.fitness, _effect_size(fitter, best), periods, best.noise)
+                LocalizedDiscrepancy(
+                    place,
+                    best.gain,
+                    best.fitness,
+                    best.explained,
+                    _effect_size(fitter, best),
+                    periods,
+                    best.regression.fit,
+                    best.noise,
+                )
             )
     random = [*_drifting_sensors(regression, likely, places, base, needed)]
     random += _random_flows(regression, likely, places, base)
@@ -155,7 +181,8 @@ def _random_flows(
     cost = math.log(2.0 * LOG_BOUND / (SCATTER * math.sqrt(2.0 * math.pi)))
     gain = _evidence(fitter, fit, apart, linearised) - base - cost
     size = _moved(with_disturbances(fitter, fit, apart, linearised), linearised)
-    return [LocalizedDiscrepancy(tank, gain, gain + cost - 1.0, size, (), apart)]
+    nothing = torch.zeros_like(fitter.data.readings)
+    return [LocalizedDiscrepancy(tank, gain, gain + cost - 1.0, nothing, size, (), fit, apart)]
 
 
 def _moved(fitter: Fitter, linearised: Linearised) -> float:
@@ -178,7 +205,8 @@ def _drifting_sensors(
         assert noise.wander is not None
         sensor = fitter.data.plant.sensors[noise.wander.channel].name
         gain, cost = _evidence(fitter, fit, noise, regression.at(sensor)[1]) - base, _drift_cost(fitter, noise.wander)
-        return LocalizedDiscrepancy(sensor, gain - cost, gain - 2.0, _drift_size(fitter, noise.wander), (), noise)
+        nothing, size = torch.zeros_like(fitter.data.readings), _drift_size(fitter, noise.wander)
+        return LocalizedDiscrepancy(sensor, gain - cost, gain - 2.0, nothing, size, (), fit, noise)
 
     def most_likely(start: LocalizedDiscrepancy) -> LocalizedDiscrepancy:
         linearised = regression.at(start.location)[1]
@@ -260,6 +288,7 @@ class _EvaluatedDiscrepancy:
     location: str
     noise: StateNoise
     under: Fitter
+    regression: DiscrepancyRegression
     discrepancy: Discrepancy
     regressed: SparseFit
     without: float
