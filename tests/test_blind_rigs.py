@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from fdi_torch.blind import case_drafts, cases
+from fdi_torch.blind import case_drafts, cases, conditions
 from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.case_kinds import KINDS, STANDARD, choose
-from fdi_torch.blind.cases import make
+from fdi_torch.blind.cases import Case, make
 from fdi_torch.blind.conditions import WIDEST, as_built, asked_of_pumps, exercised
 from fdi_torch.blind.deviation import Array, Deviation
 from fdi_torch.blind.inputs import SIGNALS, commanded, with_standstills
@@ -250,9 +251,14 @@ def test_two_independent_simulations_of_a_sound_rig_agree(rig: Rig) -> None:
     np.testing.assert_allclose(hidden, library / scales.length, atol=2e-5)
 
 
+@cache
+def case_of_first_size() -> Case:
+    return make(plans(1, 7, ("null",)), exercised(three_tank().plant), 7)[0]
+
+
 @pytest.mark.parametrize("scales", [TOWER, PHIAL], ids=["tower", "phial"])
 def test_a_rig_of_another_size_is_recorded_in_its_own_size_and_pace(scales: Scales, tmp_path: Path) -> None:
-    rig, (same,) = of_size(scales), make(plans(1, 7, ("null",)), exercised(three_tank().plant), 7)
+    rig, same = of_size(scales), case_of_first_size()
     (case,) = make(plans(1, 7, ("null",)), rig, 7)
     np.testing.assert_allclose(case.readings[0], same.readings[0], atol=1e-9)
     for part, noise in same.truth["noise_rms_m"].items():
@@ -302,7 +308,8 @@ def test_a_rig_that_cannot_be_exercised_is_refused(changes: dict[str, object], m
         Rig(**({"plant": rig_of(OUTLET, PUMP)} | changes))  # type: ignore[arg-type]
 
 
-def test_a_rig_that_always_overflows_is_refused() -> None:
+def test_a_rig_that_always_overflows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(conditions, "_MOST_TRIALS", 2)
     small = PlantDescription("small", (Tank("A", AREA, 1.0),), (), (Pump("Q", "A", 0.1),), (Sensor("a", "A"),))
     with pytest.raises(ValueError, match="lower input_high"):
         make(plans(1, 1, ("null",)), Rig(small), 1)
@@ -316,7 +323,8 @@ def test_a_rig_of_its_plant_file_alone_is_filled_half() -> None:
     assert 0.3 < exercised(narrow).input_high < 0.6
 
 
-def test_a_rig_that_cannot_drain_is_refused() -> None:
+def test_a_rig_that_cannot_drain_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(conditions, "LEAST", 0.5)  # as a share of max_flow; each input that is tried takes 0.2 s
     with pytest.raises(ValueError, match="check that every tank drains"):
         exercised(rig_of((), PUMP))
 
