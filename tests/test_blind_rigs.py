@@ -257,7 +257,10 @@ def case_of_first_size() -> Case:
 
 
 @pytest.mark.parametrize("scales", [TOWER, PHIAL], ids=["tower", "phial"])
-def test_a_rig_of_another_size_is_recorded_in_its_own_size_and_pace(scales: Scales, tmp_path: Path) -> None:
+def test_a_rig_of_another_size_is_recorded_in_its_own_size_and_pace(
+    scales: Scales, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cases, "STEP", 0.5)
     rig, same = of_size(scales), case_of_first_size()
     (case,) = make(plans(1, 7, ("null",)), rig, 7)
     np.testing.assert_allclose(case.readings[0], same.readings[0], atol=1e-9)
@@ -386,7 +389,8 @@ def test_a_round_of_kinds_holds_each_once() -> None:
 
 
 @pytest.mark.slow
-def test_a_case_is_the_same_in_any_company() -> None:
+def test_a_case_is_the_same_in_any_company(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cases, "STEP", 0.5)
     rig, all_plans = three_tank(), plans(9, 3, STANDARD)
     together, alone = make(all_plans, rig, 3), make(all_plans[4:5], rig, 3)
     for a, b in zip(together[4].readings, alone[0].readings, strict=True):
@@ -396,8 +400,9 @@ def test_a_case_is_the_same_in_any_company() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", [three_tank(), quadruple_tank(), cascaded_tanks()], ids=lambda r: r.plant.name)
-def test_full_effects_show_and_stay_in_the_tanks(rig: Rig) -> None:
+def test_full_effects_show_and_stay_in_the_tanks(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without noise, a full effect moves some reading by more than the quietest noise; the null moves none."""
+    monkeypatch.setattr(cases, "STEP", 0.5)
     for case in make(plans(40, 11, ("single", "null")), rig, 11):
         gap, truth = case.truth["gap_rms_m"]["recording"], case.truth
         quantised = truth["causes"] and truth["causes"][0]["effect"] == "sensor_quantization"
