@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from fdi_torch.blind import case_drafts, cases
+from fdi_torch.blind import case_drafts, cases, conditions
 from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.case_kinds import KINDS, STANDARD, choose
-from fdi_torch.blind.cases import make
+from fdi_torch.blind.cases import Case, make
 from fdi_torch.blind.conditions import WIDEST, as_built, asked_of_pumps, exercised
 from fdi_torch.blind.deviation import Array, Deviation
 from fdi_torch.blind.inputs import SIGNALS, commanded, with_standstills
@@ -250,9 +251,17 @@ def test_two_independent_simulations_of_a_sound_rig_agree(rig: Rig) -> None:
     np.testing.assert_allclose(hidden, library / scales.length, atol=2e-5)
 
 
+@cache
+def case_of_first_size() -> Case:
+    return make(plans(1, 7, ("null",)), exercised(three_tank().plant), 7)[0]
+
+
 @pytest.mark.parametrize("scales", [TOWER, PHIAL], ids=["tower", "phial"])
-def test_a_rig_of_another_size_is_recorded_in_its_own_size_and_pace(scales: Scales, tmp_path: Path) -> None:
-    rig, (same,) = of_size(scales), make(plans(1, 7, ("null",)), exercised(three_tank().plant), 7)
+def test_a_rig_of_another_size_is_recorded_in_its_own_size_and_pace(
+    scales: Scales, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cases, "STEP", 0.5)
+    rig, same = of_size(scales), case_of_first_size()
     (case,) = make(plans(1, 7, ("null",)), rig, 7)
     np.testing.assert_allclose(case.readings[0], same.readings[0], atol=1e-9)
     for part, noise in same.truth["noise_rms_m"].items():
@@ -302,7 +311,8 @@ def test_a_rig_that_cannot_be_exercised_is_refused(changes: dict[str, object], m
         Rig(**({"plant": rig_of(OUTLET, PUMP)} | changes))  # type: ignore[arg-type]
 
 
-def test_a_rig_that_always_overflows_is_refused() -> None:
+def test_a_rig_that_always_overflows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(conditions, "_MOST_TRIALS", 2)
     small = PlantDescription("small", (Tank("A", AREA, 1.0),), (), (Pump("Q", "A", 0.1),), (Sensor("a", "A"),))
     with pytest.raises(ValueError, match="lower input_high"):
         make(plans(1, 1, ("null",)), Rig(small), 1)
@@ -316,7 +326,8 @@ def test_a_rig_of_its_plant_file_alone_is_filled_half() -> None:
     assert 0.3 < exercised(narrow).input_high < 0.6
 
 
-def test_a_rig_that_cannot_drain_is_refused() -> None:
+def test_a_rig_that_cannot_drain_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(conditions, "LEAST", 0.5)  # as a share of max_flow; each input that is tried takes 0.2 s
     with pytest.raises(ValueError, match="check that every tank drains"):
         exercised(rig_of((), PUMP))
 
@@ -378,7 +389,8 @@ def test_a_round_of_kinds_holds_each_once() -> None:
 
 
 @pytest.mark.slow
-def test_a_case_is_the_same_in_any_company() -> None:
+def test_a_case_is_the_same_in_any_company(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cases, "STEP", 0.5)
     rig, all_plans = three_tank(), plans(9, 3, STANDARD)
     together, alone = make(all_plans, rig, 3), make(all_plans[4:5], rig, 3)
     for a, b in zip(together[4].readings, alone[0].readings, strict=True):
@@ -388,8 +400,9 @@ def test_a_case_is_the_same_in_any_company() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", [three_tank(), quadruple_tank(), cascaded_tanks()], ids=lambda r: r.plant.name)
-def test_full_effects_show_and_stay_in_the_tanks(rig: Rig) -> None:
+def test_full_effects_show_and_stay_in_the_tanks(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without noise, a full effect moves some reading by more than the quietest noise; the null moves none."""
+    monkeypatch.setattr(cases, "STEP", 0.5)
     for case in make(plans(40, 11, ("single", "null")), rig, 11):
         gap, truth = case.truth["gap_rms_m"]["recording"], case.truth
         quantised = truth["causes"] and truth["causes"][0]["effect"] == "sensor_quantization"

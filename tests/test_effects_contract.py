@@ -1,4 +1,7 @@
-"""Contract tests of every effect at every place of two plants; authors of effects need not write them."""
+"""Contract tests of every effect at every place of three plants; authors of effects need not write them.
+
+What simulates an effect by itself is tested at one place of each kind of component.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from torch import Tensor
 
 from fdi_torch.effects import EFFECTS, all_placements, build_network, effect
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import FLOW_KINDS, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
@@ -65,8 +68,21 @@ def placements_of(plant: PlantDescription) -> tuple[Placement, ...]:
     return tuple(p for p in everything if p.effect.name in accepted.get(p.location, ()))
 
 
+def one_of_each_kind(plant: PlantDescription) -> tuple[Placement, ...]:
+    """Of the places of an effect whose components are of one kind, and lead outside or not, the last one."""
+    components = {c.name: c for c in plant.components()}
+    chosen: dict[tuple[object, ...], Placement] = {}
+    for placement in placements_of(plant):
+        component = components.get(placement.location)
+        leads_outside = getattr(component, "target", None) == OUTSIDE
+        chosen[placement.effect.name, type(component), leads_outside] = placement
+    return tuple(chosen.values())
+
+
 PLACES = [(name, p.prefix) for name, plant in PLANTS.items() for p in placements_of(plant)]
 everywhere = pytest.mark.parametrize(("plant", "place"), PLACES)
+EACH_KIND = [(name, p.prefix) for name, plant in PLANTS.items() for p in one_of_each_kind(plant)]
+at_each_kind = pytest.mark.parametrize(("plant", "place"), EACH_KIND)
 
 
 def random_inputs(plant: PlantDescription) -> Recording:
@@ -196,7 +212,7 @@ def bare_reach(plant: str) -> OperatingRange:
     return operating_range_of(recording, PLANTS[plant])
 
 
-@everywhere
+@at_each_kind
 def test_neutral_at_nominal_bit_for_bit(plant: str, place: str) -> None:
     assert torch.equal(alone(plant, place).nominal, bare_reading(plant))
 
@@ -207,7 +223,7 @@ def test_the_whole_library_at_nominal_changes_no_bit(plant: str) -> None:
     assert torch.equal(r.engine.readings(r.space.nominal()), bare_reading(plant))
 
 
-@everywhere
+@at_each_kind
 def test_nothing_there_while_the_size_is_nominal_whatever_the_shape(plant: str, place: str) -> None:
     assert torch.equal(alone(plant, place).shaped, bare_reading(plant))
 
@@ -224,7 +240,7 @@ def test_starts_lie_in_the_box_and_one_of_them_shows(plant: str, place: str) -> 
     assert bool(torch.isfinite(first_starts(plant)[place]).all())
 
 
-@everywhere
+@at_each_kind
 def test_alone_equals_in_batch_beside_a_lane_of_nan(plant: str, place: str) -> None:
     assert torch.equal(alone(plant, place).started_in_batch, alone(plant, place).started)
 
@@ -270,8 +286,9 @@ def test_the_compiled_engine_gives_the_same_numbers(plant: str, place: str) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plant", PLANTS)
+@pytest.mark.parametrize("plant", ["valves", "every kind"])
 def test_the_compiled_engine_gives_the_same_slopes(plant: str) -> None:
+    """Of the three tanks with every effect, test_engines compares them."""
     r = rig(plant)
     try:
         engine = make_engine(r.network, r.space, r.engine.experiment, "compiled")
@@ -298,13 +315,13 @@ def rescaled_readings(plant: str, m: float, s: float) -> dict[str, Tensor]:
     return dict(zip((p.prefix for p in r.network.placements), engine.readings(thetas) / back, strict=True))
 
 
-@everywhere
+@at_each_kind
 def test_declared_units_are_true(plant: str, place: str) -> None:
     for metre, second in ((100.0, 1.0), (1.0, 60.0)):
         assert torch.allclose(rescaled_readings(plant, metre, second)[place], alone(plant, place).started, rtol=1e-5)
 
 
-@everywhere
+@at_each_kind
 def test_a_plant_file_can_have_it(plant: str, place: str) -> None:
     """As part of the plant's description, with these parameters, it does the same as beside it."""
     location, name = place.split(".")

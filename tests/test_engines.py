@@ -192,10 +192,10 @@ def test_the_reference_differentiates_alike() -> None:
 
 def test_an_adaptive_solver_gives_the_same_slopes_lane_by_lane() -> None:
     network, space = rig()
-    e = lay_out(recording(regular(10.0, 8)), ("Q1", "Q2"), 0.5)
+    e = lay_out(recording(regular(10.0, 4)), ("Q1", "Q2"), 0.5)
     theta = random_theta(space, 2)
     readings, slopes = adaptive_engine(network, space, e, 0.02).linearise(theta)
-    fine = replace(lay_out(recording(regular(10.0, 8)), ("Q1", "Q2"), 0.05), resolution=e.nodes.new_tensor(0.02))
+    fine = replace(lay_out(recording(regular(10.0, 4)), ("Q1", "Q2"), 0.05), resolution=e.nodes.new_tensor(0.02))
     expected, truth = CompiledEngine(network, space, fine).linearise(theta)
     assert float((readings - expected).abs().max()) < 1e-7
     assert relative(slopes, truth) < 1e-5
@@ -299,7 +299,7 @@ def test_every_effect_survives_every_engine(name: str) -> None:
     network = TankNetwork(plant, placed)
     names = [n for n in network.constants.names if n.count(".") == 2]
     space = ParameterSpace(network.constants[n] for n in names)
-    e = lay_out(waves(plant), plant.channels(), 1.0)
+    e = lay_out(waves(plant), plant.channels(), 2.0)
     low, high = space.low().clamp(min=-10.0), space.high().clamp(max=30.0)
     generator = torch.Generator().manual_seed(4)
     anywhere = low + (high - low) * torch.rand(3, len(placed), len(space), generator=generator, dtype=torch.float64)

@@ -125,7 +125,7 @@ def test_fmpy_simulates_what_we_simulate(case: str, tmp_path: Path) -> None:
 def test_every_effect_without_a_dead_time_is_that_of_the_library(tmp_path: Path) -> None:
     """All at all their places in one FMU, each set to its largest start value in turn."""
     placements = [p for p in all_placements(VALVE) if not p.prefix.endswith("_delay")]
-    network, recording = build_network(VALVE, placements), planned(VALVE, 400.0, 5.0)
+    network, recording = build_network(VALVE, placements), planned(VALVE, 200.0, 5.0)
     export_fmu(VALVE, tmp_path / "plant.fmu", effects=[p.prefix for p in placements])
     reach, nominal = operating_range_of(recording, VALVE), {p.name: p.nominal for p in network.constants}
     without = clean_readings(network, recording, nominal)

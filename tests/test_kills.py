@@ -183,16 +183,6 @@ def expect_the_same_end(job: Job, folder: Path, capsys: pytest.CaptureFixture[st
     return "resumed" if resumes else "started anew"
 
 
-def test_a_killed_job_leaves_only_whole_files_and_comes_to_the_same_end(
-    job: Job, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder, code, _ = struck_before_its_end(job, tmp_path, signal.SIGKILL)
-    assert code == -signal.SIGKILL
-    expect_whole(folder)
-    expect_the_same_end(job, folder, capsys)
-    expect_whole(folder)
-
-
 @pytest.mark.parametrize(
     ("number", "code"),
     [(signal.SIGINT, cli.INTERRUPTED), pytest.param(signal.SIGTERM, cli.TERMINATED, marks=pytest.mark.slow)],

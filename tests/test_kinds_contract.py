@@ -250,7 +250,11 @@ def test_training_recovers_one_of_its_constants(
     readings = ReferenceEngine(build_network(plant), space, lay_out(recording, plant.channels(), SAMPLE)).readings(true)
     noise = 1e-3 * torch.randn(readings.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     recording = replace(recording, outputs=readings + noise, mask=None)
-    run = {"plant": plant, "recordings": [recording], "estimate": {"parameters": [name]}}
+    run = {
+        "plant": plant,
+        "recordings": [recording],
+        "estimate": {"parameters": [name], "search": {"evaluations": 600, "population": 20}},
+    }
     estimate = fdi_torch.train(run).result.estimate
     assert abs(float(estimate.value[0] - true)) < 4.0 * float(estimate.std[0])
     assert float(estimate.std[0]) < 0.05 * float(true)

@@ -24,8 +24,13 @@ def quick_run(folder: Path, *changes: str) -> Run:
     return load_run(None, [*QUICK, f"output.folder={folder}", *changes])
 
 
-def test_the_built_in_fault_is_found(tmp_path: Path) -> None:
-    done = train(quick_run(tmp_path))
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
+    """The quick run, once for all tests that only read what it found."""
+    return train(quick_run(tmp_path_factory.mktemp("quick")))
+
+
+def test_the_built_in_fault_is_found(done: TrainResult) -> None:
     truth = torch.tensor([done.truth[p.name] for p in done.fitting.space], dtype=torch.float64)
     error = (done.result.estimate.value - truth).abs() / done.result.estimate.std
     assert bool((error < 4.0).all())
@@ -60,8 +65,7 @@ def test_a_method_that_is_gone_is_refused_in_one_sentence(method: str) -> None:
     assert len(said.value.problems) == 1
 
 
-def test_the_log_tells_how_it_was_found(tmp_path: Path) -> None:
-    done = train(quick_run(tmp_path))
+def test_the_log_tells_how_it_was_found(done: TrainResult) -> None:
     run = read_run(done.log)
     topics = {m.topic for m in run.messages()}
     assert {"/plant/input", "/plant/output", "/plant/truth", "/estimate/final", "/diagnosis/fault"} <= topics
@@ -75,11 +79,11 @@ def done_text(log: Path) -> str:
     return load_run(None, [*QUICK, f"output.folder={log.parent}"]).text
 
 
-def test_it_repeats_bit_for_bit(tmp_path: Path) -> None:
-    one, two = (train(quick_run(tmp_path)) for _ in range(2))
-    assert one.log != two.log
-    assert torch.equal(one.result.estimate.value, two.result.estimate.value)
-    assert content_hash(read_run(one.log).messages()) == content_hash(read_run(two.log).messages())
+def test_it_repeats_bit_for_bit(done: TrainResult) -> None:
+    again = train(quick_run(done.log.parent))
+    assert again.log != done.log
+    assert torch.equal(again.result.estimate.value, done.result.estimate.value)
+    assert content_hash(read_run(again.log).messages()) == content_hash(read_run(done.log).messages())
 
 
 def test_a_model_without_the_fault_is_called_unreliable_before_anything_else(
@@ -231,15 +235,14 @@ train(build_run(yaml.safe_load(sys.argv[1]), Path.cwd(), "default.yaml"), tell)
 """
 
 
-def test_a_killed_run_resumes_to_the_same_end(tmp_path: Path) -> None:
-    straight = train(quick_run(tmp_path / "straight"))
+def test_a_killed_run_resumes_to_the_same_end(done: TrainResult, tmp_path: Path) -> None:
     run = quick_run(tmp_path / "killed")
     killed_in_generation(9, run, tmp_path)
     assert list((tmp_path / "killed").glob("*.partial"))
     resumed = train(run, resume=True)
-    assert torch.equal(resumed.result.estimate.value, straight.result.estimate.value)
-    assert torch.equal(resumed.result.estimate.covariance, straight.result.estimate.covariance)
-    assert content_hash(read_run(resumed.log).messages()) == content_hash(read_run(straight.log).messages())
+    assert torch.equal(resumed.result.estimate.value, done.result.estimate.value)
+    assert torch.equal(resumed.result.estimate.covariance, done.result.estimate.covariance)
+    assert content_hash(read_run(resumed.log).messages()) == content_hash(read_run(done.log).messages())
 
 
 def test_nothing_to_resume_is_said(tmp_path: Path) -> None:

@@ -84,8 +84,13 @@ def step_to(name: str, size: float, at: float, until: float = 1e9) -> Truth:
 
 
 @lru_cache
+def fault_free() -> Samples:
+    return recorded(lambda t: SPACE.nominal(), 600, seed=99)
+
+
+@lru_cache
 def noise() -> NoiseModel:
-    return learn_noise(NETWORK, recorded(lambda t: SPACE.nominal(), 600, seed=99), SPACE, SPACE.nominal())[0]
+    return learn_noise(NETWORK, fault_free(), SPACE, SPACE.nominal())[0]
 
 
 def monitor(**settings: float) -> Monitor:
@@ -132,9 +137,8 @@ def test_sensors_may_have_different_rates_and_never_be_read_together(period: tup
             read = torch.stack([row % k == 0 for k in period], dim=1)
         return replace(samples, readings=torch.where(read, samples.readings, torch.nan))
 
-    fault_free = recorded(lambda t: SPACE.nominal(), 600, seed=99)
     run = recorded(step_to("T3.leak.size", 0.05, 300.0), 500, seed=3)
-    learnt = learn_noise(NETWORK, thinned(fault_free), SPACE, SPACE.nominal())[0]
+    learnt = learn_noise(NETWORK, thinned(fault_free()), SPACE, SPACE.nominal())[0]
     whole, rare = monitor(), replace_noise(monitor(), learnt)
     assert learnt.whitening.order == 0
     assert learnt.reading_std.tolist() == pytest.approx([STD] * 3, rel=0.15)
@@ -151,9 +155,8 @@ def replace_noise(run_monitor: Monitor, learnt: NoiseModel) -> Monitor:
 
 
 def test_random_sample_times_are_not_gaps() -> None:
-    run = recorded(lambda t: SPACE.nominal(), 3000)
     gaps = torch.empty(3000, dtype=torch.float64).exponential_(generator=torch.Generator().manual_seed(1))
-    samples = replace(run, time=torch.cumsum(gaps, 0))
+    samples = Samples(torch.cumsum(gaps, 0), INPUTS.expand(3000, 2), REST.expand(3000, 3))
     assert float(gaps.max()) > 10.0 * float(gaps.median())
     stretches, arrived = split_at_gaps(
         ClockState(float(samples.time[0])), samples.segment(1, 3000), usual_interval(samples.time)
