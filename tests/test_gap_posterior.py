@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
+import torch
 
 from fdi_torch.estimate.evidence import ODDS, posterior
 from fdi_torch.gap.diagnose import Settings, diagnose, verdict_of
+from fdi_torch.gap.localization.regressors import lagged
 from fdi_torch.gap.marginal_likelihood import log_prior
 from fdi_torch.gap.posterior import CauseHypothesis
 from tests.test_gap import nominal_plant, recorded
@@ -49,3 +52,23 @@ def test_an_unknown_that_an_effect_at_its_place_predicts_as_well_is_that_effect(
     assert named.verdict == "named"
     denied = diagnose(nominal_plant(), recorded(drift, 8), settings=Settings(leave_out=("coefficient_drift",)))
     assert denied.where[0][0] == "P32" and denied.causes[0].effect != "coefficient_drift"
+
+
+def test_a_second_effect_that_only_corrects_the_law_of_the_first_is_not_a_cause() -> None:
+    """A pump with two equal poles: a lag, and a delay of a few percent of its influence on the readings."""
+    commanded = recorded({}, 8).inputs
+    step, delivered = torch.ones(len(commanded), dtype=torch.float64), commanded.clone()
+    delivered[:, 0] = lagged(lagged(commanded[:, 0], step, 8.0), step, 8.0)
+    recording = replace(recorded({}, 8, inputs=delivered, std=2e-4), inputs=commanded)
+    answer = diagnose(nominal_plant(), recording)
+    assert [(c.effect, c.location) for c in answer.causes] == [("pump_lag", "Q1")]
+
+
+def test_an_effect_beside_an_unknown_is_found_though_the_unknown_hides_it() -> None:
+    """A sensor whose gain changes at half of its range, beside a draw from another tank."""
+    draw = {"T1.unmetered_flow.flow": 1.5e-5, "T1.unmetered_flow.begin": 300.0, "T1.unmetered_flow.duration": 300.0}
+    recording = recorded(draw, 8, std=1e-4)
+    readings = recording.outputs.clone()
+    readings[:, 1] += 0.3 * (readings[:, 1] - readings[:, 1].median()).clamp(min=0.0)
+    answer = diagnose(nominal_plant(), replace(recording, outputs=readings))
+    assert {(c.effect, c.location) for c in answer.causes} == {("unmetered_flow", "T1"), ("unknown", "h2")}

@@ -95,7 +95,7 @@ def posterior_of(
         for explanation in {e.key: e for e in (likeliest, result.best, result.null)}.values():
             hypotheses += _with_unknowns(pool, explanation, places, len(places), _likeliest(hypotheses))
         hypotheses += _with_fewer_effects(pool, _likeliest(hypotheses), len(places))
-        hypotheses = _after_fits_at_unknowns(pool, hypotheses, options)
+        hypotheses = _after_fits_at_unknowns(pool, hypotheses, options, len(places))
         hypotheses += _with_more_effects(pool, _likeliest(hypotheses), options, len(places))
         hypotheses += _from_unknown_alone(pool, result.null, _likeliest(hypotheses), options, len(places))
         least = _likeliest(hypotheses).weight + math.log(RARE)
@@ -119,31 +119,38 @@ def _likeliest(hypotheses: Sequence[CauseHypothesis]) -> CauseHypothesis:
 
 
 def _after_fits_at_unknowns(
-    pool: ExplanationPool, hypotheses: Sequence[CauseHypothesis], options: Sequence[Option]
+    pool: ExplanationPool, hypotheses: Sequence[CauseHypothesis], options: Sequence[Option], places: int
 ) -> list[CauseHypothesis]:
     """The hypotheses after the effects of the library were fitted at the place of each unknown that is relevant.
 
     An unknown is a law that no library has: its weight goes to effects at the same place that predict as well by
-    Akaike's criterion.
+    Akaike's criterion. The law of such an effect may also be inexact.
     """
-    least, before = _likeliest(hypotheses).weight + math.log(RARE), set(pool.explanations)
+    best, before = _likeliest(hypotheses), set(pool.explanations)
+    inexact: list[CauseHypothesis] = []
     for h in hypotheses:
-        if h.place and h.weight > least:
+        if h.place and h.weight > best.weight + math.log(RARE):
             under = with_disturbances(h.explanation.fitter, h.fit, replace(h.place.noise, wander=None))
             pool.extend_at(h.explanation, h.place.location, under, options)
+            here = [e for e in list(pool.explanations.values()) if _added_at(h.place.location, e, h.explanation)]
+            inexact += [law for e in here for law in _with_unknowns(pool, e, [h.place.location], places, best)]
     added = [e for key, e in pool.explanations.items() if key not in before]
     named = [CauseHypothesis(e, causes_in_order(e.fit), e.log_weight) for e in added]
-    return [*named, *(_as_known(h, pool.explanations.values()) for h in hypotheses)]
+    return [*named, *inexact, *(_as_known(h, pool.explanations.values()) for h in hypotheses)]
+
+
+def _added_at(place: str, known: RankedExplanation, alone: RankedExplanation) -> bool:
+    """Whether an explanation has all effects of another one, and further ones at one place only."""
+    return known.key > alone.key and {at for _, at in known.key - alone.key} == {place}
 
 
 def _as_known(h: CauseHypothesis, explanations: Iterable[RankedExplanation]) -> CauseHypothesis:
     """The hypothesis, or that of effects at the place of its unknown which predict as well."""
     if h.place is None:
         return h
-    key = h.explanation.key
     for known in explanations:
-        same_place = {at for _, at in known.key - key} == {h.place.location}
-        if known.key > key and same_place and _fitness(known, h.explanation) >= h.place.fitness:
+        at_place = _added_at(h.place.location, known, h.explanation)
+        if at_place and _fitness(known, h.explanation) >= h.place.fitness:
             return CauseHypothesis(known, causes_in_order(known.fit), h.weight)
     return h
 

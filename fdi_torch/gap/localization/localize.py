@@ -136,7 +136,9 @@ def localize(
             best = max(best, with_finer_position(best), key=_gain)
             if best.gain < SHARE * (needed - best.gain):
                 break
-            best = max(best, refitted(best), key=_gain)
+            # An effect at the place keeps its parameters: the discrepancy is then the error of its law.
+            if all(p.location != place for p in fit.candidate.placements):
+                best = max(best, refitted(best), key=_gain)
             if best.gain - before.gain < max(CONVERGED, SHARE * (needed - best.gain)):
                 break
         itself = max(itself, first.without, best.without if best.regression is regression else 0.0)
