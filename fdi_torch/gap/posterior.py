@@ -19,7 +19,7 @@ from fdi_torch.estimate.evidence import ODDS, RARE, posterior
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.library import canonical, tanks_of
-from fdi_torch.gap.localization.localize import LocalizedDiscrepancy, localize
+from fdi_torch.gap.localization.localize import FitBeside, LocalizedDiscrepancy, localize
 from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, SearchResult
@@ -167,11 +167,12 @@ def _with_unknowns(
     at: Sequence[str],
     places: int,
     best: CauseHypothesis | None = None,
+    beside: FitBeside | None = None,
 ) -> list[CauseHypothesis]:
     """An explanation with an unknown discrepancy at each of some places, as far as relevant against the best."""
     odds = math.log(ODDS.unknown / places)
     needed = best.weight + math.log(RARE) - explanation.log_weight - odds if best else -math.inf
-    found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed)
+    found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed, beside)
     itself = CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + found.itself)
     return [itself, *(_with_unknown(pool, explanation, d, places) for d in found.discrepancies)]
 
@@ -255,8 +256,12 @@ def _with_more_effects(
     accepted: list[CauseHypothesis] = []
     while best.place:
         under = with_disturbances(best.explanation.fitter, best.fit, best.place.noise)
-        beside = pool.extend_beside(best.explanation, best.place.explained, under, options)
-        trials = [h for e in beside for h in _with_unknowns(pool, e, [best.place.location], places, best)]
+        explained, noise, at = best.place.explained, best.place.noise, [best.place.location]
+        trials = [
+            h
+            for extension, fit in pool.extend_beside(best.explanation, explained, under, options)
+            for h in _with_unknowns(pool, extension, at, places, best, FitBeside(fit, explained, noise))
+        ]
         accepted += trials
         if not trials or _likeliest(trials).weight <= best.weight:
             break

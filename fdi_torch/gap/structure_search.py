@@ -200,8 +200,8 @@ class ExplanationPool:
 
     def extend_beside(
         self, parent: RankedExplanation, explained: Tensor, under: Fitter, options: Sequence[Option]
-    ) -> list[RankedExplanation]:
-        """Extend an explanation by effects beside an unknown, and return the extensions that were evaluated.
+    ) -> list[tuple[RankedExplanation, Fit]]:
+        """Extend an explanation by effects beside an unknown: the extensions, and their fits beside it.
 
         explained: part of the readings (S, C) that the unknown explains. under: fitter with the noise that it left.
         """
@@ -211,13 +211,18 @@ class ExplanationPool:
 
     def _extend_under(
         self, fitter: Fitter, base: Fit, parent: RankedExplanation, options: Sequence[Option]
-    ) -> list[RankedExplanation]:
+    ) -> list[tuple[RankedExplanation, Fit]]:
         """Evaluate the most promising extensions of `base`, a fit of the parent's effects, under another noise."""
         further = [o for o in options if o.cause not in parent.key]
-        candidates = self._extensions(parent, screen(fitter, base, further), own=False)
+        candidates = [
+            replace(c, starts=(*c.starts, self.explanations[c.key].fit.effect_values))
+            if c.key in self.explanations
+            else c
+            for c in self._extensions(parent, screen(fitter, base, further), own=False)
+        ]
         fits = self._fitted(fitter, replace(base, cost=fitter.cost(base)), candidates, again=True)[:EVALUATED]
         noise = replace(fitter.whitening.noise, wander=None) if fitter.whitening else parent.noise
-        return [self.evaluate(fit, noise) for fit in fits]
+        return [(self.evaluate(fit, noise), fit) for fit in fits]
 
     def _fitted(
         self,

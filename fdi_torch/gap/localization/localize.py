@@ -69,13 +69,28 @@ class Localization:
     itself: float
 
 
+@dataclass(frozen=True)
+class FitBeside:
+    """A fit of the readings without what a discrepancy explains of them, (S, C), under the noise that this left."""
+
+    fit: Fit
+    explained: Tensor
+    noise: StateNoise
+
+
 def localize(
-    fitter: Fitter, fit: Fit, noise: StateNoise, places: Sequence[str], needed: float = -math.inf
+    fitter: Fitter,
+    fit: Fit,
+    noise: StateNoise,
+    places: Sequence[str],
+    needed: float = -math.inf,
+    beside: FitBeside | None = None,
 ) -> Localization:
     """Evaluate a discrepancy at each of the places.
 
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
-    there are none in the result if none can reach it.
+    there are none in the result if none can reach it. beside: fit of the same effects beside a discrepancy, to start
+    from as well.
     """
     data, base = fitter.data, _likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     period = dominant_period(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
@@ -117,12 +132,17 @@ def localize(
     def refitted(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
         """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
         fit, corrected = known.regression.fit, replace(data, readings=data.readings - known.explained)
-        beside = Fitter(corrected, fitter.noise, known.under.whitening)
-        new = beside.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
-        of_levels = Fitter(corrected if regression.sensor(known.location) is not None else data, fitter.noise)
-        along = with_disturbances(of_levels, new, noise) if fitter.whitening else of_levels
-        again = DiscrepancyRegression(along, new, periods, STEPS)
-        return evaluate(again, again.of(known.location), known.location, known.noise)
+        refitter = Fitter(corrected, fitter.noise, known.under.whitening)
+        new = refitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
+        return about(FitBeside(new, known.explained, known.noise), known.location)
+
+    def about(beside: FitBeside, place: str) -> _EvaluatedDiscrepancy:
+        """The discrepancy about another fit, with the levels that are predicted from the readings of right sensors."""
+        explained = beside.explained if regression.sensor(place) is not None else 0.0
+        right = Fitter(replace(data, readings=data.readings - explained), fitter.noise)
+        along = with_disturbances(right, beside.fit, noise) if fitter.whitening else right
+        again = DiscrepancyRegression(along, beside.fit, periods, STEPS)
+        return evaluate(again, again.of(place), place, beside.noise)
 
     localized: list[LocalizedDiscrepancy] = []
     excess = -math.inf  # largest difference seen so far between a gain and its first-order estimate
@@ -130,7 +150,8 @@ def localize(
         if len(localized) >= CALIBRATION_PLACES and first_order[place] + excess < needed:
             break
         start = regression.of(place)
-        best = first = max((evaluate(regression, start, place, each) for each in starts), key=_gain)
+        first = [evaluate(regression, start, place, each) for each in starts]
+        best = max([*first, *([with_likely_noise(about(beside, place), True)] if beside else [])], key=_gain)
         for turn in range(MOST_TURNS):
             before, best = best, max(best, with_likely_noise(best, turn == 0), key=_gain)
             best = max(best, with_finer_position(best), key=_gain)
@@ -141,7 +162,7 @@ def localize(
                 best = max(best, refitted(best), key=_gain)
             if best.gain - before.gain < max(CONVERGED, SHARE * (needed - best.gain)):
                 break
-        itself = max(itself, first.without, best.without if best.regression is regression else 0.0)
+        itself = max(itself, *(e.without for e in (*first, best) if e.regression is regression))
         excess = max(excess, best.gain - first_order[place])
         if not _is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
             needed = max(needed, best.gain + math.log(RARE))
