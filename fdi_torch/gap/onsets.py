@@ -22,6 +22,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.screening import Option
 
 SPACING = 4.0  # times t; no onset is further than 2 t from a start, where most of its gain is left
+INSTANTS = ("onset", "begin")  # names of parameters that are onset times
 MOST = 127  # onset times, a limit on computing time
 
 
@@ -30,15 +31,14 @@ def fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
     duration = max(float(part.experiment.nodes[-1]) for part in fitter.data.parts)
     count = min(math.ceil(duration / (SPACING * detection_time(fitter))), MOST)
     further: list[Option] = []
-    coarse: dict[tuple[object, ...], list[Option]] = {}
+    coarse: dict[tuple[str, tuple[str, str], tuple[tuple[str, float], ...]], list[Option]] = {}
     for option in options:
-        onset = f"{option.placement.prefix}.onset"
-        if onset in option.start:
-            others = tuple((n, v) for n, v in option.start.items() if n != onset)
-            coarse.setdefault((option.cause, others), []).append(option)
-    for group in coarse.values():
+        for onset in (f"{option.placement.prefix}.{name}" for name in INSTANTS):
+            if onset in option.start:
+                others = tuple((n, v) for n, v in option.start.items() if n != onset)
+                coarse.setdefault((onset, option.cause, others), []).append(option)
+    for (onset, *_), group in coarse.items():
         if count > len(group):
-            onset = f"{group[0].placement.prefix}.onset"
             times = [duration * (k + 1) / (count + 1) for k in range(count)]
             further += [replace(group[0], start={**group[0].start, onset: time}) for time in times]
     return further

@@ -177,8 +177,7 @@ class ExplanationPool:
 
         own_noise: screening under its own noise. sensor_noise: screening under sensor noise alone.
         """
-        if further := fine_onsets(own_noise.promising(FITTED), parent.fitter):
-            own_noise += screen(parent.fitter, parent.fit, further)
+        own_noise = _with_fine_onsets(parent.fitter, parent.fit, own_noise)
         relevant = [c for c in self._extensions(parent, own_noise, own=True) if self._relevant(parent, c.key)]
         fits = self._fitted(parent.fitter, parent.fit, relevant)[:EVALUATED]
         if sensor_noise:
@@ -214,11 +213,12 @@ class ExplanationPool:
     ) -> list[tuple[RankedExplanation, Fit]]:
         """Evaluate the most promising extensions of `base`, a fit of the parent's effects, under another noise."""
         further = [o for o in options if o.cause not in parent.key]
+        screening = _with_fine_onsets(fitter, base, screen(fitter, base, further))
         candidates = [
             replace(c, starts=(*c.starts, self.explanations[c.key].fit.effect_values))
             if c.key in self.explanations
             else c
-            for c in self._extensions(parent, screen(fitter, base, further), own=False)
+            for c in self._extensions(parent, screening, own=False)
         ]
         fits = self._fitted(fitter, replace(base, cost=fitter.cost(base)), candidates, again=True)[:EVALUATED]
         noise = replace(fitter.whitening.noise, wander=None) if fitter.whitening else parent.noise
@@ -338,6 +338,12 @@ class ExplanationPool:
             for k, expected in self._expected_gains[key].items()
             if k in self.explanations and k not in without
         ]
+
+
+def _with_fine_onsets(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> ScreeningResult:
+    """A screening with further onset times of the most promising effects."""
+    further = fine_onsets(screening.promising(FITTED), fitter)
+    return screening + screen(fitter, fit, further) if further else screening
 
 
 def _gain_ratio(gains: Sequence[tuple[float, float]]) -> float:
