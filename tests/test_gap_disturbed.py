@@ -120,9 +120,17 @@ def test_an_onset_is_found_although_slow_random_flows_explain_a_flow_that_change
     assert abs(best.fit.values["P13.plugging.onset"] - 385.0) < 5.0
 
 
-def test_onsets_are_as_dense_as_the_random_flows_require() -> None:
+@pytest.mark.parametrize(
+    ("name", "place", "start"),
+    [
+        ("plugging", "P13", {"size": 0.1, "onset": 350.0}),
+        ("unmetered_flow", "T1", {"flow": 1e-5, "begin": 350.0, "duration": 200.0}),
+    ],
+)
+def test_onsets_are_as_dense_as_the_random_flows_require(name: str, place: str, start: dict[str, float]) -> None:
     fitter, null, _ = recalibrate(problem_of(nominal_plant(), [recorded(0.0, 1, seed=3)], [], Settings(LIBRARY)).data)
-    option = Option(Placement(effect("plugging"), "P13"), {"P13.plugging.size": 0.1, "P13.plugging.onset": 350.0})
+    placement = Placement(effect(name), place)
+    option = Option(placement, {placement.full_name(field): value for field, value in start.items()})
     assert fine_onsets([option], fitter) == []
     counts = []
     for flow, time in ((1e-6, 100.0), (8e-6, 100.0), (8e-6, 0.0)):
