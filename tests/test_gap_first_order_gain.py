@@ -27,7 +27,7 @@ def surveyed(request: pytest.FixtureRequest) -> tuple[DiscrepancyRegression, Fit
     if request.param:
         lag = Candidate((Placement(effect("sensor_lag"), "h2"),), ({"h2.sensor_lag.time_constant": 3.0},))
         null = under.fit(lag, null)
-    return DiscrepancyRegression(under, null, (), 40), under, null
+    return DiscrepancyRegression(under, null, 1.0 / 60.0, 40), under, null
 
 
 def products(

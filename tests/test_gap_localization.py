@@ -22,7 +22,7 @@ from fdi_torch.gap.localization.regressors import (
     backlash,
     decayed,
     delayed,
-    dominant_period,
+    dominant_frequency,
     hinges,
     lagged,
     rate_limited,
@@ -124,7 +124,7 @@ def test_noise_and_evidence_of_a_discrepancy_refer_to_one_trajectory(
     far_from_the_plant: tuple[Fitter, Fit, StateNoise],
 ) -> None:
     fitter, fit, noise = far_from_the_plant
-    about = DiscrepancyRegression(fitter, fit, (), 20).linearised
+    about = DiscrepancyRegression(fitter, fit, None, 20).linearised
     likely = estimate_disturbances(fitter, fit, about, start=noise, climb=False)
     under = with_disturbances(fitter, fit, likely.noise, about)
     least = -0.5 * under.log_det + likely.noise.log_prior() - 0.5 * least_chi_square(under, fit, about)
@@ -134,7 +134,7 @@ def test_noise_and_evidence_of_a_discrepancy_refer_to_one_trajectory(
 def test_every_sample_counts_in_the_weight_of_a_discrepancy(far_from_the_plant: tuple[Fitter, Fit, StateNoise]) -> None:
     """Sums of neighbouring samples would lose chi-square in proportion to the misfit."""
     fitter, fit, noise = far_from_the_plant
-    regression = DiscrepancyRegression(fitter, fit, (), 20)
+    regression = DiscrepancyRegression(fitter, fit, None, 20)
     quiet = replace(noise, intensity=1e-3 * noise.intensity)
     under, discrepancy = with_disturbances(fitter, fit, quiet, regression.linearised), regression.of("Q2")
     found = WhitenedDiscrepancy(under, fit, discrepancy).sparse_fit(column_costs(discrepancy.choices, 1e6))
@@ -176,7 +176,21 @@ def test_a_spectral_line_is_found_despite_a_slow_misfit() -> None:
     times = torch.arange(3000, dtype=torch.float64)
     slow = 0.01 * torch.sin(times / 200.0).unsqueeze(1) + noise(3000, 0.0, 0.002, 3)
     line = slow + 0.002 * torch.sin(2 * torch.pi * times / 47.3).unsqueeze(1)
-    assert dominant_period(line, 1.0) == pytest.approx(47.3, rel=2e-3)
+    frequency = dominant_frequency(line, 1.0)
+    assert frequency == pytest.approx(1.0 / 47.3, rel=2e-3)
+
+
+def test_the_frequency_of_a_pulsating_pump_is_estimated_to_its_phase() -> None:
+    """The spectrum alone shows it to 1/T: sinusoids with the pump's flow then fit hardly better than other ones."""
+    pulsation = {"amplitude": 0.3, "period": 133.5, "phase": 0.3}
+    truth = {f"Q1.pump_oscillation.{name}": value for name, value in pulsation.items()}
+    case = problem_of(nominal_plant(), (recorded(truth, 4),), (), Settings())
+    fitter, null, _ = recalibrate(case.data)
+    own, likely = with_estimated_noise(fitter, null)
+    found = localize(own, null, likely.noise, ("Q1", "T1", "P13")).discrepancies
+    assert found[0].location == "Q1" and found[0].gain > found[1].gain + 50.0
+    turns = case.data.experiment.nodes[-1] / 133.5
+    assert abs(133.5 / found[0].periods[0] - 1.0) * turns < 0.01
 
 
 @pytest.mark.parametrize("values", [{"Q1.pump_lag.time_constant": 15.0}, {"h2.sensor_hysteresis.play": 0.02}])

@@ -23,7 +23,7 @@ from fdi_torch.gap.localization.component_regressors import (
     fine_reading_regressors,
     reading_regressors,
 )
-from fdi_torch.gap.localization.regressors import time_functions
+from fdi_torch.gap.localization.regressors import HARMONICS, harmonics, time_functions
 from fdi_torch.gap.localization.sparse_regression import SparseFit, sparse_fit
 from fdi_torch.gap.marginal_likelihood import predicted_levels
 from fdi_torch.plant.description import OUTSIDE, Sensor
@@ -48,17 +48,35 @@ class NormalEquations:
 class Discrepancy:
     """Influence of a component's regressors on the readings, columns (S, C, M), about a linearised trajectory.
 
-    choices (M,): number of regressors among which each was selected.
+    choices (M,): number of regressors among which each was selected. frequency: of the sinusoids, Hz, or None if there
+    are none. sinusoids (M,) bool: which columns they are.
     """
 
     columns: Tensor
     linearised: Linearised
     choices: Tensor
+    frequency: float | None
+    sinusoids: Tensor
+
+    @property
+    def periods(self) -> tuple[float, ...]:
+        """Of the sinusoids, s."""
+        return () if self.frequency is None else tuple(1.0 / (k * self.frequency) for k in range(1, HARMONICS + 1))
 
     def with_column(self, column: Tensor, choices: int) -> Discrepancy:
         """The same with one more column (S, C)."""
-        columns = torch.cat([self.columns, column.unsqueeze(-1)], dim=-1)
-        return Discrepancy(columns, self.linearised, torch.cat([self.choices, self.choices.new_tensor([choices])]))
+        return replace(
+            self,
+            columns=torch.cat([self.columns, column.unsqueeze(-1)], dim=-1),
+            choices=torch.cat([self.choices, self.choices.new_tensor([choices])]),
+            sinusoids=torch.cat([self.sinusoids, self.sinusoids.new_zeros(1)]),
+        )
+
+    def with_sinusoids(self, frequency: float, columns: Tensor) -> Discrepancy:
+        """The same with sinusoids of another frequency; columns (S, C, W): their influence."""
+        replaced = self.columns.clone()
+        replaced[..., self.sinusoids] = columns
+        return replace(self, columns=replaced, frequency=frequency)
 
 
 @dataclass(frozen=True)
@@ -66,15 +84,20 @@ class Regressors:
     """Regressors of one component along one recording of K steps; of a sensor, along its K samples.
 
     functions (M, K): of local variables, in m^3/s, or in the sensor's unit. fine (F, K): those with kinks, on a finer
-    grid. in_time (T, K): functions of time times `factor` (K,). areas (A, K): of a tank, changes of its level rate,
-    m/s; otherwise None.
+    grid. in_time (T, K): functions of the time (K,) times `factor` (K,). areas (A, K): of a tank, changes of its level
+    rate, m/s; otherwise None.
     """
 
     functions: Tensor
     fine: Tensor
     in_time: Tensor
+    time: Tensor
     factor: Tensor
     areas: Tensor | None = None
+
+    def sinusoids(self, frequency: Tensor) -> Tensor:
+        """Harmonics of each frequency (F,), Hz, times the factor: (F, W, K)."""
+        return harmonics(self.time, frequency) * self.factor
 
 
 @dataclass(frozen=True)
@@ -106,7 +129,8 @@ class RecordingLinearisation:
         order, columns = self.linearised.gain.shape[-1], weights.shape[-1]
         paths = weights.new_zeros(1, order, columns, self.linearised.levels.shape[1], requires_grad=True)
         readings = self.engine.look(self.linearised.levels, self.theta).along(paths, [-1] * columns)
-        (by_path,) = torch.autograd.grad(readings, paths, weights.permute(1, 2, 0).unsqueeze(0))
+        # The gradient of a scalar: PyTorch imports SymPy, which takes a second, to check weights given apart.
+        (by_path,) = torch.autograd.grad((readings[0] * weights.permute(1, 2, 0)).sum(), paths)
         back, gain = self.linearised.transition.permute(0, 3, 2, 1).flip(-1), self.linearised.gain.permute(0, 3, 2, 1)
         by_level = scan_in_time(back, by_path[..., :-1].flip(-1), by_path[..., -1]).flip(-1)
         return product(gain, by_level[..., 1:])[0]
@@ -115,11 +139,12 @@ class RecordingLinearisation:
 class DiscrepancyRegression:
     """Influence of the discrepancies of all components of a data set, about one fit.
 
-    periods: of sinusoids, s. steps: number of step functions of time, over all recordings.
+    frequency: of sinusoids, Hz, or None. steps: number of step functions of time, over all recordings.
     """
 
-    def __init__(self, fitter: Fitter, fit: Fit, periods: Sequence[float], steps: int) -> None:
-        self.fitter, self.fit, self.periods = fitter, fit, tuple(periods)
+    def __init__(self, fitter: Fitter, fit: Fit, frequency: float | None, steps: int) -> None:
+        self.fitter, self.fit = fitter, fit
+        self.frequencies = torch.tensor([] if frequency is None else [frequency], dtype=fit.theta.dtype)
         self.engine = fitter.engine(fit.candidate, list(fit.effect_values))
         self.theta, self.levels = fit.theta.unsqueeze(0), predicted_levels(fitter, fit)
         self.linearised = self.engine.linearise(self.theta, self.levels)
@@ -135,7 +160,21 @@ class DiscrepancyRegression:
             if r.areas is not None:
                 shared[k] = torch.cat([self._influence_of_areas(place, k, r.areas), shared[k]], dim=-1)
         columns = _concatenated(shared, [self.influence(place, k, r.in_time) for k, r in enumerate(regressors)])
-        return Discrepancy(columns, linearised, columns.new_full((columns.shape[-1],), columns.shape[-1]))
+        frequency, first = None, columns.shape[-1]
+        if len(self.frequencies):
+            frequency = float(self.frequencies[0])
+            columns = torch.cat([columns, self.sinusoids(place, self.frequencies)[..., 0, :]], dim=-1)
+        count = columns.shape[-1]
+        choices, sinusoids = columns.new_full((count,), count), torch.arange(count) >= first
+        return Discrepancy(columns, linearised, choices, frequency, sinusoids)
+
+    def sinusoids(self, place: str, frequency: Tensor) -> Tensor:
+        """Influence (S, C, F, W) of harmonics of each frequency (F,), with separate amplitudes in each recording."""
+        per_recording = []
+        for k, regressors in enumerate(self.at(place)[0]):
+            functions = regressors.sinusoids(frequency)
+            per_recording.append(self.influence(place, k, functions.flatten(0, 1)).unflatten(-1, functions.shape[:2]))
+        return _concatenated([c[..., :0] for c in per_recording], per_recording)
 
     def at(self, place: str) -> tuple[list[Regressors], Linearised]:
         """Regressors of the component at a place along each recording, and the trajectory about which they act."""
@@ -194,7 +233,7 @@ class DiscrepancyRegression:
             functions, fine = (torch.stack(each(s, step, ends)) for each in (component.flows, component.fine))
             areas = torch.stack(component.areas(s, step, ends)) if component.areas else None
             in_time = factor * self._functions_of_time(piece, piece.middle)
-            regressors.append(Regressors(functions, fine, in_time, factor, areas))
+            regressors.append(Regressors(functions, fine, in_time, piece.middle, factor, areas))
         return regressors
 
     def _of_sensor(self, sensor: Sensor) -> tuple[list[Regressors], Linearised]:
@@ -214,7 +253,7 @@ class DiscrepancyRegression:
             functions = reading_regressors(s, piece.engine.experiment.sample_intervals, ends, scale)
             fine, in_time = fine_reading_regressors(s, ends), self._functions_of_time(piece, s["time"])
             one = torch.ones_like(s["time"])
-            regressors.append(Regressors(torch.stack(functions), torch.stack(fine), in_time, one))
+            regressors.append(Regressors(torch.stack(functions), torch.stack(fine), in_time, s["time"], one))
         return regressors, self.engine.linearise(self.theta, levels)
 
     def _rate_changes(self, piece: RecordingLinearisation, component: DiscrepancyModel, flows: Tensor) -> Tensor:
@@ -226,9 +265,9 @@ class DiscrepancyRegression:
         return piece.forcing.by_inflows(inflows, len(flows))
 
     def _functions_of_time(self, piece: RecordingLinearisation, time: Tensor) -> Tensor:
-        """Steps, ramps and sinusoids, (M, K)."""
+        """Steps and ramps, (M, K)."""
         duration = float(piece.engine.experiment.nodes[-1])
-        return torch.stack(time_functions(time, duration, self.periods, self.steps))
+        return torch.stack(time_functions(time, duration, self.steps))
 
     def tank(self, name: str) -> int:
         return [t.name for t in self.fitter.data.plant.tanks].index(name)

@@ -26,14 +26,13 @@ from fdi_torch.estimate.kalman import SCATTER, StateNoise, Wander
 from fdi_torch.estimate.state_noise import CORRELATION_TIMES, LOG_BOUND
 from fdi_torch.gap.candidate_fit import SHARE, Candidate, Fit, Fitter
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression, WhitenedDiscrepancy
-from fdi_torch.gap.localization.fine_positions import with_best_position
-from fdi_torch.gap.localization.regressors import dominant_period
+from fdi_torch.gap.localization.fine_positions import with_best_frequency, with_best_position
+from fdi_torch.gap.localization.regressors import dominant_frequency
 from fdi_torch.gap.localization.single_regressor_gain import largest_influence, single_regressor_gains
 from fdi_torch.gap.localization.sparse_regression import SparseFit, column_costs
 from fdi_torch.gap.marginal_likelihood import LinearParameters, estimate_disturbances, occam, with_disturbances
 from fdi_torch.simulate.collocation import Linearised
 
-HARMONICS = 3  # of a dominant period of the residual
 STEPS = 120  # step functions of time
 MOST_TURNS = 12  # alternations between the disturbance noise, one more regressor, and the parameters of the fit
 CONVERGED = 0.1  # nats; a smaller gain ends the alternation, as does one below SHARE of what is still needed
@@ -93,9 +92,8 @@ def localize(
     from as well.
     """
     data, base = fitter.data, _likelihood(fitter, fit, fit.linearised) + noise.log_prior()
-    period = dominant_period(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
-    periods = tuple(period / k for k in range(1, HARMONICS + 1)) if period else ()
-    regression = DiscrepancyRegression(fitter, fit, periods, STEPS)
+    frequency = dominant_frequency(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
+    regression = DiscrepancyRegression(fitter, fit, frequency, STEPS)
     if not math.isfinite(base + _evidence(fitter, fit, noise, regression.linearised)):
         return Localization((), 0.0)
     likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
@@ -129,19 +127,24 @@ def localize(
         )
         return evaluate(regression, finer, known.location, known.noise) if finer else known
 
+    def with_finer_frequency(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
+        used, regression, at = known.regressed.used, known.regression, known.discrepancy
+        finer = with_best_frequency(regression, known.location, known.under, regression.fit, at, used)
+        return evaluate(regression, finer, known.location, known.noise) if finer else known
+
     def refitted(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
         """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
         fit, corrected = known.regression.fit, replace(data, readings=data.readings - known.explained)
         refitter = Fitter(corrected, fitter.noise, known.under.whitening)
         new = refitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
-        return about(FitBeside(new, known.explained, known.noise), known.location)
+        return about(FitBeside(new, known.explained, known.noise), known.location, known.discrepancy.frequency)
 
-    def about(beside: FitBeside, place: str) -> _EvaluatedDiscrepancy:
+    def about(beside: FitBeside, place: str, frequency: float | None) -> _EvaluatedDiscrepancy:
         """The discrepancy about another fit, with the levels that are predicted from the readings of right sensors."""
         explained = beside.explained if regression.sensor(place) is not None else 0.0
         right = Fitter(replace(data, readings=data.readings - explained), fitter.noise)
         along = with_disturbances(right, beside.fit, noise) if fitter.whitening else right
-        again = DiscrepancyRegression(along, beside.fit, periods, STEPS)
+        again = DiscrepancyRegression(along, beside.fit, frequency, STEPS)
         return evaluate(again, again.of(place), place, beside.noise)
 
     localized: list[LocalizedDiscrepancy] = []
@@ -151,10 +154,11 @@ def localize(
             break
         start = regression.of(place)
         first = [evaluate(regression, start, place, each) for each in starts]
-        best = max([*first, *([with_likely_noise(about(beside, place), True)] if beside else [])], key=_gain)
+        best = max([*first, *([with_likely_noise(about(beside, place, frequency), True)] if beside else [])], key=_gain)
         for turn in range(MOST_TURNS):
             before, best = best, max(best, with_likely_noise(best, turn == 0), key=_gain)
             best = max(best, with_finer_position(best), key=_gain)
+            best = max(best, with_finer_frequency(best), key=_gain)
             if best.gain < SHARE * (needed - best.gain):
                 break
             # An effect at the place keeps its parameters: the discrepancy is then the error of its law.
@@ -173,7 +177,7 @@ def localize(
                     best.fitness,
                     best.explained,
                     _effect_size(fitter, best),
-                    periods,
+                    best.discrepancy.periods,
                     best.regression.fit,
                     best.noise,
                 )

@@ -10,7 +10,6 @@ Times are those of bench-scale tanks; `scale` multiplies them for other plants (
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -26,6 +25,7 @@ STICTION_BANDS = (0.1, 0.2, 0.3, 0.4)  # as shares of the signal's range
 TRAVEL_TIMES = (8.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # s, through the full range at the rate limit
 FATIGUE_TIMES = (150.0, 500.0)  # s, of the mean of a flow's recent past that changes it
 RAMPS = 12  # ramps in time, at equal distances
+HARMONICS = 3  # of a dominant frequency of the residual
 
 
 def hinges(x: Tensor, ends: tuple[float, float], count: int) -> list[Tensor]:
@@ -78,12 +78,18 @@ def fatigues(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -
     return [x * lagged(x, step, scale * tau) / largest for tau in FATIGUE_TIMES]
 
 
-def time_functions(time: Tensor, duration: float, periods: Sequence[float], steps: int) -> list[Tensor]:
-    """1, steps, ramps and sinusoids of time."""
+def time_functions(time: Tensor, duration: float, steps: int) -> list[Tensor]:
+    """1, steps and ramps of time."""
     stepped = [(time >= duration * j / steps).to(time.dtype) for j in range(1, steps)]
     ramps = [(time / duration - j / RAMPS).clamp(min=0.0) for j in range(RAMPS)]
-    waves = [wave(2.0 * math.pi * time / period) for period in periods for wave in (torch.sin, torch.cos)]
-    return [torch.ones_like(time), *stepped, *ramps, *waves]
+    return [torch.ones_like(time), *stepped, *ramps]
+
+
+def harmonics(time: Tensor, frequency: Tensor) -> Tensor:
+    """Sinusoids of time (K,) with multiples of each frequency (F,), Hz: (F, 2 HARMONICS, K)."""
+    multiples = torch.arange(1, HARMONICS + 1, dtype=time.dtype)
+    phase = 2.0 * math.pi * frequency[:, None, None] * multiples[:, None] * time
+    return torch.cat([torch.sin(phase), torch.cos(phase)], dim=1)
 
 
 def lagged(x: Tensor, step: Tensor, tau: float) -> Tensor:
@@ -157,8 +163,8 @@ SURROUNDINGS = 15  # frequencies of the recording to each side, for the median
 CYCLES = 8  # fewest periods in the recording
 
 
-def dominant_period(white: Tensor, spacing: float) -> float | None:
-    """Period (s) of the strongest line in the spectrum of a whitened residual (S, C), or None.
+def dominant_frequency(white: Tensor, spacing: float) -> float | None:
+    """Frequency (Hz) of the strongest line in the spectrum of a whitened residual (S, C), or None.
 
     A line is measured against the median of its surroundings in the tapered periodogram, summed over the channels.
     """
@@ -173,4 +179,4 @@ def dominant_period(white: Tensor, spacing: float) -> float | None:
     ratio = power / median.repeat_interleave(ZERO_PADDING)[: len(power)]
     ratio[: CYCLES * ZERO_PADDING] = 0.0
     peak = int(ratio.argmax())
-    return ZERO_PADDING * samples * spacing / peak if peak else None
+    return peak / (ZERO_PADDING * samples * spacing) if peak else None

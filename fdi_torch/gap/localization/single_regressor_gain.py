@@ -135,7 +135,8 @@ def _flow_products(regression: DiscrepancyRegression, place: str, adjoints: Adjo
         if regressors.areas is not None:
             products = torch.cat([regressors.areas @ rates[regression.tank(place)].T, products])
         shared.append(products)
-        per_recording.append(regressors.in_time @ net.T)
+        sinusoids = regressors.sinusoids(regression.frequencies).flatten(0, 1)
+        per_recording.append(torch.cat([regressors.in_time, sinusoids]) @ net.T)
     return torch.cat([torch.stack(shared).sum(dim=0), *per_recording])
 
 
