@@ -8,10 +8,10 @@ the sensor noise v and the residuals y of the readings obey, from sample s to th
     v_{s+1} = a v_s + p_s                       var(v_c) = (scale_c std_c)^2
     y_s     = C_s x_s + v_s
 
-with white shocks q and p. One sensor may have an additional slow random drift in its reading (`Wander`), a first-order
-process like v. The filter turns residuals, and their derivatives by parameters, into innovations of unit variance
-(Särkkä, 2013, "Bayesian filtering and smoothing", chapter 4). The disturbances model waves, pulsation and splashing,
-which occur on every real rig and are not faults.
+with white shocks q and p. One sensor may have an additional slow random drift z in its reading (`Wander`), a further
+component of x with its own w. The filter turns residuals, and their derivatives by parameters, into innovations of unit
+variance (Särkkä, 2013, "Bayesian filtering and smoothing", chapter 4). The disturbances model waves, pulsation and
+splashing, which occur on every real rig and are not faults.
 
 S: samples, C: sensors (channels), n: states (levels and states of effects), d: states of the filter, M: columns that
 are filtered together.
@@ -52,11 +52,18 @@ class Propagation:
 
 @dataclass(frozen=True)
 class Wander:
-    """Slow random drift of one sensor's reading, a first-order process. std: reading's unit; correlation_time: s."""
+    """Slow random drift z of one sensor's reading, stationary:
+
+        z_{s+1} = a z_s + b w_s,    w_{s+1} = g w_s + q_s,    a = exp(-dt / correlation_time)
+
+    std: of z, reading's unit. correlation_time: s. smooth: g = a, which makes the rate of the drift continuous, as with
+    temperature; otherwise g = 0, a process of first order.
+    """
 
     channel: int
     std: float
     correlation_time: float
+    smooth: bool = False
 
 
 # Flow disturbances of one plant have the same causes (pumps, waves, valves, supply) and are of one order of magnitude:
@@ -123,6 +130,20 @@ class KalmanFilter:
         """Decay factor exp(-dt / time) over one sampling interval; time: correlation time, s, 0 for white noise."""
         return math.exp(-self.interval / time) if time > 0.0 else 0.0
 
+    def with_wander(self, wander: Wander) -> tuple[tuple[Tensor, ...], float]:
+        """The matrices A, B and C with the drift as last component of x, and the decay factor g of its w.
+
+        b is such that the stationary variances of z and w are equal.
+        """
+        a = self.kept(wander.correlation_time)
+        g = a if wander.smooth else 0.0
+        transition, forcing, output = (
+            torch.nn.functional.pad(x, (0, 1, 0, further)) for x, further in zip(self.matrices, (1, 1, 0), strict=True)
+        )
+        transition[:, -1, -1], output[:, wander.channel, -1] = a, 1.0
+        forcing[:, -1, -1] = math.sqrt((1.0 - a * a) * (1.0 - a * g) / (1.0 + a * g))
+        return (transition, forcing, output), g
+
 
 class Filtered:
     """Kalman filter with the gains of one noise model.
@@ -135,19 +156,22 @@ class Filtered:
         self.own, self.wanders = kalman_filter, noise.wander is not None
         of_sensors, zeros = (noise.scale * kalman_filter.sensors.std) ** 2, torch.zeros_like(noise.scale)
         self.flows = len(noise.intensity)
-        flows = torch.cat([noise.intensity**2, noise.intensity.new_zeros(kalman_filter.order - self.flows)])
-        processes = [(torch.full_like(flows, kalman_filter.kept(noise.correlation_time)), flows)]
-        processes += [(kalman_filter.sensors.correlation, of_sensors)] if kalman_filter.correlated else []
-        self.r = zeros if kalman_filter.correlated else of_sensors
+        variance = torch.cat([noise.intensity**2, noise.intensity.new_zeros(kalman_filter.order - self.flows)])
+        decay, matrices = torch.full_like(variance, kalman_filter.kept(noise.correlation_time)), kalman_filter.matrices
+        start = torch.zeros_like(variance)
         if (wander := noise.wander) is not None:
-            of_wander = zeros.index_fill(0, torch.tensor(wander.channel), wander.std**2)
-            processes.append((torch.full_like(zeros, kalman_filter.kept(wander.correlation_time)), of_wander))
-        decay, variance = (torch.cat(parts) for parts in zip(*processes, strict=True))
+            matrices, kept = kalman_filter.with_wander(wander)
+            further = (variance, wander.std**2), (decay, kept), (start, wander.std**2)
+            variance, decay, start = (torch.cat([x, x.new_tensor([value])]) for x, value in further)
+        self.order = len(start)
+        if kalman_filter.correlated:
+            variance, decay = torch.cat([variance, of_sensors]), torch.cat([decay, kalman_filter.sensors.correlation])
+        self.r = zeros if kalman_filter.correlated else of_sensors
         self.keep, self.q = decay, (1.0 - decay**2) * variance
-        self.p0 = torch.cat([variance.new_zeros(kalman_filter.order), variance])
-        tensors = (*kalman_filter.matrices, self.keep, self.q, self.r, self.p0, *kalman_filter.flags)
-        self._model = _Model(*(t.data_ptr() for t in tensors))
-        self._library = _library(kalman_filter.order, kalman_filter.channels, len(processes) - 1)
+        self.p0 = torch.cat([start, variance])
+        self._tensors = (*matrices, self.keep, self.q, self.r, self.p0, *kalman_filter.flags)
+        self._model = _Model(*(t.data_ptr() for t in self._tensors))
+        self._library = _library(self.order, kalman_filter.channels, int(kalman_filter.correlated))
         self.gain = variance.new_empty(kalman_filter.samples, len(self.p0), kalman_filter.channels)
         self.white = variance.new_empty(kalman_filter.samples, kalman_filter.channels, kalman_filter.channels)
         self.log_det = float(self._run("kalman_gains", self.gain, self.white))
@@ -175,25 +199,25 @@ class Filtered:
 
     def _by_deviation(self, by_q: Tensor, by_r: Tensor, by_p0: Tensor) -> Tensor:
         """Derivatives by log standard deviations from derivatives by variances: df/dlog(s) = 2 s^2 df/d(s^2)."""
-        order, channels = self.own.order, self.own.channels
-        decaying = 2.0 * (by_q * self.q + by_p0[order:] * self.p0[order:])
-        of_sensors = decaying[order : order + channels] if self.own.correlated else 2.0 * by_r * self.r
-        wander = decaying[-channels:].sum().reshape(1) if self.wanders else decaying[:0]
+        order, at_start = self.order, 2.0 * by_p0 * self.p0
+        decaying = 2.0 * by_q * self.q + at_start[order:]
+        of_sensors = decaying[order:] if self.own.correlated else 2.0 * by_r * self.r
+        wander = decaying[order - 1 : order] + at_start[order - 1 : order] if self.wanders else decaying[:0]
         return torch.cat([decaying[: self.flows], of_sensors, wander])
 
     def smoothed(self, residual: Tensor) -> Tensor:
         """Smoothed deviation of the levels from the trajectory, (S, n) m, given all residuals (S, C)."""
         shocks = self.score(self.innovations(residual.unsqueeze(-1)).squeeze(-1)).shocks
-        levels = residual.new_empty(self.own.samples, self.own.order)
-        self._run("kalman_levels", shocks, levels)
-        return levels
+        states = residual.new_empty(self.own.samples, self.order)
+        self._run("kalman_levels", shocks, states)
+        return states[:, : self.own.order]
 
     def predicted(self, residual: Tensor) -> Tensor:
         """Deviation of the levels from the trajectory, (S, n) m, predicted for each sample from the residuals (S, C) of
         all earlier ones."""
-        levels = residual.new_empty(self.own.samples, self.own.order)
-        self._run("kalman_predictions", self.gain, residual.contiguous(), levels)
-        return levels
+        states = residual.new_empty(self.own.samples, self.order)
+        self._run("kalman_predictions", self.gain, residual.contiguous(), states)
+        return states[:, : self.own.order]
 
     def _run(self, name: str, *arguments: Tensor | int) -> Any:
         function = getattr(self._library, name)
@@ -247,7 +271,7 @@ class _Model(ctypes.Structure):
 
 @lru_cache
 def _library(tanks: int, channels: int, layers: int) -> ctypes.CDLL:
-    """kalman.hpp compiled for these sizes; layers: number of correlated noise terms on each channel."""
+    """kalman.hpp compiled for these sizes; layers: 1 if the noise of the channels is correlated in time, else 0."""
     sizes = f"#define TANKS {tanks}\n#define CHANNELS {channels}\n#define LAYERS {layers}\n"
     source = sizes + Path(__file__).with_name("kalman.hpp").read_text(encoding="utf-8")
     names = ("gains", "innovations", "transposed", "score", "predictions", "levels")

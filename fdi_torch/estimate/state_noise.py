@@ -63,7 +63,8 @@ def estimate_state_noise(
     of unit variance: precision pull^2, and `off` prior standard deviations between current value and prior mean.
     unit (n,), m^3/s: order of magnitude of a flow disturbance. start: initial noise model.
     climb: whether to search CORRELATION_TIMES for the best correlation time; otherwise that of `start` is retained. The
-    search is over the wander's correlation time if a sensor wanders, else over that of the flow disturbances.
+    search is over the wander's correlation time and smoothness if a sensor wanders, else over the correlation time of
+    the flow disturbances.
     """
     problem = _Problem(propagation, sensors, residual, jacobian, pull, off, unit)
     interval = propagation.interval
@@ -71,14 +72,13 @@ def estimate_state_noise(
         start = StateNoise(unit, interval * CORRELATION_TIMES[2], torch.ones_like(sensors.std))
     if not climb:
         return problem.solve(start)
-    if start.wander is not None:
-        return problem.climbed(
-            start,
-            [c * interval for c in CORRELATION_TIMES[1:]],
-            start.wander.correlation_time,
-            _with_wander_correlation_time,
-        )
     times = [c * interval for c in CORRELATION_TIMES]
+    if (wander := start.wander) is not None:
+        starts = [replace(start, wander=replace(wander, smooth=smooth)) for smooth in (False, True)]
+        climbs = [
+            problem.climbed(each, times[1:], wander.correlation_time, _with_wander_correlation_time) for each in starts
+        ]
+        return max(climbs, key=lambda likely: likely.log_likelihood)
     return problem.climbed(
         start, times, start.correlation_time, partial(_with_flow_correlation_time, interval=interval)
     )

@@ -369,13 +369,13 @@ def _initial_drift(fitter: Fitter, linearised: Linearised, quiet: StateNoise, ch
 
 
 def _drift_cost(fitter: Fitter, drift: Wander) -> float:
-    """Cost of the two parameters of a drift, nats."""
+    """Cost of the parameters of a drift, nats: correlation time, smoothness, and size."""
     valid = fitter.data.mask[:, drift.channel]
     readings = fitter.data.readings[valid, drift.channel]
     noise = float(fitter.noise.std[drift.channel])
     width = math.log(max(float(readings.max() - readings.min()), noise) / (SMALLEST_DRIFT * noise))
     values = max(int(valid.sum()) * fitter.data.row_spacing / drift.correlation_time, 1.0)
-    return math.log(len(CORRELATION_TIMES) - 1) + max(math.log(width * math.sqrt(values / math.pi)), 0.0)
+    return math.log(2 * (len(CORRELATION_TIMES) - 1)) + max(math.log(width * math.sqrt(values / math.pi)), 0.0)
 
 
 def _is_rounding_error(fitter: Fitter, place: str, std: float) -> bool:
