@@ -22,7 +22,7 @@ from pathlib import Path
 
 _SHARED = ("-std=c++17", "-fPIC", "-shared", "-pthread")
 _FLAGS = (
-    *_SHARED, "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
+    *_SHARED, "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
     "-fno-strict-aliasing",
 )  # fmt: skip
 
@@ -68,26 +68,28 @@ def cache_folder() -> Path:
         return Path(tempfile.gettempdir()) / f"fdi_torch_{os.geteuid()}"
 
 
-def is_cached(source: str) -> bool:
-    """Whether the cache holds the compiled source."""
+def is_cached(source: str, level: str = "-O3") -> bool:
+    """Whether the cache holds the source compiled at that level of optimisation."""
     compiler = find_compiler()
     try:
-        return compiler is not None and _cached(_own_folder(), _key(compiler, source)) is not None
+        return compiler is not None and _cached(_own_folder(), _key(compiler, source, level)) is not None
     except BuildError:
         return False
 
 
-def load_library(source: str, *functions: str) -> ctypes.CDLL:
-    """The compiled source, from the cache if possible. functions: names that it must export. Raises BuildError."""
+def load_library(source: str, *functions: str, level: str = "-O3") -> ctypes.CDLL:
+    """The compiled source, from the cache if possible. functions: names that it must export. level: of optimisation.
+    Raises BuildError.
+    """
     compiler = _expected_compiler()
-    folder, key = _own_folder(), _key(compiler, source)
+    folder, key = _own_folder(), _key(compiler, source, level)
     cached = _cached(folder, key)
     if cached is not None:
         try:
             return _opened(cached, functions)
         except BuildError:
             cached.unlink(missing_ok=True)
-    return _opened(_compile(compiler, source, folder, key), functions)
+    return _opened(_compile(compiler, source, level, folder, key), functions)
 
 
 def compile_library(source: str, path: Path, flags: Sequence[str]) -> None:
@@ -107,8 +109,8 @@ def _expected_compiler() -> Command:
     return compiler
 
 
-def _key(compiler: Command, source: str) -> str:
-    key = "\0".join([source, *_FLAGS, _identity(compiler), _processor()])
+def _key(compiler: Command, source: str, level: str) -> str:
+    key = "\0".join([source, *_FLAGS, level, _identity(compiler), _processor()])
     return hashlib.sha256(key.encode()).hexdigest()[:24]
 
 
@@ -164,13 +166,13 @@ def _opened(library: Path, functions: Sequence[str]) -> ctypes.CDLL:
     return opened
 
 
-def _compile(compiler: Command, source: str, folder: Path, key: str) -> Path:
+def _compile(compiler: Command, source: str, level: str, folder: Path, key: str) -> Path:
     """Compile the source and return the path of the library."""
     try:
         with tempfile.TemporaryDirectory(dir=folder) as place:
             code, built = Path(place) / "kernel.cpp", Path(place) / "kernel.so"
             code.write_text(source, encoding="utf-8")
-            _run_compiler(compiler, _FLAGS, code, built)
+            _run_compiler(compiler, (*_FLAGS, level), code, built)
             built.chmod(0o700)
             library = folder / f"{key}_{_content_hash(built)}.so"
             built.replace(library)  # atomic: other processes see all of it or nothing

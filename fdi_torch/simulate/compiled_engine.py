@@ -35,6 +35,8 @@ _REALS = {torch.float64: "double", torch.float32: "float"}
 VALUE_LANES, TANGENT_LANES = 32, 16
 # Steps of plants with up to this many states are unrolled, which is faster but takes longer to compile.
 MOST_UNROLLED = 6
+# -O3 takes a third longer to compile, and the loops run no faster: their vectors are written out.
+LEVEL = "-O2"
 
 
 class _Python(ctypes.Structure):
@@ -120,7 +122,7 @@ class CompiledEngine:
 
     def is_built(self, tangent: bool = False, dtype: torch.dtype = torch.float64) -> bool:
         """Whether the cache holds the compiled kernel."""
-        return is_cached(_source(self.network, self.space.names, tangent, *self._form, _REALS[dtype]))
+        return is_cached(_source(self.network, self.space.names, tangent, *self._form, _REALS[dtype]), LEVEL)
 
     @property
     def _sensors(self) -> int:
@@ -240,6 +242,7 @@ def _kernel(
     network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool, inner: bool, real: str
 ) -> tuple[Any, Tensor]:
     """The compiled function, and the numbers of the equations that are its arguments."""
-    run = _RUN(("run", load_library(_source(network, names, tangent, adaptive, inner, real), "run")))
+    source = _source(network, names, tangent, adaptive, inner, real)
+    run = _RUN(("run", load_library(source, "run", level=LEVEL)))
     lifted = _program(network, names, tangent, adaptive).graph.lifted
     return run, torch.tensor(lifted or [0.0], dtype=torch.float64)

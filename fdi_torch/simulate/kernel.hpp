@@ -5,10 +5,7 @@
 // repeats its last lane), so a trajectory does not depend on its neighbours, their number, or the threads.
 #include <atomic>
 #include <chrono>
-#include <condition_variable>
 #include <limits>
-#include <memory>
-#include <mutex>
 #include <thread>
 #include <vector>
 #if defined(__linux__)
@@ -697,18 +694,19 @@ static void run_block(const Job &job, Block &b, const Rows &rows) {
 }
 
 static void work(const Job &job, std::atomic<int64_t> &next, Watch &watch, bool calls) {
-    std::unique_ptr<Block> b(new Block());
-    b->nominal = job.nominal;
-    b->lifted = job.lifted;
-    b->resolution = *job.resolution;
-    b->watch = &watch;
-    b->looks = calls;
-    b->history.resize(LATE_SENSORS * job.samples * LANES);
+    std::vector<Block> block(1);
+    Block &b = block[0];
+    b.nominal = job.nominal;
+    b.lifted = job.lifted;
+    b.resolution = *job.resolution;
+    b.watch = &watch;
+    b.looks = calls;
+    b.history.resize(LATE_SENSORS * job.samples * LANES);
 #if TANGENT
-    b->d_history.resize(COLUMNS * LATE_SENSORS * job.samples * LANES);
+    b.d_history.resize(COLUMNS * LATE_SENSORS * job.samples * LANES);
 #endif
     for (int64_t first; !watch.stop && (first = LANES * next++) < job.lanes;)
-        run_block(job, *b, {first, job.lanes - first < LANES ? job.lanes - first : LANES});
+        run_block(job, b, {first, job.lanes - first < LANES ? job.lanes - first : LANES});
 }
 
 // Results are written once and all over: large pages are handed out five hundred times as rarely as small ones.
@@ -728,21 +726,17 @@ extern "C" void run(const Job *job) {
     std::atomic<int64_t> next(0);
     const int64_t blocks = (job->lanes + LANES - 1) / LANES;
     const int64_t threads = job->threads < blocks ? job->threads : blocks;
-    std::mutex mutex;
-    std::condition_variable ended;
-    int64_t at_work = threads - 1;
+    std::atomic<int64_t> at_work(threads - 1);
     std::vector<std::thread> others;
     for (int64_t i = 1; i < threads; ++i)
         others.emplace_back([&] {
             work(*job, next, watch, false);
-            std::lock_guard<std::mutex> lock(mutex);
             --at_work;
-            ended.notify_one();
         });
     work(*job, next, watch, true);
-    {
-        std::unique_lock<std::mutex> lock(mutex);
-        while (!ended.wait_for(lock, INTERVAL, [&] { return at_work <= 0; })) watch.look();
+    while (at_work > 0) {
+        std::this_thread::sleep_for(std::chrono::microseconds(50));
+        watch.look();
     }
     for (auto &other : others) other.join();
 }
