@@ -14,7 +14,6 @@ from torch import Tensor
 
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate_fit import Fit, Fitter
-from fdi_torch.gap.dataset import interpolate
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression, WhitenedDiscrepancy
 from fdi_torch.gap.localization.localize import localize
@@ -33,6 +32,7 @@ from fdi_torch.gap.localization.regressors import (
 from fdi_torch.gap.localization.sparse_regression import column_costs, sparse_fit
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances, with_estimated_noise
 from fdi_torch.gap.problem import problem_of
+from fdi_torch.gap.resampling import interpolate
 from fdi_torch.simulate.collocation import Linearised
 from tests.test_gap import noise, nominal_plant, recorded
 

@@ -19,7 +19,8 @@ from fdi_torch.effects import EFFECTS
 from fdi_torch.estimate.kalman import KalmanWhitening
 from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, levenberg_marquardt
 from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
-from fdi_torch.gap.dataset import DataSet, RecordingPart, interpolate
+from fdi_torch.gap.dataset import DataSet, RecordingPart
+from fdi_torch.gap.resampling import interpolate
 from fdi_torch.gap.trajectory_problem import FAR, FittedTrajectory, TrajectoryProblem
 from fdi_torch.parameters import ParameterName, ParameterSpace, common_name, is_effect_parameter, name_in_recording
 from fdi_torch.plant.effect import Placement

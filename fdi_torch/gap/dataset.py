@@ -10,6 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from fdi_torch.gap.resampling import interpolate, step_means
 from fdi_torch.parameters import name_in_recording
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -20,7 +21,11 @@ from fdi_torch.simulate.experiment import Experiment, lay_out
 
 @dataclass(frozen=True)
 class RecordingPart:
-    """One recording of a data set on its simulation grid. readings, mask: (S, C), in the plant's order of sensors."""
+    """One recording of a data set on its simulation grid.
+
+    readings, mask: (S, C), in the plant's order of sensors, at the samples of the experiment. These are the samples of
+    the recording, or one per integration step with their mean.
+    """
 
     recording: Recording
     experiment: Experiment
@@ -46,22 +51,28 @@ class DataSet:
 
     @property
     def parts(self) -> tuple[RecordingPart, ...]:
-        first = len(self.recording)
+        first = len(self.experiment.sample_times)
         return (RecordingPart(self.recording, self.experiment, self.readings[:first], self.mask[:first]), *self.further)
 
     @property
     def row_spacing(self) -> float:
         """Median time between rows of the first recording, s."""
-        return float(torch.median(torch.diff(self.recording.time)))
+        return float(torch.median(torch.diff(self.experiment.sample_times)))
 
     @property
     def rows(self) -> tuple[slice, ...]:
         """The rows of each recording among all."""
         slices, first = [], 0
         for part in self.parts:
-            slices.append(slice(first, first + len(part.recording)))
-            first += len(part.recording) + 1
+            slices.append(slice(first, first + len(part.readings)))
+            first += len(part.readings) + 1
         return tuple(slices)
+
+    def recorded(self, channel: int) -> Tensor:
+        """All valid readings of a channel as recorded."""
+        column = self.plant.sensors[channel].column
+        each = [(part.recording, part.recording.output_names.index(column)) for part in self.parts]
+        return torch.cat([r.outputs[r.mask[:, i], i] for r, i in each])
 
     def alone(self, recording: int) -> DataSet:
         """A data set of one of the recordings."""
@@ -94,10 +105,14 @@ def data_set_of(
     nominal_effects: Sequence[Placement],
     recordings: Recording | Sequence[Recording],
     step: float,
+    averaged: bool = False,
 ) -> DataSet:
-    """Lay recordings out on their simulation grid, step s. Raises ValueError if one lacks a sensor."""
+    """Lay recordings out on their simulation grid, step s. Raises ValueError if one lacks a sensor.
+
+    averaged: whether readings of one integration step are replaced by their mean, as in `resampling`.
+    """
     each = [recordings] if isinstance(recordings, Recording) else recordings
-    first, *further = [_part(plant, recording, step) for recording in each]
+    first, *further = [_part(plant, recording, step, averaged) for recording in each]
     readings, mask = [first.readings], [first.mask]
     for part in further:
         readings += [torch.zeros_like(part.readings[:1]), part.readings]
@@ -113,7 +128,13 @@ def data_set_of(
     )
 
 
-def _part(plant: PlantDescription, recording: Recording, step: float) -> RecordingPart:
+def at_recorded_times(data: DataSet, values: Tensor) -> Tensor:
+    """Values (S, C) at the rows of a data set of one recording, interpolated to the samples of the recording."""
+    time = data.recording.time - data.recording.time[0]
+    return torch.stack([interpolate(time, data.experiment.sample_times, column) for column in values.T], dim=1)
+
+
+def _part(plant: PlantDescription, recording: Recording, step: float, averaged: bool) -> RecordingPart:
     names = [s.column for s in plant.sensors]
     missing = [n for n in names if n not in recording.output_names]
     if missing:
@@ -121,13 +142,7 @@ def _part(plant: PlantDescription, recording: Recording, step: float) -> Recordi
         raise ValueError(f"{recording.source}: expected a sensor '{missing[0]}', got {columns}; map the column to it")
     order = [recording.output_names.index(n) for n in names]
     experiment = lay_out(recording, plant.channels(), step)
-    return RecordingPart(recording, experiment, recording.outputs[:, order], recording.mask[:, order])
-
-
-def interpolate(at: Tensor, times: Tensor, values: Tensor) -> Tensor:
-    """Linear interpolation of values (S,) at increasing times (S,) to times `at` (K,); constant beyond the ends."""
-    after = torch.searchsorted(times, at).clamp(max=len(times) - 1)
-    before = (after - 1).clamp(min=0)
-    width = (times[after] - times[before]).clamp(min=1e-300)
-    share = ((at - times[before]) / width).clamp(0.0, 1.0)
-    return torch.lerp(values[before], values[after], share)
+    readings, mask = recording.outputs[:, order], recording.mask[:, order]
+    if averaged:
+        experiment, readings, mask = step_means(experiment, readings, mask)
+    return RecordingPart(recording, experiment, readings, mask)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -123,8 +124,10 @@ def recalibrate(data: DataSet) -> tuple[Fitter, Fit, list[float]]:
     null = preliminary.fit(Candidate())
     residual = data.readings - null.linearised.readings[0]
     noise = estimate_noise(residual, data.mask, rows=data.rows)
-    values = [data.readings[data.mask[:, c], c] for c in range(channels)]
-    quantization_steps = [quantization_step(v, float(noise.std[c])) for c, v in enumerate(values)]
+    quantization_steps = []
+    for c, values in enumerate(map(data.recorded, range(channels))):
+        of_one_reading = float(noise.std[c]) * math.sqrt(len(values) / int(data.mask[:, c].sum()))
+        quantization_steps.append(quantization_step(values, of_one_reading))
     noise = estimate_noise(residual, data.mask, quantization_steps, data.rows)
     noise = noise_before_clipping(noise, data, null.linearised.readings[0])
     fitter = Fitter(with_noise_limits(data, null, noise), noise)

@@ -50,7 +50,7 @@ def discriminating_input(fitter: Fitter, first: Fit, second: Fit) -> Mapping[str
 def _design(fitter: Fitter, hold: float, generator: torch.Generator) -> Recording:
     """Random steps of all inputs, no two at the same time."""
     data = fitter.data
-    interval = data.recording.interval
+    interval = max(data.recording.interval, data.row_spacing)
     duration = time_scale(fitter.data.plant) * DURATION
     time = torch.arange(0.0, duration, interval, dtype=torch.float64)
     columns = []

@@ -22,7 +22,7 @@ from fdi_torch.estimate.kalman import KalmanWhitening, Propagation, SensorNoise,
 from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import Fit, Fitter
-from fdi_torch.gap.dataset import interpolate
+from fdi_torch.gap.resampling import interpolate
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.candidate_fit import Fit
-from fdi_torch.gap.dataset import DataSet
+from fdi_torch.gap.dataset import DataSet, at_recorded_times
 from fdi_torch.gap.diagnosis_result import DiagnosisResult
 from fdi_torch.gap.free_form import free_form
 from fdi_torch.gap.free_form_coefficients import coefficients_of, without_time_course
@@ -133,7 +133,7 @@ SHOWN = ("nominal", "recalibrated", "augmented", "ceiling")
 
 
 def prediction_arrays(result: DiagnosisResult, holdouts: Sequence[HeldOut]) -> dict[str, Tensor]:
-    """Predictions by name, SI, sensors in the order of the recording; hold-outs after the first carry their number."""
+    """Predictions by name, SI, sensors and samples as recorded; hold-outs after the first carry their number."""
     fitter = result.fitter
     arrays: dict[str, Tensor] = {}
     for k, rows in enumerate(fitter.data.rows):
@@ -148,18 +148,15 @@ def prediction_arrays(result: DiagnosisResult, holdouts: Sequence[HeldOut]) -> d
     for k, holdout in enumerate(holdouts):
         prefix = "holdout" if k == 0 else f"holdout_{k + 1}"
         arrays[f"{prefix}_time"] = holdout.data.recording.time
-        read = torch.where(holdout.data.mask, holdout.data.readings, torch.nan)
-        arrays |= _prefixed(prefix, {"read": read} | {n: holdout.runs[n] for n in SHOWN}, holdout.data)
+        arrays[f"{prefix}_read"] = torch.where(holdout.data.recording.mask, holdout.data.recording.outputs, torch.nan)
+        arrays |= {f"{prefix}_{name}": _as_recorded(holdout.data, holdout.runs[name]) for name in SHOWN}
     return arrays
 
 
-def _prefixed(prefix: str, values: Mapping[str, Tensor], data: DataSet) -> dict[str, Tensor]:
-    return {f"{prefix}_{name}": _as_recorded(data, each) for name, each in values.items()}
-
-
 def _as_recorded(data: DataSet, values: Tensor) -> Tensor:
-    """Map (S, C) in the plant's order of sensors to the recording's order; NaN for columns without a sensor."""
-    names = data.recording.output_names
+    """Map (S, C) in the plant's order of sensors to the recording's order and samples; NaN for columns without a
+    sensor."""
+    names, values = data.recording.output_names, at_recorded_times(data, values)
     arranged = values.new_full((len(values), len(names)), torch.nan)
     for i, sensor in enumerate(data.plant.sensors):
         arranged[:, names.index(sensor.column)] = values[:, i]

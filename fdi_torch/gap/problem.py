@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.dataset import DataSet, data_set_of
@@ -22,6 +23,7 @@ LEAST = 60
 """Fewest readings of a sensor; with fewer, noise cannot be separated from a model error. Two of the slowest periods
 that count as noise."""
 
+SHORTEST_STEP = 0.5  # s, for bench-scale tanks; a quarter of the shortest period and lag that an effect describes
 LONGEST_STEP = 2.5  # s, for bench-scale tanks; with longer steps, fits that meet a rim depend on their start
 
 
@@ -106,10 +108,8 @@ def _without_outliers(
     all_outliers: list[SensorOutliers] = []
     columns = {s.name: s.column for s in plant.sensors}
     for recording in recordings:
-        mask, of_recording = (
-            recording.mask,
-            outliers_of(data_set_of(plant, nominal_effects, recording, step or _step(plant, recording))),
-        )
+        lay_out = partial(data_set_of, plant, nominal_effects, step=step or _step(plant, recording), averaged=True)
+        mask, of_recording = recording.mask, outliers_of(recording, lay_out)
         for of_sensor in of_recording:
             mask = without(mask, of_sensor.each, recording.output_names.index(columns[of_sensor.sensor]))
         masked.append(replace(recording, mask=mask) if of_recording else recording)
@@ -173,19 +173,21 @@ def _overlap(a: Recording, b: Recording) -> bool:
 def checked_data_set(
     plant: PlantDescription, nominal_effects: Sequence[Placement], recordings: Sequence[Recording], step: float | None
 ) -> DataSet:
-    """Lay the recordings out on the grid of their simulation.
+    """Lay the recordings out on the grid of their simulation, with the mean of the readings in each step.
 
-    step: s; None for the sampling interval of the first recording, or the largest whole fraction of it that is not
-    longer than LONGEST_STEP.
+    step: s; None for the sampling interval of the first recording, or the multiple or fraction of it that lies between
+    SHORTEST_STEP and LONGEST_STEP.
     """
-    data = data_set_of(plant, nominal_effects, recordings, step or _step(plant, recordings[0]))
+    data = data_set_of(plant, nominal_effects, recordings, step or _step(plant, recordings[0]), averaged=True)
     check_enough_readings(data)
     return data
 
 
 def _step(plant: PlantDescription, recording: Recording) -> float:
-    """A whole fraction of the sampling interval, s."""
+    """A whole multiple, or a whole fraction, of the sampling interval, s."""
     interval = recording.interval
+    if interval < SHORTEST_STEP * time_scale(plant):
+        return interval * math.floor(SHORTEST_STEP * time_scale(plant) / interval + 1e-9)
     return interval / math.ceil(interval / (LONGEST_STEP * time_scale(plant)) - 1e-9)
 
 

@@ -12,6 +12,7 @@ import torch
 from fdi_torch.effects import effect
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
 from fdi_torch.gap.channel_noise import low_frequency_excess
+from fdi_torch.gap.dataset import RecordingPart
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_square
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
@@ -32,6 +33,7 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
     data = result.fitter.data
     remarks: list[str] = []
     remarks += dict.fromkeys(s for part in data.parts for s in data_warnings(part.recording, data.plant))
+    remarks += [_averaged(part) for part in data.parts if len(part.readings) < len(part.recording)]
     inputs = [column for part in data.parts for column in part.recording.inputs.T]
     if all(float(torch.diff(column).abs().max()) == 0.0 for column in inputs):
         remarks.append(
@@ -52,6 +54,15 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
     remarks += [*_nominal_values_out_of_range(data.plant), *_values_at_bounds(result), *_periods(result)]
     remarks += [_free_form_fails(result, h) for h in held if result.free_form_fit and _free_form_is_worse(h)]
     return remarks + [sentence for h in held if (sentence := rig_difference(result, h))]
+
+
+def _averaged(part: RecordingPart) -> str:
+    """How many readings were averaged, and why."""
+    step = float(part.experiment.steps.median())
+    return (
+        f"{Path(part.recording.source).name or 'the recording'}: its {len(part.recording)} samples are averaged over "
+        f"integration steps of {step:.3g} s, which loses nothing because the level is a straight line within a step"
+    )
 
 
 def _masked_outliers(outliers: SensorOutliers) -> str:

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.candidate_fit import Fit, Fitter
-from fdi_torch.gap.dataset import interpolate
 from fdi_torch.gap.forcing import Forcing
 from fdi_torch.gap.localization.component_regressors import (
     DiscrepancyModel,
@@ -26,6 +25,7 @@ from fdi_torch.gap.localization.component_regressors import (
 from fdi_torch.gap.localization.regressors import HARMONICS, harmonics, time_functions
 from fdi_torch.gap.localization.sparse_regression import SparseFit, sparse_fit
 from fdi_torch.gap.marginal_likelihood import predicted_levels
+from fdi_torch.gap.resampling import interpolate
 from fdi_torch.plant.description import OUTSIDE, Sensor
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised

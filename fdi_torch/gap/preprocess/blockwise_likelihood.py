@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.candidate_fit import CAP, Candidate, Fit, Fitter
+from fdi_torch.gap.candidate_fit import BEHIND, CAP, SHARE, Candidate, Fit, Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, data_set_of
 from fdi_torch.gap.trajectory_problem import corrected_trajectories
@@ -132,22 +132,30 @@ def blockwise_fit(
     candidate: Candidate = Candidate(),  # noqa: B008
     base: BlockwiseFit | None = None,
     cap: int = CAP,
-    rounds: int = ROUNDS,
+    target: float = -math.inf,
 ) -> BlockwiseFit:
-    """Fit the plant, with the effects of a candidate, within its tolerances. cap: most evaluations of one fit."""
+    """Fit the plant, with the effects of a candidate, within its tolerances. cap: most evaluations of one fit.
+
+    target: log-likelihood of the competitor; a fit that approaches it too slowly is given up, as in `Fitter.fit`.
+    """
     data = blocked.data
     spans = torch.tensor([reading_span(blocked.plant, s) for s in blocked.plant.sensors], dtype=torch.float64)
     variance = (BROAD * spans) ** 2 if base is None else base.variance
     fit = base.fit if base else None
     _, samples = blocked.means(data.readings, data.mask)
     means = (samples > 0).sum(dim=0).to(torch.float64) * blocked.blocks / (int(blocked.block[-1]) + 1)
-    for _ in range(rounds):
+    before = base.log_likelihood if base else -math.inf
+    for _ in range(ROUNDS):
         fitter = _fitter(data, variance, means)
         start = Candidate(candidate.placements, (fit.effect_values,)) if fit and fit.key == candidate.key else candidate
         fit = fitter.fit(start, fit, cap=cap)
         variance = _variance(blocked, data.readings - fit.linearised.readings[0])
-    assert fit is not None
-    return BlockwiseFit(blocked, fit, variance, means, _prior_chi_square(fit, fit.theta))
+        fitted = BlockwiseFit(blocked, fit, variance, means, _prior_chi_square(fit, fit.theta))
+        behind = target - fitted.log_likelihood
+        if behind > 0.5 * BEHIND and fitted.log_likelihood - before < SHARE * behind:
+            break
+        before = fitted.log_likelihood
+    return fitted
 
 
 def first_order_log_likelihood(blocked: BlockedRecording, base: BlockwiseFit) -> float:

@@ -9,10 +9,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.dataset import interpolate
 from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit
 from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, WeightedFault
 from fdi_torch.gap.preprocess.recording_fault_texts import clock_offset
+from fdi_torch.gap.resampling import interpolate
 from fdi_torch.recording import Recording
 
 MAX_DELAY = 0.25

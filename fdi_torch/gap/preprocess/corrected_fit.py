@@ -13,16 +13,11 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     blocked_recording,
     blockwise_fit,
     first_order_log_likelihood,
-    noise_of,
     thinned,
 )
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-
-PRELIMINARY_EVALUATIONS = 3
-"""Evaluations of a preliminary fit, which selects the power of ten of an input that gets a full fit. A budget of
-computing."""
 
 
 @dataclass(frozen=True)
@@ -35,41 +30,50 @@ class WeightedFault:
 
 @dataclass(frozen=True)
 class CorrectedFits:
-    """A recording and its corrections. as_is: fit without a correction. prior: log prior probability of one fault."""
+    """A recording and its corrections.
+
+    as_is: fit without a correction. noise (C,): standard deviation of each sensor's readings as recorded. prior: log
+    prior probability of one fault.
+    """
 
     plant: PlantDescription
     recording: Recording
     as_is: BlockwiseFit
+    noise: Tensor
     prior: float
+
+    @property
+    def thinned(self) -> Recording:
+        """The recording with the samples that are fitted."""
+        return self.as_is.blocked.recording
 
     def column(self, sensor: int) -> int:
         """Column of the recording that holds this sensor of the plant."""
         return self.recording.output_names.index(self.plant.sensors[sensor].column)
 
-    def fit(self, corrected: Recording, preliminary: bool = False) -> BlockwiseFit:
-        """The plant fitted to a corrected recording; preliminary: with few evaluations only."""
-        blocked = self._blocked(corrected)
-        if preliminary:
-            return blockwise_fit(blocked, base=self.as_is, cap=PRELIMINARY_EVALUATIONS, rounds=1)
-        return blockwise_fit(blocked, base=self.as_is)
+    def fit(self, corrected: Recording, noise: Tensor | None = None) -> BlockwiseFit:
+        """The plant fitted to a corrected recording. noise (C,): of its sensors, if the correction changes it."""
+        return blockwise_fit(self._blocked(corrected, noise), base=self.as_is)
 
-    def weighted(self, fault: RecordingFault, corrected: Recording, cost: float = 0.0) -> WeightedFault:
-        """A fault whose correction is this recording. cost: subtracted from the log-likelihood."""
-        return WeightedFault(fault, self.prior + self.fit(corrected).log_likelihood - cost)
+    def weighted(
+        self, fault: RecordingFault, corrected: Recording, noise: Tensor | None = None, cost: float = 0.0
+    ) -> WeightedFault:
+        """A fault whose correction is this recording. noise: as in `fit`. cost: subtracted from the log-likelihood."""
+        return WeightedFault(fault, self.prior + self.fit(corrected, noise).log_likelihood - cost)
 
-    def first_order_gain(self, corrected: Recording) -> float:
-        """Gain in log-likelihood to first order in the constants.
+    def first_order_gain(self, corrected: Recording, noise: Tensor | None = None) -> float:
+        """Gain in log-likelihood to first order in the constants. noise: as in `fit`.
 
         The constants have to be free: those of the uncorrected fit were adapted to the wrong recording.
         """
-        return first_order_log_likelihood(self._blocked(corrected), self.as_is) - self.as_is.log_likelihood
+        return first_order_log_likelihood(self._blocked(corrected, noise), self.as_is) - self.as_is.log_likelihood
 
     def worth_fitting(self, gain: float) -> bool:
         """Whether a gain in log-likelihood exceeds the cost of the prior."""
         return gain + self.prior > 0.0
 
-    def _blocked(self, corrected: Recording) -> BlockedRecording:
-        return blocked_recording(self.plant, thinned(corrected), noise_of(self.plant, corrected))
+    def _blocked(self, corrected: Recording, noise: Tensor | None) -> BlockedRecording:
+        return blocked_recording(self.plant, thinned(corrected), self.noise if noise is None else noise)
 
     def channel_log_likelihood(self, sensor: int, residual: Tensor, mask: Tensor) -> float:
         """Log-likelihood of one sensor with these residuals (S,), of which those in the mask (S,) are valid."""

@@ -7,8 +7,10 @@ which is smooth whatever else is wrong. Stuck readings are masked before (`acqui
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
 from statistics import median
 
 import torch
@@ -16,7 +18,8 @@ from torch import Tensor
 
 from fdi_torch.gap.candidate_fit import Candidate, Fitter
 from fdi_torch.gap.channel_noise import Noise
-from fdi_torch.gap.dataset import DataSet
+from fdi_torch.gap.dataset import DataSet, at_recorded_times
+from fdi_torch.recording import Recording
 
 FAR = 5.0  # size of a jump in usual differences of neighbours: seven standard deviations of white noise
 NEARER = 3.5  # the same for a sensor that is known to have outliers
@@ -61,25 +64,29 @@ class SensorOutliers:
         return many and bool(far) and median(far) > CLEAR * FAR
 
 
-def outliers_of(data: DataSet) -> tuple[SensorOutliers, ...]:
-    """Outliers of each sensor that has some. data: one recording."""
-    outliers: dict[int, list[Outlier]] = {}
-    original, mask = data.mask, data.mask
+def outliers_of(recording: Recording, lay_out: Callable[[Recording], DataSet]) -> tuple[SensorOutliers, ...]:
+    """Outliers of each sensor that has some. lay_out: the data set of a recording, which may average readings."""
+    outliers: dict[str, list[Outlier]] = {}
+    masked = recording
     for _ in range(PASSES):
-        model, new_mask = _fitted_readings(replace(data, mask=mask)), mask.clone()
-        for c in range(mask.shape[1]):
-            threshold = NEARER if len(outliers.get(c, [])) >= EVENTS else FAR
-            new_outliers = _channel_outliers(data, model[:, c], mask[:, c], c, threshold)
-            masked = int((~mask[:, c] & original[:, c]).sum()) + sum(s.rows.stop - s.rows.start for s in new_outliers)
-            if new_outliers and masked <= MOST * int(original[:, c].sum()):
-                outliers.setdefault(c, []).extend(new_outliers)
-                new_mask = without(new_mask, new_outliers, c)
-        if bool((new_mask == mask).all()):
+        data, mask = lay_out(masked), masked.mask
+        model = at_recorded_times(data, _fitted_readings(data))
+        for i, sensor in enumerate(data.plant.sensors):
+            c = recording.output_names.index(sensor.column)
+            threshold = NEARER if len(outliers.get(sensor.name, [])) >= EVENTS else FAR
+            new_outliers = _channel_outliers(masked, model[:, i], c, threshold)
+            new_mask = without(mask, new_outliers, c)
+            if new_outliers and int((recording.mask & ~new_mask)[:, c].sum()) <= MOST * int(recording.mask[:, c].sum()):
+                outliers.setdefault(sensor.name, []).extend(new_outliers)
+                mask = new_mask
+        if mask is masked.mask:
             break
-        mask = new_mask
-    sensors, source = data.plant.sensors, data.recording.source
-    each = {c: tuple(sorted(new_outliers, key=lambda s: s.rows.start)) for c, new_outliers in sorted(outliers.items())}
-    return tuple(SensorOutliers(sensors[c].name, source, new_outliers) for c, new_outliers in each.items())
+        masked = replace(masked, mask=mask)
+    return tuple(
+        SensorOutliers(s.name, recording.source, tuple(sorted(outliers[s.name], key=lambda each: each.rows.start)))
+        for s in data.plant.sensors
+        if s.name in outliers
+    )
 
 
 def sensor_with_outliers(sensors: Sequence[SensorOutliers]) -> str | None:
@@ -103,12 +110,12 @@ def _fitted_readings(data: DataSet) -> Tensor:
     return Fitter(data, Noise(1e-2 * size, torch.zeros_like(size))).fit(Candidate()).linearised.readings[0]
 
 
-def _channel_outliers(data: DataSet, model: Tensor, mask: Tensor, channel: int, far: float) -> list[Outlier]:
-    """Outliers of one channel. far: as FAR."""
-    at = mask.nonzero().flatten()
+def _channel_outliers(recording: Recording, model: Tensor, channel: int, far: float) -> list[Outlier]:
+    """Outliers of one channel of a recording whose readings a model (S,) predicts. far: as FAR."""
+    at = recording.mask[:, channel].nonzero().flatten()
     if len(at) < ENOUGH:
         return []
-    values, predicted, time = data.readings[at, channel], model[at], data.recording.time[at]
+    values, predicted, time = recording.outputs[at, channel], model[at], recording.time[at]
     spans = jumps_and_returns(values - predicted, torch.diff(predicted).abs(), _resolution(values), far)
     return [
         Outlier(slice(int(at[a]), int(at[b - 1]) + 1), (float(time[a]), float(time[b - 1])), jumps)
@@ -141,8 +148,8 @@ def jumps_and_returns(x: Tensor, slope: Tensor, least: float, far: float = FAR) 
     for n, last in enumerate(jumps):
         if segments and last < segments[-1][1]:
             continue
-        steady = [k for k in range(max(last - longest, 0), last + 1) if k not in in_segments]
-        before = median(values[k] for k in steady[-WING:])
+        steady = partial(_steady, values, last, max(last - longest, 0), in_segments)
+        before = median(steady(WING))
         for back in jumps[n + 1 : n + 1 + RETURNS]:
             if back - last > longest:
                 break
@@ -152,9 +159,14 @@ def jumps_and_returns(x: Tensor, slope: Tensor, least: float, far: float = FAR) 
             mismatch = max(abs(median(following) - before), abs(following[0] - middle), abs(values[last] - middle))
             if height > float(limit[last]) and mismatch < BACK * height:
                 # The samples before and after, as many as the block has, decide which of the two is the outlier.
-                around = [values[k] for k in steady[-len(block) :]] + values[back + 1 : back + 1 + len(block)]
+                around = steady(len(block)) + values[back + 1 : back + 1 + len(block)]
                 if median(abs(v - median(around)) for v in block) > 0.5 * height:
                     segments.append((last + 1, back + 1, height / usual))
                     in_segments.update(range(last + 1, back + 1))
                     break
     return segments
+
+
+def _steady(values: Sequence[float], last: int, first: int, excluded: Collection[int], count: int) -> list[float]:
+    """The `count` last values from first to last without those at the excluded indices, in reverse order."""
+    return list(islice((values[k] for k in range(last, first - 1, -1) if k not in excluded), count))

@@ -52,17 +52,19 @@ def recording_fault(
 
     constant: columns of sensors that never move although noise should move them. They may also be clipped throughout.
     """
-    as_is = blockwise_fit(blocked_recording(plant, thinned(recording), noise_of(plant, recording)))
+    noise = noise_of(plant, recording)
+    as_is = blockwise_fit(blocked_recording(plant, thinned(recording), noise))
     count = len(plant.sensors) + len(plant.channels())
     prior = math.log(FAULT_PROBABILITY / (len(DECADES) * count + math.comb(count, 2) + 2 * len(plant.sensors) + 1))
     if as_is.most + prior < as_is.log_likelihood + log_odds(SURE):
         return None  # even a perfect fit of a corrected recording would not reach 95 %
-    faults = list(weighted_faults(CorrectedFits(plant, recording, as_is, prior), constant))
+    faults = list(weighted_faults(CorrectedFits(plant, recording, as_is, noise, prior), constant))
     rivals = [as_is.log_likelihood]
     if not faults or not _surely_faulty(faults, rivals):
         return None
     silent = {c for f in faults if f.fault.silent for c in f.fault.channels}
-    for rival in _weights_with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}):
+    target = max(f.log_weight for f in faults) - log_odds(SURE)
+    for rival in _weights_with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}, target):
         rivals.append(rival)
         if not _surely_faulty(faults, rivals):
             return None
@@ -79,10 +81,10 @@ def _surely_faulty(faults: Sequence[WeightedFault], rivals: Sequence[float]) -> 
     return float(total - torch.logsumexp(torch.tensor(rivals), 0)) > log_odds(SURE)
 
 
-def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str]) -> Iterator[float]:
+def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float) -> Iterator[float]:
     """Log weights of the uncorrected recording with one and with two effects of the library, by a greedy search.
 
-    excluded: places at which no effect is tried.
+    excluded: places at which no effect is tried. target: log-likelihood below which an effect changes no decision.
     """
     blocked, plant = as_is.blocked, as_is.blocked.plant
     library = [p for p in library_of(plant) if not p.effect.quantizes and p.location not in excluded]
@@ -103,7 +105,7 @@ def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str]) -> Iterator[f
         for option in list(best.values())[:RIVALS]:
             start = fit.effect_values | dict(option.start)
             candidate = Candidate((*fit.candidate.placements, option.placement), (start,))
-            fits.append(blockwise_fit(blocked, candidate, as_is, EVALUATIONS))
+            fits.append(blockwise_fit(blocked, candidate, as_is, EVALUATIONS, target))
             yield _log_weight(fits[-1], len(library))
         if not fits:
             return

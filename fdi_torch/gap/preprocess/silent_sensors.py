@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 
-from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit, noise_of
+from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit
 from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, WeightedFault
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, stuck, unrelated
 
@@ -20,12 +20,12 @@ def silent_sensors(fits: CorrectedFits, constant: Collection[str]) -> Iterator[W
 
     constant: columns of the latter.
     """
-    data, noise = fits.as_is.blocked.data, noise_of(fits.plant, fits.recording)
+    data = fits.as_is.blocked.data
     moves = fits.as_is.readings.std(dim=0)
     readable = [i for i in range(len(fits.plant.sensors)) if bool(data.mask[:, i].any())]
     still = [i for i in readable if fits.plant.sensors[i].column in constant]
     for i in readable:
-        if i not in still and float(noise[i]) > float(moves[i]):
+        if i not in still and float(fits.noise[i]) > float(moves[i]):
             yield _weighted(fits, unrelated(fits.plant.sensors[i]), [i], _fit_without(fits, [i]))
     if not still:
         return
@@ -49,9 +49,9 @@ def _weighted(fits: CorrectedFits, fault: RecordingFault, silent: list[int], oth
 
 
 def _fit_without(fits: CorrectedFits, sensors: list[int]) -> BlockwiseFit:
-    mask = fits.recording.mask.clone()
+    mask = fits.thinned.mask.clone()
     mask[:, [fits.column(i) for i in sensors]] = False
-    return fits.fit(replace(fits.recording, mask=mask))
+    return fits.fit(replace(fits.thinned, mask=mask))
 
 
 def _log_likelihood(fits: CorrectedFits, sensor: int) -> float:
