@@ -27,6 +27,7 @@ OVERSHOOT, DECREASE = 1.16519, 0.02765
 # draws than counting alarms.
 BLOCKS, BLOCK, BURN_IN = 4000, 1500, 500
 SMALLEST_ERROR = 1e-6  # of a standard deviation that is known
+RAREST = 1e-300  # rate that counts as different from zero, 1/s
 MOST_ALARMS = 10**9  # of a count
 
 ChartRate = Callable[[float, Tensor], Tensor]
@@ -95,8 +96,8 @@ class FalseAlarmDesign:
         factor = 1.0
         for _ in range(8):
             design = self.longer(factor)
-            span = math.log(design.quantile(0.975) / max(design.quantile(0.025), 1e-300))
-            factor *= (0.5 * span / math.log(accuracy)) ** 2
+            low, high = (math.log(max(design.quantile(p), RAREST)) for p in (0.025, 0.975))
+            factor *= (0.5 * (high - low) / math.log(accuracy)) ** 2
         return factor
 
 

@@ -84,23 +84,23 @@ def fault_warnings(
 
 
 def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -> str:
-    """Text: the expected time between false alarms, its 95 % interval, and how long the noise should have been learnt.
+    """Text: the expected time between false alarms, how short it may be, and how long the noise should have been learnt.
 
     Needed is the fault-free time that determines the rate within a factor of RATE_FACTOR (95 %).
     """
     design = detector.design
     seconds = noise.whitening.samples * design.interval
     needed = seconds * design.learning_factor(RATE_FACTOR)
-    shortest, longest = (float(f"{1.0 / design.quantile(p):.2g}") for p in (0.975, 0.025))
+    shortest = float(f"{1.0 / design.quantile(0.95):.2g}")
     text = (
         f"learnt from {seconds:g} s, {needed:.0f} s are needed: one false alarm in {every:g} s expected, "
-        f"{shortest:g} to {longest:g} s between two (95 %)"
+        f"at most one in {shortest:g} s (95 %)"
     )
     if noise.whitening.flows is None:
         text += ", if no random flow is slow: to model these, install a C++ compiler or the extra fdi_torch[compiler]"
     if needed <= seconds:
         return text
-    return f"{text}; the threshold is raised because too little was learnt: lengthen fault_free"
+    return f"{text}; too little was learnt, so the threshold is raised: lengthen fault_free"
 
 
 def noise_std_from_differences(readings: Tensor) -> Tensor:
