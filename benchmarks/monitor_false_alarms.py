@@ -1,7 +1,7 @@
 """False alarms of single calibrations on disturbed tanks without a fault: `python -m benchmarks.monitor_false_alarms`.
 
 Each calibration learns from its own recording and is tested on the rest of it. Its number of alarms is compared with
-the 95 % interval that it states for itself: a Poisson number whose rate has the stated standard error of its logarithm.
+the 95 % interval that it predicts for itself.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from dataclasses import dataclass
 
-import torch
-from scipy.stats import norm, poisson
+import numpy as np
+from scipy.stats import poisson
 
 from benchmarks.monitor_rigs import KINDS, Case, recordings
 from fdi_torch.config.plant_file import load_plant
-from fdi_torch.monitor.detection import DRIFT, log_rate_std
 from fdi_torch.monitor.fault_free_checks import QUESTION
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
 from fdi_torch.monitor.observer import Observer
@@ -25,8 +25,25 @@ from fdi_torch.recording import Recording
 LEARN = (300.0, 1000.0, 3000.0)
 
 
-def tested(recording: Recording, learn: float, every: float) -> tuple[int, float, bool]:
-    """Alarms after the fault-free part, the stated standard error of ln(rate), and whether it is asked about."""
+@dataclass(frozen=True)
+class Calibration:
+    """alarms: number after the fault-free part. low, high: its predicted 95 % interval. share: predicted probability of
+    fewer alarms, and half that of as many. threshold: of the detector. asked: whether the recording is asked about.
+    """
+
+    alarms: int
+    low: int
+    high: int
+    share: float
+    threshold: float
+    asked: bool
+
+    @property
+    def within(self) -> bool:
+        return self.low <= self.alarms <= self.high
+
+
+def tested(recording: Recording, learn: float, every: float) -> Calibration:
     plant = load_plant("three_tank")
     prepared = prepare_monitor(plant, fault_free_part(recording, 0.0, learn), time_between_false_alarms=every)
     monitor, samples = prepared.monitor, samples_of_recording(recording, plant)
@@ -34,19 +51,11 @@ def tested(recording: Recording, learn: float, every: float) -> tuple[int, float
         monitor.network, prepared.noise.gain, monitor.space, prepared.believed, monitor.observer.stepper.longest
     )
     white = prepared.noise.whitening(observer.run(samples).steady_residual)[int(learn) :]
-    error = log_rate_std(monitor.detector.chart, every, 3, DRIFT, prepared.noise.whitening)
-    return int(monitor.detector.alarms(white).sum()), error, any(QUESTION in w for w in prepared.warnings)
-
-
-def interval(expected: float, error: float) -> tuple[int, int]:
-    """95 % interval of a Poisson number with a log-normal rate, by quadrature over 199 quantiles of the rate."""
-    quantiles = norm.ppf((torch.arange(199) + 0.5).numpy() / 199)
-    rates, low, high = expected * torch.exp(error * torch.from_numpy(quantiles)).numpy(), 0, 0
-    while poisson.cdf(low, rates).mean() < 0.025:
-        low += 1
-    while poisson.cdf(high, rates).mean() < 0.975:
-        high += 1
-    return low, high
+    detector, seconds = monitor.detector, len(white) * monitor.detector.design.interval
+    alarms, expected = int(detector.alarms(white).sum()), detector.design.rates * seconds
+    low, high = (detector.design.count_quantile(seconds, p) for p in (0.025, 0.975))
+    share = float(np.mean(poisson.cdf(alarms, expected) - 0.5 * poisson.pmf(alarms, expected)))
+    return Calibration(alarms, low, high, share, detector.threshold, any(QUESTION in w for w in prepared.warnings))
 
 
 def main() -> None:
@@ -62,20 +71,24 @@ def main() -> None:
         for i, (k, closed, learn) in enumerate(cells)
         for j in range(a.calibrations)
     ]
-    runs, started, inside, asked = recordings(cases, step=0.25), time.process_time(), 0, 0
+    runs, started, results = recordings(cases, step=0.25), time.process_time(), []
     for first in range(0, len(cases), a.calibrations):
-        case, rows = cases[first], []
-        for own, (recording, _) in zip(cases[first : first + a.calibrations], runs[first:], strict=False):
-            rows.append(tested(recording, own.learn, a.every))
-        expected = a.lasts / a.every
-        bounds = [interval(expected, error) for _, error, _ in rows]
-        within = sum(low <= alarms <= high for (alarms, *_), (low, high) in zip(rows, bounds, strict=True))
-        inside, asked = inside + within, asked + sum(q for *_, q in rows)
-        alarms, errors = [n for n, *_ in rows], [round(e, 2) for _, e, _ in rows]
-        loop = "closed" if case.closed else "open"
-        print(f"{case.kind:5} {loop:6} {case.learn:5.0f} s: alarms {alarms} of {expected:g}, ", end="")
-        print(f"error of ln rate {errors}, {within} of {len(rows)} within", flush=True)
-    print(f"{inside} of {len(cases)} within, {asked} asked about, {time.process_time() - started:.0f} s of CPU")
+        case = cases[first]
+        rows = [tested(recording, case.learn, a.every) for recording, _ in runs[first : first + a.calibrations]]
+        results += rows
+        loop, thresholds = "closed" if case.closed else "open", [round(row.threshold, 1) for row in rows]
+        texts = ", ".join(f"{row.alarms} ({row.low} to {row.high})" for row in rows)
+        print(f"{case.kind:5} {loop:6} {case.learn:5.0f} s: alarms {texts} of {a.lasts / a.every:g}, ", end="")
+        print(f"thresholds {thresholds}, {sum(row.within for row in rows)} of {len(rows)} within", flush=True)
+    for learn in LEARN:
+        rows = [row for row, case in zip(results, cases, strict=True) if case.learn == learn]
+        outer = sum(not 0.1 < row.share < 0.9 for row in rows)
+        print(
+            f"{learn:.0f} s: {sum(row.alarms for row in rows)} alarms of {len(rows) * a.lasts / a.every:g} expected, "
+        )
+        print(f"  {sum(row.within for row in rows)} of {len(rows)} within, {outer} outside the predicted 80 %")
+    within, asked = sum(row.within for row in results), sum(row.asked for row in results)
+    print(f"{within} of {len(cases)} within, {asked} asked about, {time.process_time() - started:.0f} s of CPU")
 
 
 if __name__ == "__main__":

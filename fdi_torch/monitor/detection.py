@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.run_length import (
+from fdi_torch.monitor.false_alarm_rate import (
+    ChartRate,
+    FalseAlarmDesign,
     block_maxima,
-    cusum_run_length,
-    cusum_threshold,
-    fixed_threshold,
-    threshold_from_maxima,
+    cusum_rate,
+    fixed_rate,
+    latin_hypercube,
+    sum_of_squares_rate,
 )
 from fdi_torch.monitor.whitening import Whitening
 
@@ -25,7 +28,6 @@ CHARTS: tuple[Chart, ...] = ("fixed", "cusum", "glr")
 # CUSUM's drift: half the shift, in standard deviations of the white residual, for which the detection delay is least.
 DRIFT = 0.5
 LONGEST_WINDOW = 200  # samples, of the GLR
-LARGEST_INFLATION = 3.0  # of the false-alarm rate, see `false_alarm_inflation`
 NO_ALARM = -1
 
 
@@ -33,14 +35,18 @@ NO_ALARM = -1
 class Detector:
     """A statistic of white residuals (*batch, S, C) -> (*batch, S), and its threshold.
 
-    update: the recursive form, (samples (S, C), memory or None at the start) -> (statistic (S,), memory). Its result is
-    identical to the last bit for any division of the samples into calls.
+    design: of the threshold. update: the recursive form, (samples (S, C), memory or None at the start) -> (statistic
+    (S,), memory). Its result is identical to the last bit for any division of the samples into calls.
     """
 
     chart: str
     statistic: Callable[[Tensor], Tensor]
-    threshold: float
+    design: FalseAlarmDesign
     update: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
+
+    @property
+    def threshold(self) -> float:
+        return self.design.threshold
 
     def shares(self, white: Tensor) -> Tensor:
         """Share (C,) of each channel in the statistic at the last sample of white residuals (S, C)."""
@@ -98,70 +104,42 @@ def make_detector(
     """A detector with the given mean time between false alarms (s) over all channels together.
 
     sampling: s between samples. drift: of the CUSUM. window: longest window of the GLR, in samples. learnt: whitening
-    estimated from a finite recording; the design then holds on average over such recordings. peaks: simulated block
-    maxima of the GLR, to save repeating the simulation. Raises ValueError.
+    estimated from a finite recording, whose uncertainty raises the threshold; without it the noise is known. peaks:
+    simulated block maxima of the GLR, to save repeating the simulation. Raises ValueError.
     """
     run_length = time_between_false_alarms / sampling
-    if learnt is not None:
-        run_length *= false_alarm_inflation(chart, run_length, channels, drift, learnt)
+    if not run_length >= 20.0:
+        raise ValueError(
+            f"expected a mean time between false alarms of at least 20 samples, got {run_length:g} samples; "
+            "ask for fewer false alarms"
+        )
+    rate: ChartRate
+    sums: Callable[[float], tuple[int, ...]]  # lengths of those that decide about an alarm
     if chart == "fixed":
-        threshold = fixed_threshold(run_length, channels)
-        return Detector(chart, max_abs, threshold, lambda e, before: (max_abs(e), e[:0]))
-    if chart == "cusum":
+        rate, sums = fixed_rate, lambda threshold: (1,)
+        statistic, update = max_abs, lambda e, before: (max_abs(e), e[:0])
+    elif chart == "cusum":
         if not drift > 0:
             raise ValueError(f"expected a positive drift of the CUSUM, got {drift}")
-        threshold = cusum_threshold(run_length, channels, drift)
-        return Detector(chart, lambda e: cusum(e, drift), threshold, lambda e, before: cusum_update(e, drift, before))
-    if chart == "glr":
+        # A sum that alarms by chance has most likely grown by the drift with each sample.
+        rate, sums = partial(cusum_rate, drift=drift), lambda threshold: (max(round(threshold / drift), 1),)
+        statistic, update = partial(cusum, drift=drift), lambda e, before: cusum_update(e, drift, before)
+    elif chart == "glr":
         lengths = window_lengths(window)
-
-        def statistic(white: Tensor) -> Tensor:
-            return glr(white, lengths)
-
+        statistic, update = partial(glr, lengths=lengths), lambda e, before: glr_update(e, lengths, before)
         peaks = block_maxima(statistic, channels, generator) if peaks is None else peaks
-        return Detector(
-            chart, statistic, threshold_from_maxima(peaks, run_length), lambda e, before: glr_update(e, lengths, before)
-        )
-    raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
+        rate, sums = sum_of_squares_rate(peaks, channels, generator), lambda threshold: lengths
+    else:
+        raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
 
+    def error(threshold: float) -> Tensor:
+        if learnt is None:
+            return torch.zeros(channels, dtype=torch.float64)
+        return torch.stack([learnt.error_of_sums(n) for n in sums(threshold)]).square().mean(0).sqrt()
 
-def false_alarm_inflation(chart: str, run_length: float, channels: int, drift: float, learnt: Whitening) -> float:
-    """Factor by which the mean false-alarm rate exceeds the design because the noise was estimated.
-
-    The rate grows as exp(s d) with the error d of ln of the residual's standard deviation, s = 10 to 25; an error with
-    variance v raises its mean by exp(s^2 v / 2). The factor is limited to LARGEST_INFLATION, which a few hundred
-    samples of correlated noise reach: beyond it the mean is dominated by rare recordings, and no threshold would help.
-    """
-    slope, variance = _log_rate_slope(chart, run_length, channels, drift, learnt)
-    if chart == "glr":
-        # A random excess has any direction u: E sum u^4 = 3 / (C + 2).
-        variance = variance * 3.0 / (channels + 2.0)
-    return min(float(torch.exp(0.5 * slope**2 * variance).mean()), LARGEST_INFLATION)
-
-
-def log_rate_std(chart: str, run_length: float, channels: int, drift: float, learnt: Whitening) -> float:
-    """Standard error of ln of the false-alarm rate when the noise was learnt from one recording: s sqrt(v / C).
-
-    The channels' errors are independent, and their alarm rates add.
-    """
-    slope, variance = _log_rate_slope(chart, run_length, channels, drift, learnt)
-    return float(slope * (variance.mean() / channels).sqrt())
-
-
-def _log_rate_slope(
-    chart: str, run_length: float, channels: int, drift: float, learnt: Whitening
-) -> tuple[float, Tensor]:
-    """d ln(rate) / d ln(standard deviation of the residual), and the variance (C,) of the latter's error."""
-    if chart == "fixed":
-        variance = learnt.slow_error.new_full((channels,), learnt.fast_error**2)
-        return fixed_threshold(run_length, channels) ** 2, variance
-    if chart == "cusum":
-        threshold, factor = cusum_threshold(run_length, channels, drift), 1.01
-        ratio = cusum_run_length(threshold, drift) / cusum_run_length(threshold / factor, drift / factor)
-        return math.log(ratio) / math.log(factor), learnt.slow_error**2
-    # |sum e|^2 / n over n samples is chi-square with C degrees of freedom and exceeds h with probability about
-    # exp(-h / 2); the threshold h is about the largest of run_length such values.
-    return 2.0 * math.log(run_length), learnt.slow_error**2
+    median = torch.full((1, channels), 0.5, dtype=torch.float64)
+    share = median if learnt is None else latin_hypercube(channels, generator)
+    return Detector(chart, statistic, FalseAlarmDesign(rate, error, share, run_length, sampling), update)
 
 
 def max_abs(white: Tensor) -> Tensor:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.detection import DRIFT, Detector, log_rate_std
+from fdi_torch.monitor.detection import DRIFT, Detector
 from fdi_torch.monitor.events import amount_text, percent_text
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
@@ -29,34 +28,16 @@ CONVINCING = 0.99
 # Offset of the white residual that is reported, in standard deviations: half the drift that a CUSUM allows.
 OFFSET = 0.5 * DRIFT
 SIGNIFICANT = 4.0  # standard errors of an offset or a fault size
-NORMAL_COUNT = 30.0  # mean from which a Poisson number is treated as normal
 RATE_FACTOR = 2.0  # desired accuracy of the false-alarm rate, as a factor
 QUESTION = "does the recording start faulty? Name another fault_free part"
 
 
-def _largest_alarm_count(detector: Detector, noise: NoiseModel, channels: int, every: float, sampling: float) -> int:
-    """99 % quantile of the alarms in the fault-free part: a Poisson number at the upper limit of the rate."""
-    error = log_rate_std(detector.chart, every / sampling, channels, DRIFT, noise.whitening)
-    expected = noise.whitening.samples * sampling / every * math.exp(1.96 * error)
-    if expected > NORMAL_COUNT:
-        return math.ceil(expected + 2.33 * math.sqrt(expected))
-    count, term = 0, math.exp(-expected)
-    cumulative = term
-    while cumulative < 0.99:
-        count += 1
-        term *= expected / count
-        cumulative += term
-    return count
-
-
-def residual_warnings(
-    plant: PlantDescription, noise: NoiseModel, detector: Detector, seen: Observation, every: float
-) -> list[str]:
+def residual_warnings(plant: PlantDescription, noise: NoiseModel, detector: Detector, seen: Observation) -> list[str]:
     """Warnings about the residual: too many alarms in the fault-free part, or a significant constant offset."""
     warnings = []
     alarms = detector.alarms(noise.whitening(seen.steady_residual)).nonzero().flatten()
-    sampling = float(torch.diff(seen.time).median())
-    if len(alarms) > _largest_alarm_count(detector, noise, len(plant.sensors), every, sampling):
+    seconds = noise.whitening.samples * detector.design.interval
+    if len(alarms) > detector.design.count_quantile(seconds, 0.99):
         first = f"the first at {float(seen.time[alarms[0]]):g} s"
         warnings.append(f"the part taken for fault-free raises {len(alarms)} alarms itself, {first}: {QUESTION}")
     white, smallest = noise.whitening, max(OFFSET, SIGNIFICANT * noise.whitening.samples**-0.5)
@@ -102,25 +83,24 @@ def fault_warnings(
     return [f"{fault}, explains the part taken for fault-free: {QUESTION}"]
 
 
-def false_alarm_rate_text(
-    plant: PlantDescription, noise: NoiseModel, detector: Detector, every: float, sampling: float
-) -> str:
-    """Text: accuracy of the time between false alarms, and the fault-free time that a better accuracy needs.
+def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -> str:
+    """Text: the expected time between false alarms, how short it may be, and how long the noise should have been learnt.
 
-    The standard error e of ln(rate) falls with the square root of the time. For a rate within a factor F = RATE_FACTOR
-    (95 %) the fault-free part must be (1.96 e / ln F)^2 times as long.
+    Needed is the fault-free time that determines the rate within a factor of RATE_FACTOR (95 %).
     """
-    error = log_rate_std(detector.chart, every / sampling, len(plant.sensors), DRIFT, noise.whitening)
-    seconds = noise.whitening.samples * sampling
-    needed = seconds * (1.96 * error / math.log(RATE_FACTOR)) ** 2
+    design = detector.design
+    seconds = noise.whitening.samples * design.interval
+    needed = seconds * design.learning_factor(RATE_FACTOR)
+    shortest = float(f"{1.0 / design.quantile(0.95):.2g}")
     text = (
-        f"learnt from {seconds:g} s: one false alarm in {every:g} s, to within a factor of {math.exp(1.96 * error):.2g}"
+        f"learnt from {seconds:g} s, {needed:.0f} s are needed: one false alarm in {every:g} s expected, "
+        f"at most one in {shortest:g} s (95 %)"
     )
     if noise.whitening.flows is None:
         text += ", if no random flow is slow: to model these, install a C++ compiler or the extra fdi_torch[compiler]"
     if needed <= seconds:
         return text
-    return f"{text}; a factor of {RATE_FACTOR:g} takes {needed:.0f} s without a fault: lengthen fault_free"
+    return f"{text}; too little was learnt, so the threshold is raised: lengthen fault_free"
 
 
 def noise_std_from_differences(readings: Tensor) -> Tensor:

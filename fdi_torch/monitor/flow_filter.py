@@ -20,11 +20,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import Propagation, SensorNoise, StateNoise
-from fdi_torch.estimate.state_noise import estimate_state_noise
+from fdi_torch.estimate.kalman import SCATTER, Propagation, SensorNoise, StateNoise
+from fdi_torch.estimate.state_noise import LOG_BOUND, estimate_state_noise
 from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, riccati, with_effects
 from fdi_torch.simulate.build import load_library
 
+FREQUENCIES = 2048  # at which spectra are evaluated
 FIRST_UNIT = 0.1  # initial flow per sample of the optimisation, in standard deviations of a level's measurement noise
 
 
@@ -36,7 +37,7 @@ class FlowFilter:
 
     linear: transition A (n, n) and output C (sensors, n). noise: intensities of the tanks in m per sample. reading_std
     (sensors,): measurement noise. observer: the observer's gain. start_std (tanks,): of the initial levels, m.
-    interval: s. intensity_error: standard error of ln of the flows' intensities, root mean square over the tanks.
+    interval: s. samples: number that the noise was learnt from.
     """
 
     linear: Linear
@@ -45,7 +46,7 @@ class FlowFilter:
     observer: Gain
     start_std: Tensor
     interval: float
-    intensity_error: Tensor
+    samples: int
 
     @cached_property
     def transition(self) -> Tensor:
@@ -88,17 +89,50 @@ class FlowFilter:
         return riccati(self.joint, torch.diag(self.process_std**2), torch.diag(self.reading_std**2))
 
     @cached_property
-    def error_of_sums(self) -> Tensor:
-        """Standard error of ln of the standard deviation of slow sums of the innovations, (sensors,).
+    def spectra(self) -> Tensor:
+        """Amplitudes of the white, unit innovations by tank flows and sensor noise, (FREQUENCIES, sensors, P).
 
-        It is that of the flows' intensities, times the flows' share in the variance of these sums: at frequency 0 the
-        filter's error is e = M (q - F K v) with M = (1 - F (1 - K H))^-1, and the innovation is H e + v.
+        They are T = H (z - F (1 - K H))^-1 q for the shocks q of a flow, and 1 - H (z - F (1 - K H))^-1 F K times the
+        noise of a sensor, at z = exp(i w) of `_frequencies`. T T^H is the identity at each of them.
         """
         f, h, k = self.transition, self.joint.output, self.gain.steady
-        m = torch.linalg.inv(torch.eye(len(f), dtype=f.dtype) - f + f @ k @ h)
-        of_flows = ((h @ m) * self.process_std).square().sum(-1)
-        of_readings = ((torch.eye(len(h), dtype=f.dtype) - h @ m @ f @ k) * self.reading_std).square().sum(-1)
-        return self.intensity_error * of_flows / (of_flows + of_readings)
+        tanks, n = len(self.noise.intensity), len(self.linear.transition)
+        shocks = torch.diag(self.process_std)[:, n : n + tanks]
+        sources = torch.cat([shocks, -f @ k * self.reading_std], dim=1)
+        z = torch.exp(1j * _frequencies(f)).reshape(-1, 1, 1)
+        errors = torch.linalg.solve(z * torch.eye(len(f), dtype=f.dtype) - (f - f @ k @ h), sources.to(z.dtype))
+        amplitude = h.to(z.dtype) @ errors
+        amplitude[:, :, tanks:] += torch.diag(self.reading_std)
+        covariance = (amplitude @ amplitude.mH).real.mean(0)
+        return torch.linalg.solve_triangular(torch.linalg.cholesky(covariance).to(z.dtype), amplitude, upper=False)
+
+    @cached_property
+    def covariance_of_variances(self) -> Tensor:
+        """Posterior covariance (P, P) of ln of the variances of flows and sensor noise: inverse Fisher information.
+
+        The information is that of a stationary series (Whittle 1953), samples / 2 times the mean of |t_p^H t_q|^2 over
+        frequencies, and that of the prior of the flows' intensities.
+        """
+        t, tanks = self.spectra, len(self.noise.intensity)
+        information = 0.5 * self.samples * (t.mH @ t).abs().square().mean(0)
+        eye = torch.eye(tanks, dtype=information.dtype)
+        information[:tanks, :tanks] += (eye - 1.0 / tanks) / (2.0 * SCATTER) ** 2
+        return torch.linalg.inv(information + torch.eye(len(information), dtype=eye.dtype) / (2.0 * LOG_BOUND) ** 2)
+
+    @property
+    def intensity_error(self) -> Tensor:
+        """Standard error of ln of the intensity of each tank's flow, (tanks,)."""
+        return 0.5 * torch.diagonal(self.covariance_of_variances)[: len(self.noise.intensity)].sqrt()
+
+    def error_of_sums(self, length: int) -> Tensor:
+        """Standard error (sensors,) of ln of the standard deviation of sums of `length` innovations.
+
+        It is for innovations that were scaled to unit variance in the recording (delta method).
+        """
+        power, half = self.spectra.abs().square(), 0.5 * _frequencies(self.transition)
+        of_sums = (torch.sin(length * half) / torch.sin(half)).square() / length
+        slope = ((of_sums - 1.0).reshape(-1, 1, 1) * power).mean(0)
+        return 0.5 * (slope @ self.covariance_of_variances * slope).sum(-1).sqrt()
 
     def over(self, samples: int) -> tuple[Tensor, Tensor]:
         """Transition over some samples, and covariance of the shocks that add up meanwhile, by repeated doubling."""
@@ -154,8 +188,13 @@ def estimate_flow_filter(
     ones = torch.ones_like(start_std)
     by_levels = _by_initial_levels(linear, count)[..., : len(start_std)] * start_std
     likely = estimate_state_noise(propagation, sensors, free, by_levels, ones, 0.0 * ones, unit)
-    error = (0.5 / likely.determined[: len(ones)]).mean().sqrt()
-    return FlowFilter(linear, likely.noise, likely.noise.scale * reading_std, observer, start_std, interval, error)
+    read = int(mask.sum()) // mask.shape[-1]
+    return FlowFilter(linear, likely.noise, likely.noise.scale * reading_std, observer, start_std, interval, read)
+
+
+def _frequencies(like: Tensor) -> Tensor:
+    """Angular frequencies between 0 and pi, rad per sample."""
+    return (torch.arange(FREQUENCIES, dtype=like.dtype) + 0.5) * math.pi / FREQUENCIES
 
 
 def _free_residual(linear: Linear, observer: Gain, residual: Tensor) -> Tensor:

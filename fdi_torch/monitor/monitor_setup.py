@@ -110,10 +110,10 @@ def prepare_monitor(
     detector = make_detector(chart, every, sampling, len(plant.sensors), generator, learnt=noise.whitening)
     monitor = Monitor(network, space, noise, detector, settings, step, watched=len(watched))
     warnings = (
-        *residual_warnings(plant, noise, detector, seen, every),
+        *residual_warnings(plant, noise, detector, seen),
         *fault_warnings(learning, space, samples, believed, step, faults_of(watched)),
     )
-    text = false_alarm_rate_text(plant, noise, detector, every, sampling)
+    text = false_alarm_rate_text(noise, detector, every)
     return PreparedMonitor(monitor, believed, noise, values, radius, warnings, text)
 
 

@@ -148,16 +148,13 @@ def _noise(network: TankNetwork, linear: Linear, best: _Candidate) -> NoiseModel
 def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> Whitening:
     """Whitening of an observer's residuals: random flows by their Kalman filter, what remains by an autoregression.
 
-    The error of the flows' intensity adds to that of slow sums of the white residual. Without a compiler there is no
-    flow filter.
+    Without a compiler there is no flow filter.
     """
     residual = seen.steady_residual
     flows = _flow_filter(network, linear, gain, seen)
     innovations = residual if flows is None else flows(residual)[0]
     whitening = score_whitenings(innovations)[0][1]
-    if flows is None:
-        return whitening
-    return replace(whitening, flows=flows, slow_error=torch.hypot(whitening.slow_error, flows.error_of_sums))
+    return replace(whitening, flows=flows)
 
 
 def _flow_filter(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> FlowFilter | None:

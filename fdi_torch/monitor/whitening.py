@@ -31,10 +31,15 @@ class Whitening:
     slow_error: Tensor
     flows: FlowFilter | None = None
 
-    @property
-    def fast_error(self) -> float:
-        """Standard error of ln of the standard deviation of single e: 1 / sqrt(2 n)."""
-        return (2.0 * self.samples) ** -0.5
+    def error_of_sums(self, length: int) -> Tensor:
+        """Standard error (C,) of ln of the standard deviation of sums of `length` successive e.
+
+        That of a single e is 1 / sqrt(2 n). Sums are taken for slow with regard to the autoregression, and the
+        intensities of the random flows add to their error.
+        """
+        if length == 1:
+            return torch.full_like(self.slow_error, (2.0 * self.samples) ** -0.5)
+        return self.slow_error if self.flows is None else self.slow_error.hypot(self.flows.error_of_sums(length))
 
     @property
     def order(self) -> int:

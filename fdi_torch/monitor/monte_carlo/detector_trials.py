@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from fdi_torch.monitor.detection import CHARTS, LONGEST_WINDOW, NO_ALARM, Detector, glr, make_detector, window_lengths
+from fdi_torch.monitor.false_alarm_rate import block_maxima
 from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer import Observer
-from fdi_torch.monitor.run_length import block_maxima
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.whitening import Whitening
 

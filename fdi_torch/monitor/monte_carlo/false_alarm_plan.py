@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fdi_torch.monitor.detection import CHARTS, DRIFT, log_rate_std
+from fdi_torch.monitor.detection import CHARTS
 from fdi_torch.monitor.monte_carlo.detector_trials import detectors, white_residuals
 from fdi_torch.monitor.monte_carlo.simulated_runs import SimulatedRig, fault_free_schedule
 from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, seeded_generator
@@ -49,6 +48,7 @@ class FalseAlarmPlan:
         charts = detectors(self.every, rig.sampling, sensors, learnt=noise.whitening)
         generator = seeded_generator(self.seed, 2, row, number)
         counts: dict[str, float | list[float] | list[str]] = {}
+        seconds = self.runs * (self.samples - 1) * rig.sampling
         for first in range(0, self.runs, RUNS_AT_ONCE):
             count = min(RUNS_AT_ONCE, self.runs - first)
             white = white_residuals(rig, noise, rig.run(fault_free_schedule(rig.space, count), self.samples, generator))
@@ -56,10 +56,10 @@ class FalseAlarmPlan:
                 before = counts.get(detector.chart, 0.0)
                 assert isinstance(before, float)
                 counts[detector.chart] = before + float(detector.alarms(white).sum())
-        for chart in CHARTS:
-            run_length = self.every / rig.sampling
-            counts[f"{chart} error"] = log_rate_std(chart, run_length, sensors, DRIFT, noise.whitening)
-        return {**counts, "expected": self.runs * (self.samples - 1) * rig.sampling / self.every}
+        for detector in charts:
+            interval = [float(detector.design.count_quantile(seconds, p)) for p in (0.025, 0.975)]
+            counts[f"{detector.chart} interval"] = interval
+        return {**counts, "expected": seconds / self.every}
 
     def result_table(self, numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> ResultTable:
         """Achieved and designed mean times, for all calibrations together and their range."""
@@ -72,24 +72,14 @@ class FalseAlarmPlan:
                 single = [self.every * expected / max(c, 1) for c in (max(counts), min(counts))]
                 alarms = f"{sum(counts)} ({expected * len(counts):.0f})"
                 words = (f"{mean:.0f}", f"{low:.0f} .. {high:.0f}", f"{single[0]:.0f} .. {single[1]:.0f}")
-                errors = [float(n[f"{chart} error"]) for n in results]
-                within = sum(as_asked(c, expected, error) for c, error in zip(counts, errors, strict=True))
+                intervals = [n[f"{chart} interval"] for n in results]
+                within = sum(low <= c <= high for c, (low, high) in zip(counts, intervals, strict=True))
                 rows.append((kind, chart, str(len(counts)), alarms, *words, f"{within} of {len(counts)}"))
                 agreeing, total = agreeing + within, total + len(counts)
         what = ("noise", "detector", "calibrations", "alarms (asked)")
         header = (*what, "s between", "95 %", "single calibrations", "within own 95 %")
-        summary = f"{agreeing} of {total} calibrations alarm falsely as often as asked for" if total else ""
+        summary = f"{agreeing} of {total} calibrations alarm falsely as often as they predict" if total else ""
         return ResultTable(f"false alarms, {self.every:g} s between them asked for", header, tuple(rows), summary)
-
-
-def as_asked(count: int, expected: float, rate_error: float) -> bool:
-    """Whether a count of false alarms agrees with the design at 95 %.
-
-    Two errors are allowed for: that of a Poisson count, and rate_error, the standard error of ln(rate) because the
-    noise was learnt from one recording.
-    """
-    error = NORMAL * (rate_error**2 + 1.0 / expected) ** 0.5
-    return abs(math.log(max(count, 0.5) / expected)) <= error
 
 
 def mean_time(counts: Sequence[int], every: float, expected: float) -> tuple[float, float, float]:
