@@ -23,7 +23,7 @@ from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState, PendingAlarm
 from fdi_torch.monitor.observer_bank import ObserverBank
-from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, fault_effect_rms, normalized_residuals
+from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, normalized_residuals, window_beside_faults
 
 GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes a fault that grows
 SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
@@ -227,12 +227,7 @@ class AlarmHandler:
         names = tuple(tuple(self.space.names[c] for c in f.hypothesis.columns) for f in reported)
         announce, change = announce or names != change.reported, replace(change, ended=ended, reported=names)
         state = adopt_change(self.observer, state, change, reset_to_nominal(self.space, change, back))
-        state = updated_tracks(
-            state,
-            change,
-            [fault.size for fault in self.faults],
-            lambda c: fault_effect_rms(self.observer, state, c, change.best.onset),
-        )
+        state = updated_tracks(state, change, [fault.size for fault in self.faults])
         state, events = self._end_recovered(state, change, reported, observable)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:
@@ -279,7 +274,8 @@ class AlarmHandler:
         """Explanations of the readings since `start` s, likeliest first. earlier: fits that serve
         as initial guesses.
         """
-        s, healthy, window = self.settings, self.fault_free(believed), state.window(start)
+        s, healthy = self.settings, self.fault_free(believed)
+        window = window_beside_faults(self.observer, state, start, believed)
         return isolate(self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier)
 
     def _explanations_from_onset(self, state: MonitorState, start: float) -> list[HypothesisFit]:
