@@ -7,13 +7,12 @@ from functools import lru_cache
 
 import torch
 
-from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.monitor.fault_recovery import recovery_is_observable
 from fdi_torch.monitor.hypothesis import Hypothesis, HypothesisFit, credible_set, merged
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_state import MonitorState
-from fdi_torch.monitor.state_update import window_beside_faults
+from fdi_torch.monitor.state_update import LAW_ERROR, window_beside_faults
 from tests.test_monitor import FAULTS, SPACE, followed, monitor, recorded, step_to
 
 
@@ -58,7 +57,7 @@ def test_the_evidence_beside_a_known_fault_allows_for_the_error_of_its_law() -> 
     beside = window_beside_faults(watch.observer, state, 250.0, state.believed)
     assert beside.std is not None
     effects = watch.observer.whitening.filter(state.fault_effects[:, 1])[-len(beside) :]
-    expected = torch.sqrt(1.0 + (ODDS.discrepancy * effects).square())
+    expected = torch.sqrt(1.0 + (LAW_ERROR * effects).square())
     # The parallel observer without the leak has run since its onset; that of the window starts with the window.
     assert bool((beside.std[1:] > 1.0).all()) and bool((beside.std <= expected).all())
     assert float((beside.std - 1.0)[-1, 2]) > 0.5 * float((expected - 1.0)[-1, 2])

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.monitor.hypothesis import HypothesisFit
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank
-from fdi_torch.monitor.state_update import fault_influence
+from fdi_torch.monitor.state_update import LAW_ERROR, fault_influence
 from fdi_torch.parameters import ParameterSpace
 
 
@@ -37,9 +36,7 @@ def recovery_is_observable(
     without, with_fault = observer.white_innovations(window, change.before, lanes)
     since = window.times > change.best.onset
     influence = float((without - with_fault)[since].square().sum().sqrt())
-    return influence >= ODDS.discrepancy * fault_influence(
-        observer, state, track.column, track.onset, change.best.onset
-    )
+    return influence >= LAW_ERROR * fault_influence(observer, state, track.column, track.onset, change.best.onset)
 
 
 def reset_to_nominal(space: ParameterSpace, change: DetectedChange, recovered: Sequence[int]) -> Tensor:

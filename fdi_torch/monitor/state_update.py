@@ -7,11 +7,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.monitor.hypothesis import HypothesisFit
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import LONG_AGO, NEVER, ChangeHypotheses, ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples, concatenated
+
+# Assumed error of a fault's law, as a share of the fault's effect: a real leak is not an ideal orifice.
+LAW_ERROR = 0.1
 
 
 def initial_state(
@@ -99,7 +101,7 @@ def normalized_residuals(observer: ObserverBank, state: MonitorState, count: int
     """The last white residuals (count, sensors) for the detector, widened for the model error of the known faults.
 
     e / sqrt(max(1, r)^2 + sum_i (c f_i)^2): e the white residual, f_i what known fault i takes out of it at that
-    moment, c = ODDS.discrepancy the error of a fault's law, r the root mean square that the faults left unexplained
+    moment, c = LAW_ERROR the error of a fault's law, r the root mean square that the faults left unexplained
     when they were fitted.
     """
     active = state.active_effects(observer)
@@ -107,7 +109,7 @@ def normalized_residuals(observer: ObserverBank, state: MonitorState, count: int
         return state.white[-count:]
     history = count + observer.whitening.order
     effects = observer.whitening.filter(state.fault_effects[-history:, active].movedim(1, 0))[:, -count:]
-    variance = state.unexplained_rms.clamp(min=1.0) ** 2 + (ODDS.discrepancy * effects).square().sum(0)
+    variance = state.unexplained_rms.clamp(min=1.0) ** 2 + (LAW_ERROR * effects).square().sum(0)
     return state.white[-count:] / torch.sqrt(variance)
 
 
@@ -121,7 +123,7 @@ def window_beside_faults(observer: ObserverBank, state: MonitorState, start: flo
     onsets, sudden = theta.new_full((len(theta),), LONG_AGO), torch.zeros(len(theta), dtype=torch.bool)
     constant = ChangeHypotheses(theta, onsets, sudden)
     white = observer.white_innovations(window, believed, constant)
-    return replace(window, std=torch.sqrt(1.0 + (ODDS.discrepancy * (white[1:] - white[0])).square().sum(0)))
+    return replace(window, std=torch.sqrt(1.0 + (LAW_ERROR * (white[1:] - white[0])).square().sum(0)))
 
 
 def fault_influence(observer: ObserverBank, state: MonitorState, column: int, first: float, last: float) -> float:
