@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -11,6 +11,7 @@ from fdi_torch.monitor.hypothesis import Fault, HypothesisFit
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
+from fdi_torch.monitor.state_update import window_beside_faults
 
 # A change whose effect is below this share of the known faults' effect may be a change of their size.
 SMALL_CHANGE = 1.0 / 3.0
@@ -20,7 +21,7 @@ STRONG_EVIDENCE = 5.0
 
 
 def size_change(
-    observer: ObserverBank, state: MonitorState, start: float, faults: Sequence[Fault], single_changes: int
+    observer: ObserverBank, state: MonitorState, start: float, faults: Sequence[Fault]
 ) -> HypothesisFit | None:
     """New sizes of the known faults since `start` s or later, or None if that does not explain the residual.
 
@@ -30,7 +31,7 @@ def size_change(
     known = [f for f in faults if f.size in off]
     if not known:
         return None
-    window = state.window(start)
+    window = window_beside_faults(observer, state, start, state.believed)
     fits = isolate(observer, window, state.believed, known, incipient=False, deepest=len(known), healthy=state.healthy)
     best = next(f for f in fits if f.hypothesis.columns)
     near_nominal = (best.value - state.healthy).abs() <= 3.0 * best.std
@@ -38,7 +39,7 @@ def size_change(
     if best.hypothesis.recovered or any(bool((near_nominal & changed)[c]) for c in best.hypothesis.sizes):
         return None  # one of them recovered
     best = replace(best, value=torch.where(near_nominal, state.believed, best.value))
-    if _relative_effect(observer, window, state, best) > SMALL_CHANGE:
+    if _relative_effect(observer, state.window(start), state, best) > SMALL_CHANGE:
         return None
     new = [f for f in faults if f.size not in off]
     if new:
@@ -60,13 +61,8 @@ def _relative_effect(
     return (moved / sum(removed)) ** 0.5 if sum(removed) > 0.0 else float("inf")
 
 
-def updated_tracks(
-    state: MonitorState, change: DetectedChange, sizes: Sequence[int], effect_rms: Callable[[int], float]
-) -> MonitorState:
-    """The state with one track for each fault that is present after a change.
-
-    sizes: columns of the faults' sizes. effect_rms: of a column, what the fault adds to the white residuals.
-    """
+def updated_tracks(state: MonitorState, change: DetectedChange, sizes: Sequence[int]) -> MonitorState:
+    """The state with one track for each fault that is present after a change. sizes: columns of the faults' sizes."""
     fit, tracks = change.best, []
     for column in sizes:
         if float(state.believed[column]) == float(state.healthy[column]):
@@ -78,10 +74,10 @@ def updated_tracks(
         now = state.now, float(state.believed[column]), float(fit.std[column])
         if earlier is not None and earlier.number == change.number:
             start = (fit.onset, float(change.before[column]), 0.0) if fit.hypothesis.incipient else earlier.first
-            tracks.append(replace(earlier, onset=fit.onset, first=start, last=now, effect_rms=effect_rms(column)))
+            tracks.append(replace(earlier, onset=fit.onset, first=start, last=now))
             continue
         start = (fit.onset, float(change.before[column]), 0.0) if fit.hypothesis.incipient else now
-        tracks.append(FaultTrack(column, change.number, fit.onset, start, now, effect_rms(column), state.now))
+        tracks.append(FaultTrack(column, change.number, fit.onset, start, now, state.now))
     return replace(state, tracks=tuple(tracks))
 
 
