@@ -57,10 +57,7 @@ class TrainResult(Shown):
     @property
     def headline(self) -> str:
         """The diagnosis in one sentence; it begins with a warning if the model does not explain the recording."""
-        diagnosis = self.result.diagnosis
-        names = ", ".join(fault.name for fault in diagnosis.present)
-        text = f"{diagnosis.kind}: {names}" if names else diagnosis.kind
-        return "; ".join(filter(None, (diagnosis.warning, text)))
+        return self.result.diagnosis.headline
 
     def table(self) -> Table:
         """One row per parameter, SI."""
@@ -266,7 +263,9 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profile
     if final.draws is not None:
         log.result_arrays(draws=final.draws.values)
         more["draws"] = final.draws.to_dict()
-    log.result(final.to_dict() | {"kind": result.diagnosis.kind, "explained": result.diagnosis.explained} | more)
+    diagnosis = result.diagnosis
+    more["not_isolated"] = [combination.to_dict() for combination in diagnosis.not_isolated]
+    log.result(final.to_dict() | {"kind": diagnosis.kind, "explained": diagnosis.explained} | more)
     if final.status != "converged":
         log.set_status("not_converged", final.status)
 
@@ -285,6 +284,6 @@ def draw(run: Run, fitting: Fitting, result: HybridResult, log: Path) -> tuple[P
     paths = []
     for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
         suffix = "" if len(fitting.recordings) == 1 else f"_{k + 1}"
-        figure = fit_figure(recording, predicted, f"{run.name}: {result.diagnosis.kind}")
+        figure = fit_figure(recording, predicted, f"{run.name}: {result.diagnosis.headline}")
         paths.append(save(figure, log.with_name(f"{log.stem}{suffix}.png")))
     return tuple(paths)

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from math import ceil, floor, log10
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib
@@ -20,6 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from fdi_torch.disk import replacing
+from fdi_torch.report.html import short
 
 # Readings are grey, models blue, deviations orange, a second model or the truth green
 # (after Okabe & Ito 2008, darkened until text in them has a contrast of 4.5 on white).
@@ -59,6 +61,7 @@ _SETTINGS: dict[Any, Any] = {
     "savefig.facecolor": PAPER,
 }
 WIDTH, HEIGHT = 4.4, 2.7
+MOST_TITLE, LETTERS_AN_INCH = 400, 10
 
 
 @contextmanager
@@ -112,6 +115,11 @@ def label_lines(axes: Axes, columns: int = 4) -> None:
             borderaxespad=0.0,
             fontsize=9.0,
         )
+
+
+def set_title(figure: Figure, title: str) -> None:
+    """Set the title over all panels, broken into lines that fit the figure's width."""
+    figure.suptitle(fill(short(title, MOST_TITLE), int(LETTERS_AN_INCH * figure.get_figwidth())))
 
 
 def save(figure: Figure, path: Path) -> Path:
