@@ -57,9 +57,7 @@ def test_a_pattern_stands_for_all_faults_of_a_kind() -> None:
     leaks, pipes = [f"T{k}.leak.size" for k in (1, 2, 3)], ["P13.plugging.size", "P32.plugging.size"]
     assert list(found.names) == [*leaks, *pipes, "Q1.pump_gain.factor"]
     assert [found[name].high for name in pipes] == [0.5, 0.5]
-    with pytest.raises(
-        ConfigError, match=r"expected a pattern such as \*\.leak or P1\.\*, got 'A\*\.leak', which matches"
-    ):
+    with pytest.raises(ConfigError, match=r"expected a pattern such as \*\.leak or P1\.\*, got 'A\*\.leak'"):
         requested_space(run(estimate={"parameters": ["A*.leak"]}))
 
 

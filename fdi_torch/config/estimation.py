@@ -86,7 +86,7 @@ class StepConfig(Strict):
 class EstimationConfig(Strict):
     parameters: list[Annotated[ParameterConfig, BeforeValidator(_parameter)]] = Field(
         default_factory=list,
-        description="names, '*.leak' for all of a kind, or mappings with name, low, high, nominal, std",
+        description="names, patterns such as '*.leak', or mappings with name, low, high, nominal, std",
     )
     calibrate: Annotated[Any, BeforeValidator(_auto_or_names)] = Field(
         "auto", description="constants estimated too, with their tolerance as prior; auto: all for real data"

@@ -35,7 +35,7 @@ from fdi_torch.logbook import DeferredTopic, Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure, save
-from fdi_torch.report.style import inline_svg
+from fdi_torch.report.style import notebook_svg
 from fdi_torch.tables import Shown, Table, needed
 
 Tell = Callable[[float, str], None]
@@ -74,7 +74,7 @@ class TrainResult(Shown):
     def picture(self) -> str:
         """Readings and fit of the first recording, as SVG."""
         figure = fit_figure(self.fitting.recordings[0], self.result.predicted[0], self.headline)
-        return str(inline_svg(figure, self.log.stem, self.headline))
+        return notebook_svg(figure, self.log.stem, self.headline)
 
     def profile(self, *names: str, confidence: float = 0.95) -> tuple[Profile, ...]:
         """Profile likelihoods of the named parameters, of all if none is named; see `profile_likelihood`."""

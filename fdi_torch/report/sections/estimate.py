@@ -102,7 +102,7 @@ def _numbers(value: float, std: float, si_unit: str) -> list[str]:
     value, std = scale * value, scale * std
     reach = 1.96 * std
     if not np.isfinite(reach):
-        return [unit or "1", number(value), "not determined"]
+        return [unit or "1", with_error(value, std), "–"]
     digits = max(3, min(9, 2 + _decades(value, reach)))
     interval = f"{number(value - reach, digits)} … {number(value + reach, digits)}"
     return [unit or "1", with_error(value, std), interval]
