@@ -312,3 +312,28 @@ def test_a_file_that_a_full_disk_cuts_short_is_named_and_the_old_one_stays(tmp_p
         resource.setrlimit(resource.RLIMIT_FSIZE, before[0])
         signal.signal(signal.SIGXFSZ, before[1])
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_second_recording_keeps_the_first_unless_it_is_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = [
+        "simulate",
+        "--out",
+        str(tmp_path),
+        "--quiet",
+        "--set",
+        "simulate.duration=30 s",
+        "--set",
+        "output.name=run",
+    ]
+    assert cli.main(short) == 0 and capsys.readouterr().out.endswith("run.csv\n")
+    first = (tmp_path / "run.csv").read_bytes()
+    assert cli.main([*short, "--seed", "2"]) == 0
+    said = capsys.readouterr().out
+    assert (
+        "run_2.csv\n" in said and f"{tmp_path}/run.csv existed and was kept; with --replace it is overwritten" in said
+    )
+    assert (tmp_path / "run.csv").read_bytes() == first
+    assert cli.main([*short, "--seed", "2", "--replace"]) == 0 and "kept" not in capsys.readouterr().out
+    assert (tmp_path / "run.csv").read_bytes() == (tmp_path / "run_2.csv").read_bytes() != first

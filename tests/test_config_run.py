@@ -51,6 +51,16 @@ def space(wanted: Run, real_data: bool = False) -> ParameterSpace:
     return estimated_space(wanted.config.estimate, network_constants(wanted), wanted.plant, real_data)
 
 
+def test_a_pattern_stands_for_all_faults_of_a_kind() -> None:
+    wanted = run(estimate={"parameters": ["*.leak", {"name": "P*.plugging", "high": 0.5}, "Q1.pump_gain.factor"]})
+    found = requested_space(wanted)
+    leaks, pipes = [f"T{k}.leak.size" for k in (1, 2, 3)], ["P13.plugging.size", "P32.plugging.size"]
+    assert list(found.names) == [*leaks, *pipes, "Q1.pump_gain.factor"]
+    assert [found[name].high for name in pipes] == [0.5, 0.5]
+    with pytest.raises(ConfigError, match=r"expected a pattern such as \*\.leak or P1\.\*, got 'A\*\.leak'"):
+        requested_space(run(estimate={"parameters": ["A*.leak"]}))
+
+
 @pytest.mark.parametrize("path", SHIPPED_RUNS, ids=lambda path: path.stem)
 def test_every_shipped_run_is_understood(path: Path) -> None:
     wanted = load_run(path)

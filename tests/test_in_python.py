@@ -150,9 +150,11 @@ def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path) -> None:
     row = found.table().columns["parameter"].index("A.leak.size")
     estimate_of, error_of = (found.table().columns[name][row] for name in ("estimate", "std error"))
     assert abs(estimate_of - 0.3) < 4.0 * error_of < 0.2
-    assert found.headline == "single fault: A.leak.size" and "A.leak.size" in repr(found)
-    assert "<table>" in found._repr_html_() and "<svg" in found._repr_html_() and "<svg" in RIG._repr_html_()
-    assert "<svg" in fdi_torch.predict(RIG, recording)._repr_html_()
+    assert found.headline.startswith("single fault: A.leak.size = 0.") and "A.leak.size" in repr(found)
+    assert "<table>" in found._repr_html_()
+    for html in (found._repr_html_(), RIG._repr_html_(), fdi_torch.predict(RIG, recording)._repr_html_()):
+        assert "<svg" in html and "var(--" not in html  # a notebook does not define the variables of our pages
+        assert "max-width" in html
     page = fdi_torch.report(found.log)
     assert page.page.read_text().count("one tank") and "leak at A" in page.table().columns["says"][0]
 

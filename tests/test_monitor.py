@@ -37,6 +37,7 @@ from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording,
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.recording import Recording
 from fdi_torch.simulate.equilibrium import equilibrium
 
 PLANT = load_plant("three_tank")
@@ -443,3 +444,13 @@ def test_a_jump_of_a_reading_is_found_wherever_it_lies_between_the_tried_onsets(
     fits = isolate(observer, from_rest(samples), believed, faults_of(SPACE.names), incipient=False)
     assert [SPACE.names[c] for c in fits[0].hypothesis.columns] == ["h3.sensor_bias.bias"]
     assert abs(fits[0].onset - (onset - 0.5)) < 1.0
+
+
+def test_a_sensor_without_readings_is_named_with_its_remedy() -> None:
+    mask = torch.ones(60, 3, dtype=torch.bool)
+    mask[1:, 1] = False
+    time, zeros = torch.arange(60.0, dtype=torch.float64), torch.zeros(60, 3, dtype=torch.float64)
+    names = (("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
+    recording = Recording(time, zeros[:, :2], zeros, *names, mask=mask, source="rig")
+    with pytest.raises(ValueError, match=r"rig \(0 to 50 s\): h2: .* got 1 in 51 samples; .* column or tag of h2"):
+        fault_free_part(recording, 0.0, 50.0)

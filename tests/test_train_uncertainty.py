@@ -8,8 +8,14 @@ import pytest
 import torch
 
 import fdi_torch
+from fdi_torch import load_plant
+from fdi_torch.cli.screen import Screen
+from fdi_torch.cli.train import show
 from fdi_torch.config import ConfigError
 from fdi_torch.logbook.signals import arrays
+from fdi_torch.report.material import gather
+from fdi_torch.report.page import page, report_of
+from fdi_torch.report.verdict import headline
 
 SIMULATED = {
     "inputs": {"Q1": "50 cm^3/s", "Q2": "50 cm^3/s"},
@@ -66,3 +72,25 @@ def test_cma_es_in_a_run_file_finds_the_same_estimate(tmp_path: Path) -> None:
     torch.testing.assert_close(
         cma.estimate.value, shade.estimate.value, rtol=0, atol=1e-2 * float(shade.estimate.std.min())
     )
+
+
+def test_faults_that_are_not_isolated_are_present_in_their_combination(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A leak of T2 and a plugging of its outlet act through the same sqrt(2 g h): only their difference is seen."""
+    simulated = SIMULATED | {"faults": {"T2.leak": 0.2}, "noise": {"std": {f"h{k}": "1 mm" for k in (1, 2, 3)}}}
+    estimated = {"parameters": ["T1.leak", "T2.leak", "OUT2.plugging"]}
+    done = fdi_torch.train(run(tmp_path, **estimated) | {"simulate": simulated})
+    (combination,) = done.result.estimate.combinations
+    assert combination.parameters == ("T2.leak.size", "OUT2.plugging.size")
+    assert combination.coefficients == pytest.approx((1.0, -1.0), abs=1e-5)
+    assert combination.value == pytest.approx(0.2, abs=3.0 * combination.std) and combination.std < 0.05
+    assert done.result.diagnosis.not_isolated == (combination,)
+    assert done.headline.startswith("fault not isolated: T2.leak.size or OUT2.plugging.size (T2.leak.size - OUT2.plug")
+    material = gather(fdi_torch.read_run(done.log), load_plant("three_tank"))
+    assert headline(material).startswith("Fault not isolated: leak at T2 or plugging at OUT2 (T2.leak.size - OUT2.plug")
+    html = page([report_of(material)])
+    assert html.count("not isolated</span>") == 2 and "not determined" in html
+    show(done, Screen())
+    rows = capsys.readouterr().out
+    assert " inf" not in rows and f"\n{combination.formula} " in rows

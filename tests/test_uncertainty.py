@@ -10,6 +10,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.information import (
     certainty,
     determined_combinations,
@@ -141,6 +142,31 @@ def test_determined_combinations_are_those_the_readings_depend_on() -> None:
     torch.testing.assert_close(plain[:, :3], torch.eye(3, dtype=DOUBLE), rtol=0, atol=1e-9)
     hidden = torch.linalg.svd(signals)[2][3:]
     torch.testing.assert_close(plain @ hidden.mT, torch.zeros(3, 2, dtype=DOUBLE), rtol=0, atol=1e-9)
+
+
+def test_determined_combination_has_the_value_and_standard_error_of_a_fit_for_it_alone() -> None:
+    """y = (a + k c) s + b u in mixed units equals y = d s + b u with d = a + k c, whose standard error is known."""
+    s, u, k = torch.sin(TIME), torch.exp(-TIME), 250.0
+    mixed = ParameterSpace(
+        [Parameter("P.offset", "m^3/s", 0.0), Parameter("b", "1", 0.0), Parameter("A.level", "m", 0.0, -1.0, 1.0)]
+    )
+    estimate = make_estimate(mixed, torch.tensor([0.2, 0.4, 0.003], dtype=DOUBLE), columns(s, u, k * s))
+    (combination,) = estimate.combinations
+    alone = certainty(columns(s, u))
+    assert combination.parameters == ("P.offset", "A.level") and combination.unit == "m^3/s"
+    assert combination.coefficients == pytest.approx((1.0, k), rel=1e-9)
+    assert combination.value == pytest.approx(0.2 + 0.003 * k, rel=1e-9)
+    assert combination.std == pytest.approx(float(alone.std[0]), rel=1e-6)
+    # 250 m^3/s per m is 2.5e6 cm^3/s per cm.
+    assert combination.formula == "P.offset + 2.5e+06 cm^3/s/cm A.level"
+    assert estimate.to_dict()["combinations"] == [combination.to_dict()]
+    assert Combination.from_dict(combination.to_dict()) == combination
+
+
+def test_held_parameter_counts_as_known_in_what_is_determined() -> None:
+    signal = torch.sin(TIME)
+    sure = certainty(columns(signal, 0.5 * signal), held=torch.tensor([True, False]))
+    assert not sure.null.any() and torch.equal(sure.determined, sure.covariance)
 
 
 def test_nearly_collinear_is_determined_but_told_to_exceed_its_range() -> None:

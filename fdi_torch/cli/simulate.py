@@ -18,8 +18,11 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     with screen.progress(job.name) as advance:
         advance(0.0, "integrating")
         recording = simulate_recording(job)
-        path = write_csv(recording, free_path(Path(job.config.output.folder), job.name, "csv"))
+        named = Path(job.config.output.folder) / f"{job.name}.csv"
+        path = write_csv(recording, named if arguments.replace else free_path(named.parent, job.name, "csv"))
         advance(1.0, "done")
     screen.say(f"{len(recording)} samples, {float(recording.time[-1]):g} s: {path}")
+    if path != named:
+        screen.say(f"- {named} existed and was kept; with --replace it is overwritten")
     screen.result({"format": "fdi_torch.simulate/1", "recording": str(path), "samples": len(recording)})
     return 0

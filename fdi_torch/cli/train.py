@@ -48,25 +48,41 @@ def show(done: TrainResult, screen: Screen) -> None:
     for i, p in enumerate(done.fitting.space):
         unit, scale = display_unit(p.unit)
         truth = done.truth.get(p.name)
-        value, std = scale * float(final.value[i]), scale * float(final.std[i])
-        low, high = value - 1.96 * std, value + 1.96 * std
-        numbers = [f"{value:.6g}", f"{std:.2g}", f"{low:.5g} .. {high:.5g}", f"{scale * p.nominal:.5g}"]
+        numbers = estimate_cells(float(final.value[i]), float(final.std[i]), p.nominal, scale)
         simulated = [f"{scale * truth:.5g}" if truth is not None else ""] if done.truth else []
         rows.append([p.name, unit or "1", *numbers, *simulated])
     header = ("parameter", "unit", "estimate", "std error", "95 % interval", "nominal", "simulated")
     screen.table("", header if done.truth else header[:-1], rows, left=2)
+    if final.combinations:
+        rows = []
+        for c in final.combinations:
+            unit, scale = display_unit(c.unit)
+            rows.append([c.formula, unit or "1", *estimate_cells(c.value, c.std, c.nominal, scale)])
+        screen.say()
+        screen.table("determined combinations", ("combination", *header[1:-1]), rows, left=2)
     screen.say()
     for line in in_words(done):
         screen.say(line)
     show_uncertainty(done, screen)
-    rho = ", ".join(f"{float(r):.6f}" for r in done.result.correlation)
-    steps = done.result.steps
-    screen.say(f"correlation of each sensor: {rho} (sum {float(done.result.correlation.sum()):.6f})")
-    screen.say(f"steps: search {steps[0]:g} s, refinement {steps[1]:g} s; {done.result.engine}")
+    sensors = done.fitting.recordings[0].output_names
+    rho = ", ".join(f"{n} {float(r):.6f}" for n, r in zip(sensors, done.result.correlation, strict=True))
+    search, refinement = done.result.steps
+    screen.say(f"correlation of readings and model: {rho}")
+    screen.say(f"integration step: {search:g} s in the search, {refinement:g} s in the refinement")
+    screen.say(f"simulated by the {done.result.engine}")
     screen.say(f"confidence of the whole statement: {100 * diagnosis.confidence:g} %")
     screen.say(f"log: {done.log}")
     for picture in done.pictures:
         screen.say(f"picture: {picture}")
+
+
+def estimate_cells(value: float, std: float, nominal: float, scale: float) -> list[str]:
+    """Estimate, standard error, 95 % interval and nominal value as text; scale: one SI unit in the unit for display."""
+    value, std = scale * value, scale * std
+    if math.isfinite(std):
+        low, high = value - 1.96 * std, value + 1.96 * std
+        return [f"{value:.6g}", f"{std:.2g}", f"{low:.5g} .. {high:.5g}", f"{scale * nominal:.5g}"]
+    return [f"{value:.6g}", "–", "not determined", f"{scale * nominal:.5g}"]
 
 
 def show_uncertainty(done: TrainResult, screen: Screen) -> None:
@@ -103,10 +119,7 @@ def in_words(done: TrainResult) -> list[str]:
         dict.fromkeys(s for r in recordings for s in data_warnings(r, done.fitting.plant))
     )
     if diagnosis.faults:
-        present = (
-            ", ".join(f.name for f in diagnosis.present) or "no suspected fault differs significantly from nominal"
-        )
-        lines.append(f"{diagnosis.kind}: {present}")
+        lines.append(f"{diagnosis.kind}: {diagnosis.names or 'no suspected fault differs significantly from nominal'}")
     for fault in diagnosis.present:
         parts = [f"{quantity_text(fault.value, fault.unit)} instead of {quantity_text(fault.nominal, fault.unit)}"]
         if fault.flow is not None:
@@ -144,6 +157,7 @@ def as_json(done: TrainResult) -> dict[str, object]:
             "explained": result.diagnosis.explained,
             "unexplained_ratio": finite(result.diagnosis.unexplained_ratio),
             "faults": result.diagnosis.faults,
+            "not_isolated": result.diagnosis.not_isolated,
         },
         "correlation": result.correlation.tolist(),
         "search": {"reason": result.search.reasons()[0], "generations": int(result.search.generations[0])},

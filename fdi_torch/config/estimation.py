@@ -14,7 +14,7 @@ from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
 from fdi_torch.effects import EFFECTS, all_placements, build_network, placements_for
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
-from fdi_torch.names import unknown
+from fdi_torch.names import shortened, unknown
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -85,7 +85,8 @@ class StepConfig(Strict):
 
 class EstimationConfig(Strict):
     parameters: list[Annotated[ParameterConfig, BeforeValidator(_parameter)]] = Field(
-        default_factory=list, description="names, or mappings with name, low, high, nominal, std"
+        default_factory=list,
+        description="names, patterns such as '*.leak', or mappings with name, low, high, nominal, std",
     )
     calibrate: Annotated[Any, BeforeValidator(_auto_or_names)] = Field(
         "auto", description="constants estimated too, with their tolerance as prior; auto: all for real data"
@@ -117,6 +118,22 @@ def full_name(name: str, plant: PlantDescription) -> str:
     return str(at.sibling(effect_at(at.effect, at.place, plant).parameters(at.place, plant)[0].name))
 
 
+def matching_names(pattern: str, plant: PlantDescription) -> list[str]:
+    """The full names of a name, or of all that a pattern such as '*.leak' matches, in the order of the plant.
+
+    Raises ValueError for a pattern without a match, and for an impossible place.
+    """
+    if "*" not in pattern:
+        return [full_name(pattern, plant)]
+    known = [*(p.prefix for p in all_placements(plant)), *build_network(plant).constants.names]
+    matched = [full_name(name, plant) for name in known if fnmatchcase(name, pattern)]
+    if not matched:
+        raise ValueError(
+            f"expected a pattern such as *.leak or P1.*, got '{shortened(pattern)}', which matches nothing"
+        )
+    return matched
+
+
 def names_in_full(names: Iterable[str], plant: PlantDescription, field: str) -> list[str]:
     """The full names. Raises ConfigError, naming the field, for a name that the plant does not have."""
     short = list(names)
@@ -133,7 +150,7 @@ def names_in_full(names: Iterable[str], plant: PlantDescription, field: str) -> 
 
 def placements_of(names: Iterable[str], plant: PlantDescription) -> tuple[Placement, ...]:
     """The distinct effects to which the names belong."""
-    return placements_for(full_name(name, plant) for name in names)
+    return placements_for(full for name in names for full in matching_names(name, plant))
 
 
 def estimated_space(
@@ -144,7 +161,11 @@ def estimated_space(
 
     Raises ConfigError for unknown or repeated names, wrong units, and bounds that exclude the nominal value.
     """
-    estimated = [_chosen(p, i, constants, plant) for i, p in enumerate(config.parameters)]
+    estimated = [
+        _chosen(p, f"estimate.parameters.{i}", name, constants, plant)
+        for i, p in enumerate(config.parameters)
+        for name in matching_names(p.name, plant)
+    ]
     names = {p.name for p in estimated}
     calibrated = [constants[name] for name in _calibrated(config, constants, plant, real_data) if name not in names]
     try:
@@ -153,9 +174,9 @@ def estimated_space(
         raise ConfigError([f"estimate.parameters: {error}"]) from error
 
 
-def _chosen(config: ParameterConfig, index: int, constants: ParameterSpace, plant: PlantDescription) -> Parameter:
-    place = f"estimate.parameters.{index}"
-    name = full_name(config.name, plant)
+def _chosen(
+    config: ParameterConfig, place: str, name: str, constants: ParameterSpace, plant: PlantDescription
+) -> Parameter:
     if name not in constants:
         raise ConfigError([f"{place}: {_unknown_parameter(name, constants, plant)}"])
     unit = constants[name].unit

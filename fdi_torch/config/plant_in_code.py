@@ -124,9 +124,9 @@ class Plant(PlantDescription):
     def _repr_html_(self) -> str:
         """The drawing of the rig for notebooks."""
         from fdi_torch.report.schematic import schematic
-        from fdi_torch.report.style import inline_svg
+        from fdi_torch.report.style import notebook_svg
 
-        return str(inline_svg(schematic(self), f"plant-{self.name}", f"plant {self.name}"))
+        return notebook_svg(schematic(self), f"plant-{self.name}", f"plant {self.name}")
 
 
 def _units_as_written(plant: PlantDescription) -> dict[str, str]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.combinations import Combination, listed, value_text
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, common_name
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
@@ -49,7 +51,8 @@ UNRELIABLE = "Unreliable: the model does not explain the recording"
 class Diagnosis:
     """Test results for all suspected faults, and whether the model explains the recording.
 
-    faults: all suspected faults, present or not. kind: 'no fault', 'single fault' or 'multiple faults'.
+    faults: all suspected faults, present or not. not_isolated: combinations of fault sizes, none of them determined
+    alone, that deviate significantly from nominal, so that at least one of their faults is present.
     confidence: joint confidence of all statements (Bonferroni correction).
     unexplained_ratio: standard deviation of the residuals over the sample-to-sample noise of the readings, largest of
     all channels. explained: whether this ratio is at most UNEXPLAINED_RATIO.
@@ -59,6 +62,7 @@ class Diagnosis:
     confidence: float
     explained: bool
     unexplained_ratio: float
+    not_isolated: tuple[Combination, ...] = ()
 
     @property
     def present(self) -> tuple[Fault, ...]:
@@ -66,7 +70,26 @@ class Diagnosis:
 
     @property
     def kind(self) -> str:
-        return ("no fault", "single fault", "multiple faults")[min(len(self.present), 2)]
+        """'no fault', 'single fault', 'fault not isolated' or 'multiple faults'."""
+        if self.not_isolated and not self.present:
+            return "fault not isolated"
+        return ("no fault", "single fault", "multiple faults")[min(len(self.present) + len(self.not_isolated), 2)]
+
+    @property
+    def names(self) -> str:
+        """The faults that are present, such as 'T1.leak.size, T2.leak.size or OUT2.plugging.size'; may be empty."""
+        return ", ".join([*(f.name for f in self.present), *(listed(c.parameters, "or") for c in self.not_isolated)])
+
+    @property
+    def headline(self) -> str:
+        """Kind and sizes, such as 'single fault: T1.leak.size = 0.3 ± 0.002'.
+
+        It begins with a warning if the model does not explain the recording.
+        """
+        sizes = [value_text(f.name, f.value, f.std, f.unit) for f in self.present]
+        sizes += [f"{listed(c.parameters, 'or')} ({c.words})" for c in self.not_isolated]
+        summary = f"{self.kind}: {'; '.join(sizes)}" if sizes else self.kind
+        return f"{self.warning}; {summary}" if self.warning else summary
 
     @property
     def warning(self) -> str:
@@ -85,11 +108,13 @@ def diagnose(
     mean_channels: Tensor,
     unexplained_ratio: float,
     confidence: float = 0.95,
+    combinations: Sequence[Combination] = (),
 ) -> Diagnosis:
     """Test each fault size for a significant deviation from nominal.
 
     A fault is present if |value - nominal| / std is significant at `confidence`, two-sided and Bonferroni-corrected for
-    the number of faults. A fault with an infinite standard error is never present.
+    the number of faults. A fault with an infinite standard error is never present; combinations: what is determined of
+    such faults, tested in the same way.
     value, std (P,): estimates and standard errors. mean_levels (tanks,), m; mean_channels (channels,): actuator inputs.
     """
     fault_sizes = [i for i, p in enumerate(space) if is_fault_size(network, p)]
@@ -97,15 +122,28 @@ def diagnose(
     faults = []
     for i in fault_sizes:
         p = space.parameters[i]
-        score = abs(float(value[i]) - p.nominal) / float(std[i]) if float(std[i]) > 0 else math.inf
-        probability = 2.0 * NormalDist().cdf(score) - 1.0 if math.isfinite(score) else float(value[i] != p.nominal)
+        probability = probability_of_deviation(float(value[i]), float(std[i]), p.nominal)
         flow, hole = fault_flow(network, space, value, i, mean_levels, mean_channels)
         faults.append(
             Fault(
                 p.name, p.unit, float(value[i]), float(std[i]), p.nominal, probability > level, probability, flow, hole
             )
         )
-    return Diagnosis(tuple(faults), confidence, unexplained_ratio <= UNEXPLAINED_RATIO, unexplained_ratio)
+    sizes = {space.names[i] for i in fault_sizes}
+    not_isolated = tuple(
+        c
+        for c in combinations
+        if sizes.issuperset(c.parameters) and probability_of_deviation(c.value, c.std, c.nominal) > level
+    )
+    explained = unexplained_ratio <= UNEXPLAINED_RATIO
+    return Diagnosis(tuple(faults), confidence, explained, unexplained_ratio, not_isolated)
+
+
+def probability_of_deviation(value: float, std: float, nominal: float) -> float:
+    """Confidence level at which an estimate differs from its nominal value, two-sided."""
+    if not std > 0:
+        return float(value != nominal)
+    return 2.0 * NormalDist().cdf(abs(value - nominal) / std) - 1.0
 
 
 def is_fault_size(network: TankNetwork, parameter: Parameter) -> bool:

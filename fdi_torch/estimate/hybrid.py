@@ -191,6 +191,7 @@ def conclude(
         means,
         max(noise_ratios),
         settings.confidence,
+        estimate.combinations,
     )
     return HybridResult(
         estimate=estimate,

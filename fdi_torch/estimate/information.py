@@ -39,12 +39,15 @@ class Certainty:
 
     std (*batch, P): standard errors; infinite for a parameter that belongs to an undetermined direction.
     covariance (*batch, P, P): for such a parameter infinite on the diagonal and NaN elsewhere in its row and column.
+    determined (*batch, P, P): covariance within the determined subspace; that of any determined combination follows
+    from it.
     null (*batch, P, P): projector onto the undetermined subspace, for scaled parameters; zero if there is none.
     scale (*batch, P): parameter = scale * scaled parameter.
     """
 
     std: Tensor
     covariance: Tensor
+    determined: Tensor
     null: Tensor
     scale: Tensor
 
@@ -93,11 +96,13 @@ def _certainty_from(covariance: Tensor, null: Tensor, scale: Tensor, held: Tenso
     """Set the covariance of undetermined parameters to infinity or NaN, and that of held ones to zero."""
     undetermined = null.diagonal(dim1=-2, dim2=-1) > _SHARE
     involved = undetermined[..., :, None] | undetermined[..., None, :]
+    determined = covariance
     covariance = torch.where(involved, math.nan, covariance)
     covariance = torch.where(torch.diag_embed(undetermined), math.inf, covariance)
     if held is not None:
-        covariance = torch.where(held[..., :, None] | held[..., None, :], 0.0, covariance)
-    return Certainty(covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt(), covariance, null, scale)
+        involves_held = held[..., :, None] | held[..., None, :]
+        covariance, determined = (torch.where(involves_held, 0.0, c) for c in (covariance, determined))
+    return Certainty(covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt(), covariance, determined, null, scale)
 
 
 def determined_combinations(null: Tensor, scale: Tensor) -> list[tuple[list[int], Tensor]]:

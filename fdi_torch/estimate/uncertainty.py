@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.information import RELATIVE_EIGENVALUE, Certainty, certainty, determined_combinations
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.estimate.combinations import Combination, undetermined_groups
+from fdi_torch.estimate.information import RELATIVE_EIGENVALUE, certainty
+from fdi_torch.parameters import ParameterSpace, quantity_text
 
 if TYPE_CHECKING:
     from fdi_torch.estimate.posterior_draws import Draws
@@ -28,6 +29,7 @@ class Estimate:
     std (P,): standard errors, which include the tolerances of plant constants through their priors; infinite for
     undetermined parameters. covariance (P, P): computed without regard to bounds; infinite or NaN in the rows and
     columns of undetermined parameters. at_bounds: 'low' or 'high' by name. undetermined: one sentence per group.
+    combinations: what is determined of the undetermined parameters.
     noise_std (C,): noise level of each channel, known or estimated, in its unit. chi_square: of the residuals relative
     to the noise, with degrees_of_freedom. reached: how the estimate was computed, as plain values.
     draws: from the posterior, if some were asked for.
@@ -41,6 +43,7 @@ class Estimate:
     status: str = ""
     at_bounds: Mapping[str, str] = field(default_factory=dict)
     undetermined: tuple[str, ...] = ()
+    combinations: tuple[Combination, ...] = ()
     noise_std: Tensor | None = None
     chi_square: float | None = None
     degrees_of_freedom: int | None = None
@@ -81,11 +84,14 @@ class Estimate:
 
         The covariance is flattened row by row; `covariance_shape` holds its shape.
         """
-        separate = ("covariance", "draws")
+        separate = ("covariance", "draws", "combinations")
         plain = {name: plain_value(value, name) for name, value in vars(self).items() if name not in separate}
         flat = plain_value(self.covariance.flatten(), "covariance")
         p_value = plain_value(self.p_value, "p_value")
-        return plain | {"covariance": flat, "covariance_shape": list(self.covariance.shape), "p_value": p_value}
+        shape = list(self.covariance.shape)
+        combinations = [combination.to_dict() for combination in self.combinations]
+        more = {"covariance_shape": shape, "p_value": p_value, "combinations": combinations}
+        return plain | {"covariance": flat} | more
 
 
 def make_estimate(
@@ -111,6 +117,7 @@ def make_estimate(
             f"and {tuple(information.shape)}; make one estimate for each member of a batch"
         )
     uncertainty = certainty(information, threshold=threshold)
+    groups = undetermined_groups(space, theta, uncertainty)
     return Estimate(
         names=space.names,
         units=tuple(p.unit for p in space),
@@ -119,7 +126,8 @@ def make_estimate(
         covariance=uncertainty.covariance,
         status=status,
         at_bounds=parameters_at_bounds(space, theta),
-        undetermined=(*undetermined_in_words(space.names, uncertainty), *wider_than_range(space, uncertainty.std)),
+        undetermined=(*(group.sentence for group in groups), *wider_than_range(space, uncertainty.std)),
+        combinations=tuple(combination for group in groups for combination in group.combinations),
         noise_std=noise_std,
         chi_square=chi_square,
         degrees_of_freedom=degrees_of_freedom,
@@ -139,44 +147,11 @@ def parameters_at_bounds(space: ParameterSpace, theta: Tensor) -> dict[str, str]
     return at_bounds
 
 
-def undetermined_in_words(names: Sequence[str], sure: Certainty) -> tuple[str, ...]:
-    """One sentence for each group of jointly undetermined parameters; `sure` is the certainty of one estimate."""
-    return tuple(
-        _sentence([names[i] for i in members], rows.tolist())
-        for members, rows in determined_combinations(sure.null, sure.scale)
-    )
-
-
-def _sentence(names: list[str], rows: list[list[float]]) -> str:
-    if not rows:
-        verb = "is" if len(names) == 1 else "are"
-        return (
-            f"{_listed(names)} {verb} not determined: the readings do not depend on {'it' if verb == 'is' else 'them'}"
-        )
-    verb = "is" if len(rows) == 1 else "are"
-    return f"of {_listed(names)}, only {_listed([_combination(names, row) for row in rows])} {verb} determined"
-
-
-def _combination(names: list[str], row: list[float]) -> str:
-    """Linear combination as text, such as 'a + 0.8 b - 2 c', with coefficients in SI units."""
-    size = max(abs(c) for c in row)
-    text = ""
-    for name, c in zip(names, row, strict=True):
-        if abs(c) > 1e-6 * size:
-            sign = ("- " if c < 0 else "+ ") if text else ("-" if c < 0 else "")
-            number = "" if f"{abs(c):.3g}" == "1" else f"{abs(c):.3g} "
-            text += f"{' ' if text else ''}{sign}{number}{name}"
-    return text
-
-
-def _listed(items: list[str]) -> str:
-    return items[0] if len(items) == 1 else ", ".join(items[:-1]) + " and " + items[-1]
-
-
 def wider_than_range(space: ParameterSpace, std: Tensor) -> tuple[str, ...]:
     """One sentence for each parameter whose standard error (P,) is finite but larger than its range."""
     return tuple(
-        f"{p.name} is hardly determined: standard error {error:.3g} {p.unit}, more than its range {p.low:g}..{p.high:g}"
+        f"{p.name} is hardly determined: standard error {quantity_text(error, p.unit, 3)}, more than its range from "
+        f"{quantity_text(p.low, p.unit)} to {quantity_text(p.high, p.unit)}"
         for p, error in zip(space, std.tolist(), strict=True)
         if p.high - p.low < error < math.inf
     )

@@ -34,7 +34,7 @@ from fdi_torch.parameters import display_in
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.report.free_run_figure import free_run_figure
-from fdi_torch.report.style import inline_svg
+from fdi_torch.report.style import notebook_svg
 from fdi_torch.tables import Shown, Table
 
 Tell = Callable[[float, str], None]
@@ -206,7 +206,7 @@ class FreeRun(Shown):
         """Measured and predicted readings, as SVG."""
         columns = [sensor.column for sensor in self.plant.sensors]
         figure = free_run_figure(self.recording, columns, {self.plant.name: self.prediction.readings}, self.headline)
-        return str(inline_svg(figure, "free-run", self.headline))
+        return notebook_svg(figure, "free-run", self.headline)
 
     def to_xarray(self) -> Any:
         """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""

@@ -35,7 +35,7 @@ from fdi_torch.logbook import DeferredTopic, Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure, save
-from fdi_torch.report.style import inline_svg
+from fdi_torch.report.style import notebook_svg
 from fdi_torch.tables import Shown, Table, needed
 
 Tell = Callable[[float, str], None]
@@ -57,10 +57,7 @@ class TrainResult(Shown):
     @property
     def headline(self) -> str:
         """The diagnosis in one sentence; it begins with a warning if the model does not explain the recording."""
-        diagnosis = self.result.diagnosis
-        names = ", ".join(fault.name for fault in diagnosis.present)
-        text = f"{diagnosis.kind}: {names}" if names else diagnosis.kind
-        return "; ".join(filter(None, (diagnosis.warning, text)))
+        return self.result.diagnosis.headline
 
     def table(self) -> Table:
         """One row per parameter, SI."""
@@ -77,7 +74,7 @@ class TrainResult(Shown):
     def picture(self) -> str:
         """Readings and fit of the first recording, as SVG."""
         figure = fit_figure(self.fitting.recordings[0], self.result.predicted[0], self.headline)
-        return str(inline_svg(figure, self.log.stem, self.headline))
+        return notebook_svg(figure, self.log.stem, self.headline)
 
     def profile(self, *names: str, confidence: float = 0.95) -> tuple[Profile, ...]:
         """Profile likelihoods of the named parameters, of all if none is named; see `profile_likelihood`."""
@@ -266,7 +263,9 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profile
     if final.draws is not None:
         log.result_arrays(draws=final.draws.values)
         more["draws"] = final.draws.to_dict()
-    log.result(final.to_dict() | {"kind": result.diagnosis.kind, "explained": result.diagnosis.explained} | more)
+    diagnosis = result.diagnosis
+    more["not_isolated"] = [combination.to_dict() for combination in diagnosis.not_isolated]
+    log.result(final.to_dict() | {"kind": diagnosis.kind, "explained": diagnosis.explained} | more)
     if final.status != "converged":
         log.set_status("not_converged", final.status)
 
@@ -285,6 +284,6 @@ def draw(run: Run, fitting: Fitting, result: HybridResult, log: Path) -> tuple[P
     paths = []
     for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
         suffix = "" if len(fitting.recordings) == 1 else f"_{k + 1}"
-        figure = fit_figure(recording, predicted, f"{run.name}: {result.diagnosis.kind}")
+        figure = fit_figure(recording, predicted, f"{run.name}: {result.diagnosis.headline}")
         paths.append(save(figure, log.with_name(f"{log.stem}{suffix}.png")))
     return tuple(paths)

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import placements_for
+from fdi_torch.estimate.combinations import undetermined_groups
 from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.information import certainty
-from fdi_torch.estimate.uncertainty import undetermined_in_words
 from fdi_torch.monitor.structural_analysis import structure_of
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import Pipe, PlantDescription, Tank
@@ -112,7 +112,8 @@ def diagnosability(
         smallest_detectable=_limits(reach, length, length),
         smallest_isolable=_limits(reach, length * nearest, length),
         groups=tuple(_groups(plant, faults, apart)),
-        remarks=tuple(undetermined_in_words(fitting.space.names, joint)) + _remarks(readings, length, faults),
+        remarks=tuple(g.sentence for g in undetermined_groups(fitting.space, theta, joint))
+        + _remarks(readings, length, faults),
     )
 
 

@@ -22,6 +22,7 @@ from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.observer_gain import Gain, hand_gain, start_beside_noise, timed_gain
 from fdi_torch.monitor.samples import Samples, samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
+from fdi_torch.monitor.whitening import FEWEST_SAMPLES
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.network import TankNetwork
@@ -173,5 +174,12 @@ def usual_faults(plant: PlantDescription) -> list[str]:
 
 
 def fault_free_part(recording: Recording, start: float, stop: float) -> Recording:
-    """The part between two moments (s). Raises ValueError where the recording does not hold it."""
-    return replace(recording.window(start, stop), source=f"{recording.source} ({start:g} to {stop:g} s)")
+    """The part between two moments (s). Raises ValueError if the recording, or a sensor, has too few samples there."""
+    part = replace(recording.window(start, stop), source=f"{recording.source} ({start:g} to {stop:g} s)")
+    for name, count in zip(part.output_names, part.mask.sum(dim=0).tolist(), strict=True):
+        if count < FEWEST_SAMPLES:
+            raise ValueError(
+                f"{part.source}: {name}: expected at least {FEWEST_SAMPLES} readings to learn the noise from, "
+                f"got {count} in {len(part)} samples; lengthen fault_free, or correct the column or tag of {name}"
+            )
+    return part

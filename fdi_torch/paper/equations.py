@@ -32,7 +32,7 @@ EQUATIONS = (
     Equation((8,), "full correlation means readings that are an affine map of the prediction",
              ("monitor.diagnosability:without_gain_and_offset", "estimate.objectives:correlation_loss")),
     Equation((9, 10, 11, 12), "equal rates at equal states give equal parameters; here a rank and standard errors, not "
-             "an assumption", ("estimate.information:certainty", "estimate.uncertainty:undetermined_in_words")),
+             "an assumption", ("estimate.information:certainty", "estimate.combinations:undetermined_groups")),
     Equation((13,), "fit by the sum of correlations within a box",
              ("estimate.objectives:Problem.cost", "estimate.hybrid:search")),
     Equation((14,), "Luenberger-like observer with nominal parameters",

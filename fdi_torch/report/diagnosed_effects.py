@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fdi_torch.effects import effect
+from fdi_torch.estimate.combinations import Combination
 from fdi_torch.gap.verdict_words import cause_words
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
@@ -65,6 +66,15 @@ def _fault(message: Mapping[str, Any]) -> DiagnosedEffect:
     return DiagnosedEffect(
         fault.effect, location, message.get("present") is True, size, std, unit, flow, hole, quantity
     )
+
+
+def combinations_of(material: Material, result: str) -> list[Combination]:
+    """Determined combinations in the run's result: all 'combinations', or those of faults that are 'not_isolated'."""
+    try:
+        return [Combination.from_dict(plain) for plain in material.listed(result)]
+    except (KeyError, TypeError, ValueError) as error:
+        material.trouble.append(f"the result's {result.replace('_', ' ')} are unreadable: {error}")
+        return []
 
 
 def fault_at(name: str) -> tuple[str, str]:

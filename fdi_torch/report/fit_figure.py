@@ -12,7 +12,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.report.downsampling import thinned
 from fdi_torch.report.html import short
 from fdi_torch.report.numbers import axis, shown_unit
-from fdi_torch.report.style import MODEL, SOFT, label_lines, save, styled
+from fdi_torch.report.style import MODEL, SOFT, label_lines, save, set_title, styled
 
 __all__ = ["fit_figure", "save"]
 
@@ -26,7 +26,7 @@ def fit_figure(recording: Recording, predicted: Tensor, title: str) -> Figure:
         axes = figure.subplots(2, count, sharex=True, squeeze=False, height_ratios=(2, 1))
         for i in range(count):
             _draw_sensor(axes[0, i], axes[1, i], recording, predicted, i)
-        figure.suptitle(short(title, 100))
+        set_title(figure, title)
     return figure
 
 
@@ -42,6 +42,6 @@ def _draw_sensor(upper: Axes, lower: Axes, recording: Recording, predicted: Tens
     lower.plot(*thinned(time, read - model), color=MODEL, lw=0.7)
     upper.set_title(short(recording.output_names[i]))
     upper.set_ylabel(axis("reading", unit))
-    lower.set_ylabel(axis("measured − estimate", unit))
+    lower.set_ylabel(axis("residual", unit))
     lower.set_xlabel("time, s")
     label_lines(upper)

@@ -14,7 +14,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.report.downsampling import thinned
 from fdi_torch.report.html import short
 from fdi_torch.report.numbers import axis, shown_unit
-from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, styled
+from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, set_title, styled
 
 
 def free_run_figure(recording: Recording, columns: list[str], runs: Mapping[str, Tensor], title: str) -> Figure:
@@ -30,7 +30,7 @@ def free_run_figure(recording: Recording, columns: list[str], runs: Mapping[str,
         for i, column in enumerate(columns):
             predictions = {name: predicted[:, i] for name, predicted in runs.items()}
             _draw(axes[0, i], axes[1, i], recording, recording.output_names.index(column), predictions)
-        figure.suptitle(short(title, 100))
+        set_title(figure, title)
     return figure
 
 
@@ -47,6 +47,6 @@ def _draw(upper: Axes, lower: Axes, recording: Recording, i: int, runs: Mapping[
         lower.plot(*thinned(time, read - model), color=color, lw=0.8)
     upper.set_title(short(recording.output_names[i]), loc="left")
     upper.set_ylabel(axis("reading", unit))
-    lower.set_ylabel(axis("measured − run", unit))
+    lower.set_ylabel(axis("residual", unit))
     lower.set_xlabel("time, s")
     label_lines(upper)

@@ -48,7 +48,12 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def with_error(value: float, std: float) -> str:
-    """'0.3000 ± 0.0020', '(2.44 ± 0.24)·10⁻⁷': the error with two digits, the value with as many decimals."""
+    """'0.3000 ± 0.0020', '(2.44 ± 0.24)·10⁻⁷': the error with two digits, the value with as many decimals.
+
+    A value with an infinite error is not determined.
+    """
+    if std == math.inf:
+        return "not determined"
     if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
         return number(value)
     if (largest := max(abs(value), std)) < 1e-3:

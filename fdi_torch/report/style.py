@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from math import ceil, floor, log10
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib
@@ -20,6 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from fdi_torch.disk import replacing
+from fdi_torch.report.html import escape, short
 
 # Readings are grey, models blue, deviations orange, a second model or the truth green
 # (after Okabe & Ito 2008, darkened until text in them has a contrast of 4.5 on white).
@@ -59,6 +61,7 @@ _SETTINGS: dict[Any, Any] = {
     "savefig.facecolor": PAPER,
 }
 WIDTH, HEIGHT = 4.4, 2.7
+MOST_TITLE, LETTERS_AN_INCH = 400, 10
 
 
 @contextmanager
@@ -114,6 +117,11 @@ def label_lines(axes: Axes, columns: int = 4) -> None:
         )
 
 
+def set_title(figure: Figure, title: str) -> None:
+    """Set the title over all panels, broken into lines that fit the figure's width."""
+    figure.suptitle(fill(short(title, MOST_TITLE), int(LETTERS_AN_INCH * figure.get_figwidth())))
+
+
 def save(figure: Figure, path: Path) -> Path:
     """Write the picture as PNG or SVG, by the path's suffix; equal figures give equal files."""
     metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
@@ -123,7 +131,22 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def inline_svg(figure: Figure, name: str, description: str) -> str:
-    """The figure as an HTML element: colours are the page's variables, ids are prefixed with `name`."""
+    """The figure as an element of our pages: colours are the page's variables, ids are prefixed with `name`."""
+    svg = _svg(figure, name, description)
+    for colour, variable in VARIABLES.items():
+        svg = svg.replace(colour, f"var(--{variable})")
+    return svg
+
+
+def notebook_svg(figure: Figure, name: str, description: str) -> str:
+    """The figure as an HTML element for notebooks, with colours and paper of its own, at most in its natural size."""
+    width = f"{72 * figure.get_figwidth():g}px"
+    style = f"max-width: {width}; background: {PAPER}; color: {INK}"
+    svg = _svg(figure, re.sub(r"\W+", "-", name), escape(description))
+    return f'<div style="{style}">{svg}</div>'
+
+
+def _svg(figure: Figure, name: str, description: str) -> str:
     text = io.StringIO()
     with styled():
         figure.savefig(text, format="svg", metadata={"Date": None}, transparent=True)
@@ -133,8 +156,6 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
     svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', rf'\1 role="img" aria-label="{description}"', svg, count=1)
     svg = re.sub(r"(font(?:-family)?:[^;\"]*?)'DejaVu Sans'(, [^;\"]*)?", r"\1system-ui, sans-serif", svg)
-    for colour, variable in VARIABLES.items():
-        svg = svg.replace(colour, f"var(--{variable})")
     return _own_ids(svg, name)
 
 

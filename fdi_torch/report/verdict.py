@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.diagnosis import UNRELIABLE
 from fdi_torch.gap.verdict_words import verdict_sentence
-from fdi_torch.report.diagnosed_effects import DiagnosedEffect, diagnosed_effects, fault_at
+from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, fault_at
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
 from fdi_torch.report.sections.rehearsal import rehearsal_tables
@@ -35,7 +36,7 @@ def headline(material: Material) -> str:
     sentences = (
         gap_words,
         monitor_words,
-        lambda m: fault_words(diagnosed_effects(m)),
+        fault_words,
         alarm_words,
         benchmark_words,
         rehearsal_words,
@@ -49,13 +50,23 @@ def headline(material: Material) -> str:
     return material.about("status").get("status", "did not end").replace("_", " ").capitalize()
 
 
-def fault_words(effects: list[DiagnosedEffect]) -> str:
+def fault_words(material: Material) -> str:
+    """The faults that are present, with their sizes; those that are not isolated with their determined combination."""
+    effects = diagnosed_effects(material)
     if not effects:
         return ""
     present = [f.sized for f in effects if f.present]
-    if not present:
+    not_isolated = [_rivals(combination) for combination in combinations_of(material, "not_isolated")]
+    if not present and not not_isolated:
         return "No fault found"
-    return f"{'Fault' if len(present) == 1 else f'{len(present)} faults'}: {_listed(present)}"
+    count = len(present) + len(not_isolated)
+    kind = f"{count} faults" if count > 1 else "Fault" if present else "Fault not isolated"
+    return f"{kind}: {_listed(present + not_isolated)}"
+
+
+def _rivals(combination: Combination) -> str:
+    effects = [fault_at(name) for name in combination.parameters]
+    return f"{' or '.join(f'{effect} at {place}' for effect, place in effects)} ({combination.words})"
 
 
 def gap_words(material: Material) -> str:

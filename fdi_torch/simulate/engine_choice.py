@@ -75,5 +75,6 @@ def _fastest(compiled: CompiledEngine, simulations: float, device: str) -> Engin
         compiled.prepare()
     except BuildError as error:
         return TracedEngine(*parts, f"traced engine (torch): {error}")
-    compiled.why = f"compiled engine: {torch.get_num_threads()} thread(s)"
+    threads = torch.get_num_threads()
+    compiled.why = f"compiled engine on {threads} processor core{'s' if threads > 1 else ''}"
     return compiled

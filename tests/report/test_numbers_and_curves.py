@@ -18,7 +18,7 @@ from fdi_torch.report.numbers import number, percent, probability_text, raised, 
         (1234.5, 99.0, "1234 ± 99"),
         (2.444e-7, 2.4e-8, "(2.44 ± 0.24)·10⁻⁷"),
         (-8.9e-6, 7e-8, "(−8.900 ± 0.070)·10⁻⁶"),
-        (0.3, float("inf"), "0.3"),
+        (0.3, float("inf"), "not determined"),
         (0.3, float("nan"), "0.3"),
     ],
 )

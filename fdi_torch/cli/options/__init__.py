@@ -121,7 +121,11 @@ def add_start_samples(parser: argparse.ArgumentParser) -> None:
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", help="output folder (default: logs)")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help="output folder (default: logs); a file that exists is kept, and the new one is NAME_2, NAME_3 ...",
+    )
     parser.add_argument("--device", metavar="cpu|cuda", help="device for the computation")
     parser.add_argument("--seed", metavar="N", type=int, help="seed of all random numbers")
 

@@ -8,7 +8,8 @@ from fdi_torch.cli.options import add_config, add_run
 
 EXAMPLES = """
 examples:
-  fdi simulate --config rig.yaml --out .           writes rig.csv
+  fdi simulate --config rig.yaml --out .           writes rig.csv, or rig_2.csv if rig.csv exists
+  fdi simulate --config rig.yaml --out . --replace writes rig.csv in any case
   fdi simulate --set simulate.faults.T1.leak=0.3   the built-in example with another fault
 """
 
@@ -16,3 +17,4 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, "fdi_torch.config.run_file:RunConfig")
     add_run(parser)
+    parser.add_argument("--replace", action="store_true", help="replace a recording of the same name")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from fdi_torch.report.diagnosed_effects import diagnosed_effects
+from fdi_torch.estimate.combinations import Combination
+from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import amount, number, shown_unit, with_error
@@ -23,13 +25,16 @@ def estimate_section(material: Material) -> Section | None:
     if final is None:
         return None
     rows = [_row(material, final, i) for i in range(len(final["names"]))]
-    header = ["parameter", "unit", "estimate", "95 % interval"]
+    rows += [_combination_row(material, combination) for combination in combinations_of(material, "combinations")]
+    header = ["parameter", "finding"] if material.of("/diagnosis/fault") else ["parameter"]
+    header += ["unit", "estimate", "95 % interval"]
     header += ["simulated"] if material.truth else []
-    header += ["finding"] if material.of("/diagnosis/fault") else []
     notes = [str(note) for note in final.get("unidentifiable") or ()]
     notes += [f"{name} lies at the edge of its range" for name in final.get("at_bound") or ()]
     listed = [tag("ul", *(tag("li", note) for note in notes))] if notes else []
-    return Section("Estimate", [table(header, rows, left=2), *_water(material), *listed], lead=True)
+    return Section(
+        "Estimate", [table(header, rows, left=header.index("unit") + 1), *_water(material), *listed], lead=True
+    )
 
 
 def posterior_section(material: Material) -> Section | None:
@@ -42,7 +47,8 @@ def posterior_section(material: Material) -> Section | None:
         return None
     std = np.sqrt(np.diag(covariance))
     determined = [i for i in range(len(names)) if np.isfinite(std[i]) and std[i] > 0]
-    correlation = covariance / np.outer(std, std)
+    with np.errstate(invalid="ignore"):  # undetermined parameters have no correlation
+        correlation = covariance / np.outer(std, std)
     ranked = sorted(combinations(determined, 2), key=lambda pair: -abs(correlation[pair]))[:MOST_ELLIPSES]
     pictures = [_ellipse(material, final, covariance, pair, k) for k, pair in enumerate(ranked)]
     words = "Regions with 50 % and 95 % of the probability, most correlated pairs first."
@@ -66,17 +72,40 @@ def covariance_of(final: Payload) -> np.ndarray | None:
 
 def _row(material: Material, final: Payload, i: int) -> list[Any]:
     name = str(final["names"][i])
-    unit, scale = shown_unit(final["units"][i] if final.get("units") else "")
-    value, std = scale * float(final["values"][i]), scale * float(final["std"][i])
-    reach = 1.96 * std
-    digits = 4 if not np.isfinite(reach) else max(3, min(9, 2 + _decades(value, reach)))
-    interval = f"{number(value - reach, digits)} … {number(value + reach, digits)}" if np.isfinite(reach) else "–"
-    cells: list[Any] = [name, unit or "1", with_error(value, std), interval]
-    if material.truth:
-        cells.append(number(scale * material.truth[name]) if name in material.truth else "")
+    unit = str(final["units"][i]) if final.get("units") else ""
+    cells: list[Any] = [name, _finding(material, name)] if material.of("/diagnosis/fault") else [name]
+    cells += _numbers(float(final["values"][i]), float(final["std"][i]), unit)
+    return [*cells, *_simulated(material, unit, (name,), (1.0,))]
+
+
+def _combination_row(material: Material, combination: Combination) -> list[Any]:
+    """A determined combination."""
+    c = combination
+    cells: list[Any] = [c.formula]
     if material.of("/diagnosis/fault"):
-        cells.append(_finding(material, name))
-    return cells
+        deviates = c in combinations_of(material, "not_isolated")
+        cells.append(tag("span", "present", class_="bad") if deviates else "")
+    return [*cells, *_numbers(c.value, c.std, c.unit), *_simulated(material, c.unit, c.parameters, c.coefficients)]
+
+
+def _simulated(material: Material, unit: str, names: Sequence[str], coefficients: Sequence[float]) -> list[str]:
+    """The simulated value of a combination, empty if one of its parameters has none; no cell for measured data."""
+    if not material.truth:
+        return []
+    value = sum(c * material.truth.get(name, np.nan) for c, name in zip(coefficients, names, strict=True))
+    return [number(shown_unit(unit)[1] * value) if np.isfinite(value) else ""]
+
+
+def _numbers(value: float, std: float, si_unit: str) -> list[str]:
+    """Unit, value with standard error, and 95 % interval, in the unit for display."""
+    unit, scale = shown_unit(si_unit)
+    value, std = scale * value, scale * std
+    reach = 1.96 * std
+    if not np.isfinite(reach):
+        return [unit or "1", with_error(value, std), "–"]
+    digits = max(3, min(9, 2 + _decades(value, reach)))
+    interval = f"{number(value - reach, digits)} … {number(value + reach, digits)}"
+    return [unit or "1", with_error(value, std), interval]
 
 
 def _decades(value: float, reach: float) -> int:
@@ -86,7 +115,10 @@ def _decades(value: float, reach: float) -> int:
 def _finding(material: Material, name: str) -> Any:
     for finding in diagnosed_effects(material):
         if name in (prefix := f"{finding.location}.{finding.effect}", f"{prefix}.size"):
-            return tag("span", "present", class_="bad") if finding.present else "not found"
+            if finding.present:
+                return tag("span", "present", class_="bad")
+            not_isolated = any(name in c.parameters for c in combinations_of(material, "not_isolated"))
+            return tag("span", "not isolated", class_="bad") if not_isolated else "not found"
     return ""
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.report.diagnosed_effects import diagnosed_effects
+from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, fault_at
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, shown_unit
 from fdi_torch.report.schematic import Overlay, schematic
@@ -65,6 +65,9 @@ def marks_of(material: Material) -> dict[str, list[str]]:
             unit, scale = shown_unit(finding.unit)
             size = "" if math.isnan(finding.size) else f" {number(scale * finding.size, 3)} {unit}".rstrip()
             marks.setdefault(finding.location, []).append(f"{finding.effect.replace('_', ' ')}{size}")
+    for combination in combinations_of(material, "not_isolated"):
+        for effect, place in map(fault_at, combination.parameters):
+            marks.setdefault(place, []).append(f"{effect}, not isolated")
     return marks
 
 
