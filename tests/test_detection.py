@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import pytest
 import torch
@@ -10,7 +11,9 @@ from rigs import whitening_of
 
 from fdi_torch.monitor.detection import (
     CHARTS,
+    LONGEST_WINDOW,
     NO_ALARM,
+    Chart,
     Detector,
     cusum,
     cusum_update,
@@ -33,6 +36,18 @@ from fdi_torch.monitor.whitening import score_whitenings
 
 def noise(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@cache
+def glr_peaks() -> torch.Tensor:
+    """The simulated maxima on which the thresholds of a GLR of three channels depend."""
+    lengths = window_lengths(LONGEST_WINDOW)
+    return block_maxima(lambda e: glr(e, lengths), 3, torch.Generator().manual_seed(1))
+
+
+def detector_of(chart: Chart, time_between_false_alarms: float) -> Detector:
+    peaks = glr_peaks() if chart == "glr" else None
+    return make_detector(chart, time_between_false_alarms, 1.0, 3, torch.Generator(), peaks=peaks)
 
 
 @pytest.mark.parametrize(("threshold", "run_length"), [(4.0, 335.4), (5.0, 930.9)])
@@ -60,8 +75,8 @@ def test_fixed_threshold_shares_the_false_alarms_among_channels() -> None:
 
 
 @pytest.mark.parametrize("chart", CHARTS)
-def test_false_alarms_have_the_designed_rate(chart: str) -> None:
-    detector = make_detector(chart, 2000.0, 1.0, 3, torch.Generator().manual_seed(1))  # type: ignore[arg-type]
+def test_false_alarms_have_the_designed_rate(chart: Chart) -> None:
+    detector = detector_of(chart, 2000.0)
     count = sum(int(detector.alarms(noise(100, 4000, 3, seed=s)).sum()) for s in range(3))
     expected = 3 * 100 * 4000 / 2000.0
     assert abs(count - expected) < 3.0 * math.sqrt(expected) + 0.04 * expected
@@ -77,8 +92,8 @@ def test_error_of_the_false_alarm_rate_learnt_from_one_recording() -> None:
 
 
 @pytest.mark.parametrize("chart", CHARTS)
-def test_the_first_alarm_since_a_time_is_one_of_all_alarms(chart: str) -> None:
-    detector = make_detector(chart, 200.0, 1.0, 3, torch.Generator().manual_seed(1))  # type: ignore[arg-type]
+def test_the_first_alarm_since_a_time_is_one_of_all_alarms(chart: Chart) -> None:
+    detector = detector_of(chart, 200.0)
     white = noise(40, 1000, 3, seed=5)
     white[:, 600:] += 0.5
     white[3, 700] = torch.nan
@@ -101,7 +116,7 @@ def test_a_shift_is_found_sooner_by_cusum_than_by_a_fixed_threshold() -> None:
     shifted[:, 1000:, 1] += 0.7
     delays = {}
     for chart in CHARTS:
-        first = make_detector(chart, 20000.0, 1.0, 3, torch.Generator().manual_seed(0)).first_alarm(shifted)
+        first = detector_of(chart, 20000.0).first_alarm(shifted)
         late = torch.where(first == NO_ALARM, 3000, first)
         delays[chart] = float(late[late > 1000].median() - 1000)
     assert delays["cusum"] < 0.5 * delays["fixed"] and delays["glr"] < 0.5 * delays["fixed"]
