@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from scipy import stats
 
 from fdi_torch.monitor.detection import (
     CHARTS,
+    LONGEST_WINDOW,
     NO_ALARM,
     Chart,
     Detector,
@@ -48,6 +49,18 @@ def known(rate: ChartRate, run_length: float, channels: int) -> FalseAlarmDesign
 def cusum_run_length(threshold: float, drift: float, std: float = 1.0) -> float:
     """Mean number of samples until one of the two sums of one channel exceeds the threshold."""
     return 1.0 / float(cusum_rate(threshold, torch.full((1, 1), std, dtype=torch.float64), drift))
+
+
+@cache
+def glr_peaks() -> torch.Tensor:
+    """The simulated maxima on which the thresholds of a GLR of three channels depend."""
+    lengths = window_lengths(LONGEST_WINDOW)
+    return block_maxima(lambda e: glr(e, lengths), 3, torch.Generator().manual_seed(1))
+
+
+def detector_of(chart: Chart, time_between_false_alarms: float) -> Detector:
+    peaks = glr_peaks() if chart == "glr" else None
+    return make_detector(chart, time_between_false_alarms, 1.0, 3, torch.Generator(), peaks=peaks)
 
 
 @pytest.mark.parametrize(("threshold", "run_length"), [(4.0, 335.4), (5.0, 930.9)])
@@ -88,8 +101,8 @@ def test_fixed_threshold_shares_the_false_alarms_among_channels() -> None:
 
 
 @pytest.mark.parametrize("chart", CHARTS)
-def test_false_alarms_have_the_designed_rate(chart: str) -> None:
-    detector = make_detector(chart, 2000.0, 1.0, 3, torch.Generator().manual_seed(1))  # type: ignore[arg-type]
+def test_false_alarms_have_the_designed_rate(chart: Chart) -> None:
+    detector = detector_of(chart, 2000.0)
     count = sum(int(detector.alarms(noise(100, 4000, 3, seed=s)).sum()) for s in range(3))
     expected = 3 * 100 * 4000 / 2000.0
     assert abs(count - expected) < 3.0 * math.sqrt(expected) + 0.04 * expected
@@ -132,8 +145,8 @@ def test_learning_for_as_long_as_needed_determines_the_rate() -> None:
 
 
 @pytest.mark.parametrize("chart", CHARTS)
-def test_the_first_alarm_since_a_time_is_one_of_all_alarms(chart: str) -> None:
-    detector = make_detector(chart, 200.0, 1.0, 3, torch.Generator().manual_seed(1))  # type: ignore[arg-type]
+def test_the_first_alarm_since_a_time_is_one_of_all_alarms(chart: Chart) -> None:
+    detector = detector_of(chart, 200.0)
     white = noise(40, 1000, 3, seed=5)
     white[:, 600:] += 0.5
     white[3, 700] = torch.nan
@@ -157,7 +170,7 @@ def test_a_shift_is_found_sooner_by_cusum_than_by_a_fixed_threshold() -> None:
     shifted[:, 1000:, 1] += 0.7
     delays = {}
     for chart in CHARTS:
-        first = make_detector(chart, 20000.0, 1.0, 3, torch.Generator().manual_seed(0)).first_alarm(shifted)
+        first = detector_of(chart, 20000.0).first_alarm(shifted)
         late = torch.where(first == NO_ALARM, 3000, first)
         delays[chart] = float(late[late > 1000].median() - 1000)
     assert delays["cusum"] < 0.5 * delays["fixed"] and delays["glr"] < 0.5 * delays["fixed"]

@@ -28,7 +28,7 @@ from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.reference_engine import ReferenceEngine
 from fdi_torch.simulate.traced_engine import TracedEngine
 
-SAMPLES, SAMPLE = 40, 5.0  # s
+SAMPLES, SAMPLE = 24, 5.0  # s
 
 
 def valve_plant() -> PlantDescription:

@@ -6,15 +6,19 @@ CRC in MCAP: in a damaged file it is copied if its inner lengths agree, and may 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from mcap.opcode import Opcode
+
 from fdi_torch.logbook.errors import LogError
-from fdi_torch.logbook.log_copy import copy_log
-from fdi_torch.logbook.reader import Run
-from fdi_torch.logbook.scan import Damage
+from fdi_torch.logbook.reader import Run, read_run
+from fdi_torch.logbook.scan import Damage, Frame
+from fdi_torch.logbook.sink import Sink
 
 RECORD = "fdi_torch.recovery"
+Extra = Callable[[Run, int], Mapping[str, Mapping[str, str]]]
 
 
 @dataclass(frozen=True)
@@ -78,3 +82,35 @@ def _record(recovery: Recovery) -> dict[str, str]:
     gaps = {f"lost.{i}": f"{gap.start} to {gap.end}: {gap.reason}" for i, gap in enumerate(recovery.lost)}
     about = {"source": recovery.source.name, "messages": str(recovery.messages), "ended": str(recovery.ended).lower()}
     return {**about, "lost": str(len(recovery.lost)), **gaps}
+
+
+def copy_log(source: Path, target: Path, salvage: bool = False, extra: Extra | None = None) -> Run:
+    """Write every readable record of `source` to the new file `target`, then the metadata of `extra`.
+
+    extra: called with the run and the number of copied messages.
+    """
+    run = read_run(source, salvage=salvage)
+    sink = Sink(target, run.library, run.profile)
+    try:
+        messages = _copy_records(run, sink)
+        for name, values in (extra(run, messages) if extra else {}).items():
+            sink.metadata(name, values)
+    except BaseException:
+        sink.abandon()
+        raise
+    sink.finish()
+    return run
+
+
+def _copy_records(run: Run, sink: Sink) -> int:
+    """Copy metadata, attachments and messages in order of the file; returns the number of messages."""
+    count = 0
+    for part in run.walk():
+        if not isinstance(part, Frame):
+            count += 1
+            sink.message(part.channel, part.log_time, part.publish_time, part.sequence, part.data)
+        elif part.opcode == Opcode.METADATA:
+            sink.metadata(*run.metadata_at(part))
+        elif part.opcode == Opcode.ATTACHMENT:
+            sink.attachment(*run.attachment_at(part))
+    return count

@@ -89,11 +89,6 @@ class RunLog(Topics):
         self._waiting_since: float | None = None
         self._size = 0
 
-    @property
-    def run_id(self) -> str:
-        """Identifier of this run: a hash of its inputs and its start."""
-        return self._run["run_id"]
-
     def __enter__(self) -> RunLog:
         _make_room(self.path)
         self._started = self._clock()

@@ -26,13 +26,12 @@ def extremes(values: np.ndarray, bins: int) -> np.ndarray:
     Of a segment without finite values the first sample is taken.
     """
     edges = np.linspace(0, len(values), bins + 1).astype(int)
+    missing, finite = np.isnan(values), np.isfinite(values)
+    low, high = np.where(missing, np.inf, values), np.where(missing, -np.inf, values)
     kept: list[int] = []
     for first, last in pairwise(edges.tolist()):
-        part = values[first:last]
-        if not np.isfinite(part).any():
-            kept.append(first)
-            continue
-        kept += sorted({first + int(np.nanargmin(part)), first + int(np.nanargmax(part))})
+        ends = {int(low[first:last].argmin()), int(high[first:last].argmax())} if finite[first:last].any() else {0}
+        kept += sorted(first + end for end in ends)
     return np.array(kept)
 
 

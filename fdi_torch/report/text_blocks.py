@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
@@ -43,6 +44,7 @@ class TextBlock:
         return [((x, y + k * LINE), line) for k, line in enumerate(reversed(self.lines))]
 
 
+@lru_cache(maxsize=1024)  # a drawing asks for the width of each line again and again
 def text_width(text: str, weight: str = "normal") -> float:
     """Width of a text in points."""
     path = TextPath((0.0, 0.0), text, size=POINTS, prop=FontProperties(weight=weight), usetex=False)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import cast
 
 from torch import Tensor
 
-from fdi_torch.simulate.expression import Varies
+from fdi_torch.simulate.expression import Node, Varies
 from fdi_torch.simulate.operations import OPERATIONS
 from fdi_torch.simulate.program import Program
 from fdi_torch.simulate.section import Place, Row, Section
@@ -38,8 +39,8 @@ class Interpreter:
 
     def __init__(self, program: Program, lanes: Tensor, nominal: Tensor, resolution: Tensor) -> None:
         self.program, self.lanes, self.state = program, lanes, State()
-        self._constants: dict[int, Tensor] = {}
-        self._orders: dict[int, list[int]] = {}
+        self._computed: list[Tensor | None] = [None] * len(program.graph.nodes)
+        self._plans: dict[int, _Plan] = {}
         self._tables = {
             "theta": lanes.unbind(-1),
             "nominal": nominal.to(lanes).unbind(),
@@ -65,7 +66,7 @@ class Interpreter:
             if self.program.tangent:
                 self.state.changes[place] = changes[kind, i]
 
-    def _change(self, row: Row, computed: Mapping[int, Tensor], new_changes: Mapping[Place, Change]) -> Change:
+    def _change(self, row: Row, computed: Sequence[Tensor], new_changes: Mapping[Place, Change]) -> Change:
         total: Change = None
         for factor, place in row.terms:
             change = new_changes[place] if place in new_changes else self.state.changes.get(place)
@@ -78,24 +79,42 @@ class Interpreter:
             direct[q] = computed[slope]
         return direct if total is None else total + direct
 
-    def _evaluate(self, needed: list[int], section: int) -> dict[int, Tensor]:
-        nodes = self.program.graph.nodes
-        if section not in self._orders:
-            self._orders[section] = self.program.graph.reach(needed)
-        computed: dict[int, Tensor] = {}
-        for i in self._orders[section]:
-            if i not in self._constants:
-                value = self._compute(i, computed)
-                (computed if nodes[i].varies & Varies.STEP else self._constants)[i] = value
-            if i in self._constants:
-                computed[i] = self._constants[i]
-        return computed
+    def _evaluate(self, needed: list[int], section: int) -> Sequence[Tensor]:
+        """The values of all nodes, of which the needed ones are up to date."""
+        if section not in self._plans:
+            self._plans[section] = self._plan(needed)
+        plan, values = self._plans[section], cast(list[Tensor], self._computed)
+        for i, place in plan.inputs:
+            values[i] = self.state.values[place]
+        for i, function, arguments in plan.operations:
+            values[i] = function(*[values[a] for a in arguments])
+        return values
 
-    def _compute(self, i: int, computed: Mapping[int, Tensor]) -> Tensor:
-        node = self.program.graph.nodes[i]
+    def _plan(self, needed: list[int]) -> _Plan:
+        """What varies from step to step, in order; everything else is computed here."""
+        plan, graph = _Plan(), self.program.graph
+        for i in graph.reach(needed):
+            node = graph.nodes[i]
+            if not node.varies & Varies.STEP:
+                self._computed[i] = self._constant(node) if self._computed[i] is None else self._computed[i]
+            elif node.operation == "input":
+                plan.inputs.append((i, (node.kind, node.index)))
+            else:
+                plan.operations.append((i, OPERATIONS[node.operation].torch, node.arguments))
+        return plan
+
+    def _constant(self, node: Node) -> Tensor:
         if node.operation == "literal":
             return self.lanes.new_tensor(node.value)
         if node.operation == "input":
             table = self._tables.get(node.kind)
             return self.state.values[node.kind, node.index] if table is None else table[node.index]
-        return OPERATIONS[node.operation].torch(*(computed[a] for a in node.arguments))
+        return OPERATIONS[node.operation].torch(*(self._computed[a] for a in node.arguments))
+
+
+@dataclass
+class _Plan:
+    """Inputs, and operations with their arguments, by node."""
+
+    inputs: list[tuple[int, Place]] = field(default_factory=list)
+    operations: list[tuple[int, Callable[..., Tensor], tuple[int, ...]]] = field(default_factory=list)

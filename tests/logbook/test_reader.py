@@ -27,8 +27,8 @@ from fdi_torch.logbook import (
     series,
 )
 from fdi_torch.logbook.channel import Channel
-from fdi_torch.logbook.log_copy import copy_log
 from fdi_torch.logbook.payload import unpack
+from fdi_torch.logbook.recover import copy_log
 from fdi_torch.logbook.schemas import json_schema
 from fdi_torch.logbook.sink import EPOCH_NS, Sink
 from fdi_torch.logbook.topic_definitions import topic_definition

@@ -136,9 +136,9 @@ def path(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
 def test_a_page_can_be_read_on_a_desk_and_a_phone(browser: Any, path: Path, width: int, scheme: str) -> None:  # noqa: F811
+    """The layout depends on the width alone, the contrast on the scheme alone."""
     tab, said = opened(browser, path, width, color_scheme=scheme)
     draw_all(tab)
     assert tab.evaluate(FAULTS) == [] and said == []
