@@ -92,7 +92,7 @@ def add_leave_out(parser: argparse.ArgumentParser) -> None:
 
 
 def add_step(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--step", metavar="TIME", type=seconds, help="integration step (default: as sampled, 0.5 to 2.5 s)")
+    parser.add_argument("--step", metavar="TIME", type=seconds, help="integration step (default: as sampled, <= 5 s)")
 
 
 def names(text: str | None) -> tuple[str, ...]:
