@@ -6,14 +6,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from fdi_torch.gap.candidate_fit import BEHIND, Fit, Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.preprocess.acquisition import examined, usable
 from fdi_torch.gap.preprocess.blockwise_likelihood import (
+    ROUNDS,
     blocked_recording,
     blockwise_fit,
     first_order_log_likelihood,
@@ -103,11 +106,12 @@ def test_a_wrong_unit_is_refused(factor: float) -> None:
         usable(nominal_plant(), with_channel(run, 2, factor * run.outputs[:, 2]))
 
 
-def test_a_command_in_the_wrong_unit_is_refused() -> None:
+@pytest.mark.parametrize("pump", [0, 1])
+def test_a_command_in_the_wrong_unit_is_refused(pump: int) -> None:
     run = sound()
     inputs = run.inputs.clone()
-    inputs[:, 0] *= 0.1
-    with pytest.raises(ValueError, match="Q1: its unit seems wrong: its values are 10 times too small"):
+    inputs[:, pump] *= 0.1
+    with pytest.raises(ValueError, match=f"Q{pump + 1}: its unit seems wrong: its values are 10 times too small"):
         usable(nominal_plant(), replace(run, inputs=inputs))
 
 
@@ -222,3 +226,20 @@ def test_a_recording_without_a_sensor_that_reads_is_refused() -> None:
     run = replace(sound(), outputs=torch.full((2000, 3), 0.3, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"expected a sensor that reads its level"):
         diagnose(nominal_plant(), run, settings=Settings(SMALL))
+
+
+def test_a_rival_that_lags_far_behind_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant, run = nominal_plant(), sound()
+    blocked, fits = blocked_recording(plant, thinned(run), noise_of(plant, run)), 0
+    fit = Fitter.fit
+
+    def counted(*arguments: Any, **options: Any) -> Fit:
+        nonlocal fits
+        fits += 1
+        return fit(*arguments, **options)
+
+    monkeypatch.setattr(Fitter, "fit", counted)
+    base = blockwise_fit(blocked)
+    assert fits == ROUNDS
+    blockwise_fit(blocked, base=base, target=base.log_likelihood + BEHIND)
+    assert fits == ROUNDS + 1

@@ -61,7 +61,8 @@ def _averaged(part: RecordingPart) -> str:
     step = float(part.experiment.steps.median())
     return (
         f"{Path(part.recording.source).name or 'the recording'}: its {len(part.recording)} samples are averaged over "
-        f"integration steps of {step:.3g} s, which loses nothing because the level is a straight line within a step"
+        f"integration steps of {step:.3g} s, because the level is a straight line within a step, of which single "
+        "samples say no more than their mean"
     )
 
 
