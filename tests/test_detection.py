@@ -135,6 +135,13 @@ def test_predicted_count_of_known_noise_is_poissons() -> None:
     assert counts == [int(stats.poisson.ppf(p, 10.0)) for p in (0.025, 0.5, 0.975)]
 
 
+def test_noise_that_is_hardly_known_has_a_finite_threshold() -> None:
+    learnt = replace(whitening_of(noise(400, 2), 0), slow_error=torch.tensor([0.1, 4.0], dtype=torch.float64))
+    design = make_detector("cusum", 20000.0, 1.0, 2, torch.Generator(), learnt=learnt).design
+    assert 100.0 < design.threshold < math.inf and float(design.rates.mean()) == pytest.approx(1.0 / 20000.0, rel=1e-3)
+    assert 1.0 < design.learning_factor(2.0) < math.inf
+
+
 def test_learning_for_as_long_as_needed_determines_the_rate() -> None:
     for samples in (300, 5000):
         short = make_detector("cusum", 20000.0, 1.0, 3, torch.Generator(), learnt=whitening_of(noise(samples, 3), 0))

@@ -27,7 +27,9 @@ OVERSHOOT, DECREASE = 1.16519, 0.02765
 # draws than counting alarms.
 BLOCKS, BLOCK, BURN_IN = 4000, 1500, 500
 SMALLEST_ERROR = 1e-6  # of a standard deviation that is known
+SMALLEST_DRIFT = 1e-6  # over the standard deviation; below it the run length is that without a drift
 RAREST = 1e-300  # rate that counts as different from zero, 1/s
+VERY_LONG = 1e6  # learning, over that which was done, from which the rate's error falls with the square root of time
 MOST_ALARMS = 10**9  # of a count
 
 ChartRate = Callable[[float, Tensor], Tensor]
@@ -76,7 +78,7 @@ class FalseAlarmDesign:
 
     def quantile(self, probability: float) -> float:
         """Quantile of the rate, 1/s."""
-        return float(torch.quantile(self.rates, probability))
+        return max(float(torch.quantile(self.rates, probability)), RAREST)
 
     def count_quantile(self, seconds: float, probability: float) -> int:
         """Quantile of the number of false alarms in a time: a Poisson number under each draw."""
@@ -93,10 +95,10 @@ class FalseAlarmDesign:
 
     def learning_factor(self, accuracy: float) -> float:
         """How many times as long the noise must be learnt to know the rate within a factor of `accuracy` (95 %)."""
-        factor = 1.0
+        factor = VERY_LONG
         for _ in range(8):
             design = self.longer(factor)
-            low, high = (math.log(max(design.quantile(p), RAREST)) for p in (0.025, 0.975))
+            low, high = (math.log(design.quantile(p)) for p in (0.025, 0.975))
             factor *= (0.5 * (high - low) / math.log(accuracy)) ** 2
         return factor
 
@@ -118,7 +120,7 @@ def cusum_rate(threshold: float, std: Tensor, drift: float) -> Tensor:
     The mean run length of each is (exp(2 k b) - 2 k b - 1) / (2 k^2) with k = drift / std and b = threshold / std +
     OVERSHOOT - DECREASE k^2 (Siegmund 1985), within 0.1 % for k up to 0.75 and run lengths above 20.
     """
-    k = drift / std
+    k = (drift / std).clamp(min=SMALLEST_DRIFT)
     twice = 2.0 * k * (threshold / std + OVERSHOOT - DECREASE * k.square())
     return (4.0 * k.square() / (torch.expm1(twice) - twice)).sum(dim=-1)
 

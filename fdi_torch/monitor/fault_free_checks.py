@@ -84,7 +84,7 @@ def fault_warnings(
 
 
 def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -> str:
-    """Text: the expected time between false alarms, how short it may be, and how long the noise should be learnt.
+    """Text: the expected time between false alarms, how short it may be, and how long a fault-free part it needs.
 
     Needed is the fault-free time that determines the rate within a factor of RATE_FACTOR (95 %).
     """
