@@ -66,7 +66,8 @@ class AlarmHandler:
     def on_threshold(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
         """Handle a crossing of the detector's threshold.
 
-        It is a new alarm unless the latest change still explains the residual, or a known fault only changed its size.
+        It is a new alarm unless one change, at the time of the latest one, explains the residual, or a known fault only
+        changed its size.
         """
         change = state.change
         if change is not None and self._within_window(state, change):
