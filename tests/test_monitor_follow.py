@@ -258,7 +258,7 @@ def test_a_fault_that_was_there_before_the_recording_is_said_to_be(
 def test_a_file_that_cannot_be_followed_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "rig.csv").write_text(HEADER)
     assert main(["monitor", "--config", config(tmp_path), "--follow", "--idle", "0.2", "--quiet"]) == 2
-    assert "expected samples to follow, got 0" in capsys.readouterr().err
+    assert "expected samples to follow, got 0; check that" in capsys.readouterr().err
     thinned = config(tmp_path, recording={"file": "rig.csv", "every": 2})
     assert main(["monitor", "--config", thinned, "--follow", "--quiet"]) == 2
     assert "expected neither mask nor every" in capsys.readouterr().err

@@ -52,7 +52,10 @@ def rows_until(rows: Sequence[Row], until: float) -> list[Row]:
 def recording_of_rows(rows: Sequence[Row], run: MonitorRun) -> Recording:
     """The rows after the last jump of the clock, as a recording."""
     if len(rows) < 2:
-        raise ValueError(f"{run.config.recording.file}: expected samples to follow, got {len(rows)}")
+        raise ValueError(
+            f"{run.config.recording.file}: expected samples to follow, got {len(rows)}; check that the plant delivers "
+            "samples, and that columns or tags have the names that the source uses"
+        )
     unique = [rows[0], *(after for before, after in pairwise(rows) if after[0] != before[0])]
     jumps = [k for k in range(1, len(unique)) if unique[k][0] < unique[k - 1][0]]
     samples = samples_of_rows(unique[jumps[-1] if jumps else 0 :], run)
