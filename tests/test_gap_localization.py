@@ -15,7 +15,7 @@ from torch import Tensor
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
-from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression, WhitenedDiscrepancy
+from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.localize import localize
 from fdi_torch.gap.localization.regressors import (
     backlash,
@@ -30,6 +30,7 @@ from fdi_torch.gap.localization.regressors import (
     stiction,
 )
 from fdi_torch.gap.localization.sparse_regression import column_costs, sparse_fit
+from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances, with_estimated_noise
 from fdi_torch.gap.problem import problem_of
 from fdi_torch.gap.resampling import interpolate

@@ -19,7 +19,8 @@ from fdi_torch.estimate.evidence import ODDS, RARE, posterior
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import Fit, Fitter
 from fdi_torch.gap.library import canonical, tanks_of
-from fdi_torch.gap.localization.localize import FitBeside, LocalizedDiscrepancy, localize
+from fdi_torch.gap.localization.localize import FitBeside, localize
+from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, SearchResult

@@ -23,7 +23,6 @@ from fdi_torch.gap.localization.component_regressors import (
     reading_regressors,
 )
 from fdi_torch.gap.localization.regressors import HARMONICS, harmonics, time_functions
-from fdi_torch.gap.localization.sparse_regression import SparseFit, sparse_fit
 from fdi_torch.gap.marginal_likelihood import predicted_levels
 from fdi_torch.gap.resampling import interpolate
 from fdi_torch.plant.description import OUTSIDE, Sensor
@@ -32,16 +31,7 @@ from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
 from fdi_torch.simulate.scan import product, scan_in_time
 
-MOST_ROWS = 1000  # rows per channel from which columns are selected; more samples are summed in groups
 SAMPLES_A_STEP = 9  # fewest samples per step function of time
-
-
-@dataclass(frozen=True)
-class NormalEquations:
-    """gram (M, M) = C'C and score (M,) = C'r of columns C and the residual r."""
-
-    gram: Tensor
-    score: Tensor
 
 
 @dataclass(frozen=True)
@@ -273,42 +263,6 @@ class DiscrepancyRegression:
         return [t.name for t in self.fitter.data.plant.tanks].index(name)
 
 
-class WhitenedDiscrepancy:
-    """The columns of a discrepancy and the residual under one noise, with the parameters of a fit projected out.
-
-    columns (S C, M) and residual (S C,): whitened by the fitter `under`, not projected.
-    """
-
-    def __init__(self, under: Fitter, fit: Fit, discrepancy: Discrepancy) -> None:
-        residual, jacobian = under.white(discrepancy.linearised)
-        scale, self._pull, self._off = under.priors(fit.space, fit.theta)
-        self._columns, self._residual = under.whiten(discrepancy.columns), residual[0]
-        self._jacobian = jacobian[0] * scale
-
-    def normal_equations(self, used: Tensor | None = None) -> NormalEquations:
-        """Of some columns, used (M,) bool, with all samples; or of all, with samples summed in groups.
-
-        A group is shorter than any regressor's changes. What a sum of its samples leaves out is little of the residual,
-        but may be many nats if the residual is large: it serves to select columns, not to weigh them.
-        """
-        columns = self._columns if used is None else self._columns[..., used]
-        group = max(len(columns) // MOST_ROWS, 1) if used is None else 1
-        c, r, j = (_grouped(x, group).flatten(0, 1) for x in (columns, self._residual.unsqueeze(-1), self._jacobian))
-        basis, _ = torch.linalg.qr(torch.cat([j, torch.diag(self._pull + 1e-9)]))
-        remaining = torch.cat([torch.cat([c, r], dim=1), c.new_zeros(len(self._pull), c.shape[1] + 1)])
-        remaining[len(r) :, -1] = -self._off
-        remaining -= basis @ (basis.T @ remaining)
-        products = remaining.T @ remaining
-        return NormalEquations(products[:-1, :-1], products[:-1, -1])
-
-    def sparse_fit(self, costs: Tensor) -> SparseFit:
-        """Sparse regression on the columns. costs (M,): of using each."""
-        selecting = self.normal_equations()
-        used = sparse_fit(selecting.gram, selecting.score, costs).used
-        exact = self.normal_equations(used)
-        return sparse_fit(exact.gram, exact.score, costs[used]).among(used)
-
-
 def _concatenated(shared: Sequence[Tensor], per_recording: Sequence[Tensor]) -> Tensor:
     """Stack the recordings; columns of `own` belong to one recording each."""
     rows, widths = [], [o.shape[-1] for o in per_recording]
@@ -316,9 +270,3 @@ def _concatenated(shared: Sequence[Tensor], per_recording: Sequence[Tensor]) -> 
         before, after = (o.new_zeros(*o.shape[:-1], sum(w)) for w in (widths[:k], widths[k + 1 :]))
         rows.append(torch.cat([s, before, o, after], dim=-1))
     return with_blanks(rows, dim=0)
-
-
-def _grouped(x: Tensor, each: int) -> Tensor:
-    """Sums (S / each, ...) of groups of samples of x (S, ...), scaled to unit variance."""
-    groups = len(x) // each
-    return x[: groups * each].reshape(groups, each, *x.shape[1:]).sum(dim=1) / each**0.5

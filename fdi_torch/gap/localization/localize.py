@@ -1,15 +1,9 @@
 """Ranking of the places of a discrepancy by evidence, whatever the law of the discrepancy.
 
 A discrepancy is a linear combination of a few regressors of the component's own variables (`regressors.py`), about the
-predicted trajectory; that of a sensor may also be a slow random drift. The log evidence is that of a sparse regression
-(`sparse_regression.py`), with each regressor selected among all of the component, under the disturbance noise that is
-most likely with the discrepancy (as for named effects: `marginal_likelihood.py`).
-
-The random flow into one tank may be an unknown flow there instead of one of the disturbances, which are of one order of
-magnitude in all tanks. A drift is a random process of a sensor alone, with unknown size and correlation time. Random
-flows move levels, which later readings of other sensors show; a drift shows in one channel only. Its two parameters are
-estimated together with the other noise. Its evidence is the likelihood of the innovations less the cost of the two
-parameters: the prior of the size is log-uniform between a tenth of the sensor noise and the range of the readings.
+predicted trajectory. The log evidence is that of a sparse regression (`sparse_regression.py`), with each regressor
+selected among all of the component, under the disturbance noise that is most likely with the discrepancy (as for named
+effects: `marginal_likelihood.py`). Random processes at one tank or sensor compete with these (`random_processes.py`).
 """
 
 from __future__ import annotations
@@ -22,41 +16,28 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.evidence import RARE
-from fdi_torch.estimate.kalman import SCATTER, StateNoise, Wander
-from fdi_torch.estimate.state_noise import CORRELATION_TIMES, LOG_BOUND
+from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate_fit import SHARE, Candidate, Fit, Fitter
-from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression, WhitenedDiscrepancy
+from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import with_best_frequency, with_best_position
+from fdi_torch.gap.localization.localized_discrepancy import (
+    LocalizedDiscrepancy,
+    is_rounding_error,
+    log_evidence,
+    log_likelihood,
+    nearly_without_disturbances,
+)
+from fdi_torch.gap.localization.random_processes import drifting_sensors, random_flows
 from fdi_torch.gap.localization.regressors import dominant_frequency
 from fdi_torch.gap.localization.single_regressor_gain import largest_influence, single_regressor_gains
 from fdi_torch.gap.localization.sparse_regression import SparseFit, column_costs
+from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import LinearParameters, estimate_disturbances, occam, with_disturbances
-from fdi_torch.simulate.collocation import Linearised
 
 STEPS = 120  # step functions of time
 MOST_TURNS = 12  # alternations between the disturbance noise, one more regressor, and the parameters of the fit
 CONVERGED = 0.1  # nats; a smaller gain ends the alternation, as does one below SHARE of what is still needed
 CALIBRATION_PLACES = 3  # places always evaluated; they show by how much first-order gains are too low
-
-
-@dataclass(frozen=True)
-class LocalizedDiscrepancy:
-    """A discrepancy at one component, in addition to a fit.
-
-    gain: in log evidence against the fit alone, without prior odds. fitness: log likelihood less one nat for each
-    parameter of the discrepancy (Akaike, 1974), over that of the fit alone. explained: its influence on the readings
-    (S, C); none of a random process. size: norm of its influence, in units of the sensor noise. periods: of its
-    harmonics, s. fit, noise: the fit refitted, and the most likely disturbance noise, with the discrepancy.
-    """
-
-    location: str
-    gain: float
-    fitness: float
-    explained: Tensor
-    size: float
-    periods: tuple[float, ...]
-    fit: Fit
-    noise: StateNoise
 
 
 @dataclass(frozen=True)
@@ -91,17 +72,17 @@ def localize(
     there are none in the result if none can reach it. beside: fit of the same effects beside a discrepancy, to start
     from as well.
     """
-    data, base = fitter.data, _likelihood(fitter, fit, fit.linearised) + noise.log_prior()
+    data, base = fitter.data, log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     frequency = dominant_frequency(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
     regression = DiscrepancyRegression(fitter, fit, frequency, STEPS)
-    if not math.isfinite(base + _evidence(fitter, fit, noise, regression.linearised)):
+    if not math.isfinite(base + log_evidence(fitter, fit, noise, regression.linearised)):
         return Localization((), 0.0)
     likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
-    itself = max(_evidence(fitter, fit, likely, regression.linearised) - base, 0.0)
+    itself = max(log_evidence(fitter, fit, likely, regression.linearised) - base, 0.0)
     if _evidence_bound(fitter, fit, noise, regression.steps) - base < needed:
         return Localization((), itself)
     generator, largest = torch.Generator().manual_seed(0), largest_influence(fitter)
-    starts = (likely, _nearly_without_disturbances(likely))
+    starts = (likely, nearly_without_disturbances(likely))
     first_order = _first_order_gains(regression, starts, fit, places, base)
 
     def evaluate(
@@ -111,7 +92,7 @@ def localize(
         under = with_disturbances(fitter, fit, noise, discrepancy.linearised)
         costs = column_costs(discrepancy.choices, largest)
         regressed = WhitenedDiscrepancy(under, fit, discrepancy).sparse_fit(costs)
-        without = _likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - base
+        without = log_likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - base
         return _EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, regressed, without)
 
     def with_likely_noise(known: _EvaluatedDiscrepancy, climb: bool) -> _EvaluatedDiscrepancy:
@@ -168,7 +149,7 @@ def localize(
                 break
         itself = max(itself, *(e.without for e in (*first, best) if e.regression is regression))
         excess = max(excess, best.gain - first_order[place])
-        if not _is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
+        if not is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
             needed = max(needed, best.gain + math.log(RARE))
             localized.append(
                 LocalizedDiscrepancy(
@@ -182,80 +163,13 @@ def localize(
                     best.noise,
                 )
             )
-    random = [*_drifting_sensors(regression, likely, places, base, needed)]
-    random += _random_flows(regression, likely, places, base)
+    random = [*drifting_sensors(regression, likely, places, base, needed)]
+    random += random_flows(regression, likely, places, base)
     for process in random:
         localized = [p for p in localized if p.location != process.location or p.gain > process.gain]
         if all(p.location != process.location for p in localized):
             localized.append(process)
     return Localization(tuple(sorted(localized, key=_gain, reverse=True)), itself)
-
-
-def _random_flows(
-    regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float
-) -> list[LocalizedDiscrepancy]:
-    """The tank with the largest disturbance, if more likely an unknown flow than one of the disturbances of the plant.
-
-    The prior of its logarithm is uniform over the range of the estimate instead of normal about the others'.
-    """
-    fitter, fit, linearised = regression.fitter, regression.fit, regression.linearised
-    largest = int(noise.intensity.argmax())
-    tank = fitter.data.plant.tanks[largest].name
-    if tank not in places or len(noise.intensity) < 2:
-        return []
-    start = replace(noise, apart=largest)
-    apart = estimate_disturbances(fitter, fit, linearised, start=start).noise
-    cost = math.log(2.0 * LOG_BOUND / (SCATTER * math.sqrt(2.0 * math.pi)))
-    gain = _evidence(fitter, fit, apart, linearised) - base - cost
-    size = _moved(with_disturbances(fitter, fit, apart, linearised), linearised)
-    nothing = torch.zeros_like(fitter.data.readings)
-    return [LocalizedDiscrepancy(tank, gain, gain + cost - 1.0, nothing, size, (), fit, apart)]
-
-
-def _moved(fitter: Fitter, linearised: Linearised) -> float:
-    """Norm of what the disturbances move the readings by, in units of the sensor noise."""
-    assert fitter.whitening is not None
-    plant = fitter.data.plant
-    moved = fitter.whitening.smoothed(fitter.data.readings - linearised.readings[0])
-    names = [t.name for t in plant.tanks]
-    of_sensors = moved[:, [names.index(s.tank) for s in plant.sensors]]
-    return float(torch.linalg.vector_norm(torch.where(fitter.data.mask, of_sensors, 0.0) / fitter.noise.std))
-
-
-def _drifting_sensors(
-    regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float, needed: float
-) -> list[LocalizedDiscrepancy]:
-    """Sensors with a drift, as far as their gain in evidence can be relevant."""
-    fitter, fit = regression.fitter, regression.fit
-
-    def evaluate(noise: StateNoise) -> LocalizedDiscrepancy:
-        assert noise.wander is not None
-        sensor = fitter.data.plant.sensors[noise.wander.channel].name
-        gain, cost = _evidence(fitter, fit, noise, regression.at(sensor)[1]) - base, _drift_cost(fitter, noise.wander)
-        nothing, size = torch.zeros_like(fitter.data.readings), _drift_size(fitter, noise.wander)
-        return LocalizedDiscrepancy(sensor, gain - cost, gain - 2.0, nothing, size, (), fit, noise)
-
-    def most_likely(start: LocalizedDiscrepancy) -> LocalizedDiscrepancy:
-        linearised = regression.at(start.location)[1]
-        return evaluate(estimate_disturbances(fitter, fit, linearised, start=start.noise).noise)
-
-    starts = [
-        _initial_drift(fitter, regression.at(p)[1], _nearly_without_disturbances(noise), channel)
-        for p in places
-        if (channel := regression.sensor(p)) is not None
-    ]
-    drifts: list[LocalizedDiscrepancy] = []
-    noise_gain = 0.0
-    for initial in sorted(map(evaluate, starts), key=_gain, reverse=True):
-        if drifts and initial.gain + noise_gain < needed:
-            break
-        best = max(initial, most_likely(initial), key=_gain)
-        noise_gain = max(noise_gain, best.gain - initial.gain)
-        needed = max(needed, best.gain + math.log(RARE))
-        assert best.noise.wander is not None
-        if not _is_rounding_error(fitter, best.location, best.noise.wander.std):
-            drifts.append(best)
-    return drifts
 
 
 def _first_order_gains(
@@ -269,7 +183,7 @@ def _first_order_gains(
     gains = dict.fromkeys(places, -math.inf)
     for noise in starts:
         under = with_disturbances(regression.fitter, fit, noise, regression.linearised)
-        offset = _likelihood(under, fit, regression.linearised) + noise.log_prior() - base
+        offset = log_likelihood(under, fit, regression.linearised) + noise.log_prior() - base
         for place, gain in single_regressor_gains(
             regression, under, fit, places, torch.Generator().manual_seed(0)
         ).items():
@@ -298,11 +212,6 @@ def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise, choices: int) -
 def _effect_size(fitter: Fitter, evaluated: _EvaluatedDiscrepancy) -> float:
     """Norm of the discrepancy's influence on the readings, in units of the sensor noise."""
     return float(torch.linalg.vector_norm(fitter.noise.whiten(evaluated.explained, fitter.data.mask)))
-
-
-def _nearly_without_disturbances(noise: StateNoise) -> StateNoise:
-    """The noise with nearly no random flow into any tank."""
-    return replace(noise, intensity=(0.1 * noise.intensity.min()).expand_as(noise.intensity).clone())
 
 
 @dataclass(frozen=True)
@@ -336,58 +245,3 @@ class _EvaluatedDiscrepancy:
 
 def _gain(discrepancy: _EvaluatedDiscrepancy | LocalizedDiscrepancy) -> float:
     return discrepancy.gain
-
-
-def _likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
-    """Log evidence of a fit about a linearised trajectory, without prior odds; minus infinity if it is not finite."""
-    space, theta = fit.space, fit.theta
-    residual, jacobian = (x[0] for x in fitter.white(linearised))
-    if not math.isfinite(fitter.log_det + float(residual.square().sum() + jacobian.square().sum())):
-        return -math.inf
-    scale, pull, off = fitter.priors(space, theta)
-    rows = torch.cat([(jacobian * scale).flatten(0, 1), torch.diag(pull + 1e-9)])
-    target = torch.cat([residual.flatten(), -off])
-    basis, _ = torch.linalg.qr(rows)
-    remaining = target - basis @ (basis.T @ target)
-    return -0.5 * float(remaining @ remaining) - 0.5 * fitter.log_det + occam(fitter, space, theta, jacobian)
-
-
-def _evidence(fitter: Fitter, fit: Fit, noise: StateNoise, linearised: Linearised) -> float:
-    """Log evidence of a fit and a noise model about a linearised trajectory, without prior odds."""
-    return _likelihood(with_disturbances(fitter, fit, noise, linearised), fit, linearised) + noise.log_prior()
-
-
-SMALLEST_DRIFT = 0.1  # as a share of the sensor's noise
-
-
-def _initial_drift(fitter: Fitter, linearised: Linearised, quiet: StateNoise, channel: int) -> StateNoise:
-    """Start of the optimisation: the whole residual of the sensor is drift. quiet: nearly no random flows."""
-    valid = fitter.data.mask[:, channel]
-    residual = (fitter.data.readings - linearised.readings[0])[valid, channel]
-    std = max(float(residual.square().mean().sqrt()), float(fitter.noise.std[channel]))
-    return replace(quiet, wander=Wander(channel, std, CORRELATION_TIMES[3] * fitter.data.row_spacing))
-
-
-def _drift_cost(fitter: Fitter, drift: Wander) -> float:
-    """Cost of the parameters of a drift, nats: correlation time, smoothness, and size."""
-    valid = fitter.data.mask[:, drift.channel]
-    readings = fitter.data.readings[valid, drift.channel]
-    noise = float(fitter.noise.std[drift.channel])
-    width = math.log(max(float(readings.max() - readings.min()), noise) / (SMALLEST_DRIFT * noise))
-    values = max(int(valid.sum()) * fitter.data.row_spacing / drift.correlation_time, 1.0)
-    return math.log(2 * (len(CORRELATION_TIMES) - 1)) + max(math.log(width * math.sqrt(values / math.pi)), 0.0)
-
-
-def _is_rounding_error(fitter: Fitter, place: str, std: float) -> bool:
-    """Whether a deviation of a sensor with this standard deviation may be a rounding error: up to half a step.
-
-    It is a function of the level, and varies slowly where the level does.
-    """
-    sensors, steps = [s.name for s in fitter.data.plant.sensors], fitter.noise.steps
-    return bool(steps) and place in sensors and std < 0.5 * steps[sensors.index(place)]
-
-
-def _drift_size(fitter: Fitter, drift: Wander) -> float:
-    """Norm of the drift in units of the sensor's noise."""
-    count = float(fitter.data.mask[:, drift.channel].sum())
-    return math.sqrt(count) * drift.std / float(fitter.noise.std[drift.channel])

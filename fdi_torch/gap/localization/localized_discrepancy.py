@@ -1,0 +1,67 @@
+"""A discrepancy at one component, its weight, and what is no discrepancy: a rounding error."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
+from fdi_torch.simulate.collocation import Linearised
+
+
+@dataclass(frozen=True)
+class LocalizedDiscrepancy:
+    """A discrepancy at one component, in addition to a fit.
+
+    gain: in log evidence against the fit alone, without prior odds. fitness: log likelihood less one nat for each
+    parameter of the discrepancy (Akaike, 1974), over that of the fit alone. explained: its influence on the readings
+    (S, C); none of a random process. size: norm of its influence, in units of the sensor noise. periods: of its
+    harmonics, s. fit, noise: the fit refitted, and the most likely disturbance noise, with the discrepancy.
+    """
+
+    location: str
+    gain: float
+    fitness: float
+    explained: Tensor
+    size: float
+    periods: tuple[float, ...]
+    fit: Fit
+    noise: StateNoise
+
+
+def log_likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
+    """Log evidence of a fit about a linearised trajectory, without prior odds; minus infinity if it is not finite."""
+    space, theta = fit.space, fit.theta
+    residual, jacobian = (x[0] for x in fitter.white(linearised))
+    if not math.isfinite(fitter.log_det + float(residual.square().sum() + jacobian.square().sum())):
+        return -math.inf
+    scale, pull, off = fitter.priors(space, theta)
+    rows = torch.cat([(jacobian * scale).flatten(0, 1), torch.diag(pull + 1e-9)])
+    target = torch.cat([residual.flatten(), -off])
+    basis, _ = torch.linalg.qr(rows)
+    remaining = target - basis @ (basis.T @ target)
+    return -0.5 * float(remaining @ remaining) - 0.5 * fitter.log_det + occam(fitter, space, theta, jacobian)
+
+
+def log_evidence(fitter: Fitter, fit: Fit, noise: StateNoise, linearised: Linearised) -> float:
+    """Log evidence of a fit and a noise model about a linearised trajectory, without prior odds."""
+    return log_likelihood(with_disturbances(fitter, fit, noise, linearised), fit, linearised) + noise.log_prior()
+
+
+def nearly_without_disturbances(noise: StateNoise) -> StateNoise:
+    """The noise with nearly no random flow into any tank."""
+    return replace(noise, intensity=(0.1 * noise.intensity.min()).expand_as(noise.intensity).clone())
+
+
+def is_rounding_error(fitter: Fitter, place: str, std: float) -> bool:
+    """Whether a deviation of a sensor with this standard deviation may be a rounding error: up to half a step.
+
+    It is a function of the level, and varies slowly where the level does.
+    """
+    sensors, steps = [s.name for s in fitter.data.plant.sensors], fitter.noise.steps
+    return bool(steps) and place in sensors and std < 0.5 * steps[sensors.index(place)]

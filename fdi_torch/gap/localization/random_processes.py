@@ -1,0 +1,124 @@
+"""Discrepancies that are random processes: the flow into one tank, and the drift of one sensor.
+
+The random flow into one tank may be an unknown flow there instead of one of the disturbances, which are of one order of
+magnitude in all tanks. A drift is a random process of a sensor alone, with unknown size and correlation time. Random
+flows move levels, which later readings of other sensors show; a drift shows in one channel only. Its parameters are
+estimated together with the other noise. Its evidence is the likelihood of the innovations less the cost of its
+parameters: the prior of the size is log-uniform between a tenth of the sensor noise and the range of the readings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from fdi_torch.estimate.evidence import RARE
+from fdi_torch.estimate.kalman import SCATTER, StateNoise, Wander
+from fdi_torch.estimate.state_noise import CORRELATION_TIMES, LOG_BOUND
+from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.localization.localized_discrepancy import (
+    LocalizedDiscrepancy,
+    is_rounding_error,
+    log_evidence,
+    nearly_without_disturbances,
+)
+from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances
+from fdi_torch.simulate.collocation import Linearised
+
+SMALLEST_DRIFT = 0.1  # as a share of the sensor's noise
+
+
+def random_flows(
+    regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float
+) -> list[LocalizedDiscrepancy]:
+    """The tank with the largest disturbance, if more likely an unknown flow than one of the disturbances of the plant.
+
+    The prior of its logarithm is uniform over the range of the estimate instead of normal about the others'.
+    """
+    fitter, fit, linearised = regression.fitter, regression.fit, regression.linearised
+    largest = int(noise.intensity.argmax())
+    tank = fitter.data.plant.tanks[largest].name
+    if tank not in places or len(noise.intensity) < 2:
+        return []
+    start = replace(noise, apart=largest)
+    apart = estimate_disturbances(fitter, fit, linearised, start=start).noise
+    cost = math.log(2.0 * LOG_BOUND / (SCATTER * math.sqrt(2.0 * math.pi)))
+    gain = log_evidence(fitter, fit, apart, linearised) - base - cost
+    size = _moved(with_disturbances(fitter, fit, apart, linearised), linearised)
+    nothing = torch.zeros_like(fitter.data.readings)
+    return [LocalizedDiscrepancy(tank, gain, gain + cost - 1.0, nothing, size, (), fit, apart)]
+
+
+def _moved(fitter: Fitter, linearised: Linearised) -> float:
+    """Norm of what the disturbances move the readings by, in units of the sensor noise."""
+    assert fitter.whitening is not None
+    plant = fitter.data.plant
+    moved = fitter.whitening.smoothed(fitter.data.readings - linearised.readings[0])
+    names = [t.name for t in plant.tanks]
+    of_sensors = moved[:, [names.index(s.tank) for s in plant.sensors]]
+    return float(torch.linalg.vector_norm(torch.where(fitter.data.mask, of_sensors, 0.0) / fitter.noise.std))
+
+
+def drifting_sensors(
+    regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float, needed: float
+) -> list[LocalizedDiscrepancy]:
+    """Sensors with a drift, as far as their gain in evidence can be relevant."""
+    fitter, fit = regression.fitter, regression.fit
+
+    def evaluate(noise: StateNoise) -> LocalizedDiscrepancy:
+        assert noise.wander is not None
+        sensor = fitter.data.plant.sensors[noise.wander.channel].name
+        gain = log_evidence(fitter, fit, noise, regression.at(sensor)[1]) - base
+        cost = _drift_cost(fitter, noise.wander)
+        nothing, size = torch.zeros_like(fitter.data.readings), _drift_size(fitter, noise.wander)
+        return LocalizedDiscrepancy(sensor, gain - cost, gain - 2.0, nothing, size, (), fit, noise)
+
+    def most_likely(start: LocalizedDiscrepancy) -> LocalizedDiscrepancy:
+        linearised = regression.at(start.location)[1]
+        return evaluate(estimate_disturbances(fitter, fit, linearised, start=start.noise).noise)
+
+    starts = [
+        _initial_drift(fitter, regression.at(p)[1], nearly_without_disturbances(noise), channel)
+        for p in places
+        if (channel := regression.sensor(p)) is not None
+    ]
+    drifts: list[LocalizedDiscrepancy] = []
+    noise_gain = 0.0
+    for initial in sorted(map(evaluate, starts), key=lambda d: d.gain, reverse=True):
+        if drifts and initial.gain + noise_gain < needed:
+            break
+        best = max(initial, most_likely(initial), key=lambda d: d.gain)
+        noise_gain = max(noise_gain, best.gain - initial.gain)
+        needed = max(needed, best.gain + math.log(RARE))
+        assert best.noise.wander is not None
+        if not is_rounding_error(fitter, best.location, best.noise.wander.std):
+            drifts.append(best)
+    return drifts
+
+
+def _initial_drift(fitter: Fitter, linearised: Linearised, quiet: StateNoise, channel: int) -> StateNoise:
+    """Start of the optimisation: the whole residual of the sensor is drift. quiet: nearly no random flows."""
+    valid = fitter.data.mask[:, channel]
+    residual = (fitter.data.readings - linearised.readings[0])[valid, channel]
+    std = max(float(residual.square().mean().sqrt()), float(fitter.noise.std[channel]))
+    return replace(quiet, wander=Wander(channel, std, CORRELATION_TIMES[3] * fitter.data.row_spacing))
+
+
+def _drift_cost(fitter: Fitter, drift: Wander) -> float:
+    """Cost of the parameters of a drift, nats: correlation time, smoothness, and size."""
+    valid = fitter.data.mask[:, drift.channel]
+    readings = fitter.data.readings[valid, drift.channel]
+    noise = float(fitter.noise.std[drift.channel])
+    width = math.log(max(float(readings.max() - readings.min()), noise) / (SMALLEST_DRIFT * noise))
+    values = max(int(valid.sum()) * fitter.data.row_spacing / drift.correlation_time, 1.0)
+    return math.log(2 * (len(CORRELATION_TIMES) - 1)) + max(math.log(width * math.sqrt(values / math.pi)), 0.0)
+
+
+def _drift_size(fitter: Fitter, drift: Wander) -> float:
+    """Norm of the drift in units of the sensor's noise."""
+    count = float(fitter.data.mask[:, drift.channel].sum())
+    return math.sqrt(count) * drift.std / float(fitter.noise.std[drift.channel])

@@ -1,0 +1,64 @@
+"""Sparse regression of the whitened residual on the influence of a discrepancy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.localization.discrepancy_regression import Discrepancy
+from fdi_torch.gap.localization.sparse_regression import SparseFit, sparse_fit
+
+MOST_ROWS = 1000  # rows per channel from which columns are selected; more samples are summed in groups
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """gram (M, M) = C'C and score (M,) = C'r of columns C and the residual r."""
+
+    gram: Tensor
+    score: Tensor
+
+
+class WhitenedDiscrepancy:
+    """The columns of a discrepancy and the residual under one noise, with the parameters of a fit projected out.
+
+    columns (S C, M) and residual (S C,): whitened by the fitter `under`, not projected.
+    """
+
+    def __init__(self, under: Fitter, fit: Fit, discrepancy: Discrepancy) -> None:
+        residual, jacobian = under.white(discrepancy.linearised)
+        scale, self._pull, self._off = under.priors(fit.space, fit.theta)
+        self._columns, self._residual = under.whiten(discrepancy.columns), residual[0]
+        self._jacobian = jacobian[0] * scale
+
+    def normal_equations(self, used: Tensor | None = None) -> NormalEquations:
+        """Of some columns, used (M,) bool, with all samples; or of all, with samples summed in groups.
+
+        A group is shorter than any regressor's changes. What a sum of its samples leaves out is little of the residual,
+        but may be many nats if the residual is large: it serves to select columns, not to weigh them.
+        """
+        columns = self._columns if used is None else self._columns[..., used]
+        group = max(len(columns) // MOST_ROWS, 1) if used is None else 1
+        c, r, j = (_grouped(x, group).flatten(0, 1) for x in (columns, self._residual.unsqueeze(-1), self._jacobian))
+        basis, _ = torch.linalg.qr(torch.cat([j, torch.diag(self._pull + 1e-9)]))
+        remaining = torch.cat([torch.cat([c, r], dim=1), c.new_zeros(len(self._pull), c.shape[1] + 1)])
+        remaining[len(r) :, -1] = -self._off
+        remaining -= basis @ (basis.T @ remaining)
+        products = remaining.T @ remaining
+        return NormalEquations(products[:-1, :-1], products[:-1, -1])
+
+    def sparse_fit(self, costs: Tensor) -> SparseFit:
+        """Sparse regression on the columns. costs (M,): of using each."""
+        selecting = self.normal_equations()
+        used = sparse_fit(selecting.gram, selecting.score, costs).used
+        exact = self.normal_equations(used)
+        return sparse_fit(exact.gram, exact.score, costs[used]).among(used)
+
+
+def _grouped(x: Tensor, each: int) -> Tensor:
+    """Sums (S / each, ...) of groups of samples of x (S, ...), scaled to unit variance."""
+    groups = len(x) // each
+    return x[: groups * each].reshape(groups, each, *x.shape[1:]).sum(dim=1) / each**0.5
