@@ -52,15 +52,11 @@ def test_every_fault_is_fitted_when_a_wrong_explanation_no_longer_holds() -> Non
 
 def test_the_evidence_beside_a_known_fault_allows_for_the_error_of_its_law() -> None:
     watch, state = leaking()
-    alone = window_beside_faults(watch.observer, state, 250.0, state.healthy)
-    assert alone.std is not None and bool((alone.std == 1.0).all())
+    assert window_beside_faults(watch.observer, state, 250.0, state.healthy).std is None
     beside = window_beside_faults(watch.observer, state, 250.0, state.believed)
-    assert beside.std is not None
     effects = watch.observer.whitening.filter(state.fault_effects[:, 1])[-len(beside) :]
-    expected = torch.sqrt(1.0 + (LAW_ERROR * effects).square())
-    # The parallel observer without the leak has run since its onset; that of the window starts with the window.
-    assert bool((beside.std[1:] > 1.0).all()) and bool((beside.std <= expected).all())
-    assert float((beside.std - 1.0)[-1, 2]) > 0.5 * float((expected - 1.0)[-1, 2])
+    assert beside.std is not None and float(effects[-1, 2].abs()) > 5.0
+    assert torch.allclose(beside.std, torch.sqrt(1.0 + (LAW_ERROR * effects).square()))
 
 
 def test_a_recovery_is_told_once_the_fault_would_have_shown_more_than_the_error_of_its_law() -> None:

@@ -118,12 +118,11 @@ def window_beside_faults(observer: ObserverBank, state: MonitorState, start: flo
 
     The variance is 1 + sum_i (c f_i)^2 as in `normalized_residuals`, so that evidence and detector use one noise model.
     """
-    window, known = state.window(start), replace(state, believed=believed)
-    theta = torch.cat([believed[None], known.parameters_without_each(observer)])
-    onsets, sudden = theta.new_full((len(theta),), LONG_AGO), torch.zeros(len(theta), dtype=torch.bool)
-    constant = ChangeHypotheses(theta, onsets, sudden)
-    white = observer.white_innovations(window, believed, constant)
-    return replace(window, std=torch.sqrt(1.0 + (LAW_ERROR * (white[1:] - white[0])).square().sum(0)))
+    window, active = state.window(start), replace(state, believed=believed).active_effects(observer)
+    if not active:
+        return window
+    effects = observer.whitening.filter(state.fault_effects[:, active].movedim(1, 0))[:, -len(window) :]
+    return replace(window, std=torch.sqrt(1.0 + (LAW_ERROR * effects).square().sum(0)))
 
 
 def fault_influence(observer: ObserverBank, state: MonitorState, column: int, first: float, last: float) -> float:
