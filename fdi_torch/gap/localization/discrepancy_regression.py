@@ -156,6 +156,8 @@ class DiscrepancyRegression:
             columns = torch.cat([columns, self.sinusoids(place, self.frequencies)[..., 0, :]], dim=-1)
         count = columns.shape[-1]
         choices, sinusoids = columns.new_full((count,), count), torch.arange(count) >= first
+        # A sinusoid is one of those of all frequencies that the recording distinguishes.
+        choices[sinusoids] += (count - first) * (len(columns) // 2)
         return Discrepancy(columns, linearised, choices, frequency, sinusoids)
 
     def sinusoids(self, place: str, frequency: Tensor) -> Tensor:
