@@ -96,7 +96,7 @@ def test_a_growing_csv_file_is_followed_row_by_row(tmp_path: Path, capsys: pytes
     """In pieces that end within a row, with a row that is no row, one that comes twice, and a hole in the clock."""
     file = tmp_path / "rig.csv"
     file.write_text(HEADER)
-    rows = [row(k if k < 260 else k + 40, levels) for k, levels in enumerate(readings())]
+    rows = [row(k if k < 280 else k + 40, levels) for k, levels in enumerate(readings())]
     rows.insert(50, "50,oops,50,1,2,3\n")
     rows.insert(120, rows[119])
     text = "".join(rows)
@@ -364,7 +364,7 @@ def test_a_growing_file_is_followed_on_after_a_kill_to_the_same_events(
     whole = written(tmp_path / "all.csv")
     expected = monitored(["--config", config(tmp_path, recording={"file": "all.csv"})], capsys)
     lines, file = whole.read_text().splitlines(keepends=True), tmp_path / "rig.csv"
-    file.write_text("".join(lines[:225]))
+    file.write_text("".join(lines[:250]))
     words = ["--config", config(tmp_path), "--follow", "--idle", "0.3"]
     with monkeypatch.context() as patch:
 
@@ -375,7 +375,7 @@ def test_a_growing_file_is_followed_on_after_a_kill_to_the_same_events(
         assert main(["monitor", *words, "--json", "--quiet"]) == INTERRUPTED
     early = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert kinds(early) == ["alarm"]
-    file.write_text(lines[0] + "".join(lines[215:] if rotated else lines[1:]))
+    file.write_text(lines[0] + "".join(lines[240:] if rotated else lines[1:]))
     late = monitored([*words, "--resume"], capsys)
     assert early + late == expected
     logs = [path for path in (tmp_path / "logs").glob("*.mcap") if "_2" in path.name]

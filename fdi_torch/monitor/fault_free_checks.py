@@ -86,15 +86,16 @@ def fault_warnings(
 def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -> str:
     """Text: the expected time between false alarms, how short it may be, and how long a fault-free part it needs.
 
-    Needed is the fault-free time that determines the rate within a factor of RATE_FACTOR (95 %).
+    The mean is over the posterior of the noise, of which a small share may determine it. Needed is the fault-free time
+    that determines the rate within a factor of RATE_FACTOR (95 %).
     """
     design = detector.design
     seconds = noise.whitening.samples * design.interval
     needed = seconds * design.learning_factor(RATE_FACTOR)
     shortest = float(f"{1.0 / design.quantile(0.95):.2g}")
     text = (
-        f"learnt from {seconds:g} s, {needed:.0f} s are needed: one false alarm in {every:g} s expected, "
-        f"at most one in {shortest:g} s (95 %)"
+        f"learnt from {seconds:g} s, {needed:.0f} s are needed: on average one false alarm in {every:g} s, "
+        f"with 95 % at most one in {shortest:g} s"
     )
     if noise.whitening.flows is None:
         text += ", if no random flow is slow: to model these, install a C++ compiler or the extra fdi_torch[compiler]"
