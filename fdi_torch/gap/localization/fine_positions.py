@@ -82,10 +82,10 @@ def with_best_frequency(
 ) -> Discrepancy | None:
     """The discrepancy with the frequency at which its sinusoids explain most beside the other regressors that it uses.
 
-    under, used: as for `with_best_position`. None if no sinusoid is used.
+    under, used: as for `with_best_position`. None if there are no sinusoids.
     """
     sinusoids = discrepancy.sinusoids
-    if discrepancy.frequency is None or not bool(used[sinusoids].any()):
+    if discrepancy.frequency is None:
         return None
     basis = parameter_basis(under, fit, discrepancy.columns[..., used & ~sinusoids])
     residual = whitened_residual(under, fit, discrepancy.linearised)
