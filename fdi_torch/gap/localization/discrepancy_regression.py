@@ -156,7 +156,7 @@ class DiscrepancyRegression:
             columns = torch.cat([columns, self.sinusoids(place, self.frequencies)[..., 0, :]], dim=-1)
         count = columns.shape[-1]
         choices, sinusoids = columns.new_full((count,), count), torch.arange(count) >= first
-        # A sinusoid is one of those of all frequencies: 1 / (2 dt) over the width sqrt(2 pi) s of a frequency's posterior,
+        # A sinusoid is one of those of all frequencies: 1 / (2 dt) over the width sqrt(2 pi) s of the posterior,
         # s = sqrt(6 / G) / (2 pi T) with a gain of G nats (Rife and Boorstyn, 1974), is 2 S if it is just worth it.
         choices[sinusoids] *= 2 * len(columns)
         return Discrepancy(columns, linearised, choices, frequency, sinusoids)
