@@ -19,11 +19,11 @@ from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.fault_recovery import recovered_columns, recovery_is_observable, reset_to_nominal
 from fdi_torch.monitor.fault_tracking import STRONG_EVIDENCE, size_change, updated_tracks, with_new_sizes
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
-from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.isolation import isolate, refit
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState, PendingAlarm
 from fdi_torch.monitor.observer_bank import ObserverBank
-from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, normalized_residuals, window_beside_faults
+from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, fault_effect_rms, normalized_residuals
 
 GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes a fault that grows
 SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
@@ -43,6 +43,7 @@ class AlarmHandler:
     ) -> None:
         self.observer, self.space, self.detector = observer, observer.space, detector
         self.faults, self.watched, self.settings, self.writer = faults, watched, settings, writer
+        self.single_changes = len(faults) * (2 if settings.incipient else 1)
 
     # Schedule
 
@@ -66,16 +67,23 @@ class AlarmHandler:
     def on_threshold(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
         """Handle a crossing of the detector's threshold.
 
-        It is a new alarm unless one change, at the time of the latest one, explains the residual, or a known fault only
-        changed its size.
+        It is a new alarm unless the latest change still explains the residual, or a known fault only changed its size.
         """
         change = state.change
         if change is not None and self._within_window(state, change):
-            fits = self._explanations(state, self._window_start(state, change), change.before, change.explanations)
-            if fits[0].fits and fits[0].hypothesis.columns:
+            window = state.window(self._window_start(state, change))
+            same = refit(self.observer, window, change.before, change.explanations, self.single_changes)
+            if same[0].fits and same[0].hypothesis.columns:
+                scheduled = change.next_fit
                 state = state.with_alarm(state.alarm(change.number).raised_again(state.now))
-                return self._revise(state, change, "revised", fits, announce=False)
-        resized = size_change(self.observer, state, self._search_start(state, state.now), self.faults)
+                revised, events = self._revise(state, change, "revised", same, announce=False)
+                assert revised.change is not None
+                # The full comparison of explanations must not be postponed by this refit.
+                next_fit = min(scheduled, revised.change.next_fit)
+                return replace(revised, change=replace(revised.change, next_fit=next_fit)), events
+        resized = size_change(
+            self.observer, state, self._search_start(state, state.now), self.faults, self.single_changes
+        )
         if resized is not None:
             moved = adopt_sizes(self.observer, state, resized)
             moved, announced = with_new_sizes(moved, resized, self.settings.revise)
@@ -228,7 +236,12 @@ class AlarmHandler:
         names = tuple(tuple(self.space.names[c] for c in f.hypothesis.columns) for f in reported)
         announce, change = announce or names != change.reported, replace(change, ended=ended, reported=names)
         state = adopt_change(self.observer, state, change, reset_to_nominal(self.space, change, back))
-        state = updated_tracks(state, change, [fault.size for fault in self.faults])
+        state = updated_tracks(
+            state,
+            change,
+            [fault.size for fault in self.faults],
+            lambda c: fault_effect_rms(self.observer, state, c, change.best.onset),
+        )
         state, events = self._end_recovered(state, change, reported, observable)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:
@@ -275,8 +288,7 @@ class AlarmHandler:
         """Explanations of the readings since `start` s, likeliest first. earlier: fits that serve
         as initial guesses.
         """
-        s, healthy = self.settings, self.fault_free(believed)
-        window = window_beside_faults(self.observer, state, start, believed)
+        s, healthy, window = self.settings, self.fault_free(believed), state.window(start)
         return isolate(self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier)
 
     def _explanations_from_onset(self, state: MonitorState, start: float) -> list[HypothesisFit]:

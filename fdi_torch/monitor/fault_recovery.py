@@ -10,7 +10,7 @@ from torch import Tensor
 from fdi_torch.monitor.hypothesis import HypothesisFit
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank
-from fdi_torch.monitor.state_update import LAW_ERROR, fault_influence
+from fdi_torch.monitor.state_update import FAULT_MODEL_ERROR
 from fdi_torch.parameters import ParameterSpace
 
 
@@ -24,8 +24,8 @@ def recovery_is_observable(
 ) -> bool:
     """Whether the readings since the recovery would show the fault if it were still present.
 
-    They would not if its influence since then is small compared with its influence before: then the error of its law
-    may look like a recovery, for example in a dry tank or behind a closed valve.
+    They would not if it adds less to the white innovations than the share FAULT_MODEL_ERROR of its earlier effect, for
+    example in a dry tank or behind a closed valve.
     """
     window = state.window(change.best.onset)
     persisting = change.best.value.clone()
@@ -35,8 +35,8 @@ def recovery_is_observable(
     lanes = ChangeHypotheses(theta, onsets, torch.tensor([False, False]))
     without, with_fault = observer.white_innovations(window, change.before, lanes)
     since = window.times > change.best.onset
-    influence = float((without - with_fault)[since].square().sum().sqrt())
-    return influence >= LAW_ERROR * fault_influence(observer, state, track.column, track.onset, change.best.onset)
+    rms = float((without - with_fault)[since].square().mean().sqrt()) if bool(since.any()) else 0.0
+    return rms >= FAULT_MODEL_ERROR * track.effect_rms
 
 
 def reset_to_nominal(space: ParameterSpace, change: DetectedChange, recovered: Sequence[int]) -> Tensor:

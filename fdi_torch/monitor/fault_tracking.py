@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -11,7 +11,6 @@ from fdi_torch.monitor.hypothesis import Fault, HypothesisFit
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
-from fdi_torch.monitor.state_update import window_beside_faults
 
 # A change whose effect is below this share of the known faults' effect may be a change of their size.
 SMALL_CHANGE = 1.0 / 3.0
@@ -21,7 +20,7 @@ STRONG_EVIDENCE = 5.0
 
 
 def size_change(
-    observer: ObserverBank, state: MonitorState, start: float, faults: Sequence[Fault]
+    observer: ObserverBank, state: MonitorState, start: float, faults: Sequence[Fault], single_changes: int
 ) -> HypothesisFit | None:
     """New sizes of the known faults since `start` s or later, or None if that does not explain the residual.
 
@@ -31,7 +30,7 @@ def size_change(
     known = [f for f in faults if f.size in off]
     if not known:
         return None
-    window = window_beside_faults(observer, state, start, state.believed)
+    window = state.window(start)
     fits = isolate(observer, window, state.believed, known, incipient=False, deepest=len(known), healthy=state.healthy)
     best = next(f for f in fits if f.hypothesis.columns)
     near_nominal = (best.value - state.healthy).abs() <= 3.0 * best.std
@@ -39,7 +38,7 @@ def size_change(
     if best.hypothesis.recovered or any(bool((near_nominal & changed)[c]) for c in best.hypothesis.sizes):
         return None  # one of them recovered
     best = replace(best, value=torch.where(near_nominal, state.believed, best.value))
-    if _relative_effect(observer, state.window(start), state, best) > SMALL_CHANGE:
+    if _relative_effect(observer, window, state, best) > SMALL_CHANGE:
         return None
     new = [f for f in faults if f.size not in off]
     if new:
@@ -61,8 +60,13 @@ def _relative_effect(
     return (moved / sum(removed)) ** 0.5 if sum(removed) > 0.0 else float("inf")
 
 
-def updated_tracks(state: MonitorState, change: DetectedChange, sizes: Sequence[int]) -> MonitorState:
-    """The state with one track for each fault that is present after a change. sizes: columns of the faults' sizes."""
+def updated_tracks(
+    state: MonitorState, change: DetectedChange, sizes: Sequence[int], effect_rms: Callable[[int], float]
+) -> MonitorState:
+    """The state with one track for each fault that is present after a change.
+
+    sizes: columns of the faults' sizes. effect_rms: of a column, what the fault adds to the white residuals.
+    """
     fit, tracks = change.best, []
     for column in sizes:
         if float(state.believed[column]) == float(state.healthy[column]):
@@ -74,10 +78,10 @@ def updated_tracks(state: MonitorState, change: DetectedChange, sizes: Sequence[
         now = state.now, float(state.believed[column]), float(fit.std[column])
         if earlier is not None and earlier.number == change.number:
             start = (fit.onset, float(change.before[column]), 0.0) if fit.hypothesis.incipient else earlier.first
-            tracks.append(replace(earlier, onset=fit.onset, first=start, last=now))
+            tracks.append(replace(earlier, onset=fit.onset, first=start, last=now, effect_rms=effect_rms(column)))
             continue
         start = (fit.onset, float(change.before[column]), 0.0) if fit.hypothesis.incipient else now
-        tracks.append(FaultTrack(column, change.number, fit.onset, start, now, state.now))
+        tracks.append(FaultTrack(column, change.number, fit.onset, start, now, effect_rms(column), state.now))
     return replace(state, tracks=tuple(tracks))
 
 

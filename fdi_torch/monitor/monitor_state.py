@@ -18,8 +18,8 @@ class FaultTrack:
     """The size of a known fault over time.
 
     column: of the parameter space. number: of its alarm. onset: s. first, last: (time in s, size, standard deviation)
-    of the first and the latest estimate. announced: when its size was last announced, s. adjusted: onset of the latest
-    change of size, s.
+    of the first and the latest estimate. effect_rms: root mean square of what the fault adds to the white residuals.
+    announced: when its size was last announced, s. adjusted: onset of the latest change of size, s.
     """
 
     column: int
@@ -27,6 +27,7 @@ class FaultTrack:
     onset: float
     first: tuple[float, float, float]
     last: tuple[float, float, float]
+    effect_rms: float
     announced: float
     adjusted: float = LONG_AGO
 

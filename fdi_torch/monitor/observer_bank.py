@@ -56,14 +56,12 @@ class ObserverWindow:
     samples: the first one only sets the start; `state` (order + M,) is the observer's state after its correction,
     `number` the count of samples that the observer had processed by then, and `memory` the state of the flow filter
     (None: zero). The later samples are compared. state and memory may have a lane for each hypothesis.
-    std (S, sensors): standard deviation of the white innovations; 1 if None.
     """
 
     samples: Samples
     state: Tensor
     number: int
     memory: Tensor | None = None
-    std: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.samples) - 1
@@ -112,13 +110,11 @@ class ObserverBank:
         self._columns = ParameterSpace(self.changing.constants[name] for name in names)
 
     def white_innovations(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
-        """White innovations (L, S, sensors), scaled to unit variance; zero where a reading, or one that the whitening
-        needs, is missing.
-        """
+        """White innovations (L, S, sensors); zero where a reading, or one that the whitening needs, is missing."""
         residual = self.run(window, believed, changes)[1]
         white = self.whitening.of_innovations(self.whitening.innovations(residual, window.number, window.memory)[0])
         white[:, : self.whitening.order] = 0.0
-        return torch.nan_to_num(white if window.std is None else white / window.std, nan=0.0)
+        return torch.nan_to_num(white, nan=0.0)
 
     def in_blocks(self, window: ObserverWindow, changes: ChangeHypotheses, even: int = 1) -> list[ChangeHypotheses]:
         """The hypotheses in blocks that fit into memory; each block's size is a multiple of `even`."""

@@ -12,8 +12,8 @@ from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import LONG_AGO, NEVER, ChangeHypotheses, ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples, concatenated
 
-# Assumed error of a fault's law, as a share of the fault's effect: a real leak is not an ideal orifice.
-LAW_ERROR = 0.1
+# Assumed error of a fault's model, as a share of the fault's effect: a real leak is not an ideal orifice.
+FAULT_MODEL_ERROR = 0.1
 
 
 def initial_state(
@@ -101,35 +101,22 @@ def normalized_residuals(observer: ObserverBank, state: MonitorState, count: int
     """The last white residuals (count, sensors) for the detector, widened for the model error of the known faults.
 
     e / sqrt(max(1, r)^2 + sum_i (c f_i)^2): e the white residual, f_i what known fault i takes out of it at that
-    moment, c = LAW_ERROR the error of a fault's law, r the root mean square that the faults left unexplained
-    when they were fitted.
+    moment, c = FAULT_MODEL_ERROR, r the root mean square that the faults left unexplained when they were fitted.
     """
     active = state.active_effects(observer)
     if not active:
         return state.white[-count:]
     history = count + observer.whitening.order
     effects = observer.whitening.filter(state.fault_effects[-history:, active].movedim(1, 0))[:, -count:]
-    variance = state.unexplained_rms.clamp(min=1.0) ** 2 + (LAW_ERROR * effects).square().sum(0)
+    variance = state.unexplained_rms.clamp(min=1.0) ** 2 + (FAULT_MODEL_ERROR * effects).square().sum(0)
     return state.white[-count:] / torch.sqrt(variance)
 
 
-def window_beside_faults(observer: ObserverBank, state: MonitorState, start: float, believed: Tensor) -> ObserverWindow:
-    """The window from `start` s, with innovations widened for the model error of the faults in `believed` (P,).
-
-    The variance is 1 + sum_i (c f_i)^2 as in `normalized_residuals`, so that evidence and detector use one noise model.
-    """
-    window, active = state.window(start), replace(state, believed=believed).active_effects(observer)
-    if not active:
-        return window
-    effects = observer.whitening.filter(state.fault_effects[:, active].movedim(1, 0))[:, -len(window) :]
-    return replace(window, std=torch.sqrt(1.0 + (LAW_ERROR * effects).square().sum(0)))
-
-
-def fault_influence(observer: ObserverBank, state: MonitorState, column: int, first: float, last: float) -> float:
-    """Root sum of squares of what a known fault adds to the white residuals between two times (s)."""
+def fault_effect_rms(observer: ObserverBank, state: MonitorState, column: int, since: float) -> float:
+    """Root mean square of what a known fault adds to the white residuals since a time (s)."""
     [effect] = [e for e, columns in enumerate(observer.effects) if column in columns]
-    during = (state.samples.time > first) & (state.samples.time <= last)
-    return float(observer.whitening.filter(state.fault_effects[:, effect])[during].square().sum().sqrt())
+    count = max(int((state.samples.time > since).sum()), 1)
+    return float(observer.whitening.filter(state.fault_effects[:, effect])[-count:].square().mean().sqrt())
 
 
 def _run(

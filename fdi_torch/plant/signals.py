@@ -40,8 +40,6 @@ class Clock:
 
     def risen(self, onset: Tensor, ramp: Tensor) -> Tensor:
         """Exact mean over the step of a linear rise from 0 to 1 that begins at `onset` (s) and takes `ramp` (s)."""
-        # Differences of times after an onset in the remote past would lose the step to rounding.
-        onset = torch.maximum(onset, self.start - self.step - ramp)
         return (_rise_integral(self.end - onset, ramp) - _rise_integral(self.start - onset, ramp)) / self.step
 
     def risen_by_end(self, onset: Tensor, ramp: Tensor) -> Tensor:
