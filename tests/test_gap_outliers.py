@@ -60,12 +60,15 @@ def test_outliers_are_masked_in_their_channel_only() -> None:
     assert found.samples == len(found.each)
 
 
-def test_spikes_do_not_hide_a_cause_and_are_reported_with_it() -> None:
+def test_spikes_do_not_hide_a_cause_and_are_unknown_beside_it() -> None:
     recording = with_spikes(recorded({"Q1.pump_gain.factor": 1.1}, 52), 2, 60)
     holdout = with_spikes(recorded({"Q1.pump_gain.factor": 1.1}, 53), 0, 60)
     answer = diagnose(nominal_plant(), recording, holdout, Settings(SMALL))
-    assert answer.verdict == "named"
-    assert [(c.effect, c.location) for c in answer.causes] == [("pump_gain", "Q1")]
+    both = [("pump_gain", "Q1"), ("unknown", nominal_plant().sensors[2].name)]
+    assert answer.verdict == "unknown" and set(answer.certain) == set(both)
+    assert [(c.effect, c.location) for c in answer.causes] == both
+    named = diagnose(nominal_plant(), recording, settings=Settings(SMALL, named_only=True))
+    assert named.verdict == "named" and [(c.effect, c.location) for c in named.causes] == both[:1]
     assert answer.closure["closed"] == pytest.approx(1.0, abs=0.03)
     assert answer.closure["augmented"] == pytest.approx(0.1, rel=0.1)  # cm: the noise, without the spikes
     sensors = [s.name for s in nominal_plant().sensors]
@@ -75,8 +78,9 @@ def test_spikes_do_not_hide_a_cause_and_are_reported_with_it() -> None:
 def test_spikes_alone_are_unknown_at_their_sensor_and_a_single_one_is_no_gap() -> None:
     sound = recorded({"P13.discharge_coefficient": 0.615}, 11)
     many = diagnose(nominal_plant(), with_spikes(sound, 1, 90), settings=Settings(SMALL))
-    assert many.verdict == "unknown" and not many.causes and many.p_value == 0.0
-    assert many.where[0] == (nominal_plant().sensors[1].name, 1.0)
+    sensor = nominal_plant().sensors[1].name
+    assert many.verdict == "unknown" and many.where[0] == (sensor, 1.0) and many.p_value == 0.0
+    assert [(c.effect, c.location) for c in many.causes] == many.certain == [("unknown", sensor)]
     one = diagnose(nominal_plant(), with_spikes(sound, 1, 2000), settings=Settings(SMALL))
     assert one.verdict == "no_gap"
     assert any("1 reading of" in remark for remark in one.remarks)

@@ -38,10 +38,10 @@ def test_probabilities_follow_from_differences_of_logarithms_alone() -> None:
 def test_no_gap_needs_95_percent_as_any_other_verdict() -> None:
     evaluated: Any = None
     nothing, leak = CauseHypothesis(evaluated, (), 0.0), CauseHypothesis(evaluated, (("leak", "T1"),), -2.0)
-    assert verdict_of([nothing], True, False, None) == "no_gap"
-    assert verdict_of([nothing, leak], False, False, None) == "ambiguous"
-    assert verdict_of([nothing, leak], False, False, "h1") == "unknown"
-    assert verdict_of([leak], True, False, None) == "named"
+    assert verdict_of([nothing], True, []) == "no_gap"
+    assert verdict_of([nothing, leak], False, []) == "ambiguous"
+    assert verdict_of([nothing, leak], False, [("unknown", "h1")]) == "unknown"
+    assert verdict_of([leak], True, []) == "named"
 
 
 def test_an_unknown_that_an_effect_at_its_place_predicts_as_well_is_that_effect() -> None:

@@ -37,7 +37,7 @@ def test_the_terminal_prints_the_unknown_and_the_named_causes(capsys: pytest.Cap
     said = capsys.readouterr().out
     assert said.startswith(
         "The gap comes from leak at T1 and something unknown at Q1, probability 97.0 %; no effect of the library "
-        "describes it."
+        "describes the unknown part."
     )
     rows = [line.split() for line in said.splitlines()]
     assert ["T1", "2.5", "cm^3/s", "15", "s"] in rows and ["T2", "1", "cm^3/s", "none"] in rows

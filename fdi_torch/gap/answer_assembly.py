@@ -26,7 +26,6 @@ from fdi_torch.gap.model_comparison import (
     reference_models,
 )
 from fdi_torch.gap.posterior import CauseHypothesis
-from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.remarks import remarks_on
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
@@ -46,7 +45,7 @@ def build_answer(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer
         p_value=_p_value(result),
         where=_where(result),
         causes=_causes(result),
-        ambiguity_set=[_names(result, h) for h in result.credible_set] if has_causes else [],
+        ambiguity_set=[_names(result, h) for h in result.credible_set] if result.verdict != "no_gap" else [],
         posterior=[ProbableExplanation((*h.causes, *result.from_readings), p, h.unknown_at) for h, p in hypotheses],
         unexamined=posterior.unexamined,
         converged=result.best.converged,
@@ -71,15 +70,10 @@ def _names(result: DiagnosisResult, hypothesis: CauseHypothesis) -> tuple[CauseN
 
 
 def _where(result: DiagnosisResult) -> list[tuple[str, float]]:
-    """Places by the probability of a cause there.
-
-    A sensor with outliers comes first if nothing else is wrong.
-    """
-    places = list(result.posterior.places)
-    best = result.posterior.best
-    if result.verdict == "unknown" and not best.place and (sensor := sensor_with_outliers(result.outliers[0])):
-        places = [(sensor, 1.0), *((p, share) for p, share in places if p != sensor)]
-    return places
+    """Places by the probability of a cause there; it is one at a sensor with outliers."""
+    shown = {place for effect, place in result.from_readings if effect == UNKNOWN}
+    places = [(place, 1.0 if place in shown else share) for place, share in result.posterior.places]
+    return sorted(places, key=lambda item: -item[1])
 
 
 def _holdout_runs(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> list[HeldOut]:
@@ -162,7 +156,9 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     limits = {(p.effect.name, p.location): p for p in result.limits}
     units = {s.name: s.unit for s in plant.sensors}
     for name, place in result.from_readings:
-        if (name, place) in limits:
+        if name == UNKNOWN:
+            causes.append(Cause(UNKNOWN, place))
+        elif (name, place) in limits:
             causes.append(Cause(name, place, _amounts_from_readings(limits[name, place], plant)))
         else:
             parameter, value = steps[place]
@@ -178,7 +174,7 @@ def _amounts_from_readings(placement: Placement, plant: PlantDescription) -> dic
 
 def _p_value(result: DiagnosisResult) -> float:
     """Probability that noise alone explains the gap; 0 if the readings themselves show a cause."""
-    if result.from_readings or (result.verdict == "unknown" and sensor_with_outliers(result.outliers[0])):
+    if result.from_readings:
         return 0.0
     return p_value(result.search)
 

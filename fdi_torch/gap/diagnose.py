@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import torch
 
-from fdi_torch.gap.answer import Answer, Verdict
+from fdi_torch.gap.answer import UNKNOWN, Answer, CauseName, Verdict
 from fdi_torch.gap.answer_assembly import build_answer
 from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
 from fdi_torch.gap.channel_noise import Noise, estimate_noise, quantization_step
@@ -67,10 +67,11 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     ]
     from_readings = [c for c in from_readings if any((p.effect.name, p.location) == c for p in library)]
     from_readings += [(p.effect.name, p.location) for p in problem.known_effects]
-    outlier_sensor = None if problem.named_only else sensor_with_outliers(problem.outliers[0])
+    if not problem.named_only and (sensor := sensor_with_outliers(problem.outliers[0])):
+        from_readings.append((UNKNOWN, sensor))
     free_form_fit = _free_form(posterior, reach)
     sure = posterior.probabilities[0] >= CONTENT
-    verdict = verdict_of(credible_set, sure, bool(from_readings), outlier_sensor)
+    verdict = verdict_of(credible_set, sure, from_readings)
     progress(0.8, "hold-out")
     diagnosis = DiagnosisResult(
         fitter,
@@ -90,17 +91,16 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
 
 
 def verdict_of(
-    credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: bool, outlier_sensor: str | None
+    credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]
 ) -> Verdict:
     """The verdict of a credible set of hypotheses.
 
-    sure: whether the likeliest alone has 95 %. from_readings: whether the readings themselves show a quantization or a
-    limit. outlier_sensor: a sensor with outliers that no effect of the library explains.
+    sure: whether the likeliest alone has 95 %. from_readings: causes that the readings show without a model.
     """
     best = credible_set[0]
     if not best.causes and not best.place and not from_readings:
-        return "unknown" if outlier_sensor else "no_gap" if sure else "ambiguous"
-    if all(h.place for h in credible_set):
+        return "no_gap" if sure else "ambiguous"
+    if all(h.place for h in credible_set) or any(effect == UNKNOWN for effect, _ in from_readings):
         return "unknown"
     return "named" if sure else "ambiguous"
 

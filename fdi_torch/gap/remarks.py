@@ -16,7 +16,6 @@ from fdi_torch.gap.dataset import RecordingPart
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_square
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
-from fdi_torch.gap.model_comparison import causal_places
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
 from fdi_torch.parameters import ParameterName, display_unit
 from fdi_torch.plant.description import PlantDescription
@@ -85,7 +84,7 @@ def _free_form_fails(result: DiagnosisResult, held: HeldOut) -> str:
     """The remark on a free form that fails on a hold-out."""
     source = Path(held.data.recording.source).name or "the hold-out"
     return (
-        f"the free function for the unknown discrepancy at {' and '.join(causal_places(result))} "
+        f"the free function for the unknown discrepancy at {result.posterior.best.unknown_at} "
         f"predicts {source} worse than the recalibrated plant: the discrepancy has memory, depends on time, or lies "
         "outside the recorded range; use the place from this answer, but not the function"
     )
@@ -96,9 +95,8 @@ def _periods(result: DiagnosisResult) -> list[str]:
     shape: Any = discrepancy_tables(result.free_form_fit)["tables"] if result.free_form_fit else {}
     waves = [(t["at"][0], t["share"][0]) for name, t in shape.items() if name.endswith(".period")]
     return [
-        f"the unknown discrepancy at {place} oscillates with a period of {period:.3g} s; its phase differs between "
-        "recordings, so that it explains nothing of a hold-out"
-        for place in causal_places(result)
+        f"the unknown discrepancy at {result.posterior.best.unknown_at} oscillates with a period of {period:.3g} s; its "
+        "phase differs between recordings, so that it explains nothing of a hold-out"
         for period, share in waves
         if share > SWINGS
     ]

@@ -66,8 +66,8 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
     if verdict != "unknown":
         return ""
     if causes_of(first):
-        return f"The gap comes from {best}{chance}; no effect of the library describes it."
-    place = next((str(w["location"]) for w in answer.get("where") or []), "a sensor")
+        return f"The gap comes from {best}{chance}; no effect of the library describes the unknown part."
+    place = next((str(w["location"]) for w in answer.get("where") or []), "a sensor")  # logs of earlier versions
     return f"Readings of {place} are outliers or stuck; apart from these, the plant file explains the recording."
 
 

@@ -89,7 +89,7 @@ def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> No
         ),
         (
             {"verdict": "unknown", "causes": [], "posterior": [{"causes": [], "probability": 0.9, "unknown_at": "Q1"}]},
-            "The gap comes from something unknown at Q1, probability 90.0 %; no effect of the library describes it",
+            "The gap comes from something unknown at Q1, probability 90.0 %; no effect of the library describes the unknown part",
         ),
         (
             {"verdict": "unknown", "causes": [], "posterior": [{"causes": [], "probability": 1.0}]},
@@ -114,7 +114,7 @@ def test_a_page_of_the_second_format_shows_what_the_first_could_not_say(tmp_path
     text = page([report_of(material)])
     assert headline(material) == (
         "The gap comes from leak at T1 (size 0.200 ± 0.010) and something unknown at Q1, probability 90.0 %; no effect "
-        "of the library describes it"
+        "of the library describes the unknown part"
     )
     assert "With 95 % probability, whichever explanation is true: leak at T1." in text
     assert "Probability that something is wrong there." in text and "share of the gap" not in text

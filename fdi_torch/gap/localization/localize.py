@@ -101,12 +101,18 @@ def localize(
         likely = estimate_disturbances(fitter, known.regression.fit, at.linearised, further, known.noise, climb).noise
         return evaluate(known.regression, at, known.location, likely)
 
-    def with_finer_position(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
-        used, regression = known.regressed.used, known.regression
-        finer = with_best_position(
-            regression, known.location, known.under, regression.fit, known.discrepancy, used, generator
-        )
-        return evaluate(regression, finer, known.location, known.noise) if finer else known
+    def with_finer_positions(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
+        """With further regressors under the same noise, until none is worth its selection. The noise falls only after
+        most of them were found: that one alone gains little says nothing about all of them."""
+        while True:
+            used, regression = known.regressed.used, known.regression
+            finer = with_best_position(
+                regression, known.location, known.under, regression.fit, known.discrepancy, used, generator
+            )
+            further = evaluate(regression, finer, known.location, known.noise) if finer else known
+            if further.gain - known.gain < CONVERGED:
+                return known
+            known = further
 
     def with_finer_frequency(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
         used, regression, at = known.regressed.used, known.regression, known.discrepancy
@@ -138,7 +144,7 @@ def localize(
         best = max([*first, *([with_likely_noise(about(beside, place, frequency), True)] if beside else [])], key=_gain)
         for turn in range(MOST_TURNS):
             before, best = best, max(best, with_likely_noise(best, turn == 0), key=_gain)
-            best = max(best, with_finer_position(best), key=_gain)
+            best = with_finer_positions(best)
             best = max(best, with_finer_frequency(best), key=_gain)
             if best.gain < SHARE * (needed - best.gain):
                 break
