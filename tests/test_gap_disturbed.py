@@ -32,11 +32,19 @@ LIBRARY = ("pump_gain", "plugging", "leak", "sensor_bias")
 SAMPLES = 700
 
 
-def recorded(flow: float, hold: int, seed: int, plugged: float = 0.0, onset: float = 0.0) -> Recording:
+def recorded(
+    flow: float,
+    hold: int,
+    seed: int,
+    plugged: float = 0.0,
+    onset: float = 0.0,
+    inflow: float = 0.0,
+    between: tuple[int, int] = (0, SAMPLES),
+) -> Recording:
     """Three tanks by Euler steps of a tenth of a second, read each second with 1 mm of noise.
 
     flow: standard deviation of the random flow into each tank, m^3/s, new every `hold` s. plugged: by how much the
-    coefficient of P13 is lower from `onset` on.
+    coefficient of P13 is lower from `onset` on. inflow: m^3/s, into T1 between two instants.
     """
     plant, generator = nominal_plant(), torch.Generator().manual_seed(seed)
     tanks = [t.name for t in plant.tanks]
@@ -49,6 +57,7 @@ def recorded(flow: float, hold: int, seed: int, plugged: float = 0.0, onset: flo
         rows.append(list(level))
         for _ in range(SUBSTEPS):
             into = disturbing[second].tolist()
+            into[0] += inflow if between[0] <= second < between[1] else 0.0
             for pump, command in zip(plant.pumps, inputs[second].tolist(), strict=True):
                 into[tanks.index(pump.target)] += command
             for pipe in plant.pipes:
@@ -120,17 +129,25 @@ def test_an_onset_is_found_although_slow_random_flows_explain_a_flow_that_change
     assert abs(best.fit.values["P13.plugging.onset"] - 385.0) < 5.0
 
 
-@pytest.mark.parametrize(
-    ("name", "place", "start"),
-    [
-        ("plugging", "P13", {"size": 0.1, "onset": 350.0}),
-        ("unmetered_flow", "T1", {"flow": 1e-5, "begin": 350.0, "duration": 200.0}),
-    ],
-)
-def test_onsets_are_as_dense_as_the_random_flows_require(name: str, place: str, start: dict[str, float]) -> None:
+@pytest.mark.parametrize("between", [(95, 330), (180, 560), (20, 60)])
+@pytest.mark.parametrize(("flow", "hold"), [(0.0, 1), (3e-6, 100)])
+def test_both_ends_of_an_interval_are_found_wherever_they_are(between: tuple[int, int], flow: float, hold: int) -> None:
+    recording = recorded(flow, hold, seed=6, inflow=-3e-5, between=between)
+    problem = problem_of(nominal_plant(), [recording], [], Settings(("unmetered_flow", "leak")))
+    fitter, null, _ = recalibrate(problem.data)
+    pool = ExplanationPool(fitter, null, len(problem.library))
+    reach = operating_range_of_all(problem.recordings, problem.data.plant)
+    best = search(pool, options_of(problem.library, fitter, reach), most=1).best
+    assert ("unmetered_flow", "T1") in best.key
+    begin, lasting = best.fit.values["T1.unmetered_flow.begin"], best.fit.values["T1.unmetered_flow.duration"]
+    assert begin == pytest.approx(between[0], abs=3.0) and begin + lasting == pytest.approx(between[1], abs=3.0)
+    assert best.fit.values["T1.unmetered_flow.flow"] == pytest.approx(-3e-5, rel=0.3)
+
+
+def test_onsets_are_as_dense_as_the_random_flows_require() -> None:
     fitter, null, _ = recalibrate(problem_of(nominal_plant(), [recorded(0.0, 1, seed=3)], [], Settings(LIBRARY)).data)
-    placement = Placement(effect(name), place)
-    option = Option(placement, {placement.full_name(field): value for field, value in start.items()})
+    placement = Placement(effect("plugging"), "P13")
+    option = Option(placement, {"P13.plugging.size": 0.1, "P13.plugging.onset": 350.0})
     assert fine_onsets([option], fitter) == []
     counts = []
     for flow, time in ((1e-6, 100.0), (8e-6, 100.0), (8e-6, 0.0)):

@@ -90,9 +90,7 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     return build_answer(diagnosis, problem.holdouts)
 
 
-def verdict_of(
-    credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]
-) -> Verdict:
+def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]) -> Verdict:
     """The verdict of a credible set of hypotheses.
 
     sure: whether the likeliest alone has 95 %. from_readings: causes that the readings show without a model.

@@ -22,8 +22,8 @@ class DiagnosisResult:
     """undisturbed: fitter with sensor noise alone. library: the effects searched. reach: ranges of the signals.
     credible_set: the fewest hypotheses that have 95 % together. free_form_fit: fit of the free discrepancy, if the
     likeliest hypothesis has an unknown. from_readings: causes that the readings show without a model (quantization,
-    limits, stuck sensors, outliers). quantization_steps (C,): 0 where there is none. limits: limits of sensors with their values.
-    outliers: masked readings of the recordings, and of the hold-outs."""
+    limits, stuck sensors, outliers). quantization_steps (C,): 0 where there is none. limits: limits of sensors with
+    their values. outliers: masked readings of the recordings, and of the hold-outs."""
 
     undisturbed: Fitter
     library: tuple[Placement, ...]

@@ -1,4 +1,4 @@
-"""Onset times from which fits under random flows start.
+"""Onset times and intervals from which fits start.
 
 Under sensor noise alone the cost has a wide minimum about an onset, and a coarse grid of starts suffices. Random flows
 with a long correlation time make it narrow: they explain a flow that changed some time ago. A random flow of standard
@@ -8,6 +8,9 @@ has the standard error s sqrt(dt / t). Both are equal after
     t = (s A sqrt(dt) / q)^(2/3)
 
 The readings show a random flow after this time t, so the minimum about an onset is a few t wide.
+
+An effect between two instants is to first order the difference of two effects that begin at these instants and do not
+end. The gain of every interval on a grid therefore follows from the products of the grid's steps.
 """
 
 from __future__ import annotations
@@ -17,31 +20,77 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.screening import Option
+from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.screening import Option, products
 
 SPACING = 4.0  # times t; no onset is further than 2 t from a start, where most of its gain is left
-INSTANTS = ("onset", "begin")  # names of parameters that are onset times
 MOST = 127  # onset times, a limit on computing time
+FEWEST = 60  # instants of intervals, which have no other starts in between
+INTERVALS = 4  # the likeliest intervals of an effect, from each of which a fit starts
 
 
 def fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
     """Further onset times of these options, as dense as the random flows in the fitter's noise require."""
-    duration = max(float(part.experiment.nodes[-1]) for part in fitter.data.parts)
-    count = min(math.ceil(duration / (SPACING * detection_time(fitter))), MOST)
+    duration, count = _duration(fitter), _count(fitter)
     further: list[Option] = []
-    coarse: dict[tuple[str, tuple[str, str], tuple[tuple[str, float], ...]], list[Option]] = {}
+    coarse: dict[tuple[tuple[str, str], tuple[tuple[str, float], ...]], list[Option]] = {}
     for option in options:
-        for onset in (f"{option.placement.prefix}.{name}" for name in INSTANTS):
-            if onset in option.start:
-                others = tuple((n, v) for n, v in option.start.items() if n != onset)
-                coarse.setdefault((onset, option.cause, others), []).append(option)
-    for (onset, *_), group in coarse.items():
+        onset = option.placement.full_name("onset")
+        if onset in option.start:
+            others = tuple((n, v) for n, v in option.start.items() if n != onset)
+            coarse.setdefault((option.cause, others), []).append(option)
+    for group in coarse.values():
         if count > len(group):
             times = [duration * (k + 1) / (count + 1) for k in range(count)]
+            onset = group[0].placement.full_name("onset")
             further += [replace(group[0], start={**group[0].start, onset: time}) for time in times]
     return further
+
+
+def likeliest_intervals(options: Sequence[Option], fitter: Fitter, fit: Fit) -> list[Option]:
+    """The intervals in which these options explain most in addition to a fit, for effects that begin and end."""
+    count = max(_count(fitter), FEWEST)
+    times = torch.arange(count, dtype=torch.float64) * _duration(fitter) / count
+    further: list[Option] = []
+    for option in {o.cause: o for o in options}.values():
+        begin, lasting = (option.placement.full_name(name) for name in ("begin", "duration"))
+        if begin in option.start and lasting in option.start:
+            ends = float(times[-1]) + float(times[1])
+            steps = [
+                replace(option, start={**option.start, begin: time, lasting: ends - time}) for time in times.tolist()
+            ]
+            size = next(iter(option.start))
+            for first, beyond, sign in _best_pairs(*products(fitter, fit, steps)):
+                end = float(times[beyond]) if beyond < count else ends
+                start = {begin: float(times[first]), lasting: end - float(times[first])}
+                further.append(replace(option, start={**option.start, **start, size: sign * option.start[size]}))
+    return further
+
+
+def _best_pairs(score: Tensor, gram: Tensor) -> list[tuple[int, int, float]]:
+    """First step, step at which it ends (M: never), and sign of the size, of the pairs with the largest local maxima of
+    the gain. score (M,) and gram (M, M) of steps that do not end.
+    """
+    score, gram = torch.nn.functional.pad(score, (0, 1)), torch.nn.functional.pad(gram, (0, 1, 0, 1))
+    strength = torch.diagonal(gram).unsqueeze(0) + torch.diagonal(gram).unsqueeze(1) - 2.0 * gram
+    difference = score.unsqueeze(1) - score.unsqueeze(0)
+    visible = torch.triu(torch.ones_like(gram), diagonal=1).bool() & (strength > 1e-6)
+    gain = torch.where(visible, difference.square() / strength.clamp(min=1e-6), 0.0)
+    highest = torch.nn.functional.max_pool2d(gain[None, None], 3, 1, 1)[0, 0]
+    order = torch.where(gain == highest, gain, 0.0).flatten().argsort(descending=True)[:INTERVALS].tolist()
+    pairs = [divmod(flat, len(gain)) for flat in order]
+    return [(i, j, math.copysign(1.0, float(difference[i, j]))) for i, j in pairs if float(gain[i, j]) > 0.0]
+
+
+def _duration(fitter: Fitter) -> float:
+    return max(float(part.experiment.nodes[-1]) for part in fitter.data.parts)
+
+
+def _count(fitter: Fitter) -> int:
+    """Number of instants that random flows require."""
+    return min(math.ceil(_duration(fitter) / (SPACING * detection_time(fitter))), MOST)
 
 
 def detection_time(fitter: Fitter) -> float:

@@ -95,8 +95,8 @@ def _periods(result: DiagnosisResult) -> list[str]:
     shape: Any = discrepancy_tables(result.free_form_fit)["tables"] if result.free_form_fit else {}
     waves = [(t["at"][0], t["share"][0]) for name, t in shape.items() if name.endswith(".period")]
     return [
-        f"the unknown discrepancy at {result.posterior.best.unknown_at} oscillates with a period of {period:.3g} s; its "
-        "phase differs between recordings, so that it explains nothing of a hold-out"
+        f"the unknown discrepancy at {result.posterior.best.unknown_at} oscillates with a period of {period:.3g} s; "
+        "its phase differs between recordings, so that it explains nothing of a hold-out"
         for period, share in waves
         if share > SWINGS
     ]

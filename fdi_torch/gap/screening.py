@@ -124,6 +124,11 @@ def screen_under_each(fitters: Sequence[Fitter], fit: Fit, options: Sequence[Opt
     return [ScreeningResult(tuple(options), score, strength) for score, strength in sums]
 
 
+def products(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> tuple[Tensor, Tensor]:
+    """Score (M,) and gram (M, M) of options in addition to a fit, as in `ScreeningResult` and `Pairs`."""
+    return _ProjectedRegression.of(fitter, fit).products(options)
+
+
 def pairs_of(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> Pairs:
     """The regression on pairs of the most promising options of a screening under the same noise."""
     return _ProjectedRegression.of(fitter, fit).pairs(screening)
@@ -176,12 +181,15 @@ class _ProjectedRegression:
             for i in torch.argsort(value, descending=True).tolist():
                 best.setdefault(screening.options[i].cause, i)
             chosen |= set(best.values())
-        indices = sorted(chosen)
-        options = tuple(screening.options[i] for i in indices)
+        options = tuple(screening.options[i] for i in sorted(chosen))
+        return Pairs(options, *self.products(options))
+
+    def products(self, options: Sequence[Option]) -> tuple[Tensor, Tensor]:
+        """Score (M,) and gram (M, M) of options."""
         columns = self.fitter.whiten(effect_columns(self.fitter, self.fit, options)).permute(1, 0, 2)
         shared = (columns.mT @ self.basis.permute(1, 0, 2)).sum(dim=0)
-        gram = (columns.mT @ columns).sum(dim=0) - shared @ shared.T
-        return Pairs(options, screening.score[indices], gram)
+        score = (columns.mT @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
+        return score, (columns.mT @ columns).sum(dim=0) - shared @ shared.T
 
 
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:

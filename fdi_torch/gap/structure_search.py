@@ -25,7 +25,7 @@ from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate_fit import BEHIND, SHARE, Candidate, Fit, Fitter, Key
 from fdi_torch.gap.extensions import ExpectedGain, best_pairs, extended, log_prior_width
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
-from fdi_torch.gap.onsets import fine_onsets
+from fdi_torch.gap.onsets import fine_onsets, likeliest_intervals
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
 
 # DEEPEST, BEAM, FITTED, STARTS, EVALUATED, TURNS and PAIRS are budgets of computing. An extension that FITTED,
@@ -341,8 +341,9 @@ class ExplanationPool:
 
 
 def _with_fine_onsets(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> ScreeningResult:
-    """A screening with further onset times of the most promising effects."""
-    further = fine_onsets(screening.promising(FITTED), fitter)
+    """A screening with further onset times and intervals of the most promising effects."""
+    promising = screening.promising(FITTED)
+    further = fine_onsets(promising, fitter) + likeliest_intervals(promising, fitter, fit)
     return screening + screen(fitter, fit, further) if further else screening
 
 

@@ -89,7 +89,8 @@ def test_a_gap_page_says_where_which_how_far_and_what_next(tmp_path: Path) -> No
         ),
         (
             {"verdict": "unknown", "causes": [], "posterior": [{"causes": [], "probability": 0.9, "unknown_at": "Q1"}]},
-            "The gap comes from something unknown at Q1, probability 90.0 %; no effect of the library describes the unknown part",
+            "The gap comes from something unknown at Q1, probability 90.0 %; no effect of the library describes the "
+            "unknown part",
         ),
         (
             {"verdict": "unknown", "causes": [], "posterior": [{"causes": [], "probability": 1.0}]},
