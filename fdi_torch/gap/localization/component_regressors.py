@@ -34,7 +34,7 @@ from fdi_torch.plant.scales import time_scale
 
 Signals = dict[str, Tensor]
 RELAYS = 6  # thresholds of relays
-FINER = 8  # factor by which kinks may be placed more closely than in the first grid
+FINER = 8  # factor by which kinks and jumps may be placed more closely than in the first grid
 SLOW = (100.0, 300.0)  # time constants (s) of a side chamber of a tank
 
 
@@ -60,6 +60,9 @@ class SignalRanges:
     def steps_in_value(self, s: Signals, name: str, count: int) -> list[Tensor]:
         return steps_in_value(s[name], self(name), 3 * count)
 
+    def fine_steps_in_value(self, s: Signals, name: str, count: int) -> list[Tensor]:
+        return self.steps_in_value(s, name, FINER * count)
+
     def relays(self, s: Signals, name: str) -> list[tuple[float, Tensor]]:
         return relays(s[name], self(name), RELAYS)
 
@@ -73,7 +76,7 @@ class DiscrepancyModel:
     """Regressors of one component's discrepancy.
 
     signals: the local signals along a recording. flows: regressors in m^3/s, or to be scaled to it, of a flow from
-    `source` to `target`. fine: the kinks among them on a finer grid. in_time: name of the signal that functions of time
+    `source` to `target`. fine: the kinks and jumps among them on a finer grid. in_time: name of the signal that functions of time
     multiply. areas: regressors of a relative change of the target's area, as level rates in m/s.
     """
 
@@ -154,7 +157,8 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
 
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         of_opening = [s["root"] * b for b in ends.fine_hinges(s, "opening", 9)] if has_valve else []
-        return [*ends.fine_hinges(s, "root", 16), *of_opening]
+        jumps = [s["flow"] * j for j in ends.fine_steps_in_value(s, "root", 24)]
+        return [*ends.fine_hinges(s, "root", 16), *jumps, *of_opening]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 
@@ -199,7 +203,7 @@ def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
         return [s["rate"] * b for b in ends.hinges(s, "level", 12)]
 
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        return ends.fine_hinges(s, "level", 12)
+        return [*ends.fine_hinges(s, "level", 12), *ends.fine_steps_in_value(s, "level", 24)]
 
     return DiscrepancyModel(signals, flows, fine, "one", OUTSIDE, place, areas)
 

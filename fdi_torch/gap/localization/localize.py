@@ -135,12 +135,15 @@ def localize(
         return evaluate(again, again.of(place), place, beside.noise)
 
     localized: list[LocalizedDiscrepancy] = []
+    likeliest: _EvaluatedDiscrepancy | None = None
     excess = -math.inf  # largest difference seen so far between a gain and its first-order estimate
     for place in sorted(places, key=lambda p: -first_order[p]):
         if len(localized) >= CALIBRATION_PLACES and first_order[place] + excess < needed:
             break
         start = regression.of(place)
         first = [evaluate(regression, start, place, each) for each in starts]
+        if likeliest:  # the noise that it left; a larger one hides what this place explains as well
+            first.append(with_finer_positions(evaluate(regression, start, place, likeliest.noise)))
         best = max([*first, *([with_likely_noise(about(beside, place, frequency), True)] if beside else [])], key=_gain)
         for turn in range(MOST_TURNS):
             before, best = best, max(best, with_likely_noise(best, turn == 0), key=_gain)
@@ -155,6 +158,7 @@ def localize(
                 break
         itself = max(itself, *(e.without for e in (*first, best) if e.regression is regression))
         excess = max(excess, best.gain - first_order[place])
+        likeliest = max(likeliest or best, best, key=_gain)
         if not is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
             needed = max(needed, best.gain + math.log(RARE))
             localized.append(
