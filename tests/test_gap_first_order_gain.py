@@ -32,11 +32,11 @@ def surveyed(request: pytest.FixtureRequest) -> tuple[DiscrepancyRegression, Fit
 
 def products(
     surveyed: tuple[DiscrepancyRegression, Fitter, Fit], place: str, monkeypatch: pytest.MonkeyPatch
-) -> Tensor:
-    """Of the forms with the residual and random signs."""
+) -> tuple[Tensor, Tensor]:
+    """Scores and strengths."""
     survey, under, null = surveyed
-    found: list[Tensor] = []
-    monkeypatch.setattr(promise, "gains_of", lambda p: found.append(p) or p[:, 0])
+    found: list[tuple[Tensor, Tensor]] = []
+    monkeypatch.setattr(promise, "gains_of", lambda *p: found.append(p) or p[0])
     promise.single_regressor_gains(survey, under, null, [place], torch.Generator().manual_seed(5))
     return found[0]
 
@@ -54,13 +54,13 @@ def test_products_are_those_of_the_columns(
     columns = under.whiten(own.columns).flatten(0, 1)
     columns = torch.cat([columns, columns.new_zeros(len(pull), columns.shape[1])])
     columns -= basis @ (basis.T @ columns)
-    found = products(surveyed, place, monkeypatch)
+    scores, strengths = products(surveyed, place, monkeypatch)
     size = torch.linalg.vector_norm(columns, dim=0)
     score = (columns.T @ (residual - basis @ (basis.T @ residual))) / size
     live = size > 1e-3 * size.max()
-    torch.testing.assert_close((found[:, 0] / size)[live], score[live], rtol=1e-6, atol=1e-6 * float(score.abs().max()))
+    torch.testing.assert_close((scores / size)[live], score[live], rtol=1e-6, atol=1e-6 * float(score.abs().max()))
     # The root of a mean of squares of N signs has a standard deviation of 1 / sqrt(2 N) of itself.
-    share = found[:, 1:].square().mean(dim=1).sqrt()[live] / size[live]
+    share = strengths.sqrt()[live] / size[live]
     assert float((share - 1.0).abs().max()) < 6.0 / (2.0 * promise.SIGNS) ** 0.5
     assert float(share.mean()) == pytest.approx(1.0, abs=0.15)
 

@@ -76,8 +76,8 @@ class DiscrepancyModel:
     """Regressors of one component's discrepancy.
 
     signals: the local signals along a recording. flows: regressors in m^3/s, or to be scaled to it, of a flow from
-    `source` to `target`. fine: the kinks and jumps among them on a finer grid. in_time: name of the signal that functions of time
-    multiply. areas: regressors of a relative change of the target's area, as level rates in m/s.
+    `source` to `target`. fine: the kinks and jumps among them on a finer grid. in_time: name of the signal that
+    functions of time multiply. areas: regressors of a relative change of the target's area, as level rates in m/s.
     """
 
     signals: Callable[[Forcing], Signals]

@@ -1,9 +1,10 @@
-"""Positions of regressors where they explain most: of a kink, of a step in time, and the frequency of sinusoids.
+"""Positions of regressors where they explain most: of a kink, a jump, a step in time; and the frequency of sinusoids.
 
 The grids of `regressors.py` are coarse. Where a discrepancy is many times the noise, a law with a kink between two
 nodes, or a change between two steps in time, would need many regressors of the grid. As in orthogonal matching pursuit
 (Pati, Rezaiifar and Krishnaprasad, 1993), the next regressor is the one with the largest gain in addition to all that
-were selected before: among kinks on a fine grid and steps in time at every step. One adjoint pass compares all of them.
+were selected before: among kinks and jumps on a fine grid and steps in time at every step. One adjoint pass compares
+all of them.
 
 The spectrum of a residual shows a frequency to about 1/T in a recording of length T. The phase is then wrong by up to
 half a turn at its ends, which may cost hundreds of nats.
@@ -23,6 +24,7 @@ from fdi_torch.gap.localization.single_regressor_gain import (
     largest_influence,
     parameter_basis,
     random_signs,
+    strengths_of,
     whitened_residual,
 )
 from fdi_torch.gap.localization.sparse_regression import column_costs
@@ -32,44 +34,59 @@ FREQUENCIES = 17  # of one round, over twice the spacing of the round before
 FREQUENCY_ROUNDS = 3  # the last spacing is then 1/600 of 1/T
 
 
-def with_best_position(
-    regression: DiscrepancyRegression,
-    place: str,
-    under: Fitter,
-    fit: Fit,
-    discrepancy: Discrepancy,
-    used: Tensor,
-    generator: torch.Generator,
-) -> Discrepancy | None:
-    """The discrepancy with one more regressor, or None if none is worth its selection.
+class Positions:
+    """All positions of a kink, a jump or a step in time at a place, under one noise.
 
-    under: fitter with the disturbance noise. used (M,): whether a regressor of the discrepancy was selected.
+    under: fitter with the disturbance noise. used (M,): the regressors of the discrepancy that are selected already.
+    The strength of each position is that beside these; regressors that are added later only reduce it.
     """
-    basis = parameter_basis(under, fit, discrepancy.columns[..., used])
-    residual = whitened_residual(under, fit, discrepancy.linearised)
-    adjoints = adjoints_of(regression, under, torch.cat([residual, random_signs(residual, generator)], dim=1), basis)
-    channel, regressors = regression.sensor(place), regression.at(place)[0]
-    if channel is None:
-        weights = inflow_weights(regression, place, adjoints)
-    else:
-        weights = [adjoints.readings[piece.rows, channel].T for piece in regression.pieces]
-    pairs = list(zip(regressors, weights, strict=True))
-    products = [torch.stack([r.fine @ w.T for r, w in pairs]).sum(dim=0), *(_of_steps(r, w) for r, w in pairs)]
-    gains = [gains_of(p) for p in products]
-    choices = sum(len(g) for g in gains)
-    family = max(range(len(gains)), key=lambda k: float(gains[k].max()))
-    position = int(gains[family].argmax())
-    (cost,) = column_costs(torch.tensor([float(choices)]), largest_influence(under)).tolist()
-    if float(gains[family][position]) < cost:
-        return None
-    columns = []
-    for k, r in enumerate(regressors):
-        step = torch.zeros_like(r.factor)
-        if family == k + 1:
-            step[position:] = r.factor[position:]
-        function = step if family else r.fine[position]
-        columns.append(regression.influence(place, k, function.unsqueeze(0))[..., 0])
-    return discrepancy.with_column(with_blanks(columns, dim=0), choices)
+
+    def __init__(
+        self,
+        regression: DiscrepancyRegression,
+        place: str,
+        under: Fitter,
+        discrepancy: Discrepancy,
+        used: Tensor,
+        generator: torch.Generator,
+    ) -> None:
+        self.regression, self.place, self.under, self.fit = regression, place, under, regression.fit
+        self._residual = whitened_residual(under, self.fit, discrepancy.linearised)
+        signs = random_signs(self._residual, generator)
+        self._strengths = [strengths_of(p) for p in self._products(signs, discrepancy.columns[..., used])]
+        choices = sum(map(len, self._strengths))
+        (self._cost,) = column_costs(torch.tensor([float(choices)]), largest_influence(under)).tolist()
+        self._choices = choices
+
+    def best(self, discrepancy: Discrepancy, used: Tensor) -> Discrepancy | None:
+        """The discrepancy with the regressor that explains most in addition to those used, or None if none is worth
+        its selection."""
+        products = self._products(self._residual, discrepancy.columns[..., used])
+        gains = [gains_of(p[:, 0], strength) for p, strength in zip(products, self._strengths, strict=True)]
+        family = max(range(len(gains)), key=lambda k: float(gains[k].max()))
+        position = int(gains[family].argmax())
+        if float(gains[family][position]) < self._cost:
+            return None
+        columns = []
+        for k, r in enumerate(self.regression.at(self.place)[0]):
+            step = torch.zeros_like(r.factor)
+            if family == k + 1:
+                step[position:] = r.factor[position:]
+            function = step if family else r.fine[position]
+            columns.append(self.regression.influence(self.place, k, function.unsqueeze(0))[..., 0])
+        return discrepancy.with_column(with_blanks(columns, dim=0), self._choices)
+
+    def _products(self, white: Tensor, used: Tensor) -> list[Tensor]:
+        """Products of all regressors with whitened columns (S C + P, W), what the parameters and the used columns
+        explain projected out: kinks and jumps (F, W), and the steps in time of each recording (K, W)."""
+        basis = parameter_basis(self.under, self.fit, used)
+        adjoints = adjoints_of(self.regression, self.under, white, basis)
+        if (channel := self.regression.sensor(self.place)) is None:
+            weights = inflow_weights(self.regression, self.place, adjoints)
+        else:
+            weights = [adjoints.readings[piece.rows, channel].T for piece in self.regression.pieces]
+        pairs = list(zip(self.regression.at(self.place)[0], weights, strict=True))
+        return [torch.stack([r.fine @ w.T for r, w in pairs]).sum(dim=0), *(_of_steps(r, w) for r, w in pairs)]
 
 
 def with_best_frequency(
@@ -82,7 +99,7 @@ def with_best_frequency(
 ) -> Discrepancy | None:
     """The discrepancy with the frequency at which its sinusoids explain most beside the other regressors that it uses.
 
-    under, used: as for `with_best_position`. None if there are no sinusoids.
+    under, used: as for `Positions`. None if there are no sinusoids.
     """
     sinusoids = discrepancy.sinusoids
     if discrepancy.frequency is None:

@@ -19,7 +19,7 @@ from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate_fit import SHARE, Candidate, Fit, Fitter
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
-from fdi_torch.gap.localization.fine_positions import with_best_frequency, with_best_position
+from fdi_torch.gap.localization.fine_positions import Positions, with_best_frequency
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
     is_rounding_error,
@@ -90,10 +90,16 @@ def localize(
     ) -> _EvaluatedDiscrepancy:
         fit = regression.fit
         under = with_disturbances(fitter, fit, noise, discrepancy.linearised)
-        costs = column_costs(discrepancy.choices, largest)
-        regressed = WhitenedDiscrepancy(under, fit, discrepancy).sparse_fit(costs)
+        whitened = WhitenedDiscrepancy(under, fit, discrepancy)
+        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, largest))
         without = log_likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - base
-        return _EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, regressed, without)
+        return _EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, whitened, regressed, without)
+
+    def changed(known: _EvaluatedDiscrepancy, discrepancy: Discrepancy, columns: Tensor) -> _EvaluatedDiscrepancy:
+        """The same with a discrepancy that differs in some columns, (M,) bool."""
+        whitened = known.whitened.with_columns(discrepancy.columns, columns)
+        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, largest))
+        return replace(known, discrepancy=discrepancy, whitened=whitened, regressed=regressed)
 
     def with_likely_noise(known: _EvaluatedDiscrepancy, climb: bool) -> _EvaluatedDiscrepancy:
         at, used = known.discrepancy, known.regressed.used
@@ -104,20 +110,20 @@ def localize(
     def with_finer_positions(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
         """With further regressors under the same noise, until none is worth its selection. The noise falls only after
         most of them were found: that one alone gains little says nothing about all of them."""
-        while True:
-            used, regression = known.regressed.used, known.regression
-            finer = with_best_position(
-                regression, known.location, known.under, regression.fit, known.discrepancy, used, generator
-            )
-            further = evaluate(regression, finer, known.location, known.noise) if finer else known
+        at, used = known.discrepancy, known.regressed.used
+        positions = Positions(known.regression, known.location, known.under, at, used, generator)
+        while finer := positions.best(known.discrepancy, known.regressed.used):
+            last = torch.arange(len(finer.choices)) == len(finer.choices) - 1
+            further = changed(known, finer, last)
             if further.gain - known.gain < CONVERGED:
-                return known
+                break
             known = further
+        return known
 
     def with_finer_frequency(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
         used, regression, at = known.regressed.used, known.regression, known.discrepancy
         finer = with_best_frequency(regression, known.location, known.under, regression.fit, at, used)
-        return evaluate(regression, finer, known.location, known.noise) if finer else known
+        return changed(known, finer, finer.sinusoids) if finer else known
 
     def refitted(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
         """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
@@ -236,6 +242,7 @@ class _EvaluatedDiscrepancy:
     under: Fitter
     regression: DiscrepancyRegression
     discrepancy: Discrepancy
+    whitened: WhitenedDiscrepancy
     regressed: SparseFit
     without: float
 

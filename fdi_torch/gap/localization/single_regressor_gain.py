@@ -52,7 +52,7 @@ def single_regressor_gains(
         else:
             products = _sensor_products(regression.of(place), under, fit, basis, adjoints, channel)
         (cost,) = column_costs(torch.tensor([float(len(products))]), largest_influence(under)).tolist()
-        gains[place] = float(gains_of(products).max()) - cost
+        gains[place] = float(gains_of(products[:, 0], strengths_of(products[:, 1:])).max()) - cost
     return gains
 
 
@@ -70,14 +70,19 @@ def random_signs(residual: Tensor, generator: torch.Generator) -> Tensor:
     return torch.randint(0, 2, (len(residual), SIGNS), generator=generator, dtype=torch.float64) * 2.0 - 1.0
 
 
-def gains_of(products: Tensor) -> Tensor:
+def gains_of(score: Tensor, strength: Tensor) -> Tensor:
     """Gain in log evidence of each regressor (M,), without its cost (`column_costs`).
 
-    products (M, 1 + SIGNS): of the columns with the residual and with the random signs.
+    score (M,): product of its column with the residual. strength (M,): squared norm of its column.
     """
-    gain = 0.5 * products[:, 0].square() / products[:, 1:].square().mean(dim=1).clamp(min=1e-12)
+    gain = 0.5 * score.square() / strength.clamp(min=1e-12)
     # A regressor that reduces chi-square by G costs (1 + log G) / 2 nats at its most likely precision.
     return gain - 0.5 * (1.0 + torch.log((2.0 * gain).clamp(min=1.0)))
+
+
+def strengths_of(products: Tensor) -> Tensor:
+    """Squared norm of each column (M,), from its products with random signs (M, SIGNS)."""
+    return products.square().mean(dim=1)
 
 
 def whitened_residual(under: Fitter, fit: Fit, linearised: Linearised) -> Tensor:

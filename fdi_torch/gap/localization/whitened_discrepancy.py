@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -31,8 +32,16 @@ class WhitenedDiscrepancy:
     def __init__(self, under: Fitter, fit: Fit, discrepancy: Discrepancy) -> None:
         residual, jacobian = under.white(discrepancy.linearised)
         scale, self._pull, self._off = under.priors(fit.space, fit.theta)
-        self._columns, self._residual = under.whiten(discrepancy.columns), residual[0]
+        self._under, self._columns, self._residual = under, under.whiten(discrepancy.columns), residual[0]
         self._jacobian = jacobian[0] * scale
+
+    def with_columns(self, columns: Tensor, changed: Tensor) -> WhitenedDiscrepancy:
+        """The same with other columns (S, C, M), of which only the `changed` ones, (M,) bool, are whitened."""
+        other = copy(self)
+        other._columns = columns.new_empty(columns.shape)
+        other._columns[..., ~changed] = self._columns[..., ~changed[: self._columns.shape[-1]]]
+        other._columns[..., changed] = self._under.whiten(columns[..., changed])
+        return other
 
     def normal_equations(self, used: Tensor | None = None) -> NormalEquations:
         """Of some columns, used (M,) bool, with all samples; or of all, with samples summed in groups.
