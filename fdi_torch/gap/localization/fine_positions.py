@@ -30,6 +30,7 @@ from fdi_torch.gap.localization.single_regressor_gain import (
 from fdi_torch.gap.localization.sparse_regression import column_costs
 from fdi_torch.simulate.joint_collocation import with_blanks
 
+TRIED = 8  # positions with the largest estimated gains, whose gains are computed exactly
 FREQUENCIES = 17  # of one round, over twice the spacing of the round before
 FREQUENCY_ROUNDS = 3  # the last spacing is then 1/600 of 1/T
 
@@ -53,7 +54,8 @@ class Positions:
         self.regression, self.place, self.under, self.fit = regression, place, under, regression.fit
         self._residual = whitened_residual(under, self.fit, discrepancy.linearised)
         signs = random_signs(self._residual, generator)
-        self._strengths = [strengths_of(p) for p in self._products(signs, discrepancy.columns[..., used])]
+        basis = parameter_basis(under, self.fit, discrepancy.columns[..., used])
+        self._strengths = [strengths_of(p) for p in self._products(signs, basis)]
         choices = sum(map(len, self._strengths))
         (self._cost,) = column_costs(torch.tensor([float(choices)]), largest_influence(under)).tolist()
         self._choices = choices
@@ -61,12 +63,22 @@ class Positions:
     def best(self, discrepancy: Discrepancy, used: Tensor) -> Discrepancy | None:
         """The discrepancy with the regressor that explains most in addition to those used, or None if none is worth
         its selection."""
-        products = self._products(self._residual, discrepancy.columns[..., used])
+        basis = parameter_basis(self.under, self.fit, discrepancy.columns[..., used])
+        products = self._products(self._residual, basis)
         gains = [gains_of(p[:, 0], strength) for p, strength in zip(products, self._strengths, strict=True)]
-        family = max(range(len(gains)), key=lambda k: float(gains[k].max()))
-        position = int(gains[family].argmax())
-        if float(gains[family][position]) < self._cost:
+        highest = [(float(g[i]), family, i) for family, g in enumerate(gains) for i in _local_maxima(g)]
+        tried = sorted(highest, reverse=True)[:TRIED]
+        if not tried or tried[0][0] < self._cost:
             return None
+        columns = torch.stack([self._column(family, position) for _, family, position in tried], dim=-1)
+        white = self.under.whiten(columns).flatten(0, 1)
+        white = torch.cat([white, white.new_zeros(len(basis) - len(white), white.shape[1])])
+        white -= basis @ (basis.T @ white)
+        exact = gains_of((white.T @ self._residual).squeeze(1), white.square().sum(dim=0))
+        return discrepancy.with_column(columns[..., int(exact.argmax())], self._choices)
+
+    def _column(self, family: int, position: int) -> Tensor:
+        """Influence (S, C) of one regressor."""
         columns = []
         for k, r in enumerate(self.regression.at(self.place)[0]):
             step = torch.zeros_like(r.factor)
@@ -74,12 +86,11 @@ class Positions:
                 step[position:] = r.factor[position:]
             function = step if family else r.fine[position]
             columns.append(self.regression.influence(self.place, k, function.unsqueeze(0))[..., 0])
-        return discrepancy.with_column(with_blanks(columns, dim=0), self._choices)
+        return with_blanks(columns, dim=0)
 
-    def _products(self, white: Tensor, used: Tensor) -> list[Tensor]:
-        """Products of all regressors with whitened columns (S C + P, W), what the parameters and the used columns
-        explain projected out: kinks and jumps (F, W), and the steps in time of each recording (K, W)."""
-        basis = parameter_basis(self.under, self.fit, used)
+    def _products(self, white: Tensor, basis: Tensor) -> list[Tensor]:
+        """Products of all regressors with whitened columns (S C + P, W), what the basis explains projected out: kinks
+        and jumps (F, W), and the steps in time of each recording (K, W)."""
         adjoints = adjoints_of(self.regression, self.under, white, basis)
         if (channel := self.regression.sensor(self.place)) is None:
             weights = inflow_weights(self.regression, self.place, adjoints)
@@ -126,3 +137,10 @@ def with_best_frequency(
 def _of_steps(regressors: Regressors, weights: Tensor) -> Tensor:
     """Products (K, .) of the steps in time at every step with weights (., K)."""
     return (regressors.factor * weights).flip(-1).cumsum(dim=-1).flip(-1).T
+
+
+def _local_maxima(gains: Tensor) -> list[int]:
+    """Positions (M,) at which a gain is as large as at both neighbours, the largest first; at most TRIED."""
+    around = torch.nn.functional.max_pool1d(gains.reshape(1, 1, -1), 3, 1, 1).flatten()
+    order = torch.where(gains == around, gains, -torch.inf).argsort(descending=True)[:TRIED]
+    return order.tolist()

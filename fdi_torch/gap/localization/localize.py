@@ -140,17 +140,8 @@ def localize(
         again = DiscrepancyRegression(along, beside.fit, frequency, STEPS)
         return evaluate(again, again.of(place), place, beside.noise)
 
-    localized: list[LocalizedDiscrepancy] = []
-    likeliest: _EvaluatedDiscrepancy | None = None
-    excess = -math.inf  # largest difference seen so far between a gain and its first-order estimate
-    for place in sorted(places, key=lambda p: -first_order[p]):
-        if len(localized) >= CALIBRATION_PLACES and first_order[place] + excess < needed:
-            break
-        start = regression.of(place)
-        first = [evaluate(regression, start, place, each) for each in starts]
-        if likeliest:  # the noise that it left; a larger one hides what this place explains as well
-            first.append(with_finer_positions(evaluate(regression, start, place, likeliest.noise)))
-        best = max([*first, *([with_likely_noise(about(beside, place, frequency), True)] if beside else [])], key=_gain)
+    def climbed(best: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
+        """Noise, regressors and parameters of the fit in turn, until nothing gains or `needed` is out of reach."""
         for turn in range(MOST_TURNS):
             before, best = best, max(best, with_likely_noise(best, turn == 0), key=_gain)
             best = with_finer_positions(best)
@@ -158,27 +149,44 @@ def localize(
             if best.gain < SHARE * (needed - best.gain):
                 break
             # An effect at the place keeps its parameters: the discrepancy is then the error of its law.
-            if all(p.location != place for p in fit.candidate.placements):
+            if all(p.location != best.location for p in fit.candidate.placements):
                 best = max(best, refitted(best), key=_gain)
             if best.gain - before.gain < max(CONVERGED, SHARE * (needed - best.gain)):
                 break
-        itself = max(itself, *(e.without for e in (*first, best) if e.regression is regression))
-        excess = max(excess, best.gain - first_order[place])
-        likeliest = max(likeliest or best, best, key=_gain)
-        if not is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
-            needed = max(needed, best.gain + math.log(RARE))
-            localized.append(
-                LocalizedDiscrepancy(
-                    place,
-                    best.gain,
-                    best.fitness,
-                    best.explained,
-                    _effect_size(fitter, best),
-                    best.discrepancy.periods,
-                    best.regression.fit,
-                    best.noise,
-                )
-            )
+        return best
+
+    evaluated: dict[str, _EvaluatedDiscrepancy] = {}
+    excess = -math.inf  # largest difference seen so far between a gain and its first-order estimate
+    for place in sorted(places, key=lambda p: -first_order[p]):
+        if len(evaluated) >= CALIBRATION_PLACES and first_order[place] + excess < needed:
+            break
+        start = regression.of(place)
+        first = [evaluate(regression, start, place, each) for each in starts]
+        others = [with_likely_noise(about(beside, place, frequency), True)] if beside else []
+        found = climbed(max([*first, *others], key=_gain))
+        itself = max(itself, *(e.without for e in (*first, found) if e.regression is regression))
+        excess = max(excess, found.gain - first_order[place])
+        if not is_rounding_error(fitter, place, float(found.explained.square().mean(dim=0).max().sqrt())):
+            needed, evaluated[place] = max(needed, found.gain + math.log(RARE)), found
+    likeliest = max(evaluated.values(), key=_gain, default=None)
+    for place, known in evaluated.items():
+        # A larger noise than that which the likeliest discrepancy left hides what another place explains as well.
+        if likeliest and known is not likeliest:
+            again = with_finer_positions(evaluate(known.regression, known.discrepancy, place, likeliest.noise))
+            evaluated[place] = max(known, climbed(again), key=_gain)
+    localized = [
+        LocalizedDiscrepancy(
+            place,
+            found.gain,
+            found.fitness,
+            found.explained,
+            _effect_size(fitter, found),
+            found.discrepancy.periods,
+            found.regression.fit,
+            found.noise,
+        )
+        for place, found in evaluated.items()
+    ]
     random = [*drifting_sensors(regression, likely, places, base, needed)]
     random += random_flows(regression, likely, places, base)
     for process in random:
