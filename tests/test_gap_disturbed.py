@@ -46,8 +46,8 @@ def recorded(
     """Three tanks by Euler steps of a tenth of a second, read each second with 1 mm of noise.
 
     flow: standard deviation of the random flow into each tank, m^3/s, new every `hold` s. plugged: by how much the
-    coefficient of one pipe is lower from `onset` on; at the instants `switched`, it returns and falls again. inflow: m^3/s,
-    into T1 between two instants.
+    coefficient of one pipe is lower from `onset` on; at the instants `switched`, it returns and falls again. inflow:
+    m^3/s, into T1 between two instants.
     """
     plant, generator = nominal_plant(), torch.Generator().manual_seed(seed)
     tanks = [t.name for t in plant.tanks]

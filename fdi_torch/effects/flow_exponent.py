@@ -6,15 +6,17 @@ import torch
 from torch import Tensor
 
 from fdi_torch.parameters import Parameter
+from fdi_torch.plant.constants import source_height
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Stage, Values
 
-REFERENCE_SHARE = 0.2
+TYPICAL, LEAST, MOST = 0.2, 0.02, 2.0  # reference head, as a share of the tank's height
 
 
 class FlowExponent(Effect):
     """The flow is q (|x| / x_r)^n, so that the head x has the exponent 1/2 + n (pipe friction: 4/7, Blasius, 1913;
-    laminar flow: 1). The reference x_r, a fifth of the tank's height, decorrelates n from the discharge coefficient.
+    laminar flow: 1). At the reference head x_r the flow is that of the nominal law; a discharge coefficient was perhaps
+    measured at some head.
 
     Typical: n of -0.1 to 0.3. Nearly the same as laminar flow or an outlet at another height.
     """
@@ -25,8 +27,13 @@ class FlowExponent(Effect):
     mistaken_for = ("laminar_flow", "outlet_drop", "evaporation", "pump_offset", "sensor_bias")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("excess", "1", 0.0, -0.4, 0.6, meaning="exponent of the head less 1/2"),)
+        height = source_height(plant, place)
+        typical, low, high = (share * height for share in (TYPICAL, LEAST, MOST))
+        return (
+            Parameter("excess", "1", 0.0, -0.4, 0.6, meaning="exponent of the head less 1/2"),
+            Parameter("reference", "m", typical, low, high, meaning="head at which the flow is the nominal one"),
+        )
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
         # exp(n log x): a power with a tensor exponent differs in its last bit alone and in a batch.
-        return flow * torch.exp(p["excess"] * torch.log(local.magnitude(local.head) / (REFERENCE_SHARE * local.height)))
+        return flow * torch.exp(p["excess"] * torch.log(local.magnitude(local.head) / p["reference"]))
