@@ -23,7 +23,7 @@ LAYERS = (
     {"report", "gap", "study", "monitor"},
     {"config"},
     {"jobs"},
-    {"paper", "view"},
+    {"view"},
     {"cli", "train", "__main__", "__init__"},
 )
 RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
