@@ -14,7 +14,7 @@ import pytest
 from example_logs import FIXED, VERDICT, log_generation, write_everything, write_finished
 from mcap.reader import make_reader
 
-from fdi_torch.logbook import DeferredTopic, RunLog, read_run, tail_buffer
+from fdi_torch.logbook import DeferredTopic, RunLog, read_run, sink
 from fdi_torch.logbook.provenance import environment, git_state
 from fdi_torch.logbook.topic_definitions import TOPICS
 
@@ -168,11 +168,11 @@ def test_chunks_cut_within_or_after_a_recording_leave_no_trace(tmp_path: Path, c
     assert sum(1 for _ in read_run(tmp_path / "b.mcap").messages()) == 2005
 
 
-@pytest.mark.parametrize("in_memory", [tail_buffer.IN_MEMORY, 1])
+@pytest.mark.parametrize("in_memory", [sink.IN_MEMORY, 1])
 def test_chunks_cut_between_messages_and_attachments_leave_no_trace(
     tmp_path: Path, in_memory: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tail_buffer, "IN_MEMORY", in_memory)  # beyond it, the buffer is a file
+    monkeypatch.setattr(sink, "IN_MEMORY", in_memory)  # beyond it, the buffer is a file
     for name, cuts in (("a", ()), ("b", (1, 5, 2500, 4000))):
         with RunLog(tmp_path / f"{name}.mcap", "train", **FIXED) as log:
             for number in range(5000):
