@@ -43,6 +43,7 @@ DOORS = {
         "recordings/matlab.py",
         "blind/statistics.py",
         "estimate/state_noise.py",
+        "logbook/compare.py",
         "monitor/false_alarm_rate.py",
         "monitor/monte_carlo/false_alarm_plan.py",
     ),
