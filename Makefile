@@ -36,7 +36,7 @@ lint: $(STAMP)
 	$(BIN)/mypy
 
 paper: $(STAMP)
-	$(BIN)/python -m fdi_torch paper
+	$(BIN)/python -m benchmarks.paper
 
 # The site, in site/; its links are checked.
 docs: $(STAMP)

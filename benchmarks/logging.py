@@ -44,7 +44,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "monitor: 10,000 samples": ("monitor", "--config", "MONITOR"),
     "rehearse: 20 runs of an hour": (*REHEARSAL, "false_alarms={noises: {white: {}}, runs: 20, calibrations: 2}"),
     "gap: 1,000 samples, all effects": ("gap", "--plant", "three_tank", "--recording", "RECORDING"),
-    "challenge: 1 rig": ("challenge", "--cases", "1", "--kinds", "single", "--no-bic"),
+    "challenge: 1 rig": ("challenge", "--cases", "1", "--kinds", "single"),
 }
 """MONITOR and RECORDING stand for files that are made first."""
 

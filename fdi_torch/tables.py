@@ -79,8 +79,12 @@ class Shown:
         return self.table().to_pandas()
 
 
+class MissingExtraError(ImportError, ValueError):
+    """A library of an extra is not installed. The text is a sentence with the command that installs it."""
+
+
 def needed(library: str, extra: str = "") -> Any:
-    """Import a library of an extra. Raises ImportError, with the command to install it, if it is missing."""
+    """Import a library of an extra. Raises MissingExtraError if it is missing."""
     try:
         return import_module(library)
     except ModuleNotFoundError as error:
@@ -89,7 +93,7 @@ def needed(library: str, extra: str = "") -> Any:
         sentence = (
             f"expected the library {library.partition('.')[0]}, got none; pip install 'fdi_torch[{extra or library}]'"
         )
-        raise ImportError(sentence) from error
+        raise MissingExtraError(sentence) from error
 
 
 def _cell(value: Any) -> str:

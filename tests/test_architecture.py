@@ -23,7 +23,7 @@ LAYERS = (
     {"report", "gap", "study", "monitor"},
     {"config"},
     {"jobs"},
-    {"paper", "view"},
+    {"view"},
     {"cli", "train", "__main__", "__init__"},
 )
 RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
@@ -43,6 +43,7 @@ DOORS = {
         "recordings/matlab.py",
         "blind/statistics.py",
         "estimate/state_noise.py",
+        "logbook/compare.py",
         "monitor/false_alarm_rate.py",
         "monitor/monte_carlo/false_alarm_plan.py",
     ),

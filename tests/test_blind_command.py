@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from fdi_torch.cli import DONE, MISUSE, main
-from fdi_torch.cli.challenge import REGRESSIONS
 from fdi_torch.config.plant_file import load_plant
 
 
@@ -19,7 +18,7 @@ def test_a_sound_rig_is_called_sound(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main([*words, "--plant", "three_tank"]) == DONE
     scores = json.loads(capsys.readouterr().out)["tables"]["three_tank"]
     assert scores["fdi"]["strata"]["null"]["right"]["share"] == 1.0
-    assert set(scores) == {"always_null", "random", *REGRESSIONS, "one_at_a_time_bic", "fdi"}
+    assert set(scores) == {"always_null", "random", "fdi"}
     key = json.loads((tmp_path / "manifest.jsonl").read_text())["key"]
     with gzip.open(tmp_path / "cases" / "case0001_recording.csv.gz", "rt") as recording:
         assert recording.readline() == f"# SHA-256 of the sealed key: {key}\n"

@@ -9,15 +9,20 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.blind_rivals.equation_errors import BLOCK, equation_errors
+from benchmarks.blind_rivals.regression_baselines import (
+    f_test,
+    gaussian_process,
+    noise_of,
+    sparse_regression,
+    split_f_test,
+)
 from fdi_torch.blind.conditions import asked_of_pumps, levels_at_rest
 from fdi_torch.blind.deviation import Deviation
-from fdi_torch.blind.equation_errors import BLOCK, equation_errors
 from fdi_torch.blind.inputs import commanded
 from fdi_torch.blind.networks import with_unmeasured
 from fdi_torch.blind.plants import three_tank
-from fdi_torch.blind.regression_baselines import gaussian_process, noise_of, sparse_regression, split_f_test
 from fdi_torch.blind.simulator import Drive, HiddenRigs, simulate
-from fdi_torch.blind.statistics import f_test
 from fdi_torch.recording import Recording
 
 RIG = three_tank()

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from fdi_torch.blind import blind_benchmark, joined, tables
-from fdi_torch.blind.baselines import always_null
+from fdi_torch.blind.benchmark import always_null
 from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.cases import Case
 from fdi_torch.blind.plants import three_tank

@@ -214,7 +214,7 @@ def test_a_job_shows_life_before_its_libraries_are_loaded() -> None:
 def test_kept_memory_is_not_asked_of_the_system_again() -> None:
     program = """
 import resource
-from fdi_torch.cli.allocation import keep_memory
+from fdi_torch.cli.gap import keep_memory
 
 def pages():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

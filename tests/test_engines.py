@@ -379,14 +379,10 @@ def test_a_compiler_that_fails_is_named(tmp_path, monkeypatch: pytest.MonkeyPatc
         build.load_library("int x;")
 
 
-def test_auto_chooses_by_the_work_ahead(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_auto_compiles_where_the_processor_computes() -> None:
     network, space = rig()
     e = experiment()
-    little = make_engine(network, space, e, simulations=1)
-    assert little.name == "traced" and "too little work" in little.why
     assert make_engine(network, space, e).name == "compiled"
-    assert make_engine(network, space, e, simulations=1).name == "compiled"  # now that it is compiled
     assert make_engine(network, space, e, "reference").name == "reference"
     assert make_engine(network, space, e, "traced").name == "traced"
     assert make_engine(network, space, e, device="cuda").name == "traced"

@@ -41,7 +41,8 @@ def write_estimate(path: Path, value: float, seed: int = 0) -> Path:
     with RunLog(path, "train", seeds={"seed": seed}, config={"a": 1, "b": seed}, env={}, git={}) as log:
         log.recording(np.arange(3.0), np.ones((3, 1)), np.ones((3, 1)), ("Q1",), ("h1",), ("m^3/s",), ("m",))
         for g in range(3):
-            log.generation(g, 1.0 / (g + 1 + seed), {"T1.leak.size": 0.1})
+            fields = {"problem": 0, "generation": g, "best_cost": 1.0 / (g + 1 + seed), "T1.leak.size": 0.1}
+            log.write("/estimator/de/generation", fields, g)
         log.estimate(["T1.leak.size"], [value], [0.01], [[1e-4]], "converged", units=["1"])
         log.result_arrays(predicted=np.full((3, 1), 0.99))
     return path

@@ -125,8 +125,8 @@ def test_a_growing_log_is_followed_until_its_end(tmp_path: Path, capsys: pytest.
     def write() -> None:
         with RunLog(path, "rig", flush_seconds=0.05) as log:
             for k, levels in enumerate(readings()):
-                log.sample("/plant/input", k, {"Q1": 50.0, "Q2": 50.0}, units={"Q1": "cm^3/s", "Q2": "cm^3/s"})
-                log.sample("/plant/output", k, dict(zip(("h1", "h2", "h3"), levels, strict=True)),
+                log.write("/plant/input", {"Q1": 50.0, "Q2": 50.0}, k, units={"Q1": "cm^3/s", "Q2": "cm^3/s"})
+                log.write("/plant/output", dict(zip(("h1", "h2", "h3"), levels, strict=True)), k,
                            units=dict.fromkeys(("h1", "h2", "h3"), "m"))  # fmt: skip
                 if k % 25 == 0:
                     log.flush()
@@ -264,7 +264,7 @@ def test_a_file_that_cannot_be_followed_is_refused(tmp_path: Path, capsys: pytes
     assert "expected neither mask nor every" in capsys.readouterr().err
     assert main(["monitor", "--config", config(tmp_path, recording={"file": "no.mcap"}), "--follow", "--quiet"]) == 2
     with RunLog(tmp_path / "bare.mcap", "rig") as log:
-        log.sample("/plant/input", 0.0, {"Q1": 1.0, "Q2": 1.0})
+        log.write("/plant/input", {"Q1": 1.0, "Q2": 1.0}, 0.0)
     assert main(["monitor", "--config", config(tmp_path, recording={"file": "bare.mcap"}), "--follow", "--quiet"]) == 2
     assert "expected a unit, got none" in capsys.readouterr().err
 
@@ -336,7 +336,7 @@ def test_a_log_that_ends_between_two_looks_is_read_once(
     path = tmp_path / "rig.mcap"
     stack = ExitStack()
     log = stack.enter_context(RunLog(path, "rig", flush_seconds=0.0))
-    log.sample("/plant/output", 0.0, {"h1": 0.5}, units={"h1": "m"})
+    log.write("/plant/output", {"h1": 0.5}, 0.0, units={"h1": "m"})
     log.flush()
     exists, looks = Path.exists, iter(range(100))
 
@@ -344,7 +344,7 @@ def test_a_log_that_ends_between_two_looks_is_read_once(
         found = exists(self)
         if found and self.suffix == ".partial" and next(looks) == look:
             monkeypatch.setattr(Path, "exists", exists)
-            log.sample("/plant/output", 1.0, {"h1": 0.4}, units={"h1": "m"})
+            log.write("/plant/output", {"h1": 0.4}, 1.0, units={"h1": "m"})
             stack.close()
         return found
 

@@ -10,12 +10,12 @@ import yaml
 
 from fdi_torch import cli
 from fdi_torch.config.estimation import parameter_values, placements_of
+from fdi_torch.config.file_templates import KINDS, template
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.run_file import load_run
 from fdi_torch.config.study_file import load_study
-from fdi_torch.config.templates import TEMPLATES, template
 from fdi_torch.config.yaml_files import read_yaml, shipped_plants
 from fdi_torch.effects import EFFECTS, build_network
 from fdi_torch.effects.catalogue import effects
@@ -46,10 +46,10 @@ def test_from_nothing_to_a_diagnosis_with_new_files_alone(
 @pytest.mark.parametrize("name", shipped_plants())
 def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str, tmp_path: Path) -> None:
     plant = load_plant(name)
-    paths = {kind: tmp_path / f"{kind}.yaml" for kind in TEMPLATES}
+    paths = {kind: tmp_path / f"{kind}.yaml" for kind in KINDS}
     for kind, path in paths.items():
         path.write_text(template(kind, plant, name, kind))
-        assert "@" not in path.read_text()
+        assert "${" not in path.read_text()
     assert load_plant(paths["plant"]).name == "rig"
     assert load_run(paths["run"]).plant == plant and load_monitor(paths["monitor"]).plant == plant
     assert load_study(paths["study"]).plan.trials == 600

@@ -9,15 +9,15 @@ from operator import attrgetter
 import pytest
 import torch
 
+from benchmarks.paper import paper_tables
+from benchmarks.paper.equations import EQUATIONS, ERRATA, STATEMENTS
+from benchmarks.paper.modes import Modes, all_modes, called_present, confusion, diagnose_modes, mode_name
+from benchmarks.paper.online import follow, varies
+from benchmarks.paper.paper_page import PAGE, WINDOWS
+from benchmarks.paper.published import PARAMETERS, TABLE_2, TABLE_3
+from benchmarks.paper.table_cases import Case, shipped_run, solve
 from fdi_torch.config.run_file import load_run
 from fdi_torch.config.yaml_files import SHIPPED
-from fdi_torch.paper import paper_tables
-from fdi_torch.paper.equations import EQUATIONS, ERRATA, STATEMENTS
-from fdi_torch.paper.modes import Modes, all_modes, called_present, confusion, diagnose_modes, mode_name
-from fdi_torch.paper.online import follow, varies
-from fdi_torch.paper.paper_page import PAGE, WINDOWS
-from fdi_torch.paper.published import PARAMETERS, TABLE_2, TABLE_3
-from fdi_torch.paper.table_cases import Case, shipped_run, solve
 from fdi_torch.recording import Recording
 
 TRUTH = torch.tensor([0.1, 0.6, 0.5, 1.0, 1.0], dtype=torch.float64)

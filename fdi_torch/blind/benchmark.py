@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import math
 import time
+import zlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
-from fdi_torch.blind.baselines import Diagnosis, always_null, random_pair
+import numpy as np
+
 from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.case_kinds import ON_NETWORKS, STANDARD
 from fdi_torch.blind.cases import make
 from fdi_torch.blind.networks import Networks
+from fdi_torch.blind.places import effect_places
 from fdi_torch.blind.plants import Rig, three_tank
 from fdi_torch.blind.scored_rows import Row, judged
 from fdi_torch.blind.sealed_files import (
@@ -27,7 +30,10 @@ from fdi_torch.blind.sealed_files import (
     read_recording,
     write_cases,
 )
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
 
+Diagnosis = Callable[..., dict[str, Any]]
 Task = tuple[str, Mapping[str, Any]]
 """Name of the diagnosis, and a case's line of the manifest."""
 Done = tuple[str, dict[str, Any]]
@@ -158,3 +164,24 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [without_nan(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def always_null(plant: PlantDescription, recording: Recording, holdout: Recording, **options: Any) -> dict[str, Any]:
+    """Always answers that there is no gap."""
+    return {"verdict": "no_gap", "where": [], "causes": [], "ambiguity_set": [], "posterior": []}
+
+
+def random_pair(seed: int) -> Diagnosis:
+    """Names a random effect and location; the same for the same recording."""
+
+    def diagnose(plant: PlantDescription, recording: Recording, holdout: Recording, **options: Any) -> dict[str, Any]:
+        pairs = effect_places(plant)
+        rng = np.random.default_rng([seed, zlib.crc32(recording.sha256.encode())])
+        effect, place = pairs[int(rng.integers(len(pairs)))]
+        cause = {"effect": effect, "location": place}
+        return {"verdict": "named", "where": [{"location": place, "share": 1.0}], "causes": [cause]} | {
+            "ambiguity_set": [[cause]],
+            "posterior": [{"causes": [cause], "probability": 1.0}],
+        }
+
+    return diagnose

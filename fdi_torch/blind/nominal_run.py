@@ -48,6 +48,15 @@ class NominalRun:
         column = self.asked[:, [p.name for p in self.plant.pumps].index(name)]
         return float(column.min()), float(column.max())
 
+    def pump_range(self, name: str) -> float:
+        """Difference of the highest and lowest flow requested from the pump, m^3/s."""
+        low, high = self.pump(name)
+        return high - low
+
+    def area(self, tank: str) -> float:
+        """Cross-section of the tank, m^2."""
+        return next(t.area for t in self.plant.tanks if t.name == tank)
+
     def tank(self, name: str, share: float) -> float:
         """The level below which the tank is for this share of the time, m."""
         column = self.levels[:, [t.name for t in self.plant.tanks].index(name)]

@@ -1,4 +1,4 @@
-"""Confidence intervals for shares, means and medians, and the F test."""
+"""Confidence intervals for shares, means and medians."""
 
 from __future__ import annotations
 
@@ -48,11 +48,3 @@ def root_mean_square_interval(values: Sequence[float]) -> tuple[float, float, fl
     square = math.fsum(v * v for v in values)
     low, high = (math.sqrt(square / float(stats.chi2.ppf(p, n))) for p in (0.975, 0.025))
     return math.sqrt(square / n), low, high
-
-
-def f_test(explained: float, residual: float, parameters: int, samples: float) -> float:
-    """p-value of `parameters` columns that reduce the sum of squares by `explained` to `residual`."""
-    freedom = samples - parameters
-    if freedom <= 0 or residual <= 0:
-        return 1.0
-    return float(stats.f.sf(explained / parameters / (residual / freedom), parameters, freedom))

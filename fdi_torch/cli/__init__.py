@@ -47,10 +47,9 @@ COMMANDS = {
     "predict": "run a plant freely along a recording and report the error",
     "challenge": "blind benchmark of the gap diagnosis on hidden rigs",
     "study": "repeat an experiment many times: errors against their bounds, coverage, failures",
-    "paper": "reproduce the tables and figures of the 2020 paper",
 }
 
-LONG = ("train", "study", "gap", "refit", "monitor", "challenge", "paper")
+LONG = ("train", "study", "gap", "refit", "monitor", "challenge")
 """Commands that take more than a moment to start, and announce that."""
 
 

@@ -12,11 +12,9 @@ from typing import Any
 import torch
 
 from fdi_torch.blind import Networks, Row, Tables, blind_benchmark, joined
-from fdi_torch.blind.baselines import Diagnosis
-from fdi_torch.blind.benchmark import Each
+from fdi_torch.blind.benchmark import Diagnosis, Each
 from fdi_torch.blind.conditions import exercised
 from fdi_torch.blind.plants import RIGS, Rig
-from fdi_torch.blind.regression_baselines import gaussian_process, sparse_regression, split_f_test
 from fdi_torch.blind.scaling import Scales
 from fdi_torch.blind.score_tables import misses, sheets
 from fdi_torch.cli import DONE
@@ -24,7 +22,6 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.library import STANDARD as LIBRARY
-from fdi_torch.gap.one_at_a_time import one_at_a_time
 from fdi_torch.interruption import Terminated
 from fdi_torch.jobs.blind_results import LOG, write_plants, write_results
 from fdi_torch.logbook.provenance import git_state
@@ -35,16 +32,15 @@ from fdi_torch.study.cluster import connected, each_on
 
 CASES = 22
 NETWORK = "network"
-REGRESSIONS: Mapping[str, Diagnosis] = {f.__name__: f for f in (split_f_test, sparse_regression, gaussian_process)}
-"""Fast competing methods."""
 
 
-def run(arguments: argparse.Namespace, screen: Screen) -> int:
+def run(arguments: argparse.Namespace, screen: Screen, rivals: Mapping[str, Diagnosis] | None = None) -> int:
+    """rivals: competing methods that answer the same cases."""
     out = Path(arguments.out)
     if arguments.join:
         rows, scores = _merged(arguments, out)
     else:
-        rows, scores = _benchmarked(arguments, out, screen)
+        rows, scores = _benchmarked(arguments, out, screen, rivals)
     show(scores, rows, screen)
     screen.say(f"tables: {out / 'scores.md'}; log: {out / LOG} (fdi report {out / LOG} makes the page)")
     screen.result({"format": "fdi_torch.challenge/2", "answers": len(rows), "tables": scores})
@@ -61,7 +57,9 @@ def _merged(arguments: argparse.Namespace, out: Path) -> tuple[Sequence[Row], Ta
     return rows, write_results(out, rows, {"join": arguments.join}, [folder / "rows.jsonl" for folder in folders])
 
 
-def _benchmarked(arguments: argparse.Namespace, out: Path, screen: Screen) -> tuple[Sequence[Row], Tables]:
+def _benchmarked(
+    arguments: argparse.Namespace, out: Path, screen: Screen, rivals: Mapping[str, Diagnosis] | None
+) -> tuple[Sequence[Row], Tables]:
     """Rows and scores of a new or resumed benchmark."""
     torch.set_num_threads(1)  # faster for arrays of this size
     cases, seed = (CASES if arguments.cases is None else arguments.cases), arguments.seed or 0
@@ -82,7 +80,7 @@ def _benchmarked(arguments: argparse.Namespace, out: Path, screen: Screen) -> tu
             kinds=tuple(arguments.kinds.split(",")) if arguments.kinds else (),
             library=LIBRARY,
             leave_out=left_out,
-            rivals={**REGRESSIONS} | ({} if arguments.no_bic else {"one_at_a_time_bic": _one_at_a_time}),
+            rivals=rivals,
             each=each,
             minutes=arguments.minutes,
             code=code["commit"][:12] + ("+" if code["changed"] == "yes" else ""),
@@ -137,12 +135,6 @@ def _diagnose(
     plant: PlantDescription, recording: Recording, holdout: Recording, leave_out: Collection[str] = ()
 ) -> dict[str, Any]:
     return diagnose(plant, recording, holdout, Settings(leave_out=tuple(leave_out))).to_dict()
-
-
-def _one_at_a_time(
-    plant: PlantDescription, recording: Recording, holdout: Recording, leave_out: Collection[str] = ()
-) -> dict[str, Any]:
-    return one_at_a_time(plant, recording, leave_out=tuple(leave_out))
 
 
 def show(scores: Tables, rows: Sequence[Row], screen: Screen) -> None:

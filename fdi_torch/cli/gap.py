@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.adoption import write_adopted
-from fdi_torch.cli.allocation import keep_memory
 from fdi_torch.cli.gap_text import next_steps, show
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
@@ -25,6 +25,9 @@ from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import write_csv
+
+KEPT = 1 << 30  # bytes of free memory to keep, and size up to which an array is kept
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -109,3 +112,16 @@ def _error(plant: PlantDescription, recordings: Sequence[Recording]) -> float:
             std = float(recording.outputs[recording.mask[:, column], column].std())
             total += (errors[sensor.name] / max(std, 1e-300)) ** 2
     return total
+
+
+def keep_memory() -> bool:
+    """Keep freed memory in the process. Returns False if the C library does not support it.
+
+    Fits of whole trajectories allocate and free the same few large arrays again and again. By default the GNU C library
+    maps each of them anew and the system clears every page, which takes a considerable part of a short run.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # another C library; TypeError: Windows wants a name
+        return False
+    return bool(mallopt(_MMAP_THRESHOLD, KEPT)) and bool(mallopt(_TRIM_THRESHOLD, KEPT))

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
+from fdi_torch.config.file_templates import template
 from fdi_torch.config.plant_file import chosen_plant
-from fdi_torch.config.templates import template
 from fdi_torch.disk import named_errors
 
 NEXT = {

@@ -21,7 +21,7 @@ from fdi_torch.parameters import display_unit, quantity_text
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_header
-from fdi_torch.report.free_run_figure import free_run_figure
+from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import save
 
 
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             runs = {_other_name(other, plant, arguments): before.readings} | runs
         columns = [sensor.column for sensor in plant.sensors]
         title = f"free run along {Path(recording.source).name}"
-        screen.note(f"picture: {save(free_run_figure(recording, columns, runs, title), Path(arguments.picture))}")
+        screen.note(f"picture: {save(fit_figure(recording, runs, title, columns), Path(arguments.picture))}")
     results = [_result(plant, recording, prediction, arguments) for recording, prediction in predictions]
     screen.result(results[0] if len(results) == 1 else {"format": "fdi_torch.predictions/1", "runs": results})
     return DONE

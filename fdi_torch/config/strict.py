@@ -60,7 +60,6 @@ def quantity_of(unit: str) -> tuple[BeforeValidator, Any]:
 Share = Annotated[float, *quantity_of("1")]
 Length = Annotated[float, *quantity_of("m")]
 Area = Annotated[float, *quantity_of("m^2")]
-Flow = Annotated[float, *quantity_of("m^3/s")]
 Seconds = Annotated[float, *quantity_of("s")]
 Decibel = Annotated[float, Field(ge=-300, le=300)]
 _ON_A_BENCH = "the default is for a bench-top rig"

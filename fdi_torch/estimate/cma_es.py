@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import apply, dot, row_sum
-from fdi_torch.estimate.bounds import into_box
+from fdi_torch.estimate.bounds import reflected
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.strategy import Proposal, SearchState, before_first_generation, pick, with_first_guess
@@ -111,7 +111,7 @@ class CmaEs:
         moved = apply(cholesky(state.covariance)[..., None, :, :], normal)
         low, width = state.low[..., None, :], _width(state.low, state.high)[..., None, :]
         candidates = low + width * (state.mean[..., None, :] + state.step[..., None, None] * moved)
-        candidates = into_box(candidates, candidates, low, state.high[..., None, :], "reflect", torch.Tensor)
+        candidates = reflected(candidates, low, state.high[..., None, :])
         if state.generation == 0 and state.guess.shape[-2]:
             known = ((state.guess - low) / width - state.mean[..., None, :]) / state.step[..., None, None]
             normal, moved = with_first_guess(normal, known), with_first_guess(moved, known)

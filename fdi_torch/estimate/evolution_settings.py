@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fdi_torch.estimate.bounds import RULES
-
 # Name of each strategy -> module in `estimate` whose `STRATEGY` it is.
 STRATEGIES = {"rand/1/bin": "generation", "l-shade": "generation", "cma_es": "cma_es"}
 
@@ -17,8 +15,7 @@ class EvolutionSettings:
 
     population: number of members N; None: 10 P (rand/1/bin), 18 P (l-shade) or
     4 + 3 ln P (cma_es; more is safer where the cost has several minima), with P parameters.
-    evaluations: budget of cost evaluations per problem. bounds: rule that returns mutants of
-    differential evolution to the box (bounds.RULES); cma_es reflects.
+    evaluations: budget of cost evaluations per problem.
     parameter_tolerance: relative to the box's width; cost_tolerance: relative to the scale of the costs, `State.scale`.
     patience: number of generations without improvement after which a problem has stalled.
     target: cost at which the search stops. factor, rate: F and CR.
@@ -28,7 +25,6 @@ class EvolutionSettings:
     strategy: str = "l-shade"
     population: int | None = None
     evaluations: int = 20_000
-    bounds: str = "midpoint"
     parameter_tolerance: float = 1e-6
     cost_tolerance: float = 1e-9
     patience: int = 200
@@ -44,7 +40,6 @@ class EvolutionSettings:
 
     def __post_init__(self) -> None:
         _expect(self.strategy in STRATEGIES, f"strategy to be one of {', '.join(STRATEGIES)}", self.strategy)
-        _expect(self.bounds in RULES, f"bounds to be one of {', '.join(RULES)}", self.bounds)
         _expect(self.population is None or self.population >= 4, "a population of at least 4", self.population)
         _expect(self.smallest >= 4, "smallest (population) of at least 4", self.smallest)
         _expect(self.evaluations >= 4, "a budget of at least 4 evaluations", self.evaluations)

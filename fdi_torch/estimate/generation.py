@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.bounds import into_box
+from fdi_torch.estimate.bounds import halfway
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.shade import draw_factor, draw_rate, update_archive, update_memory
 from fdi_torch.estimate.strategy import Proposal, SearchState, before_first_generation, pick, with_first_guess
 
-_VARIATION, _REPAIR, _ARCHIVE = range(3)  # indices of the random streams of one generation
+_VARIATION, _ARCHIVE = 0, 2  # indices of the random streams of one generation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ def ask(state: State, settings: EvolutionSettings) -> Trial:
     per_member, per_component = u.split((size * rows, size * parameters), -1)
     q, *others = per_member.unflatten(-1, (rows, size)).unbind(-2)
     mutant, factor, rate = (_rand_1 if settings.strategy == "rand/1/bin" else _to_p_best_1)(state, settings, others)
-    mutant = _repaired(mutant, state, settings)
+    mutant = halfway(mutant, state.population, state.low[..., None, :], state.high[..., None, :])
     crossed = per_component.unflatten(-1, (size, parameters)) <= rate[..., None]
     crossed |= torch.arange(parameters, device=u.device) == (q * parameters).long()[..., None]
     return Trial(torch.where(crossed, mutant, state.population), factor, rate)
@@ -147,17 +147,6 @@ def _ascending(values: list[Tensor]) -> list[Tensor]:
         for a in range(end):
             values[a], values[a + 1] = torch.minimum(values[a], values[a + 1]), torch.maximum(values[a], values[a + 1])
     return values
-
-
-def _repaired(mutant: Tensor, state: State, settings: EvolutionSettings) -> Tensor:
-    size, parameters = mutant.shape[-2:]
-
-    def draw() -> Tensor:
-        key = stream(state.seed, state.generation, _REPAIR)
-        return uniform(key, size * parameters).unflatten(-1, (size, parameters))
-
-    low, high = state.low[..., None, :], state.high[..., None, :]
-    return into_box(mutant, state.population, low, high, settings.bounds, draw)
 
 
 def tell(state: State, trial: Trial, cost: Tensor, settings: EvolutionSettings) -> State:

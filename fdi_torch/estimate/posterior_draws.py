@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.bounds import into_box
+from fdi_torch.estimate.bounds import reflected
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.tables import Shown, Table, needed
 
@@ -213,7 +213,7 @@ def first_walkers(
     # A missing bound becomes one beyond all walkers, since reflection needs the width of the box.
     low = torch.where(torch.isfinite(space.low(start)), space.low(start), theta.amin(0))
     high = torch.where(torch.isfinite(space.high(start)), space.high(start), theta.amax(0))
-    return into_box(theta, theta, low, high, "reflect", torch.Tensor).cpu().numpy()
+    return reflected(theta, low, high).cpu().numpy()
 
 
 def convergence(chains: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor
 
 from fdi_torch.estimate.combinations import Combination, undetermined_groups
@@ -30,9 +29,8 @@ class Estimate:
     undetermined parameters. covariance (P, P): computed without regard to bounds; infinite or NaN in the rows and
     columns of undetermined parameters. at_bounds: 'low' or 'high' by name. undetermined: one sentence per group.
     combinations: what is determined of the undetermined parameters.
-    noise_std (C,): noise level of each channel, known or estimated, in its unit. chi_square: of the residuals relative
-    to the noise, with degrees_of_freedom. reached: how the estimate was computed, as plain values.
-    draws: from the posterior, if some were asked for.
+    noise_std (C,): noise level of each channel, known or estimated, in its unit. reached: how the estimate was
+    computed, as plain values. draws: from the posterior, if some were asked for.
     """
 
     names: tuple[str, ...]
@@ -45,8 +43,6 @@ class Estimate:
     undetermined: tuple[str, ...] = ()
     combinations: tuple[Combination, ...] = ()
     noise_std: Tensor | None = None
-    chi_square: float | None = None
-    degrees_of_freedom: int | None = None
     reached: Mapping[str, Any] = field(default_factory=dict)
     draws: Draws | None = field(default=None, repr=False)
 
@@ -54,14 +50,6 @@ class Estimate:
     def correlation(self) -> Tensor:
         """Correlation matrix (P, P); NaN in rows and columns of undetermined parameters."""
         return self.covariance / (self.std[:, None] * self.std[None, :])
-
-    @property
-    def p_value(self) -> float | None:
-        """p-value of the chi-square test; None without a chi-square or degrees of freedom."""
-        if self.chi_square is None or not self.degrees_of_freedom:
-            return None
-        half = torch.tensor([0.5 * self.degrees_of_freedom, 0.5 * self.chi_square], dtype=torch.float64)
-        return float(torch.special.gammaincc(half[0], half[1]))
 
     def interval(self, confidence: float = 0.95) -> tuple[Tensor, Tensor]:
         """Lower and upper limits (P,) of each parameter's confidence interval, from the normal distribution."""
@@ -87,10 +75,9 @@ class Estimate:
         separate = ("covariance", "draws", "combinations")
         plain = {name: plain_value(value, name) for name, value in vars(self).items() if name not in separate}
         flat = plain_value(self.covariance.flatten(), "covariance")
-        p_value = plain_value(self.p_value, "p_value")
         shape = list(self.covariance.shape)
         combinations = [combination.to_dict() for combination in self.combinations]
-        more = {"covariance_shape": shape, "p_value": p_value, "combinations": combinations}
+        more = {"covariance_shape": shape, "combinations": combinations}
         return plain | {"covariance": flat} | more
 
 
@@ -101,8 +88,6 @@ def make_estimate(
     *,
     status: str = "",
     noise_std: Tensor | None = None,
-    chi_square: float | None = None,
-    degrees_of_freedom: int | None = None,
     reached: Mapping[str, Any] | None = None,
     threshold: float = RELATIVE_EIGENVALUE,
 ) -> Estimate:
@@ -129,8 +114,6 @@ def make_estimate(
         undetermined=(*(group.sentence for group in groups), *wider_than_range(space, uncertainty.std)),
         combinations=tuple(combination for group in groups for combination in group.combinations),
         noise_std=noise_std,
-        chi_square=chi_square,
-        degrees_of_freedom=degrees_of_freedom,
         reached=dict(reached or {}),
     )
 

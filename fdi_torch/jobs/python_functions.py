@@ -33,7 +33,7 @@ from fdi_torch.names import unknown
 from fdi_torch.parameters import display_in
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.report.free_run_figure import free_run_figure
+from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg
 from fdi_torch.tables import Shown, Table
 
@@ -205,7 +205,7 @@ class FreeRun(Shown):
     def picture(self) -> str:
         """Measured and predicted readings, as SVG."""
         columns = [sensor.column for sensor in self.plant.sensors]
-        figure = free_run_figure(self.recording, columns, {self.plant.name: self.prediction.readings}, self.headline)
+        figure = fit_figure(self.recording, {self.plant.name: self.prediction.readings}, self.headline, columns)
         return notebook_svg(figure, "free-run", self.headline)
 
     def to_xarray(self) -> Any:

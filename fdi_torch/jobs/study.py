@@ -12,8 +12,8 @@ from fdi_torch.config.study_file import Study
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.logbook.reader import Run as LoggedRun
-from fdi_torch.report.fit_figure import save
 from fdi_torch.report.study_figures import correlation_figure, error_figure
+from fdi_torch.report.style import save
 from fdi_torch.study.cluster import run_on_cluster
 from fdi_torch.study.mode_isolation import Isolation, count_modes
 from fdi_torch.study.monte_carlo import Trial, run_blocks

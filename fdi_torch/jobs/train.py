@@ -34,8 +34,8 @@ from fdi_torch.jobs.run_setup import (
 from fdi_torch.logbook import DeferredTopic, Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.recording import Recording
-from fdi_torch.report.fit_figure import fit_figure, save
-from fdi_torch.report.style import notebook_svg
+from fdi_torch.report.fit_figure import fit_figure
+from fdi_torch.report.style import notebook_svg, save
 from fdi_torch.tables import Shown, Table, needed
 
 Tell = Callable[[float, str], None]
@@ -73,7 +73,7 @@ class TrainResult(Shown):
 
     def picture(self) -> str:
         """Readings and fit of the first recording, as SVG."""
-        figure = fit_figure(self.fitting.recordings[0], self.result.predicted[0], self.headline)
+        figure = fit_figure(self.fitting.recordings[0], {"estimate": self.result.predicted[0]}, self.headline)
         return notebook_svg(figure, self.log.stem, self.headline)
 
     def profile(self, *names: str, confidence: float = 0.95) -> tuple[Profile, ...]:
@@ -284,6 +284,6 @@ def draw(run: Run, fitting: Fitting, result: HybridResult, log: Path) -> tuple[P
     paths = []
     for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
         suffix = "" if len(fitting.recordings) == 1 else f"_{k + 1}"
-        figure = fit_figure(recording, predicted, f"{run.name}: {result.diagnosis.headline}")
+        figure = fit_figure(recording, {"estimate": predicted}, f"{run.name}: {result.diagnosis.headline}")
         paths.append(save(figure, log.with_name(f"{log.stem}{suffix}.png")))
     return tuple(paths)

@@ -8,8 +8,8 @@ from typing import Any
 
 import orjson
 
-from fdi_torch.live.extras import library_of
 from fdi_torch.logbook.channel import Channel
+from fdi_torch.tables import needed
 
 PORT = 9464
 """Default port of the OpenTelemetry exporter for Prometheus."""
@@ -90,7 +90,7 @@ def _set_all(gauge: Any, payload: dict[str, Any]) -> None:
 @contextmanager
 def serve_metrics(host: str = "127.0.0.1", port: int = PORT) -> Iterator[Metrics]:
     """A server of /metrics during the block. port 0: any free port. Raises ValueError for an address in use."""
-    library = library_of("prometheus", "prometheus_client")
+    library = needed("prometheus_client", "prometheus")
     metrics = Metrics(library)
     try:
         server, thread = library.start_http_server(port, host, metrics.registry)

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from fdi_torch.live.address import Address
-from fdi_torch.live.extras import library_of
 from fdi_torch.live.values import BackOff, Item, Value
 from fdi_torch.names import unknown
+from fdi_torch.tables import needed
 
 WordOrder = Literal["big", "little"]
 TABLES = {
@@ -93,7 +93,7 @@ class ModbusSource:
         device: int = 1,
         word_order: WordOrder = "big",
     ) -> None:
-        library = library_of("modbus", "pymodbus.client")
+        library = needed("pymodbus.client", "modbus")
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # losses are reported as events
         self.dated = dated or clock is None
         self._registers = {tag: register_of(tag) for tag in tags}
@@ -151,7 +151,7 @@ class ModbusSource:
         return numbers
 
     def _request(self, table: str, first: int, count: int) -> Sequence[int]:
-        errors = library_of("modbus", "pymodbus.exceptions")
+        errors = needed("pymodbus.exceptions", "modbus")
         if not self._client.connected and not self._client.connect():
             raise ConnectionError("no connection")
         try:

@@ -11,10 +11,10 @@ from typing import Any
 import orjson
 
 from fdi_torch.live.address import Address, credentials
-from fdi_torch.live.extras import library_of
 from fdi_torch.live.values import Inbox, Item, Value
 from fdi_torch.logbook import number_at
 from fdi_torch.recordings.time_stamps import seconds_of
+from fdi_torch.tables import needed
 
 WAIT = 10.0
 """Time within which a broker must answer the first connection, s."""
@@ -40,7 +40,7 @@ class MqttClient:
         on_message: Callable[[str, bytes], None] | None = None,
         on_state: Callable[[str], None] | None = None,
     ) -> None:
-        paho = library_of("mqtt", "paho.mqtt.client")
+        paho = needed("paho.mqtt.client", "mqtt")
         self._topics, self._place = topics, address.place
         self._on_message, self._on_state = on_message, on_state
         self._answered, self._refusal = threading.Event(), ""

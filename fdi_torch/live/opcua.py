@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from fdi_torch.live.address import Address, credentials
-from fdi_torch.live.extras import library_of
 from fdi_torch.live.values import Inbox, Item, Value
+from fdi_torch.tables import needed
 
 WAIT = 15.0
 """Time within which a server must accept the first connection, s."""
@@ -37,7 +37,7 @@ class OpcUaSource:
     dated = True
 
     def __init__(self, address: Address, tags: Sequence[str], period: float, publish: float) -> None:
-        self._asyncua = library_of("opcua", "asyncua")
+        self._asyncua = needed("asyncua", "opcua")
         logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # losses are reported as events
         self._url = f"opc.tcp://{address.place}/{address.path}".rstrip("/")
         self._place, self._tags, self._period, self._publish = address.place, tags, period, publish

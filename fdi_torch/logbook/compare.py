@@ -117,16 +117,11 @@ def chi2_p_value(values: Sequence[float], std: Sequence[float]) -> float:
     x, s = x[usable], s[usable]
     if len(x) < 2:
         return float("nan")
+    from scipy.special import chdtrc  # SciPy takes a while to load, and most users of logs do not compare them
+
     weights = s**-2.0
     q = float(np.sum(weights * (x - np.sum(weights * x) / np.sum(weights)) ** 2))
-    return _chi2_tail(q / 2, len(x) - 1)
-
-
-def _chi2_tail(half: float, degrees: int) -> float:
-    """P(chi^2 > 2 half), the finite sum for whole degrees of freedom (Abramowitz and Stegun 1964, 26.4.4-26.4.5)."""
-    odd = degrees % 2
-    terms = (half ** (i + odd / 2) / math.gamma(i + 1 + odd / 2) for i in range(degrees // 2))
-    return (math.erfc(math.sqrt(half)) if odd else 0.0) + math.exp(-half) * sum(terms)
+    return float(chdtrc(len(x) - 1, q))
 
 
 def _differing(runs: Sequence[Run], section: str) -> dict[str, tuple[str, ...]]:

@@ -51,9 +51,6 @@ class Messages:
     def put_block(self, block: Block) -> None:
         raise NotImplementedError
 
-    def wall(self) -> dict[str, int]:
-        raise NotImplementedError
-
     def write(
         self,
         topic: str,
@@ -61,17 +58,14 @@ class Messages:
         t: float | None = None,
         *,
         units: Mapping[str, str] | None = None,
-        about: Mapping[str, str] | None = None,
-        wall: bool = False,
     ) -> None:
-        """Write one message. units: of named numbers; about: further metadata of the channel, used with its first
-        message.
+        """Write one message. units: of named numbers.
 
         A field with the value None is omitted. Raises ValueError for a non-finite time and for reserved names.
         """
         with self._lock:
             self.settle()
-            self.put([self._timed(topic, fields, t, units, about, wall)])
+            self.put([self._timed(topic, fields, t, units)])
 
     def _timed(
         self,
@@ -79,8 +73,6 @@ class Messages:
         fields: Named,
         t: float | None,
         units: Mapping[str, str] | None,
-        about: Mapping[str, str] | None = None,
-        wall: bool = False,
     ) -> Timed:
         if "t" in fields:
             raise ValueError(f"{topic}: expected the time as argument, got it among the fields; remove it there")
@@ -88,12 +80,12 @@ class Messages:
         if not math.isfinite(t):
             raise ValueError(f"{topic}: expected a finite time, got {t}; give the plant's time in s")
         message: Named = {"t": t, **fields}
-        data = None if wall else as_it_is(message)
+        data = as_it_is(message)
         if data is None:
             message = plain(message)
-            data = orjson.dumps({**message, WALL: self.wall()} if wall else message)
+            data = orjson.dumps(message)
         self._latest = max(self._latest, t)
-        channel = self.register.channel(topic, fields, message, units, about)
+        channel = self.register.channel(topic, fields, message, units)
         log_time = log_time_of(t)
         return channel, log_time, log_time, self.register.next_number(topic), data
 
@@ -126,10 +118,9 @@ class Messages:
         values: Any,
         names: Sequence[str],
         units: Sequence[str],
-        about: Mapping[str, str] | None = None,
     ) -> None:
         """Write a whole signal, values (T, N) over time (T,), one message per sample."""
-        self.recording_blocks([(topic, as_array(values), names, units, None, about)], as_array(time))
+        self.recording_blocks([(topic, as_array(values), names, units, None, None)], as_array(time))
 
     def recording(
         self,
@@ -228,10 +219,6 @@ class Messages:
         """Continue numbering and description as if the message (channel, sequence, t) had just been written."""
         self.register.follow_on(channel, sequence)
         self._latest = max(self._latest, t)
-
-    def sample(self, topic: str, t: float, values: Named, units: Mapping[str, str] | None = None) -> None:
-        """Write one sample of a signal that arrives incrementally, such as "/plant/output" or "/plant/truth"."""
-        self.write(topic, values, t, units=units)
 
 
 def _in_turn(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -21,6 +21,8 @@ from fdi_torch.logbook.reader import Message, Run, read_run
 Rerun = Callable[[Run], "str | Path | Iterable[Message]"]
 Select = Callable[[Iterable[Message]], Iterable[Message]]
 Outcome = Literal["bit-equal", "within tolerance", "differs"]
+ABSOLUTE = 1e-12
+"""Absolute part of the tolerance of a number."""
 
 
 @dataclass(frozen=True)
@@ -59,16 +61,14 @@ def replay(
     rerun: Rerun,
     *,
     relative: float = 1e-9,
-    absolute: float = 1e-12,
-    skip_topics: Collection[str] = ("/log",),
     select: Select | None = None,
     env: Mapping[str, str] | None = None,
 ) -> Replay:
     """Repeat a run and compare it with its log.
 
     rerun: receives the opened log and returns the new log's path, or its messages. Numbers are within tolerance if |a -
-    b| <= absolute + relative max(|a|, |b|). skip_topics: not compared; by default log messages. select: chooses and
-    orders the messages to compare on each side; by default all as logged. Raises LogError for an unreadable log.
+    b| <= ABSOLUTE + relative max(|a|, |b|). select: chooses and orders the messages to compare on each side; by default
+    all as logged. Sentences on `/log` are not compared. Raises LogError for an unreadable log.
     """
     run = read_run(path)
     repeated = rerun(run)
@@ -76,8 +76,6 @@ def replay(
     return compare_events(
         *((select(side) if select else side) for side in (run.messages(), replayed)),
         relative=relative,
-        absolute=absolute,
-        skip_topics=skip_topics,
         versions=version_changes(run, environment() if env is None else env),
     )
 
@@ -87,13 +85,11 @@ def compare_events(
     replayed: Iterable[Message],
     *,
     relative: float,
-    absolute: float,
-    skip_topics: Collection[str] = (),
     versions: dict[str, tuple[str, str]] | None = None,
 ) -> Replay:
     """Compare two ordered streams of events, up to the first difference beyond the tolerance."""
     events, largest, first_inexact = 0, 0.0, None
-    streams = ((m for m in stream if m.topic not in skip_topics) for stream in (logged, replayed))
+    streams = ((m for m in stream if m.topic != "/log") for stream in (logged, replayed))
     for events, (then, now) in enumerate(zip_longest(*streams), 1):
         for deviation in _deviations(then, now):
             difference = Difference(
@@ -101,7 +97,7 @@ def compare_events(
             )
             first_inexact = first_inexact or difference
             largest = max(largest, deviation.relative)
-            if not deviation.within(relative, absolute):
+            if not deviation.within(relative):
                 return Replay("differs", events, difference, first_inexact, largest, versions or {})
     outcome: Outcome = "bit-equal" if first_inexact is None else "within tolerance"
     return Replay(outcome, events, None, first_inexact, largest, versions or {})
@@ -134,10 +130,10 @@ class _Deviation:
         scale = max(abs(self.then), abs(self.now))
         return abs(self.then - self.now) / scale if scale else 0.0
 
-    def within(self, relative: float, absolute: float) -> bool:
+    def within(self, relative: float) -> bool:
         if not self.numeric:
             return False
-        return bool(abs(self.then - self.now) <= absolute + relative * max(abs(self.then), abs(self.now)))
+        return bool(abs(self.then - self.now) <= ABSOLUTE + relative * max(abs(self.then), abs(self.now)))
 
 
 def _deviations(then: Message | None, now: Message | None) -> Iterator[_Deviation]:

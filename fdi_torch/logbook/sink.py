@@ -9,8 +9,9 @@ slow.
 
 from __future__ import annotations
 
+import tempfile
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +21,19 @@ from mcap import records
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.chunk import Chunk, Described, packer
 from fdi_torch.logbook.contents import Contents, metadata_bytes, record_bytes
-from fdi_torch.logbook.errors import LogError
+from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.exclusive_file import ExclusiveFile
 from fdi_torch.logbook.sample_block import Block, Timed
 from fdi_torch.logbook.scan import MAGIC
-from fdi_torch.logbook.tail_buffer import TailBuffer
 
 PROFILE = "fdi_torch"
 CHUNK_BYTES = 256 * 1024
 EPOCH_NS = 946_684_800 * 10**9  # 2000-01-01T00:00:00Z: plant time 0; leaves room for negative times
 STRETCH = 1000
 """A run of at least this many messages of signals, as of a recording, ends its chunk."""
+IN_MEMORY = 4 << 20
+"""Size beyond which the buffer of a file's tail is an unnamed file, which disappears with its process."""
+_PIECE = 1 << 20
 
 
 class Sink:
@@ -205,6 +208,29 @@ class Sink:
                 raise
         self._size += len(data)
         self._crc = zlib.crc32(data, self._crc)
+
+
+class TailBuffer:
+    """Buffer for the bytes after the first `start` of the final file at `path`. Raises LogError if the disk is full."""
+
+    def __init__(self, path: Path, start: int) -> None:
+        self.path, self.start = path, start
+        self._bytes = tempfile.SpooledTemporaryFile(IN_MEMORY, dir=str(path.parent))  # noqa: SIM115
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._bytes.write(data)
+        except OSError as error:
+            raise log_error(self.path, error) from error
+
+    def pieces(self) -> Iterator[bytes]:
+        """All bytes, in pieces."""
+        self._bytes.seek(0)
+        while data := self._bytes.read(_PIECE):
+            yield data
+
+    def close(self) -> None:
+        self._bytes.close()
 
 
 def _end(stream: ExclusiveFile, tail: TailBuffer, ending: bytes) -> None:

@@ -16,7 +16,7 @@ from fdi_torch.logbook.payload import as_array, pack
 from fdi_torch.logbook.sink import log_time_of
 from fdi_torch.logbook.write_buffer import DeferredTopic
 
-_LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
+_INFO = 2  # of the levels debug (1) to fatal (5) of foxglove.Log
 
 
 def _packed(items: Sequence[tuple[float, Named, Named]]) -> Iterator[tuple[float, Named]]:
@@ -33,81 +33,19 @@ _POPULATION = DeferredTopic("/estimator/de/population", _packed)
 class Topics(Messages):
     """One method per topic."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._deferred: dict[str, DeferredTopic] = {}
-
-    def _deferred_topic(self, topic: str, units: Mapping[str, str] | None) -> DeferredTopic:
-        """The deferred topic for messages whose fields need no conversion."""
-        deferred = self._deferred.get(topic)
-        if deferred is None or deferred.units != units:
-            deferred = self._deferred[topic] = DeferredTopic(topic, lambda items: items, units)
-        return deferred
-
-    def residual(
-        self,
-        t: float,
-        residuals: Named,
-        statistics: Named | None = None,
-        thresholds: Named | None = None,
-        units: Mapping[str, str] | None = None,
-    ) -> None:
-        """y - y_hat of each sensor, with its test statistics and thresholds if any."""
-        tested = {f"{name}_statistic": value for name, value in (statistics or {}).items()}
-        limits = {f"{name}_threshold": value for name, value in (thresholds or {}).items()}
-        self.write("/observer/residual", {**residuals, **tested, **limits}, t, units=units)
-
-    def alarm(self, t: float, event: str, channel: str, message: str = "", wall: bool = False, **numbers: Any) -> None:
+    def alarm(self, t: float, event: str, channel: str, message: str = "", **numbers: Any) -> None:
         """An event of the detection; numbers: value, threshold, onset (s) and others by name."""
         fields = {"event": event, "channel": channel, "message": message, **numbers}
-        self.write("/observer/alarm", fields, t, wall=wall)
+        self.write("/observer/alarm", fields, t)
 
-    def generation(
-        self,
-        generation: int,
-        best_cost: float,
-        best: Named,
-        *,
-        problem: int = 0,
-        t: float | None = None,
-        units: Mapping[str, str] | None = None,
-        **numbers: Any,
-    ) -> None:
-        """A generation of the search; best: parameter -> value of the best member.
-
-        numbers: mean_cost, spread, evaluations and others by name.
-        """
-        fields = {"problem": problem, "generation": generation, "best_cost": best_cost, **numbers, **best}
-        self.later(self._deferred_topic("/estimator/de/generation", units), (generation if t is None else t, fields))
-
-    def population(
-        self, generation: int, arrays: Mapping[str, Any], *, problem: int = 0, t: float | None = None
-    ) -> None:
+    def population(self, generation: int, arrays: Mapping[str, Any], *, problem: int = 0) -> None:
         """The state of the search for its continuation: any numeric arrays, such as population and cost.
 
         They are written with delay, and must not be changed in place.
         """
         fields = {"problem": problem, "generation": generation}
         size = sum(getattr(array, "nbytes", 0) for array in arrays.values())
-        self.later(_POPULATION, (generation if t is None else t, fields, dict(arrays)), size)
-
-    def iteration(
-        self,
-        iteration: int,
-        cost: float,
-        parameters: Named,
-        *,
-        problem: int = 0,
-        t: float | None = None,
-        units: Mapping[str, str] | None = None,
-        **numbers: Any,
-    ) -> None:
-        """An iteration of the refinement; parameters: name -> value.
-
-        numbers: step, gradient, damping, accepted and others by name.
-        """
-        fields = {"problem": problem, "iteration": iteration, "cost": cost, **numbers, **parameters}
-        self.later(self._deferred_topic("/estimator/refine/iteration", units), (iteration if t is None else t, fields))
+        self.later(_POPULATION, (generation, fields, dict(arrays)), size)
 
     def estimate(
         self,
@@ -118,16 +56,13 @@ class Topics(Messages):
         status: str,
         *,
         units: Sequence[str] = (),
-        reason: str = "",
         at_bound: Sequence[str] = (),
         unidentifiable: Sequence[str] = (),
-        problem: int = 0,
-        t: float | None = None,
         **numbers: Any,
     ) -> None:
         """The final estimate: values (P,), std (P,), covariance (P, P); numbers: goodness of fit and others by name."""
         fields = {
-            "problem": problem,
+            "problem": 0,
             "names": names,
             "units": units,
             "values": values,
@@ -135,12 +70,12 @@ class Topics(Messages):
             "covariance": covariance,
             "covariance_shape": list(as_array(covariance).shape),
             "status": status,
-            "reason": reason,
+            "reason": "",
             "at_bound": at_bound,
             "unidentifiable": unidentifiable,
             **numbers,
         }
-        self.write("/estimate/final", fields, t)
+        self.write("/estimate/final", fields)
 
     def fault(
         self, fault: str, location: str, present: bool, *, t: float | None = None, message: str = "", **numbers: Any
@@ -186,14 +121,11 @@ class Topics(Messages):
         """The summary of one setting of a study."""
         self.write("/study/summary", {"group": group, "trials": trials, **texts, **numbers})
 
-    def say(self, message: str, level: str = "info", name: str = "fdi", t: float | None = None) -> None:
-        """One sentence on `/log`. level: debug, info, warning, error or fatal."""
-        if level not in _LEVELS:
-            raise ValueError(f"expected a level among {', '.join(_LEVELS)}, got {level}")
-        t = self._latest if t is None else float(t)
-        sec, nsec = divmod(log_time_of(t), 10**9)
-        fields = {"timestamp": {"sec": sec, "nsec": nsec}, "level": _LEVELS[level], "message": message, "name": name}
-        self.write("/log", {**fields, "file": "", "line": 0}, t)
+    def say(self, message: str) -> None:
+        """One sentence on `/log`."""
+        sec, nsec = divmod(log_time_of(self._latest), 10**9)
+        fields = {"timestamp": {"sec": sec, "nsec": nsec}, "level": _INFO, "message": message, "name": "fdi"}
+        self.write("/log", {**fields, "file": "", "line": 0})
 
 
 def _cause(cause: Named) -> str:

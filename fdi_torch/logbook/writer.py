@@ -189,11 +189,6 @@ class RunLog(Topics):
             yield message
             listener(message[0], message[1], message[4])
 
-    def wall(self) -> dict[str, int]:
-        """Wall time for a message's field `wall`."""
-        sec, nsec = divmod(self._clock(), 10**9)
-        return {"sec": sec, "nsec": nsec}
-
     def _open_sink(self) -> Sink:
         if self._sink is None:
             raise ValueError(f"{self.path}: expected an open log, got one outside its `with` block; write inside it")

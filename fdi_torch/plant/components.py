@@ -131,8 +131,3 @@ class Sensor(Component):
     @property
     def column(self) -> str:
         return self.channel or self.name
-
-
-def describe(component: Component) -> str:
-    """'tank T1', 'outlet OUT2' ...: kind and name of a component."""
-    return f"{component.place_kind} {component.name}"

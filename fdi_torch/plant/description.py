@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from fdi_torch.parameters import ParameterName
-from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Sensor, Tank, describe
+from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
 from fdi_torch.plant.kinds.pipe import Pipe
 from fdi_torch.plant.kinds.pump import Pump
@@ -30,7 +30,6 @@ __all__ = [
     "Pump",
     "Sensor",
     "Tank",
-    "describe",
 ]
 
 SMALLEST, LARGEST = 1e-12, 1e9

@@ -14,7 +14,7 @@ from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import fits
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import amount, shown_unit, with_error
+from fdi_torch.report.numbers import amount, as_float, shown_unit, with_error
 
 NAN = float("nan")
 
@@ -59,7 +59,7 @@ def diagnosed_effects(material: Material) -> list[DiagnosedEffect]:
 
 
 def _fault(message: Mapping[str, Any]) -> DiagnosedEffect:
-    size, std, flow, hole = (as_number(message.get(name)) for name in ("size", "size_std", "flow", "hole_diameter"))
+    size, std, flow, hole = (as_float(message.get(name)) for name in ("size", "size_std", "flow", "hole_diameter"))
     name, location, unit = (str(message.get(key, "")) for key in ("fault", "location", "unit"))
     fault = ParameterName.of_effect(f"{location}.{name}")
     quantity = fault.field or "size"
@@ -89,7 +89,7 @@ def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> Diagnose
     quantity = _size_of(name, location, plant)
     quantity = quantity if quantity in parameters else next(iter(parameters), "size")
     size: Mapping[str, Any] = parameters.get(quantity, {})
-    value, std = as_number(size.get("value")), as_number(size.get("std"))
+    value, std = as_float(size.get("value")), as_float(size.get("std"))
     return DiagnosedEffect(name, location, True, value, std, str(size.get("unit", "")), quantity=quantity)
 
 
@@ -100,8 +100,3 @@ def _size_of(name: str, location: str, plant: PlantDescription | None) -> str:
     except ValueError:
         return ""
     return effect(name).parameters(location, plant)[0].name if placed and plant is not None else ""
-
-
-def as_number(value: Any) -> float:
-    """A number of a log, or NaN."""
-    return float(value) if isinstance(value, int | float) else NAN

@@ -1,6 +1,8 @@
-"""Figure of a fit: readings, prediction and residual of each sensor."""
+"""Figure of readings beside the predictions of one or two models, with the residuals of each sensor."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,34 +14,41 @@ from fdi_torch.recording import Recording
 from fdi_torch.report.downsampling import thinned
 from fdi_torch.report.html import short
 from fdi_torch.report.numbers import axis, shown_unit
-from fdi_torch.report.style import MODEL, SOFT, label_lines, save, set_title, styled
-
-__all__ = ["fit_figure", "save"]
+from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, set_title, styled
 
 
-def fit_figure(recording: Recording, predicted: Tensor, title: str) -> Figure:
-    """Readings and prediction above, residual below, one column per sensor. predicted (T, N) in SI."""
-    count = len(recording.output_names)
+def fit_figure(
+    recording: Recording, predictions: Mapping[str, Tensor], title: str, columns: Sequence[str] | None = None
+) -> Figure:
+    """Readings and predictions above, residuals below; one column per sensor.
+
+    predictions: readings (T, N) in SI by the name of the model, the better one last. columns (N,): the outputs of the
+    recording that are predicted; by default all.
+    """
+    columns = recording.output_names if columns is None else columns
+    count = len(columns)
     with styled():
         figure = Figure(figsize=(max(4.2 * count, 6.0), 5.2), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots(2, count, sharex=True, squeeze=False, height_ratios=(2, 1))
-        for i in range(count):
-            _draw_sensor(axes[0, i], axes[1, i], recording, predicted, i)
+        for i, column in enumerate(columns):
+            of_sensor = {name: predicted[:, i] for name, predicted in predictions.items()}
+            _draw_sensor(axes[0, i], axes[1, i], recording, recording.output_names.index(column), of_sensor)
         set_title(figure, title)
     return figure
 
 
-def _draw_sensor(upper: Axes, lower: Axes, recording: Recording, predicted: Tensor, i: int) -> None:
+def _draw_sensor(upper: Axes, lower: Axes, recording: Recording, i: int, predictions: Mapping[str, Tensor]) -> None:
     unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
     counted, outputs = recording.mask[:, i].cpu().numpy(), recording.outputs[:, i].cpu().numpy()
     read = scale * np.where(counted, outputs, np.nan)
-    model = scale * predicted[:, i].detach().cpu().numpy()
     time = recording.time.cpu().numpy()
     upper.plot(*thinned(time, read), color=SOFT, lw=2.4, label="measured")
-    upper.plot(*thinned(time, model), color=MODEL, lw=1.0, label="estimate")
     lower.axhline(0.0, color=SOFT, lw=0.7)
-    lower.plot(*thinned(time, read - model), color=MODEL, lw=0.7)
+    for (name, predicted), colour in zip(predictions.items(), (MARK, MODEL)[-len(predictions) :], strict=True):
+        model = scale * predicted.detach().cpu().numpy()
+        upper.plot(*thinned(time, model), color=colour, lw=1.0, label=name)
+        lower.plot(*thinned(time, read - model), color=colour, lw=0.7)
     upper.set_title(short(recording.output_names[i]))
     upper.set_ylabel(axis("reading", unit))
     lower.set_ylabel(axis("residual", unit))

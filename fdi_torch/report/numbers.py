@@ -1,8 +1,11 @@
-"""Numbers and units as text for people."""
+"""Numbers and units as text for people, and numbers out of a log's JSON, which may hold anything."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
+
+import numpy as np
 
 from fdi_torch.parameters import display_unit
 
@@ -74,3 +77,12 @@ def probability_text(probability: float) -> str:
 
 def _minus(text: str) -> str:
     return text.replace("-", "−")
+
+
+def as_float(value: Any) -> float:
+    """A number of a log; NaN for anything else."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+
+
+def as_vector(values: Any) -> np.ndarray:
+    return np.array([as_float(value) for value in values])

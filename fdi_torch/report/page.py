@@ -8,12 +8,11 @@ from pathlib import Path
 
 from fdi_torch.report.html import Markup, join, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.script import CHART_STYLE, POLICY, SCRIPT
+from fdi_torch.report.page_assets import POLICY, SCRIPT, STYLESHEET
 from fdi_torch.report.section import Maker, Picture, Section, section_html
 from fdi_torch.report.sections import SECTIONS
 from fdi_torch.report.sections.rig import RIG
 from fdi_torch.report.style import save
-from fdi_torch.report.stylesheet import STYLESHEET
 from fdi_torch.report.verdict import headline, how_it_ended, kind_words
 
 WIDEST_BESIDE = 6.8  # inches of a rig beside the result; a wider one would have letters too small to read
@@ -58,7 +57,7 @@ def document(title: str, content: Sequence[Markup], style: str = "", refresh: in
             Markup(f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'),
             Markup(f'<meta http-equiv="refresh" content="{refresh}">' if refresh else ""),
             tag("title", f"{title} – fdi_torch"),
-            tag("style", Markup(CHART_STYLE + STYLESHEET + style)),
+            tag("style", Markup(STYLESHEET + style)),
             tag("script", Markup(SCRIPT)),
         ]
     )

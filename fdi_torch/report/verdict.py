@@ -13,7 +13,7 @@ from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
 from fdi_torch.report.sections.rehearsal import rehearsal_tables
 from fdi_torch.report.sections.study import ESTIMATORS
-from fdi_torch.report.windowed_fit_result import logged_windows
+from fdi_torch.report.sections.windows import logged_windows
 
 MOST_LISTED = 2  # alarms in the headline
 KINDS = {

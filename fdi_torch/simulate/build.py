@@ -68,15 +68,6 @@ def cache_folder() -> Path:
         return Path(tempfile.gettempdir()) / f"fdi_torch_{os.geteuid()}"
 
 
-def is_cached(source: str, level: str = "-O3") -> bool:
-    """Whether the cache holds the source compiled at that level of optimisation."""
-    compiler = find_compiler()
-    try:
-        return compiler is not None and _cached(_own_folder(), _key(compiler, source, level)) is not None
-    except BuildError:
-        return False
-
-
 def load_library(source: str, *functions: str, level: str = "-O3") -> ctypes.CDLL:
     """The compiled source, from the cache if possible. functions: names that it must export. level: of optimisation.
     Raises BuildError.

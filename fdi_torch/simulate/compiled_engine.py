@@ -12,7 +12,7 @@ from torch import Tensor
 from fdi_torch.capacity import expect_room
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.simulate.build import is_cached, load_library
+from fdi_torch.simulate.build import load_library
 from fdi_torch.simulate.cpp_source import emit
 from fdi_torch.simulate.engine import Readings, expect_problems
 from fdi_torch.simulate.experiment import Experiment
@@ -119,10 +119,6 @@ class CompiledEngine:
     def prepare(self, tangent: bool = False, dtype: torch.dtype = torch.float64) -> None:
         """Compile before the first use."""
         _kernel(self.network, self.space.names, tangent, *self._form, _REALS[dtype])
-
-    def is_built(self, tangent: bool = False, dtype: torch.dtype = torch.float64) -> bool:
-        """Whether the cache holds the compiled kernel."""
-        return is_cached(_source(self.network, self.space.names, tangent, *self._form, _REALS[dtype]), LEVEL)
 
     @property
     def _sensors(self) -> int:

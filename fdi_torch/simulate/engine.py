@@ -39,11 +39,6 @@ class Readings:
         return self.weight.sum(dim=-2)
 
     @cached_property
-    def centred(self) -> Tensor:
-        """Values less their channel's mean; zero where masked."""
-        return torch.where(self.weight > 0, self.known - self.centre.unsqueeze(-2), 0.0)
-
-    @cached_property
     def known(self) -> Tensor:
         """The values, 0 where masked."""
         return torch.where(self.weight > 0, self.values, 0.0)

@@ -1,4 +1,4 @@
-"""Choice of the simulation engine for a given amount of work, with the reason as a sentence."""
+"""Choice of the simulation engine, with the reason as a sentence."""
 
 from __future__ import annotations
 
@@ -20,21 +20,15 @@ from fdi_torch.simulate.traced_engine import TracedEngine
 Kind = Literal["auto", "compiled", "traced", "reference"]
 KINDS = ("auto", "compiled", "traced", "reference")
 
-# Below this product of simulations and time steps, the traced engine (about 2000 steps per second, for any number of
-# lanes) is finished before a compiler would be.
-_WORTH_COMPILING = 2000
-
 
 def make_engine(
     network: TankNetwork,
     space: ParameterSpace,
     experiment: Experiment,
     kind: str = "auto",
-    simulations: float = float("inf"),
     device: str = "cpu",
 ) -> Engine:
-    """The requested engine, or under 'auto' the fastest one for about `simulations` calls; `engine.why` states the
-    reason.
+    """The requested engine, or under 'auto' the fastest one; `engine.why` states the reason.
 
     Raises ValueError for an unknown kind, and BuildError if 'compiled' is requested without a compiler.
     """
@@ -48,7 +42,7 @@ def make_engine(
     if kind == "compiled":
         engine.prepare()
         return engine
-    return _fastest(engine, simulations, torch.device(device).type)
+    return _fastest(engine, torch.device(device).type)
 
 
 def adaptive_engine(network: TankNetwork, space: ParameterSpace, experiment: Experiment, step: float) -> Engine:
@@ -65,12 +59,10 @@ def adaptive_engine(network: TankNetwork, space: ParameterSpace, experiment: Exp
     return ReferenceEngine(network, space, smoothed, "dopri5", rtol, atol, why, every_node=False)
 
 
-def _fastest(compiled: CompiledEngine, simulations: float, device: str) -> Engine:
+def _fastest(compiled: CompiledEngine, device: str) -> Engine:
     parts = (compiled.network, compiled.space, compiled.experiment)
     if device != "cpu":
         return TracedEngine(*parts, f"traced engine (torch): runs on {device}")
-    if not compiled.is_built() and simulations * len(compiled.experiment.steps) < _WORTH_COMPILING:
-        return TracedEngine(*parts, "traced engine (torch): too little work to compile for")
     try:
         compiled.prepare()
     except BuildError as error:

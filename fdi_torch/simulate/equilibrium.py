@@ -15,7 +15,7 @@ RESOLUTION = 1e-3  # little smoothing of square roots, see plant.orifice.regular
 AT_REST = 1e-12
 
 
-def equilibrium(network: TankNetwork, inputs: Tensor, start: Tensor | None = None) -> Tensor:
+def equilibrium(network: TankNetwork, inputs: Tensor) -> Tensor:
     """Levels (tanks,), m, at which dh/dt = 0 for constant inputs (channels,) and nominal constants.
 
     Pseudo-transient continuation (Kelley and Keyes, 1998): implicit Euler steps that double until they equal Newton's.
@@ -33,7 +33,7 @@ def equilibrium(network: TankNetwork, inputs: Tensor, start: Tensor | None = Non
         return network(levels, commands, clock, values)[: len(plant.tanks)]  # effects with states are in steady state
 
     heights = inputs.new_tensor([tank.height for tank in plant.tanks])
-    levels = 0.5 * heights if start is None else start.clone()
+    levels = 0.5 * heights
     step, eye = scale, torch.eye(len(heights), dtype=inputs.dtype, device=inputs.device)
     for _ in range(200):
         rate = rates(levels)

@@ -16,7 +16,7 @@ from typing import Any
 from fdi_torch.jobs.report import page_of, report_of_log
 from fdi_torch.logbook import LogError, read_run
 from fdi_torch.report.material import gather
-from fdi_torch.report.script import POLICY
+from fdi_torch.report.page_assets import POLICY
 from fdi_torch.tables import needed
 from fdi_torch.view.log_list import RUNNING, UNSHOWN, Entry, LogList, selected
 from fdi_torch.view.pages import address, follow_page, list_page, navigation, problem_page, query_of
@@ -39,7 +39,7 @@ class Pages:
     def __init__(self, folder: Path) -> None:
         self.logs = LogList(folder)
         self._lock = threading.Lock()
-        self._responses = _library("starlette.responses")
+        self._responses = needed("starlette.responses", "view")
 
     def listed(self, request: Any) -> Any:
         query = query_of(dict(request.query_params))
@@ -95,12 +95,12 @@ def _material(entry: Entry) -> Any:
 def application(folder: Path) -> Any:
     """The ASGI application: GET requests for the list, reports and running jobs, from this machine's names only."""
     pages = Pages(folder)
-    route = _library("starlette.routing").Route
-    middleware = _library("starlette.middleware").Middleware
-    trusted = _library("starlette.middleware.trustedhost").TrustedHostMiddleware
+    route = needed("starlette.routing", "view").Route
+    middleware = needed("starlette.middleware", "view").Middleware
+    trusted = needed("starlette.middleware.trustedhost", "view").TrustedHostMiddleware
     routes = [route("/", pages.listed), route("/report", pages.report), route("/follow", pages.follow)]
     guards = [middleware(trusted, allowed_hosts=list(HOSTS), www_redirect=False)]
-    return _library("starlette.applications").Starlette(routes=routes, middleware=guards)
+    return needed("starlette.applications", "view").Starlette(routes=routes, middleware=guards)
 
 
 @contextmanager
@@ -111,7 +111,7 @@ def bound(folder: Path, port: int = 0) -> Iterator[tuple[str, Callable[[], None]
     """
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder with logs, got none there; name another folder")
-    uvicorn = _library("uvicorn")
+    uvicorn = needed("uvicorn", "view")
     # Without access log, WebSockets and lifespan events, none of which these pages have.
     config = uvicorn.Config(
         application(folder), log_level="error", access_log=False, ws="none", lifespan="off", server_header=False
@@ -125,10 +125,3 @@ def bound(folder: Path, port: int = 0) -> Iterator[tuple[str, Callable[[], None]
             raise ValueError(f"--port: expected a free port, got {port} ({error}); name another, or none") from error
         server = uvicorn.Server(config)
         yield f"http://{HOST}:{listening.getsockname()[1]}/", lambda: server.run(sockets=[listening])
-
-
-def _library(name: str) -> Any:
-    try:
-        return needed(name, "view")
-    except ImportError as error:
-        raise ValueError(str(error)) from None

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.logbook import RunLog
+from fdi_torch.logbook import DeferredTopic, RunLog
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.schemas import json_schema
 from fdi_torch.logbook.sink import Sink
@@ -23,6 +23,15 @@ FIXED: dict[str, Any] = {
     "git": {"commit": "0" * 40, "changed": "no"},
     "clock": lambda: FROZEN,
 }
+
+
+GENERATIONS = DeferredTopic("/estimator/de/generation", lambda items: items)
+
+
+def log_generation(log: RunLog, generation: int, cost: float, numbers: dict[str, Any], problem: int = 0) -> None:
+    """A generation of the search, written with delay, as by `train`."""
+    fields = {"problem": problem, "generation": generation, "best_cost": cost, **numbers}
+    log.later(GENERATIONS, (generation, fields))
 
 
 def write_everything(log: RunLog, samples: int = 50) -> None:
@@ -45,14 +54,17 @@ def write_everything(log: RunLog, samples: int = 50) -> None:
         hold="linear",
     )
     log.write("/source/clock", {"origin": 1.7e9}, 0.0)
-    log.sample("/plant/truth", 0.0, {"T1.leak.size": 0.1}, {"T1.leak.size": "1"})
+    log.write("/plant/truth", {"T1.leak.size": 0.1}, 0.0, units={"T1.leak.size": "1"})
     levels = ("h1", "h2", "h3")
-    log.residual(1.0, dict.fromkeys(levels, 1e-3), dict.fromkeys(levels, 4.2), {"h1": 5.0}, dict.fromkeys(levels, "m"))
+    tested = dict.fromkeys([f"{name}_statistic" for name in levels], 4.2) | {"h1_threshold": 5.0}
+    log.write("/observer/residual", dict.fromkeys(levels, 1e-3) | tested, 1.0, units=dict.fromkeys(levels, "m"))
     log.alarm(2.0, "raised", "h1", "h1 left its band", value=6.1, threshold=5.0, onset=1.5)
     for generation in range(3):
-        log.generation(generation, 1.0 / (generation + 1), {"T1.leak.size": 0.1}, mean_cost=np.inf, evaluations=50)
+        numbers: dict[str, Any] = {"T1.leak.size": 0.1, "mean_cost": np.inf, "evaluations": 50}
+        log_generation(log, generation, 1.0 / (generation + 1), numbers)
     log.population(2, {"population": rng.random((4, 2)), "cost": np.array([1.0, np.nan, 2.0, np.inf])})
-    log.iteration(0, 0.5, {"T1.leak.size": 0.1}, step=0.01, gradient=1e-6, damping=1e-3, accepted=True)
+    steps = {"step": 0.01, "gradient": 1e-6, "damping": 1e-3, "accepted": True, "T1.leak.size": 0.1}
+    log.write("/estimator/refine/iteration", {"problem": 0, "iteration": 0, "cost": 0.5, **steps}, 0.0)
     log.estimate(
         ["a", "b"], np.array([0.1, np.nan]), [0.01, np.inf], np.eye(2), "converged", units=["1", "1"], cost=2.0
     )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import orjson
 import pytest
-from example_logs import FIXED, write_everything, write_finished
+from example_logs import FIXED, log_generation, write_everything, write_finished
 from scipy import stats
 
 from fdi_torch.logbook import Message, Run, RunLog, align, compare, read_run, replay
@@ -23,7 +23,7 @@ def write_run(path: Path, value: float, *, std: float = 0.01, generations: int =
     with RunLog(path, "train", **{**FIXED, **changes}) as log:
         for generation in range(generations):
             for problem in range(2):
-                log.generation(generation, 1 / (generation + 1) + problem, {"leak": value}, problem=problem)
+                log_generation(log, generation, 1 / (generation + 1) + problem, {"leak": value}, problem)
         log.estimate(["leak", "gain"], [value, 1.0], [std, 0.1], np.eye(2), "converged", units=["1", "m"])
     return path
 
@@ -86,7 +86,7 @@ def test_residuals_align_by_plant_time(tmp_path: Path) -> None:
     for name, times in (("a", (0.0, 2.0)), ("b", (1.0, 2.0))):
         with RunLog(tmp_path / f"{name}.mcap", "monitor", **FIXED) as log:
             for t in times:
-                log.residual(t, {"h1": t})
+                log.write("/observer/residual", {"h1": t}, t)
     axis, values = align([tmp_path / "a.mcap", tmp_path / "b.mcap"], "/observer/residual", "h1")
     np.testing.assert_array_equal(axis, [0, 1, 2])
     np.testing.assert_array_equal(values, [[0, np.nan, 2], [np.nan, 1, 2]])

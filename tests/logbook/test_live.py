@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from example_logs import FIXED
+from example_logs import FIXED, log_generation
 
 from fdi_torch.cli import MISUSE, main
 from fdi_torch.logbook import Live, RunLog, read_run, serve
@@ -53,7 +53,7 @@ class Viewer:
 
 def write(log: RunLog, generations: range) -> None:
     for g in generations:
-        log.generation(g, 1.0 / (g + 1), {"T1.leak.size": 0.1 * g}, units={"T1.leak.size": "1"})
+        log_generation(log, g, 1.0 / (g + 1), {"T1.leak.size": 0.1 * g})
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from example_logs import FIXED
+from example_logs import FIXED, log_generation
 
 from fdi_torch.jobs.train import next_logged_generation, state_is_due
 from fdi_torch.logbook import LogError, Message, RunLog, content_hash, last_state, read_run, set_aside, unfinished
@@ -18,8 +18,9 @@ def search(log: RunLog, generations: range, population: np.ndarray) -> None:
     """A deterministic walk that logs its state every third generation."""
     for generation in generations:
         population = np.cos(population) + generation
-        log.residual(float(generation), {"h1": generation}, {"h1": 2.0} if generation > 4 else None)
-        log.generation(generation, float(population.sum()), {"x": population[0]})
+        tested = {"h1_statistic": 2.0} if generation > 4 else {}
+        log.write("/observer/residual", {"h1": generation, **tested}, float(generation))
+        log_generation(log, generation, float(population.sum()), {"x": population[0]})
         if generation % 3 == 2:
             log.population(generation, {"population": population})
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import orjson
 import pytest
-from example_logs import FIXED, FROZEN, VERDICT, write_everything, write_finished
+from example_logs import FIXED, VERDICT, log_generation, write_everything, write_finished
 from mcap.reader import make_reader
 
-from fdi_torch.logbook import DeferredTopic, RunLog, content_hash, read_run, tail_buffer
+from fdi_torch.logbook import DeferredTopic, RunLog, read_run, sink
 from fdi_torch.logbook.provenance import environment, git_state
 from fdi_torch.logbook.topic_definitions import TOPICS
 
@@ -80,16 +80,6 @@ def test_chunks_cut_by_the_clock_leave_no_trace(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "b.mcap"]
 
 
-def test_wall_time_stands_only_where_it_is_asked_for(tmp_path: Path) -> None:
-    with RunLog(tmp_path / "a.mcap", "monitor", **FIXED) as log:
-        log.alarm(1.0, "raised", "h1", wall=True)
-        log.alarm(1.0, "raised", "h1")
-    with_wall, without = read_run(tmp_path / "a.mcap").messages()
-    assert with_wall.payload["wall"] == {"sec": FROZEN // 10**9, "nsec": FROZEN % 10**9}
-    assert "wall" not in without.payload
-    assert content_hash([with_wall]) == content_hash([without])
-
-
 def test_the_whole_verdict_is_kept(finished: Path) -> None:
     (message,) = read_run(finished).messages(["/gap/verdict"])
     payload = message.payload
@@ -108,9 +98,9 @@ def test_the_kind_of_a_field_outlives_further_fields(tmp_path: Path) -> None:
 
 def test_further_fields_get_a_described_channel(tmp_path: Path) -> None:
     with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
-        log.residual(0.0, {"h1": 1.0})
-        log.residual(1.0, {"h1": 1.0}, {"h1": 2.0})
-        log.residual(2.0, {"h1": 1.0, "absent": None})
+        log.write("/observer/residual", {"h1": 1.0}, 0.0)
+        log.write("/observer/residual", {"h1": 1.0, "h1_statistic": 2.0}, 1.0)
+        log.write("/observer/residual", {"h1": 1.0, "absent": None}, 2.0)
     channels = [message.channel for message in read_run(tmp_path / "a.mcap").messages()]
     assert b"h1_statistic" not in channels[0].schema_data
     assert b"h1_statistic" in channels[1].schema_data
@@ -132,8 +122,6 @@ def test_misuse_is_told(tmp_path: Path) -> None:
     with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
         with pytest.raises(ValueError, match="expected a finite time, got nan"):
             log.write("/study/trial", {"trial": 1}, float("nan"))
-        with pytest.raises(ValueError, match="expected a level among debug"):
-            log.say("x", level="loud")
         with pytest.raises(ValueError, match=r"expected values of shape \(3, 1\), got \(2, 1\)"):
             log.samples("/plant/output", np.arange(3.0), np.zeros((2, 1)), ["h1"], ["m"])
         with pytest.raises(ValueError, match="expected a name other than t"):
@@ -175,16 +163,16 @@ def test_chunks_cut_within_or_after_a_recording_leave_no_trace(tmp_path: Path, c
                 if last in at:
                     log.flush()
             for generation in range(5):
-                log.generation(generation, 1.0 / (1 + generation), {"x": 0.5})
+                log_generation(log, generation, 1.0 / (1 + generation), {"x": 0.5})
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
     assert sum(1 for _ in read_run(tmp_path / "b.mcap").messages()) == 2005
 
 
-@pytest.mark.parametrize("in_memory", [tail_buffer.IN_MEMORY, 1])
+@pytest.mark.parametrize("in_memory", [sink.IN_MEMORY, 1])
 def test_chunks_cut_between_messages_and_attachments_leave_no_trace(
     tmp_path: Path, in_memory: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tail_buffer, "IN_MEMORY", in_memory)  # beyond it, the buffer is a file
+    monkeypatch.setattr(sink, "IN_MEMORY", in_memory)  # beyond it, the buffer is a file
     for name, cuts in (("a", ()), ("b", (1, 5, 2500, 4000))):
         with RunLog(tmp_path / f"{name}.mcap", "train", **FIXED) as log:
             for number in range(5000):
@@ -203,7 +191,7 @@ def test_chunks_cut_between_messages_and_attachments_leave_no_trace(
 def test_what_is_put_off_comes_before_what_follows(tmp_path: Path) -> None:
     with RunLog(tmp_path / "a.mcap", "train", **FIXED, flush_seconds=0.02) as log:
         for generation in range(200):
-            log.generation(generation, 1.0, {"x": 0.5})
+            log_generation(log, generation, 1.0, {"x": 0.5})
             if generation == 150:
                 time.sleep(0.1)
                 assert len(list(read_run(tmp_path / "a.mcap.partial").messages())) == 151

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from example_logs import FIXED
+from example_logs import FIXED, log_generation
 
 from fdi_torch.interruption import Terminated
 from fdi_torch.logbook import LogError, RunLog, read_run
@@ -28,7 +28,7 @@ from fdi_torch.logbook import LogError, RunLog, read_run
 )
 def test_what_was_logged_before_a_failure_stays(tmp_path: Path, error: BaseException, status: str, reason: str) -> None:
     with pytest.raises(type(error)), RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
-        log.generation(0, 1.0, {"x": 0.5})
+        log_generation(log, 0, 1.0, {"x": 0.5})
         raise error
     run = read_run(tmp_path / "a.mcap")
     assert run.complete and [m.payload["best_cost"] for m in run.messages()] == [1.0]

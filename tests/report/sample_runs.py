@@ -29,11 +29,13 @@ def write_train(path: Path, name: str = "T1.leak.size", predicted: bool = True) 
     inputs = np.stack([5e-5 + 1e-5 * (time % 200 > 100), np.full(1000, 4e-5)], 1)
     with RunLog(path, "train", config_text="plant: three_tank\n", **FIXED) as log:
         log.recording(time, inputs, read, ("Q1", "Q2"), ("h1", "h2"), ("m^3/s",) * 2, ("m",) * 2)
-        log.sample("/plant/truth", 0.0, {name: 0.3, "P13.openness.size": 0.6})
+        log.write("/plant/truth", {name: 0.3, "P13.openness.size": 0.6}, 0.0)
         for g in range(20):
-            log.generation(g, 2.0 * math.exp(-g), {name: 0.3 + 0.1 / (g + 1)}, mean_cost=3.0, evaluations=50 * g)
+            fields = {"problem": 0, "generation": g, "best_cost": 2.0 * math.exp(-g), name: 0.3 + 0.1 / (g + 1)}
+            log.write("/estimator/de/generation", fields | {"mean_cost": 3.0, "evaluations": 50 * g}, g)
         for i in range(5):
-            log.iteration(i, 1.0 / (i + 1), {name: 0.3})
+            fields = {"problem": 0, "iteration": i, "cost": 1.0 / (i + 1), name: 0.3}
+            log.write("/estimator/refine/iteration", fields, i)
         names, covariance = [name, "P13.openness.size"], np.array([[4e-6, -3e-6], [-3e-6, 9e-6]])
         log.estimate(names, [0.3004, 0.599], [2e-3, 3e-3], covariance, "converged", units=["1", "1"])
         location, _, effect = name.partition(".")
@@ -185,7 +187,8 @@ def write_monitor(path: Path) -> Path:
     with RunLog(path, "monitor", config_text="plant: three_tank\n", **FIXED) as log:
         for t in time:
             r = {f"h{k}": 1e-3 * rng.standard_normal() + (0.006 if t > 400 else 0.0) for k in (1, 2, 3)}
-            log.residual(t, r, {"all": 3.0 + 40.0 * (t > 400)}, {"all": 16.0}, dict.fromkeys(r, "m"))
+            tested = {"all_statistic": 3.0 + 40.0 * (t > 400), "all_threshold": 16.0}
+            log.write("/observer/residual", r | tested, t, units=dict.fromkeys(r, "m"))
         log.alarm(408.0, "alarm", "h1", "the residual leaves its fault-free range", onset=400.0)
         log.alarm(468.0, "isolated", "T1.leak", "leak at T1: 0.2 ± 0.01", onset=401.0)
         log.fault("leak", "T1", True, size=0.2, size_std=0.01, unit="1")

@@ -188,7 +188,8 @@ def test_names_from_logs_stay_text(client: Client) -> None:
 def test_a_running_job_is_followed_until_its_report(client: Client, folder: Path) -> None:
     path = folder / "live.mcap"
     with RunLog(path, "train", config={"estimate": {"search": {"evaluations": 200}}}) as log:
-        log.generation(3, 0.25, {"T1.leak.size": 0.1}, evaluations=50)
+        topic = "/estimator/de/generation"
+        log.write(topic, {"problem": 0, "generation": 3, "best_cost": 0.25, "evaluations": 50}, 3)
         log.say("halfway there")
         log.flush()
         listed = client.page("/")
@@ -198,7 +199,7 @@ def test_a_running_job_is_followed_until_its_report(client: Client, folder: Path
         assert "search: generation 3, cost 0.25, 50 of at most 200 simulations" in page.words
         assert ("progress", {"value": "0.250", "max": "1"}) in page.tags and "halfway there" in page.words
         assert any(values.get("http-equiv") == "refresh" for tag, values in page.tags if tag == "meta")
-        log.generation(4, 0.2, {"T1.leak.size": 0.1}, evaluations=100)
+        log.write(topic, {"problem": 0, "generation": 4, "best_cost": 0.2, "evaluations": 100}, 4)
         log.flush()
         assert "generation 4" in client.page(link).words
     status, _, headers = client.ask(link)

@@ -1,8 +1,8 @@
 """Blind benchmark of the gap diagnosis on hidden rigs with other equations and another integrator.
 
 The benchmark simulates recordings and seals their causes (each recording contains the hash of the key). It diagnoses
-every recording without the key, then opens the key and scores the answers by kind of case, with 95 % intervals and
-baselines. Everything is written to --out; repeating the command resumes an interrupted benchmark.
+every recording without the key, then opens the key and scores the answers by kind of case, with 95 % intervals, beside
+two answers without skill. Everything is written to --out; repeating the command resumes an interrupted benchmark.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ examples:
   fdi challenge                                            22 cases, two of each kind, four minutes on one core
   fdi challenge --cases 450 --seed 7 --out logs/seven      fifty of each kind; the same command resumes after Ctrl-C
   fdi challenge --cases 450 --seed 7 --out logs/seven --minutes 30      score what is diagnosed within half an hour
-  fdi challenge --rig quadruple_tank --kinds single,pair --no-bic
+  fdi challenge --rig quadruple_tank --kinds single,pair
   fdi challenge --plant my_rig.yaml                        hidden rigs built like your plant file
   fdi challenge --plant network --tanks 3..6 --cases 16    random networks of three to six tanks
   fdi challenge --leave-out all --cases 24 --out logs/denied
@@ -57,7 +57,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--leave-out", metavar="EFFECT,...", default="", help="effects to remove from the library, or all, one per case"
     )
-    parser.add_argument("--no-bic", action="store_true", help="skip the slow baseline, one effect at a time by BIC")
     parser.add_argument("--minutes", metavar="M", type=float, default=math.inf, help="start no case after this time")
     parser.add_argument(
         "--cluster",

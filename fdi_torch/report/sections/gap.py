@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from fdi_torch.gap.verdict_words import FORMAT_1, causes_of
 from fdi_torch.gap.verdict_words import explanation_words as in_words
 from fdi_torch.report.html import table, tag
-from fdi_torch.report.json_numbers import as_float
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, percent, probability_text, shown_unit, with_error
+from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
 from fdi_torch.report.panels import BAR_NAME, bar_panel
 from fdi_torch.report.section import Picture, Section
 

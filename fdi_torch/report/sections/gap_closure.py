@@ -7,9 +7,8 @@ from pathlib import PurePath
 from typing import Any
 
 from fdi_torch.report.html import table
-from fdi_torch.report.json_numbers import as_float
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import axis, number, percent, shown_unit, with_error
+from fdi_torch.report.numbers import as_float, axis, number, percent, shown_unit, with_error
 from fdi_torch.report.panels import bar_panel
 from fdi_torch.report.section import Picture, Section
 

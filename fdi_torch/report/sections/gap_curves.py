@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import short
-from fdi_torch.report.json_numbers import as_float, as_vector
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import axis, shown_unit
+from fdi_torch.report.numbers import as_float, as_vector, axis, shown_unit
 from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, panel
 

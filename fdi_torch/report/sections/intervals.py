@@ -10,9 +10,8 @@ import numpy as np
 from fdi_torch.estimate.profile import chi_square_quantile
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import table, tag
-from fdi_torch.report.json_numbers import as_float, as_vector
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import axis, number, shown_unit
+from fdi_torch.report.numbers import as_float, as_vector, axis, number, shown_unit
 from fdi_torch.report.section import Column, Picture, Section, signals
 from fdi_torch.report.sections.estimate import last_estimate
 from fdi_torch.report.style import MODEL, OTHER

@@ -8,14 +8,13 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from fdi_torch.report.diagnosed_effects import as_number
 from fdi_torch.report.html import short, table
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, shown_unit, with_error
+from fdi_torch.report.numbers import as_float, number, shown_unit, with_error
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import FAINT, MARK, panel
-from fdi_torch.report.windowed_fit_result import logged_windows
 
+Records = list[dict[str, Any]]
 MOST_SUSPECTS = 40
 
 
@@ -37,10 +36,10 @@ def windows_section(material: Material) -> Section | None:
 def _row(stretch: dict[str, Any]) -> list[str]:
     """Sizes in a practical unit; a size beyond its range has no error."""
     unit, scale = shown_unit(str(stretch.get("unit", "1")))
-    size, std = (as_number(stretch.get(name)) * scale for name in ("size", "std"))
+    size, std = (as_float(stretch.get(name)) * scale for name in ("size", "std"))
     shown = with_error(size, std) if math.isfinite(std) else f"> {number(size)}"
     flow, flow_scale = shown_unit("m^3/s")
-    moved = as_number(stretch.get("flow")) * flow_scale
+    moved = as_float(stretch.get("flow")) * flow_scale
     return [
         str(stretch["name"]),
         *(number(stretch[name], 6) for name in ("start", "stop")),
@@ -66,3 +65,17 @@ def _bars(windows: Sequence[dict[str, Any]]) -> Figure:
     axes.set_xlim(float(windows[0]["start"]), max(float(w["stop"]) for w in windows))
     axes.grid(False)
     return figure
+
+
+def logged_windows(material: Material) -> tuple[Records, Records]:
+    """Windows, and the periods in which a fault was present; empty if they are missing or unreadable."""
+    windows, stretches = (_records(material, name) for name in ("windows", "stretches"))
+    return [w for w in windows if _spans(w)], [s for s in stretches if _spans(s) and isinstance(s.get("name"), str)]
+
+
+def _records(material: Material, name: str) -> Records:
+    return [each for each in material.listed(name) if isinstance(each, dict)]
+
+
+def _spans(record: dict[str, Any]) -> bool:
+    return all(isinstance(record.get(name), int | float) for name in ("start", "stop"))

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from torch import Tensor
 
-from fdi_torch.paper.equations import EQUATIONS, ERRATA, STATEMENTS
-from fdi_torch.paper.modes import Modes, mode_name
-from fdi_torch.paper.online import OnLine
-from fdi_torch.paper.published import SYMBOLS
-from fdi_torch.paper.table_cases import BOUND_SNR, Case
+from benchmarks.paper.equations import EQUATIONS, ERRATA, STATEMENTS
+from benchmarks.paper.modes import Modes, mode_name
+from benchmarks.paper.online import OnLine
+from benchmarks.paper.published import SYMBOLS
+from benchmarks.paper.table_cases import BOUND_SNR, Case
 
 MISPRINT = "misprint"
 ROUNDING = 1e-7

@@ -1,4 +1,7 @@
-"""The page's only script: uPlot and the charts made with it. The content security policy allows it by its hash."""
+"""The page's stylesheet and its only script: uPlot and the charts made with it.
+
+The content security policy allows the script by its hash.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ def _text(name: str) -> str:
 LICENCE = _text("uPlot.LICENSE.txt")
 _OWN = f'(() => {{\n"use strict";\n{_text("charts.js")}\n{_text("page.js")}}})();\n'
 SCRIPT = "\n".join((f"/*\n{LICENCE}*/", _text("uPlot.iife.min.js"), _OWN))
-CHART_STYLE = _text("uPlot.min.css")
+STYLESHEET = _text("uPlot.min.css") + _text("page.css")
 
 # Even if something passed the escaping, the browser would load nothing, and run nothing but SCRIPT.
 _HASH = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()

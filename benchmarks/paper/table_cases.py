@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from benchmarks.paper.published import PARAMETERS
 from fdi_torch.config.run_file import Run, load_run
 from fdi_torch.config.simulation import NoiseConfig, noise_std
 from fdi_torch.config.yaml_files import SHIPPED
@@ -17,7 +18,6 @@ from fdi_torch.estimate.hybrid import estimate_parameters
 from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
 from fdi_torch.estimate.refinement import information_std
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space, simulated_truth
-from fdi_torch.paper.published import PARAMETERS
 
 BOUND_SNR = 50.0
 """SNR in dB for which the bound of a noise-free row is stated."""

@@ -10,11 +10,11 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
+from benchmarks.blind_rivals.equation_errors import EquationErrors, equation_errors
 from fdi_torch.blind.deviation import Array
-from fdi_torch.blind.equation_errors import EquationErrors, equation_errors
 from fdi_torch.blind.places import Cause
-from fdi_torch.blind.statistics import f_test
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
@@ -152,3 +152,11 @@ def _answer(causes: Sequence[Cause]) -> dict[str, Any]:
         "ambiguity_set": [listed] if causes else [],
         "posterior": [],
     }
+
+
+def f_test(explained: float, residual: float, parameters: int, samples: float) -> float:
+    """p-value of `parameters` columns that reduce the sum of squares by `explained` to `residual`."""
+    freedom = samples - parameters
+    if freedom <= 0 or residual <= 0:
+        return 1.0
+    return float(stats.f.sf(explained / parameters / (residual / freedom), parameters, freedom))

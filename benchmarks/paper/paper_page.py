@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_torch.disk import write_text
-from fdi_torch.paper import paper_tables
-from fdi_torch.paper.modes import Modes, confusion, diagnose_modes, mode_name
-from fdi_torch.paper.online import TIME_BETWEEN_FALSE_ALARMS, OnLine, follow
-from fdi_torch.paper.published import SYMBOLS, TABLE_2, TABLE_3
-from fdi_torch.paper.table_cases import Case, shipped_run, solve
-from fdi_torch.report.paper_figures import (
+from benchmarks.paper import paper_tables
+from benchmarks.paper.modes import Modes, confusion, diagnose_modes, mode_name
+from benchmarks.paper.online import TIME_BETWEEN_FALSE_ALARMS, OnLine, follow
+from benchmarks.paper.paper_figures import (
     confusion_figure,
     convergence_figure,
     correlation_figure,
     outputs_figure,
     residuals_figure,
 )
+from benchmarks.paper.published import SYMBOLS, TABLE_2, TABLE_3
+from benchmarks.paper.table_cases import Case, shipped_run, solve
+from fdi_torch.disk import write_text
 from fdi_torch.report.style import save
 
 WINDOWS = ("nominal", "table2_2d", "table3_snr50")
@@ -133,7 +133,7 @@ def _alarms(online: OnLine) -> str:
 PAGE = """# The paper's tables and figures, made again
 
 "A Nonlinear Adaptive Observer-Based Differential Evolution Algorithm to Multiparameter Fault Diagnosis" (2020).
-Everything here is made by `make paper` (`fdi paper`) from the run files under `configs/paper`, seeds included.
+Everything here is made by `make paper` from the run files under `configs/paper`, seeds included.
 
 The three tanks are simulated by an adaptive solver at a relative tolerance of 1e-10 and estimated with fixed steps,
 so data and model are not the same code. *DE alone* is the paper's way: differential evolution on the sum of

@@ -1,0 +1,1 @@
+"""Competing methods for the blind benchmark of the gap diagnosis."""

@@ -1,0 +1,52 @@
+"""Commented minimal files: a plant, and runs, monitors and studies of any plant."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from string import Template
+
+from fdi_torch.names import unknown
+from fdi_torch.parameters import quantity_text
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recordings.csv_files import header_of
+
+KINDS = ("plant", "run", "monitor", "study")
+
+
+def template(kind: str, plant: PlantDescription, plant_file: str, name: str) -> str:
+    """The text of a new file of that kind.
+
+    plant: the plant of the file; plant_file: its entry under the key `plant`; name: of the run and of the recording
+    that it reads. Raises ValueError for an unknown kind.
+    """
+    if kind not in KINDS:
+        raise ValueError(unknown("a kind of file", kind, KINDS))
+    pipe = plant.pipes[0].name if plant.pipes else plant.tanks[0].name
+    plugging = f"{pipe}.plugging" if plant.pipes else f"{pipe}.evaporation"
+    constant = f"{pipe}.discharge_coefficient" if plant.pipes else f"{pipe}.area"
+    text = files("fdi_torch.config").joinpath("templates", f"{kind}.yaml").read_text(encoding="utf-8")
+    return Template(text).substitute(
+        plant=plant_file,
+        name=name,
+        header=header_of(plant.channel_units(), {s.column: s.unit for s in plant.sensors}),
+        output=plant.sensors[0].column,
+        leak=f"{plant.tanks[0].name}.leak",
+        plugging=plugging,
+        constant=constant,
+        inputs=_inputs(plant),
+    )
+
+
+def _inputs(plant: PlantDescription) -> str:
+    """For each pump and transfer a step up and a step down about half of its range; valves are open."""
+    full_commands = {c.channel: (c.full_command, c.command_unit) for c in plant.metered_flows()}
+    lines = []
+    for channel in plant.channels():
+        if channel not in full_commands:
+            lines.append(f"    {channel}: 1")
+            continue
+        high, unit = full_commands[channel]
+        levels = [quantity_text(share * high, unit, 3) for share in (0.4, 0.5, 0.3)]
+        steps = ", ".join(f"[{t} s, {level}]" for t, level in zip((0, 200, 400), levels, strict=True))
+        lines.append(f"    {channel}: {{steps: [{steps}]}}")
+    return "\n".join(lines)
