@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank, Transfer
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.orifice import rim_strength, weir_flow
 from fdi_torch.plant.signals import Clock, CumulativeSignal
@@ -87,6 +87,58 @@ def test_small_steps_about_rest_follow_the_matrix_exponential() -> None:
     for k in range(11):
         expected = rest + torch.from_numpy(expm(10.0 * k * slope.numpy())) @ push
         assert (levels[k] - expected).abs().max() < 1e-9
+
+
+def test_an_outlet_above_the_level_passes_nothing() -> None:
+    plant = PlantDescription(
+        "one",
+        (Tank("T", 0.02, 1.0, 0.1),),
+        (Pipe("O", "T", OUTSIDE, 1e-4, 0.6, elevation=0.3),),
+        (),
+        (Sensor("h", "T"),),
+    )
+    recording = blank_recording(plant, torch.zeros(3, 0, dtype=torch.float64), torch.arange(3, dtype=torch.float64))
+    space, theta = nothing()
+    levels = ReferenceEngine(build_network(plant), space, lay_out(recording, (), 0.5)).levels(theta)
+    assert torch.equal(levels, torch.full_like(levels, 0.1))
+
+
+@pytest.mark.parametrize("levels", [(0.5, 0.1), (0.1, 0.5), (0.5, 0.4), (0.2, 0.1)])
+def test_a_raised_pipe_is_driven_by_the_water_above_it(levels: tuple[float, float]) -> None:
+    """Torricelli with the head of the water above a pipe at 0.3 m: the level of a tank that does not reach it is no head."""
+    plant = PlantDescription(
+        "two",
+        (Tank("A", 0.02, 1.0), Tank("B", 0.02, 1.0)),
+        (Pipe("P", "A", "B", 1e-4, 0.6, elevation=0.3),),
+        (),
+        (Sensor("h", "A", gain=2.0, offset=0.1),),
+    )
+    network = build_network(plant)
+    state = torch.tensor(levels, dtype=torch.float64)
+    rates = network(state, state[:0], clock(), network.bind(*(nothing()[0], state[:0])))
+    head = max(levels[0] - 0.3, 0.0) - max(levels[1] - 0.3, 0.0)
+    flow = 0.6 * 1e-4 * math.copysign(math.sqrt(2 * 9.81 * abs(head)), head)
+    assert (0.02 * rates).tolist() == pytest.approx([-flow, flow], rel=1e-6, abs=1e-12)
+
+
+def test_a_reading_is_gain_times_level_plus_offset() -> None:
+    plant = replace(three_tank(), sensors=(Sensor("h1", "T1", gain=2.0, offset=0.1),))
+    network, level = build_network(plant), torch.tensor(0.4, dtype=torch.float64)
+    readings, _ = network.read([level], (), clock(), network.bind(ParameterSpace(), level.new_zeros(0)))
+    assert float(readings[0]) == pytest.approx(2.0 * 0.4 + 0.1)
+
+
+@pytest.mark.parametrize("draw", [1e-3, 1e-5])
+def test_a_tank_that_is_drawn_empty_loses_no_more_than_it_holds(draw: float) -> None:
+    """The law -2 h / step, 0 below the floor, takes the 3/8 rule from h to h (1 - (2 + 3 (2/3 + 2) + 0) / 8) = -h / 4."""
+    tanks = (Tank("A", 0.02, 1.0, 0.01), Tank("B", 0.02, 1.0, 0.0))
+    plant = PlantDescription("two", tanks, (), (), (Sensor("h", "A"),), transfers=(Transfer("Q", "A", "B", 1e-2),))
+    time = 5.0 * torch.arange(9, dtype=torch.float64)
+    recording = blank_recording(plant, torch.full((9, 1), draw, dtype=torch.float64), time)
+    space, theta = nothing()
+    levels = ReferenceEngine(build_network(plant), space, lay_out(recording, ("Q",), 5.0)).levels(theta)[0]
+    assert bool((levels[:, 0] >= -0.01 / 4 - 1e-12).all()) and bool((levels[1:, 0] <= levels[:-1, 0]).all())
+    assert torch.allclose(levels.sum(1), torch.full_like(levels[:, 0], 0.01), rtol=1e-12)
 
 
 def test_rest_is_where_the_paper_reading_has_it() -> None:
