@@ -256,7 +256,7 @@ def test_rand_1_mutant_is_a_base_plus_a_scaled_difference_of_members() -> None:
 
 
 def test_l_shade_mutant_goes_to_a_p_best_member_with_a_difference_to_members_or_archived_ones() -> None:
-    """x_i + F (x_best - x_i + x_1 - x_2) with the unit vectors as members, so that each mutant tells what it was made of.
+    """x_i + F (x_best - x_i + x_1 - x_2) with unit vectors as members, so that each mutant tells what it was made of.
     (Tanabe and Fukunaga 2013, current-to-pbest/1 with archive.)
     """
     size, kept = 20, 10

@@ -19,7 +19,7 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlacedEffect
 from fdi_torch.recording import Recording
 from tests.rigs import blank_recording, three_tank
-from tests.test_gap import nominal_plant, noise, recorded
+from tests.test_gap import noise, nominal_plant, recorded
 
 LAMINAR = {"P13.laminar_flow.transition_head": 0.05}
 LIBRARY = ("laminar_flow", "pump_lag", "leak")
@@ -99,7 +99,7 @@ def test_the_noise_of_a_hold_out_is_right_even_if_the_augmented_model_diverges()
 
 
 def held_out(gap: float, ar: float, samples: int = 6000) -> HeldOut:
-    """Readings of the augmented model with AR(1) noise of 1 mm; the recalibrated model is off by `gap` (m) throughout."""
+    """Readings of the augmented model with AR(1) noise of 1 mm; the recalibrated model is off by `gap`, m."""
     plant, time = nominal_plant(), torch.arange(samples, dtype=torch.float64)
     zero = torch.zeros(samples, 3, dtype=torch.float64)
     blank = blank_recording(plant, zero[:, :2], time)

@@ -267,7 +267,7 @@ def test_a_lane_far_behind_is_given_up_and_has_not_converged() -> None:
 
 
 def test_a_lane_that_catches_up_is_not_given_up() -> None:
-    """Half the distance in each step leaves a quarter of the cost of a parabola: three quarters of its excess are gained."""
+    """Half the distance in each step leaves a quarter of a parabola: three quarters of the excess are gained."""
 
     def half_way(theta: Tensor, lanes: Tensor) -> Linearisation:
         x = theta[:, 0]

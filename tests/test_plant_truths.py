@@ -105,7 +105,7 @@ def test_an_outlet_above_the_level_passes_nothing() -> None:
 
 @pytest.mark.parametrize("levels", [(0.5, 0.1), (0.1, 0.5), (0.5, 0.4), (0.2, 0.1)])
 def test_a_raised_pipe_is_driven_by_the_water_above_it(levels: tuple[float, float]) -> None:
-    """Torricelli with the head of the water above a pipe at 0.3 m: the level of a tank that does not reach it is no head."""
+    """Torricelli with the water above a pipe at 0.3 m: a level below it is no head."""
     plant = PlantDescription(
         "two",
         (Tank("A", 0.02, 1.0), Tank("B", 0.02, 1.0)),
@@ -130,7 +130,7 @@ def test_a_reading_is_gain_times_level_plus_offset() -> None:
 
 @pytest.mark.parametrize("draw", [1e-3, 1e-5])
 def test_a_tank_that_is_drawn_empty_loses_no_more_than_it_holds(draw: float) -> None:
-    """The law -2 h / step, 0 below the floor, takes the 3/8 rule from h to h (1 - (2 + 3 (2/3 + 2) + 0) / 8) = -h / 4."""
+    """The law -2 h / step, 0 below the floor, leads the 3/8 rule from h to h (1 - (2 + 3 (2/3 + 2)) / 8) = -h / 4."""
     tanks = (Tank("A", 0.02, 1.0, 0.01), Tank("B", 0.02, 1.0, 0.0))
     plant = PlantDescription("two", tanks, (), (), (Sensor("h", "A"),), transfers=(Transfer("Q", "A", "B", 1e-2),))
     time = 5.0 * torch.arange(9, dtype=torch.float64)

@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 
 from fdi_torch.logbook import DeferredTopic, RunLog, content_hash, read_run, tail_buffer
 from fdi_torch.logbook.provenance import environment, git_state
+from fdi_torch.logbook.sink import EPOCH_NS, log_time_of
 from fdi_torch.logbook.topic_definitions import TOPICS
 
 
@@ -53,6 +54,11 @@ def test_units_stand_in_the_channel(finished: Path) -> None:
     assert channels["/plant/output"]["unit.h3"] == "m" and channels["/plant/output"]["unit.t"] == "s"
     assert channels["/diagnosis/fault"]["unit.flow"] == "m^3/s"
     assert channels["/study/trial"]["schema_version"] == "1"
+
+
+def test_a_log_time_is_the_nearest_nanosecond() -> None:
+    times = [0.3 * k for k in range(1000)]
+    assert [log_time_of(t) - EPOCH_NS for t in times] == [300_000_000 * k for k in range(1000)]
 
 
 def test_equal_runs_are_equal_byte_for_byte(tmp_path: Path) -> None:
