@@ -91,6 +91,7 @@ def test_a_scan_with_a_gain_is_one_of_the_product(columns: int, loop: bool, monk
         {("pump_gain", "Q1"): {"factor": 1.1}},
         {("pump_lag", "Q1"): {"time_constant": 9.0}, ("sensor_lag", "h2"): {"time_constant": 12.0}},
         {("pump_delay", "Q2"): {"delay": 7.3}, ("sensor_delay", "h1"): {"delay": 4.6}},
+        {("sensor_drift", "h1"): {"rate": 1e-4}},
     ],
 )
 def test_levels_and_slopes_are_those_of_the_reference_and_of_finite_differences(causes: dict) -> None:
