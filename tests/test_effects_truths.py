@@ -14,11 +14,12 @@ from torch import Tensor
 from fdi_torch.effects import build_network, effect, placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect, Sensor, Tank
-from fdi_torch.plant.effect import Effect, Local, Memory
+from fdi_torch.plant.effect import Effect, Local, Memory, Placement
 from fdi_torch.plant.operating_range import bounded_by_recording, head_range, interior_points, operating_range_of
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.simulated_recording import quantized
 
 
 def number(value: float) -> Tensor:
@@ -329,6 +330,13 @@ def test_operating_range_of_a_recording() -> None:
     assert reach.levels["T4"] == (0.0, 0.7), "a tank without a sensor"
     assert operating_range_of(recording, plant).readings["d1"] == (7.0, 9.0), "nothing read: from floor to rim"
     assert interior_points((0.0, 4.0), 3) == [1.0, 2.0, 3.0]
+
+
+def test_a_quantized_reading_is_the_nearest_step() -> None:
+    network = build_network(three_tank(), [Placement(effect("sensor_quantization"), "h2", {"step": 0.01})])
+    readings = torch.tensor([[0.1234, 0.1234, 0.1234], [0.1234, 0.1266, 0.1234]], dtype=torch.float64)
+    assert quantized(readings, network)[:, 1].tolist() == pytest.approx([0.12, 0.13])
+    assert torch.equal(quantized(readings, network)[:, ::2], readings[:, ::2])
 
 
 def test_the_heads_of_a_pipe_lie_between_those_of_its_ends() -> None:
