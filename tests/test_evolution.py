@@ -10,7 +10,7 @@ from scipy import stats
 from torch import Tensor
 
 from fdi_torch.estimate.draws import stream, uniform
-from fdi_torch.estimate.evolution import REASONS, EvolutionSettings, Search, evolve, snapshot
+from fdi_torch.estimate.evolution import REASONS, EvolutionSettings, Search, evolve, snapshot, stop_reason
 from fdi_torch.estimate.generation import ask, draw_other, init, tell
 from fdi_torch.estimate.strategy import state_from_dict, strategy_named
 
@@ -118,6 +118,20 @@ def test_each_reason_to_stop_is_given() -> None:
     assert result.best_cost[0] <= 0.5 and torch.isinf(result.best_cost[2])
     assert result.converged.tolist() == [True, False, False, False, False]
     assert REASONS[0] == "running"
+
+
+@ALL
+def test_a_contracted_population_whose_costs_differ_has_not_converged(settings: EvolutionSettings) -> None:
+    state = strategy_named(settings.strategy).init(*box(1.0, (2,)), settings, torch.tensor([1, 2]))
+    cost = torch.linspace(1.0, 2.0, state.cost.shape[-1], dtype=DOUBLE)
+    contracted = replace(
+        state,
+        population=torch.zeros_like(state.population),
+        cost=torch.stack([cost, torch.ones_like(cost)]),
+        scale=torch.ones(2, dtype=DOUBLE),
+        generation=5,
+    )
+    assert [REASONS[code] for code in stop_reason(contracted, settings).tolist()] == ["running", "converged"]
 
 
 @ALL

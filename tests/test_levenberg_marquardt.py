@@ -11,6 +11,7 @@ from scipy.optimize import least_squares, lsq_linear
 from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import apply, row_sum, solve_positive
+from fdi_torch.estimate.damped_step import Quadratic, damped_step, newton_decrement
 from fdi_torch.estimate.levenberg_marquardt import Competition, Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.linearisation import Linearisation
 from fdi_torch.estimate.refined import Refined
@@ -291,6 +292,16 @@ def test_each_refusal_doubles_the_growth_of_the_damping() -> None:
     settings = RefineSettings(iterations=4)
     levenberg_marquardt(only_up, start, start - 9.0, start + 9.0, settings, on_iteration=seen.append)
     assert [p.damping.item() / settings.damping for p in seen] == pytest.approx([2.0, 8.0, 64.0, 1024.0])
+
+
+def test_predicted_decreases_are_those_of_the_parabola() -> None:
+    """3 x^2 / 2 at 2 is 6 above its minimum; a damped step falls short of it, a bound cuts it off."""
+    theta, infinite = rows([2.0], [2.0]), rows([INF], [INF])
+    model = Quadratic(theta, 3.0 * theta, torch.full((2, 1, 1), 3.0, dtype=DOUBLE), rows([-INF], [1.5]), infinite)
+    step = damped_step(model, torch.tensor([1.0, 0.1], dtype=DOUBLE))
+    assert step.trial.tolist() == [[pytest.approx(1.0)], [1.5]]
+    assert step.predicted.tolist() == pytest.approx([1.5 * (4.0 - 1.0**2), 1.5 * (4.0 - 1.5**2)])
+    assert newton_decrement(model)[0].tolist() == pytest.approx([6.0, 6.0])
 
 
 def test_a_start_outside_the_box_begins_at_its_nearest_point() -> None:
