@@ -14,7 +14,7 @@ from fdi_torch.estimate.batch_algebra import apply, row_sum, solve_positive
 from fdi_torch.estimate.damped_step import Quadratic, damped_step, newton_decrement
 from fdi_torch.estimate.levenberg_marquardt import Competition, Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.linearisation import Linearisation
-from fdi_torch.estimate.refined import Refined
+from fdi_torch.estimate.refined import Refined, held_back
 
 DOUBLE = torch.float64
 INF = math.inf
@@ -292,6 +292,12 @@ def test_each_refusal_doubles_the_growth_of_the_damping() -> None:
     settings = RefineSettings(iterations=4)
     levenberg_marquardt(only_up, start, start - 9.0, start + 9.0, settings, on_iteration=seen.append)
     assert [p.damping.item() / settings.damping for p in seen] == pytest.approx([2.0, 8.0, 64.0, 1024.0])
+
+
+def test_a_parameter_is_held_where_its_descent_leads_out_of_the_box() -> None:
+    theta, gradient = rows([0.0, 0.0, 1.0, 1.0, 0.5]), rows([3.0, -3.0, 3.0, -3.0, 3.0])
+    held = held_back(theta, gradient, torch.zeros_like(theta), torch.ones_like(theta))
+    assert held.tolist() == [[True, False, False, True, False]]
 
 
 def test_predicted_decreases_are_those_of_the_parabola() -> None:
