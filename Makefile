@@ -16,7 +16,7 @@ LOWEST = tests/test_units.py tests/test_yaml_files.py tests/test_config_plant.py
 LOWEST_EXTRAS := parquet,excel,hdf5,sql,influx,mqtt,opcua,modbus,prometheus
 EXTRAS := test$(if $(COMPILER),,$(comma)compiler)
 
-.PHONY: run test slow longest lint paper docs lowest clean
+.PHONY: run test slow longest mutants lint paper docs lowest clean
 
 run: $(STAMP)
 	$(BIN)/python -m fdi_torch.train
@@ -29,6 +29,10 @@ slow: $(STAMP)
 
 longest: $(STAMP)
 	$(TESTS) -m longest
+
+# Deliberate faults in the core, each of which the tests of its room must notice; WORDS=estimate runs some of them.
+mutants: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.mutants $(WORDS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

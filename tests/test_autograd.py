@@ -12,13 +12,15 @@ from torch import Tensor, nn
 import fdi_torch
 from fdi_torch import Plant, Recording
 from fdi_torch.config.plant_file import load_plant
-from fdi_torch.effects import placements_for
+from fdi_torch.effects import build_network, placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.engine_choice import adaptive_engine, make_engine
 from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.ode import PlantOde
 from fdi_torch.simulate.step_control import StepControl
+from tests.rigs import blank_recording, three_tank
 
 NAMES = ("T1.leak.size", "P13.plugging.size", "Q1.pump_lag.time_constant", "h2.sensor_bias.bias", "P32.area")
 THETA = torch.tensor([[0.2, 0.1, 6.0, 0.01, 5e-5], [0.05, 0.3, 12.0, -0.02, 6.5e-5]], dtype=torch.float64)
@@ -137,6 +139,14 @@ def test_an_ode_takes_constant_inputs_functions_and_batches() -> None:
     mixed = torch.tensor(30.0, dtype=torch.float64)
     on = plant.ode(inputs, {"T1.leak.size": 0.2, "T1.leak.onset": 30.0})
     assert float(on(mixed - 1.0, rest)[0]) > float(on(mixed + 1.0, rest)[0])
+
+
+def test_a_held_input_of_an_ode_has_its_new_value_from_the_sample_on() -> None:
+    plant, time = three_tank(), torch.arange(3, dtype=torch.float64)
+    flows = torch.tensor([[1e-5, 0.0], [4e-5, 0.0], [4e-5, 0.0]], dtype=torch.float64)
+    ode = PlantOde(build_network(plant), blank_recording(plant, flows, time))
+    before, at = (ode(torch.tensor(t, dtype=torch.float64), ode.start)[0] for t in (0.9, 1.0))
+    assert float(at - before) == pytest.approx(3e-5 / 160e-4)
 
 
 def test_an_ode_refuses_what_it_cannot_be() -> None:

@@ -13,6 +13,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.midpoint import newton_step
+from fdi_torch.simulate.output_map import SampleGrid
 from fdi_torch.simulate.reference_engine import ReferenceEngine
 from fdi_torch.simulate.scan import linear_scan, scan_in_time
 from tests.rigs import constant_inputs, three_tank
@@ -90,6 +91,7 @@ def test_a_scan_with_a_gain_is_one_of_the_product(columns: int, loop: bool, monk
         {("pump_gain", "Q1"): {"factor": 1.1}},
         {("pump_lag", "Q1"): {"time_constant": 9.0}, ("sensor_lag", "h2"): {"time_constant": 12.0}},
         {("pump_delay", "Q2"): {"delay": 7.3}, ("sensor_delay", "h1"): {"delay": 4.6}},
+        {("sensor_drift", "h1"): {"rate": 1e-4}},
     ],
 )
 def test_levels_and_slopes_are_those_of_the_reference_and_of_finite_differences(causes: dict) -> None:
@@ -122,3 +124,22 @@ def test_what_runs_over_a_rim_is_the_references() -> None:
     exact = ReferenceEngine(network, space, lay_out(recording, low.channels(), 0.25)).readings(theta)
     assert float(exact.max()) > 0.4
     assert float((found.readings - exact).abs().max()) < 1e-3  # m
+
+
+def test_a_tank_simulated_alone_between_the_levels_of_the_others_has_its_own_level() -> None:
+    network = build_network(three_tank(), [])
+    space = ParameterSpace([network.constants["T1.start_level"]])
+    theta = space.nominal().unsqueeze(0)
+    engine = Collocation(network, space, lay_out(stepped(80.0), network.description.channels(), 2.0))
+    levels = engine.converge(theta, engine.constant_guess(theta)).levels
+    for tank in range(3):
+        guess = levels.clone()
+        guess[..., tank] = guess[:, :1, tank]
+        assert torch.allclose(engine.simulate_tank(theta, guess, tank), levels, rtol=0, atol=1e-6)
+
+
+def test_levels_between_nodes_lie_on_the_line_through_them() -> None:
+    experiment = lay_out(constant_inputs(three_tank(), 6.0, sample=0.5), ("Q1", "Q2"), 2.0)
+    line = 0.1 + 0.02 * experiment.nodes
+    assert len(experiment.nodes) < len(experiment.sample_times)
+    assert torch.allclose(SampleGrid(experiment).of(line), 0.1 + 0.02 * experiment.sample_times)

@@ -80,6 +80,17 @@ def test_a_pump_follows_a_current_a_frequency_or_a_duty(gain: str, unit: str, fl
     assert build_plant(yaml.safe_load(dump_plant(plant)), "again") == plant
 
 
+def test_a_sensor_has_its_limits_and_the_tolerance_of_its_offset_in_its_own_unit() -> None:
+    data = GOOD | {
+        "sensors": {"y": {"tank": "T1", "gain": "20 V/m", "offset": "1 V", "low": "500 mV", "high": "9 V"}},
+        "tolerances": {"y.offset": "50 mV", "y.gain": "2 %"},
+    }
+    plant = build_plant(data, "rig.yaml")
+    sensor = plant.sensors[0]
+    assert (sensor.unit, sensor.offset, sensor.low, sensor.high) == ("V", 1.0, 0.5, 9.0)
+    assert plant.tolerances == {"y.offset": 0.05, "y.gain": 0.02}
+
+
 def test_quadruple_tank_splits_each_pump_by_its_valve() -> None:
     """gamma_i k_i into the lower tank and (1 - gamma_i) k_i across into the upper one (Johansson 2000, eq. 1)."""
     gains = {p.target: (p.channel, p.gain * 1e6) for p in load_plant("quadruple_tank").pumps}

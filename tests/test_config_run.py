@@ -190,6 +190,7 @@ def test_constants_to_calibrate_by_pattern() -> None:
     ("faults", "sentence"),
     [
         ({"T1.leak.size": "3 cm"}, "simulate.faults.T1.leak.size: expected a quantity in 1"),
+        ({"T1.leak.size": 1.5}, r"simulate.faults.T1.leak.size: expected a size from 0 to 1, got 1.5"),
         ({"T9.area": "3 cm^2"}, "simulate.faults: expected a parameter of the plant .* the nearest is 'T3.area'"),
     ],
 )

@@ -244,6 +244,15 @@ def test_coloured_noise_becomes_white(coefficient: float) -> None:
     assert float(whitening.mean[1]) == pytest.approx(5e-3, rel=0.1)
 
 
+def test_the_residual_s_variance_allows_for_the_coefficients_that_it_spends() -> None:
+    """An AR(2) model of 64 samples leaves 62 errors and, unbiased, 60 degrees of freedom."""
+    drive, series = noise(64, 1), torch.zeros(64, 1, dtype=torch.float64)
+    for k in range(2, 64):
+        series[k] = 0.5 * series[k - 1] - 0.5 * series[k - 2] + drive[k]
+    (whitening,) = (w for _, w in score_whitenings(series, 2) if w.order == 2 and not bool(w.mean.any()))
+    assert float(whitening(series)[2:].square().sum()) == pytest.approx(60.0)
+
+
 def test_channels_that_move_together_are_separated() -> None:
     e = noise(3000, 2)
     mixed = torch.stack([e[:, 0], 0.9 * e[:, 0] + 0.3 * e[:, 1]], dim=1)

@@ -14,11 +14,12 @@ from torch import Tensor
 from fdi_torch.effects import build_network, effect, placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect, Sensor, Tank
-from fdi_torch.plant.effect import Effect, Local, Memory
-from fdi_torch.plant.operating_range import bounded_by_recording, interior_points, operating_range_of
+from fdi_torch.plant.effect import Effect, Local, Memory, Placement
+from fdi_torch.plant.operating_range import bounded_by_recording, head_range, interior_points, operating_range_of
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.reference_engine import ReferenceEngine
+from fdi_torch.simulate.simulated_recording import quantized
 
 
 def number(value: float) -> Tensor:
@@ -192,6 +193,45 @@ def test_a_heap_takes_up_less_towards_its_top(level: float, left: float) -> None
     assert float(area) == pytest.approx(left, rel=1e-9)
 
 
+def test_a_curved_sensor_is_right_at_half_the_height_and_wrong_by_the_square_of_the_distance() -> None:
+    plant = replace(three_tank(), sensors=(Sensor("h1", "T1", gain=2.0, offset=0.1),))
+    curvature, clock = effect("sensor_curvature"), Clock(number(0.0), number(1.0), number(1.0))
+    nominal = {p.name: number(p.nominal) for p in curvature.parameters("h1", plant)}
+    p = nominal | values(bend=0.3)
+    wrong = [
+        float(curvature.reading(number(2.0 * h + 0.1), (), clock, p)[0]) - (2.0 * h + 0.1) for h in (0.5, 0.6, 0.4)
+    ]
+    assert wrong == pytest.approx([0.0, 0.3 * 0.2**2, 0.3 * 0.2**2])
+
+
+def test_a_drifting_sensor_is_wrong_by_its_rate_times_the_time_of_the_reading() -> None:
+    assert read(effect("sensor_drift"), [0.0] * 4, 2.0, values(rate=1e-3)) == pytest.approx([0.0, 2e-3, 4e-3, 6e-3])
+
+
+def test_a_leak_above_the_floor_has_the_head_above_it_and_none_before_it_opens() -> None:
+    def lost(level: float, onset: float) -> float:
+        here = replace(local(level, level), clock=Clock(number(10.0), number(2.0), number(2.0)))
+        return -float(effect("leak").inflow(here, values(size=0.1, height=0.2, onset=onset, ramp=0.0)))
+
+    full = 0.1 * math.sqrt(0.36 - 0.2)
+    assert [lost(0.36, 0.0), lost(0.36, 11.0), lost(0.36, 12.0)] == pytest.approx([full, 0.5 * full, 0.0])
+    assert lost(0.15, 0.0) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_path_between_two_tanks_passes_what_is_above_it() -> None:
+    def passed(near: float, far: float) -> float:
+        here = replace(local(near, near), far_level=number(far))
+        return float(effect("cross_flow").inflow(here, values(size=0.1, height=0.3, transition_head=0.0)))
+
+    flows = [passed(0.5, 0.46), passed(0.46, 0.5), passed(0.39, 0.1), passed(0.2, 0.1)]
+    assert flows == pytest.approx([0.1 * 0.2, -0.1 * 0.2, 0.1 * 0.3, 0.0], abs=1e-6)
+
+
+def test_a_bent_pump_curve_meets_the_line_at_rest_and_at_full_flow() -> None:
+    flows = [float(effect("pump_curve").flow(number(q), local(0.5), values(bend=0.4))) for q in (0.0, 2e-5, 5e-5, 1e-4)]
+    assert flows == pytest.approx([0.0, 2e-5 * (1.0 + 0.4 * 0.8), 5e-5 * 1.2, 1e-4])
+
+
 def test_a_limited_pump_has_a_kink_or_a_knee() -> None:
     full, limit = 1e-4, 5e-5
     for flow in (0.0, 1e-5, 4e-5, 5e-5, 8e-5):
@@ -292,6 +332,24 @@ def test_operating_range_of_a_recording() -> None:
     assert reach.levels["T4"] == (0.0, 0.7), "a tank without a sensor"
     assert operating_range_of(recording, plant).readings["d1"] == (7.0, 9.0), "nothing read: from floor to rim"
     assert interior_points((0.0, 4.0), 3) == [1.0, 2.0, 3.0]
+
+
+def test_a_quantized_reading_is_the_nearest_step() -> None:
+    network = build_network(three_tank(), [Placement(effect("sensor_quantization"), "h2", {"step": 0.01})])
+    readings = torch.tensor([[0.1234, 0.1234, 0.1234], [0.1234, 0.1266, 0.1234]], dtype=torch.float64)
+    assert quantized(readings, network)[:, 1].tolist() == pytest.approx([0.12, 0.13])
+    assert torch.equal(quantized(readings, network)[:, ::2], readings[:, ::2])
+
+
+def test_the_heads_of_a_pipe_lie_between_those_of_its_ends() -> None:
+    plant = three_tank()
+    reach = operating_range_of(constant_inputs(plant, 10.0), plant)
+    for first, second, heads in (
+        ((0.4, 0.6), (0.1, 0.3), (0.1, 0.5)),
+        ((0.1, 0.3), (0.4, 0.6), (0.1, 0.5)),
+        ((0.2, 0.5), (0.4, 0.6), (0.0, 0.4)),
+    ):
+        assert head_range(plant, "P13", replace(reach, levels={"T1": first, "T3": second})) == pytest.approx(heads)
 
 
 def test_times_that_may_be_endless_are_bounded_by_the_recording() -> None:

@@ -10,7 +10,7 @@ from scipy import stats
 from torch import Tensor
 
 from fdi_torch.estimate.draws import stream, uniform
-from fdi_torch.estimate.evolution import REASONS, EvolutionSettings, Search, evolve, snapshot
+from fdi_torch.estimate.evolution import REASONS, EvolutionSettings, Search, evolve, snapshot, stop_reason
 from fdi_torch.estimate.generation import ask, draw_other, init, tell
 from fdi_torch.estimate.strategy import state_from_dict, strategy_named
 
@@ -118,6 +118,20 @@ def test_each_reason_to_stop_is_given() -> None:
     assert result.best_cost[0] <= 0.5 and torch.isinf(result.best_cost[2])
     assert result.converged.tolist() == [True, False, False, False, False]
     assert REASONS[0] == "running"
+
+
+@ALL
+def test_a_contracted_population_whose_costs_differ_has_not_converged(settings: EvolutionSettings) -> None:
+    state = strategy_named(settings.strategy).init(*box(1.0, (2,)), settings, torch.tensor([1, 2]))
+    cost = torch.linspace(1.0, 2.0, state.cost.shape[-1], dtype=DOUBLE)
+    contracted = replace(
+        state,
+        population=torch.zeros_like(state.population),
+        cost=torch.stack([cost, torch.ones_like(cost)]),
+        scale=torch.ones(2, dtype=DOUBLE),
+        generation=5,
+    )
+    assert [REASONS[code] for code in stop_reason(contracted, settings).tolist()] == ["running", "converged"]
 
 
 @ALL
@@ -250,6 +264,44 @@ def test_rand_1_mutant_is_a_base_plus_a_scaled_difference_of_members() -> None:
     for i, candidate in enumerate(ask(state, settings).candidates[0]):
         j, k, m = torch.isclose(every, candidate, rtol=1e-12).all(-1).nonzero()[0].tolist()
         assert len({i, j, k, m}) == 4
+
+
+def test_l_shade_mutant_goes_to_a_p_best_member_with_a_difference_to_members_or_archived_ones() -> None:
+    """x_i + F (x_best - x_i + x_1 - x_2) with unit vectors as members, so that each mutant tells what it was made of.
+    (Tanabe and Fukunaga 2013, current-to-pbest/1 with archive.)
+    """
+    size, kept = 20, 10
+    settings = replace(L_SHADE, population=size, best_share=0.2, archive_share=kept / size)
+    first = init(*box(9.0, (1,), parameters=size + kept), settings, torch.tensor([4]))
+    unit = torch.eye(size + kept, dtype=DOUBLE)[None]
+    state = replace(
+        first,
+        population=unit[:, :size],
+        cost=torch.arange(size, dtype=DOUBLE)[None],
+        archive=unit[:, size:],
+        archived=torch.tensor([kept]),
+        memory_cr=torch.ones_like(first.memory_cr),
+    )
+    archived = draws = 0
+    for generation in range(1, 60):
+        trial = ask(replace(state, generation=generation), settings)
+        moves = (trial.candidates[0] - unit[0, :size]) / trial.factor[0, :, None]
+        for i in (trial.rate[0] == 1.0).nonzero().flatten().tolist():
+            ahead, behind = ((sign * moves[i] > 0.5).nonzero().flatten().tolist() for sign in (1.0, -1.0))
+            assert len(behind) < 2 or min(ahead) < 4, "20 % of 20 members, unless x_2 or x_i is the best and cancels it"
+            archived, draws = archived + (max(behind, default=0) >= size), draws + 1
+    share = kept / (size + kept - 2)
+    assert archived / draws == pytest.approx(share, abs=4.0 * (share * (1.0 - share) / draws) ** 0.5)
+
+
+def test_equal_costs_are_no_successes_in_l_shade() -> None:
+    low, high = box(1.0, (1,))
+    state = init(low, high, L_SHADE, torch.tensor([1]))
+    zeros = torch.zeros_like(state.cost)
+    state = tell(state, ask(state, L_SHADE), zeros, L_SHADE)
+    after = tell(state, ask(state, L_SHADE), zeros, L_SHADE)
+    assert int(after.memory_cell) == 0 and int(after.archived) == 0
+    assert bool((after.memory_f == 0.5).all()) and bool((after.memory_cr == 0.5).all())
 
 
 def test_selection_is_strict_in_the_paper_and_lets_equals_pass_in_l_shade() -> None:

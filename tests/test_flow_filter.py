@@ -14,6 +14,7 @@ from fdi_torch.effects import build_network
 from fdi_torch.monitor import noise_model
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text
+from fdi_torch.monitor.flow_filter import forcing
 from fdi_torch.monitor.noise_model import learn_noise, noise_of_gain, operating_point
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.observer_gain import hand_gain
@@ -152,6 +153,13 @@ def test_filtering_in_parts_gives_the_same_innovations_to_the_last_bit() -> None
     assert bool(whole[50].isnan().equal(torch.tensor([False, True, False]))) and bool(path.isfinite().all())
     lanes = flows(residual.expand(3, -1, -1), 0, torch.zeros(3, path.shape[-1], dtype=path.dtype))[0]
     assert torch.equal(lanes[2].nan_to_num(), whole.nan_to_num())
+
+
+def test_a_flow_that_is_held_over_a_sample_decays_within_it() -> None:
+    """The integral of exp(-k s) over a sample is (1 - exp(-k)) / k; the trapezoidal rule is off by k^2 / 12."""
+    rates = torch.tensor([0.001, 0.02, 0.1], dtype=torch.float64)
+    held = torch.diagonal(forcing(torch.diag(torch.exp(-rates))))
+    assert held.tolist() == pytest.approx(((1.0 - torch.exp(-rates)) / rates).tolist(), rel=1e-3)
 
 
 def test_shocks_that_add_up_over_samples_have_the_covariance_of_the_recursion() -> None:

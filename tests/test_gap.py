@@ -11,7 +11,13 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.gap.answer import adopted
-from fdi_torch.gap.channel_noise import Noise, estimate_noise, low_frequency_excess, quantization_step
+from fdi_torch.gap.channel_noise import (
+    Noise,
+    estimate_noise,
+    low_frequency_excess,
+    quantization_step,
+    with_rounding,
+)
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.identifiability import planned_identifiability
 from fdi_torch.gap.library import STANDARD, canonical, library_of
@@ -126,6 +132,14 @@ def test_a_quantized_channel_has_a_step_and_a_printed_one_has_none() -> None:
     assert quantization_step((x / 0.013).round() * 0.013, 0.001) == pytest.approx(0.013, rel=1e-6)
     assert quantization_step((x * 1e6).round() / 1e6, 0.001) == 0.0
     assert quantization_step(x, 0.001) == 0.0
+
+
+def test_rounding_adds_a_uniform_error_to_the_noise_of_the_other_channels() -> None:
+    """A step q has the standard deviation q / sqrt(12)."""
+    both = Noise(torch.full((2,), 1e-3, dtype=torch.float64), torch.zeros(2, dtype=torch.float64))
+    moving = 0.05 * torch.arange(100, dtype=torch.float64).unsqueeze(1).expand(100, 2)
+    told = with_rounding(both, (0.0, 0.012), moving)
+    assert told.std.tolist() == pytest.approx([1e-3, math.hypot(1e-3, 0.012 / math.sqrt(12.0))])
 
 
 def test_a_pair_gains_nothing_if_one_size_had_to_be_negative() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 
@@ -13,12 +14,12 @@ from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.holdout import Model, run_reference_models, transferable_values
+from fdi_torch.gap.holdout import HeldOut, Model, closure, run_reference_models, transferable_values
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import PlacedEffect
 from fdi_torch.recording import Recording
-from tests.rigs import three_tank
-from tests.test_gap import nominal_plant, recorded
+from tests.rigs import blank_recording, three_tank
+from tests.test_gap import noise, nominal_plant, recorded
 
 LAMINAR = {"P13.laminar_flow.transition_head": 0.05}
 LIBRARY = ("laminar_flow", "pump_lag", "leak")
@@ -89,12 +90,39 @@ def test_the_mean_of_a_time_function_transfers_and_sinusoids_do_not() -> None:
 
 def test_the_noise_of_a_hold_out_is_right_even_if_the_augmented_model_diverges() -> None:
     held = data_set_of(nominal_plant(), (), recorded({}, 5, samples=600), 1.0)
-    noise = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    white = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     swinging = {"h1.sensor_oscillation.amplitude": 0.05, "h1.sensor_oscillation.period": 5.0}
     models = {"recalibrated": Model(), "augmented": Model(placements_for(swinging), swinging)}
-    found = run_reference_models(held, noise, models, [0.0, 0.0, 0.0])
+    found = run_reference_models(held, white, models, [0.0, 0.0, 0.0])
     assert found.squares("augmented").sum() > 1.5 * found.squares("recalibrated").sum()
     assert found.noise.std.tolist() == pytest.approx([1e-3] * 3, rel=0.1)
+
+
+def held_out(gap: float, ar: float, samples: int = 6000) -> HeldOut:
+    """Readings of the augmented model with AR(1) noise of 1 mm; the recalibrated model is off by `gap`, m."""
+    plant, time = nominal_plant(), torch.arange(samples, dtype=torch.float64)
+    zero = torch.zeros(samples, 3, dtype=torch.float64)
+    blank = blank_recording(plant, zero[:, :2], time)
+    recording = replace(blank, outputs=noise(samples, ar, 1e-3, 9), mask=None)  # type: ignore[arg-type]
+    runs = {"recalibrated": zero + gap, "augmented": zero}
+    each = torch.full((3,), ar, dtype=torch.float64)
+    return HeldOut(data_set_of(plant, (), recording, 1.0), runs, Noise(1e-3 * torch.sqrt(1.0 - each**2), each))
+
+
+@pytest.mark.parametrize("ar", [0.0, 0.9])
+def test_the_closed_share_is_as_certain_as_the_mean_square_of_correlated_noise(ar: float) -> None:
+    """Bartlett (1946): sum e^2 of n samples of AR(1) noise has the variance 2 n s^4 (1 + a^2) / (1 - a^2)."""
+    gap, samples = 1e-3, 6000
+    told = closure([held_out(gap, ar, samples)])
+    assert told.closed is not None and told.closed_ci95 is not None
+    noise_error = math.sqrt(2.0 * 3 * samples * (1.0 + ar**2) / (1.0 - ar**2)) * 1e-6
+    assert 1.0 - told.closed_ci95[0] == pytest.approx(1.96 * noise_error / (3 * samples * gap**2), rel=0.25)
+
+
+def test_a_gap_of_less_than_five_standard_errors_has_no_closed_share() -> None:
+    """A gap g of n readings with white noise s: the sum of squares n g^2 has the standard error 2 g s sqrt(n)."""
+    for errors, closed in ((3.0, None), (8.0, 1.0)):
+        assert closure([held_out(2.0 * errors * 1e-3 / math.sqrt(18000), 0.0)]).closed == closed
 
 
 def test_arrays_of_all_models_are_there_for_the_page(answer: Answer) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -19,13 +20,14 @@ from fdi_torch.gap.localization.localize import localize
 from fdi_torch.gap.marginal_likelihood import with_disturbances, with_estimated_noise
 from fdi_torch.gap.onsets import fine_onsets
 from fdi_torch.gap.problem import problem_of
-from fdi_torch.gap.screening import Option, options_of
-from fdi_torch.gap.structure_search import ExplanationPool, search
+from fdi_torch.gap.screening import Option, options_of, screen
+from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, search
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
 from tests.rigs import blank_recording
 from tests.test_gap import nominal_plant
+from tests.test_gap import recorded as gap_recording
 
 SUBSTEPS = 10  # a second
 LIBRARY = ("pump_gain", "plugging", "leak", "sensor_bias")
@@ -161,6 +163,21 @@ def test_both_ends_of_an_interval_are_found_wherever_they_are(between: tuple[int
     begin, lasting = best.fit.values["T1.unmetered_flow.begin"], best.fit.values["T1.unmetered_flow.duration"]
     assert begin == pytest.approx(between[0], abs=3.0) and begin + lasting == pytest.approx(between[1], abs=3.0)
     assert best.fit.values["T1.unmetered_flow.flow"] == pytest.approx(-3e-5, rel=0.3)
+
+
+def test_the_two_effects_that_explain_most_together_are_fitted_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A weak pump into a tank with a leak: each of them seems to be the other."""
+    truth = {"Q1.pump_gain.factor": 0.85, "T1.leak.size": 0.1}
+    problem = problem_of(nominal_plant(), [gap_recording(truth, 4, samples=300)], [], Settings(("pump_gain", "leak")))
+    fitter, null, _ = recalibrate(problem.data)
+    pool, fitted = ExplanationPool(fitter, null, len(problem.library)), []
+    monkeypatch.setattr(pool, "_fitted", lambda fitter, base, candidates, rivals=(): fitted.extend(candidates) or [])
+    base: Any = RankedExplanation(null, fitter, None, 0.0)  # type: ignore[arg-type]
+    pool.explanations[base.key] = base
+    reach = operating_range_of_all(problem.recordings, problem.data.plant)
+    screening = screen(fitter, null, options_of(problem.library, fitter, reach))
+    pool.extend(base, screening, screening)
+    assert {("pump_gain", "Q1"), ("leak", "T1")} in [candidate.key for candidate in fitted]
 
 
 def test_onsets_are_as_dense_as_the_random_flows_require() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,12 +11,14 @@ import torch
 from fdi_torch.effects import effect
 from fdi_torch.gap.candidate_fit import Candidate, Fitter
 from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.experiment_design import HIGH, discriminating_input, planned_recording
 from fdi_torch.gap.identifiability import DRAWS, identifiability, simulated_confusions
 from fdi_torch.gap.problem import checked_data_set
-from fdi_torch.gap.screening import Option, Pairs
+from fdi_torch.gap.screening import Option, Pairs, screen
 from fdi_torch.plant.effect import Placement
+from tests.rigs import three_tank
 from tests.test_gap import nominal_plant, recorded
 
 
@@ -54,6 +57,17 @@ def test_effects_with_different_signatures_are_never_confused() -> None:
 def test_a_gap_that_no_other_effect_can_cause_is_not_confused() -> None:
     pairs = made_up(1e-2 * torch.eye(3, dtype=torch.float64))
     assert simulated_confusions(pairs, ("pump_gain", "Q1"), 1e9, nominal_plant()) is None
+
+
+def test_an_effect_that_a_calibrated_constant_absorbs_shows_nothing() -> None:
+    """The gain of the first pump is all but unknown, that of the second is given."""
+    plant = replace(three_tank(), tolerances={"Q1.gain": 100.0})
+    noise = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    fitter = Fitter(data_set_of(plant, (), recorded({}, 3, samples=200), 1.0), noise)
+    gains = [Placement(effect("pump_gain"), pump) for pump in ("Q1", "Q2")]
+    options = [Option(p, {p.full_name("factor"): 1.01}) for p in gains]
+    absorbed, shown = screen(fitter, fitter.fit(Candidate()), options).strength.tolist()
+    assert absorbed < 1e-3 * shown
 
 
 def test_inseparable_and_hidden_effects_follow_from_the_columns() -> None:

@@ -1,5 +1,6 @@
 """Outliers are distinguished from noise and from normal behaviour of tanks and sensors, and bias no fit."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -27,6 +28,14 @@ def test_spikes_and_drop_outs_are_located_exactly_and_noise_has_none(ar: float) 
     for k, (a, b) in enumerate(put):
         x[a:b] += 0.03 * (-1) ** k
     assert spans(x) == put
+
+
+def test_the_jumps_of_an_outlier_are_counted_in_standard_deviations_of_neighbours() -> None:
+    """A spike of 20 sqrt(2) standard deviations of white noise is 20 of those of the difference of two readings."""
+    x = noise(4000, 0.0, 0.001, 7)[:, 0]
+    x[1000] = 0.02 * math.sqrt(2.0)
+    ((_, _, jumps),) = jumps_and_returns(x, STILL, 0.0)
+    assert jumps == pytest.approx(20.0, rel=0.05)
 
 
 def test_a_persistent_or_gradual_jump_is_no_outlier() -> None:

@@ -10,10 +10,14 @@ import pytest
 import torch
 
 from fdi_torch.estimate.evidence import ODDS, posterior
+from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.channel_noise import Noise
+from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose, verdict_of
 from fdi_torch.gap.localization.regressors import lagged
-from fdi_torch.gap.marginal_likelihood import log_prior
+from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior
 from fdi_torch.gap.posterior import CauseHypothesis
+from tests.rigs import three_tank
 from tests.test_gap import nominal_plant, recorded
 
 
@@ -33,6 +37,30 @@ def test_two_effects_at_one_place_are_less_likely_than_at_two() -> None:
 def test_probabilities_follow_from_differences_of_logarithms_alone() -> None:
     for shift in (0.0, 1e6, -1e6):
         assert posterior([shift + math.log(3.0), shift]) == pytest.approx([0.75, 0.25], rel=1e-6)
+
+
+def white(std: float) -> Noise:
+    return Noise(torch.full((3,), std, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+
+def test_a_constant_that_could_have_been_anywhere_in_twice_the_range_halves_the_evidence() -> None:
+    """Occam's factor of a constant that the recording determines far better than its tolerance does."""
+    recording, told = recorded({}, 3, samples=300), []
+    for tolerance in (0.05, 0.1):
+        plant = replace(three_tank(), tolerances={"P13.discharge_coefficient": tolerance})
+        fitter = Fitter(data_set_of(plant, (), recording, 1.0), white(1e-3))
+        told.append(log_evidence(fitter, fitter.fit(Candidate()), 7))
+    assert told[0] - told[1] == pytest.approx(math.log(2.0), abs=0.02)
+
+
+def test_noise_of_twice_the_size_has_the_evidence_of_its_normal_density() -> None:
+    """N readings lose log 2 each, but for the three initial levels that are estimated from them."""
+    data, told = data_set_of(three_tank(), (), recorded({}, 3, samples=300), 1.0), []
+    for std in (1e-3, 2e-3):
+        fitter = Fitter(data, white(std))
+        fit = fitter.fit(Candidate())
+        told.append(log_evidence(fitter, fit, 7) + 0.5 * fit.cost)
+    assert told[0] - told[1] == pytest.approx((900 - 3) * math.log(2.0), abs=0.02)
 
 
 def test_no_gap_needs_95_percent_as_any_other_verdict() -> None:

@@ -11,9 +11,10 @@ from scipy.optimize import least_squares, lsq_linear
 from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import apply, row_sum, solve_positive
+from fdi_torch.estimate.damped_step import Quadratic, damped_step, newton_decrement
 from fdi_torch.estimate.levenberg_marquardt import Competition, Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.linearisation import Linearisation
-from fdi_torch.estimate.refined import Refined
+from fdi_torch.estimate.refined import Refined, held_back
 
 DOUBLE = torch.float64
 INF = math.inf
@@ -264,6 +265,61 @@ def test_a_lane_far_behind_is_given_up_and_has_not_converged() -> None:
     result = levenberg_marquardt(DECAYS.linearise, START, *FREE, beaten)
     assert set(result.statuses()) == {"abandoned"} and not result.converged.any()
     assert (result.iterations < levenberg_marquardt(DECAYS.linearise, START, *FREE).iterations).all()
+
+
+def test_a_lane_that_catches_up_is_not_given_up() -> None:
+    """Half the distance in each step leaves a quarter of a parabola: three quarters of the excess are gained."""
+
+    def half_way(theta: Tensor, lanes: Tensor) -> Linearisation:
+        x = theta[:, 0]
+        return Linearisation(0.5 * x**2, x[:, None], torch.full_like(x, 2.0)[:, None, None])
+
+    start = torch.tensor([[100.0]], dtype=DOUBLE)
+    settings = RefineSettings(competition=Competition(behind=1.0, share=0.25, target=0.0))
+    found = levenberg_marquardt(half_way, start, -2.0 * start, 2.0 * start, settings)
+    assert found.converged.all() and found.cost.item() < 1e-9
+
+
+def test_each_refusal_doubles_the_growth_of_the_damping() -> None:
+    """Nielsen (1999): mu grows by nu = 2, 4, 8 ... with every step in succession that does not lower the cost."""
+
+    def only_up(theta: Tensor, lanes: Tensor) -> Linearisation:
+        x = theta[:, 0]
+        return Linearisation(x.abs(), torch.ones_like(x)[:, None], torch.ones_like(x)[:, None, None])
+
+    seen: list[Progress] = []
+    start = torch.zeros(1, 1, dtype=DOUBLE)
+    settings = RefineSettings(iterations=4)
+    levenberg_marquardt(only_up, start, start - 9.0, start + 9.0, settings, on_iteration=seen.append)
+    assert [p.damping.item() / settings.damping for p in seen] == pytest.approx([2.0, 8.0, 64.0, 1024.0])
+
+
+def test_a_parameter_is_held_where_its_descent_leads_out_of_the_box() -> None:
+    theta, gradient = rows([0.0, 0.0, 1.0, 1.0, 0.5]), rows([3.0, -3.0, 3.0, -3.0, 3.0])
+    held = held_back(theta, gradient, torch.zeros_like(theta), torch.ones_like(theta))
+    assert held.tolist() == [[True, False, False, True, False]]
+
+
+def test_predicted_decreases_are_those_of_the_parabola() -> None:
+    """3 x^2 / 2 at 2 is 6 above its minimum; a damped step falls short of it, a bound cuts it off."""
+    theta, infinite = rows([2.0], [2.0]), rows([INF], [INF])
+    model = Quadratic(theta, 3.0 * theta, torch.full((2, 1, 1), 3.0, dtype=DOUBLE), rows([-INF], [1.5]), infinite)
+    step = damped_step(model, torch.tensor([1.0, 0.1], dtype=DOUBLE))
+    assert step.trial.tolist() == [[pytest.approx(1.0)], [1.5]]
+    assert step.predicted.tolist() == pytest.approx([1.5 * (4.0 - 1.0**2), 1.5 * (4.0 - 1.5**2)])
+    assert newton_decrement(model)[0].tolist() == pytest.approx([6.0, 6.0])
+
+
+def test_a_start_outside_the_box_begins_at_its_nearest_point() -> None:
+    seen: list[Tensor] = []
+
+    def bowl(theta: Tensor, lanes: Tensor) -> Linearisation:
+        seen.append(theta)
+        one = torch.ones_like(theta)
+        return Linearisation(0.5 * row_sum(theta**2), theta, torch.diag_embed(one))
+
+    levenberg_marquardt(bowl, rows([7.0, -7.0, 0.5]), rows([-1.0] * 3), rows([1.0, 2.0, 3.0]))
+    assert seen[0].tolist() == [[1.0, -1.0, 0.5]]
 
 
 def test_refused_steps_do_not_give_a_lane_up() -> None:

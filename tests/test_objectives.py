@@ -106,6 +106,17 @@ def test_noise_is_as_large_as_it_was_whatever_the_parameters_took_up() -> None:
     assert float(noise.square().mean().sqrt()) == pytest.approx(1e-3, rel=0.02)
 
 
+def test_parameters_of_several_recordings_take_their_degrees_of_freedom_once() -> None:
+    """Two parameters from two recordings of two channels: half a degree of each channel of each recording."""
+    one, two = problem("likelihood"), problem("likelihood", noise=0.05, samples=60)
+    both = Problem(space(), [*one.terms, *two.terms], "likelihood")
+    theta = THETA[0, 2:]
+    for term, noise in zip(both.terms, both.noise(theta, LANE), strict=True):
+        residual = term.data.known - term.engine.readings(theta)[0]
+        squares, count = (term.data.weight * residual**2).sum(0), term.data.weight.sum(0)
+        assert torch.allclose(noise[0] ** 2, squares / (count - 0.5), rtol=1e-12)
+
+
 def test_known_noise_gives_half_chi_square() -> None:
     p = problem("likelihood", known=True)
     data = p.terms[0].data

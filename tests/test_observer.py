@@ -18,7 +18,7 @@ from fdi_torch.monitor.observer_run import run_observers
 from fdi_torch.monitor.samples import Samples, samples_of_recording
 from fdi_torch.monitor.stepper import PlantState, Stepper
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import PlacedEffect
+from fdi_torch.plant.description import Pipe, PlacedEffect, PlantDescription, Sensor, Tank
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings
@@ -58,6 +58,17 @@ def test_the_stepper_is_the_reference_engine_sample_by_sample() -> None:
     samples = samples_of_recording(replace(recording, outputs=truth), PLANT)
     seen = Observer(network, hand_gain(torch.zeros(3, 3, dtype=torch.float64))).run(samples, truth[0])
     assert seen.residual.abs().max() < 1e-12
+
+
+def test_one_long_step_of_an_emptying_tank_follows_torricelli() -> None:
+    """sqrt(h) falls by C_d a sqrt(2 g) / A t / 2; a method of lower order is off by 6 um."""
+    pipe = Pipe("O", "T", "outside", 1e-4, 0.6)
+    network = build_network(PlantDescription("one", (Tank("T", 0.02, 1.0, 0.8),), (pipe,), (), (Sensor("h", "T"),)))
+    values, level = network.bind(ParameterSpace(), network.nominal.new_zeros(0)), network.nominal.new_tensor([0.8])
+    stepper, none = Stepper(network, 10.0), network.nominal.new_zeros(0)
+    after = stepper.advance(stepper.start(level, none, values), lambda share: none, 0.0, 10.0, values).levels
+    rate = 0.6 * 1e-4 * math.sqrt(2.0 * 9.81) / 0.02
+    assert float(after[0]) == pytest.approx((math.sqrt(0.8) - 0.5 * rate * 10.0) ** 2, abs=2e-6)
 
 
 def test_riccati_equals_scipys() -> None:

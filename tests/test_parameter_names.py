@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 from rigs import three_tank
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import build_network, effect
 from fdi_torch.parameters import ParameterName, by_prefix, common_name, name_in_recording
-from fdi_torch.plant.description import PlacedEffect, with_tolerances
+from fdi_torch.plant.description import PlacedEffect, Sensor, with_tolerances
 from fdi_torch.plant.effect import Placement
 
 
@@ -49,6 +49,19 @@ def test_placements_form_the_names_that_group_by_prefix() -> None:
     assert placement.full_name("size") == PlacedEffect("leak", "T1").full_name("size") == "T1.leak.size"
     grouped = by_prefix({"T1.leak.size": 1, "T1.area": 2, "T1.leak.height": 3, "gravity": 4})
     assert grouped == {"T1.leak": {"size": 1, "height": 3}, "T1": {"area": 2}, "": {"gravity": 4}}
+
+
+def test_tolerances_of_constants_are_relative_and_those_of_offsets_and_effects_absolute() -> None:
+    plant = replace(
+        three_tank(),
+        sensors=(Sensor("h1", "T1", unit="V", gain=-20.0, offset=9.0),),
+        tolerances={"T1.area": 0.01, "h1.gain": 0.02, "h1.offset": 0.03, "Q1.pump_lag.time_constant": 0.5},
+    )
+    constants = build_network(plant, [Placement(effect("pump_lag"), "Q1")]).constants
+    std = {name: constants[name].std for name in plant.tolerances}
+    assert std == pytest.approx(
+        {"T1.area": 0.01 * 160e-4, "h1.gain": 0.02 * 20.0, "h1.offset": 0.03, "Q1.pump_lag.time_constant": 0.5}
+    )
 
 
 def test_tolerances_are_kept_by_name() -> None:

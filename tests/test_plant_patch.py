@@ -83,6 +83,14 @@ def test_a_constant_changes_its_line_in_its_own_unit(constants: dict[str, float]
     assert kept and lines_changed(TEXT, changed) == ([gone], [come])
 
 
+def test_a_tolerance_that_was_there_is_replaced() -> None:
+    before = read(TEXT.replace('"*.discharge_coefficient": 3 %', "link.discharge_coefficient: 3 %"))
+    text = TEXT.replace('"*.discharge_coefficient": 3 %', "link.discharge_coefficient: 3 %")
+    after = replace(before, tolerances={"link.discharge_coefficient": 0.01})
+    changed, kept = patched_plant(text, before, after)
+    assert kept and read(changed).tolerances == {"link.discharge_coefficient": 0.01}
+
+
 def test_a_key_that_was_not_there_comes_at_the_end_of_its_block() -> None:
     changed, kept = patched_plant(TEXT, BEFORE, with_constants(BEFORE, {"pB.offset": 250.0, "B.start_level": 0.2}))
     assert kept and lines_changed(TEXT, changed) == ([], ["    start_level: 200 mm", "    offset: 2.5 mbar"])

@@ -14,9 +14,20 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import (
+    OUTSIDE,
+    Pipe,
+    PlacedEffect,
+    PlantDescription,
+    Pump,
+    Sensor,
+    Tank,
+    Transfer,
+    Weir,
+)
+from fdi_torch.plant.inverted_sensor import levels_from_readings
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.orifice import rim_strength, weir_flow
+from fdi_torch.plant.orifice import limit_draw, rim_strength, weir_flow, weir_law
 from fdi_torch.plant.signals import Clock, CumulativeSignal
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import grid_nodes, lay_out
@@ -87,6 +98,61 @@ def test_small_steps_about_rest_follow_the_matrix_exponential() -> None:
     for k in range(11):
         expected = rest + torch.from_numpy(expm(10.0 * k * slope.numpy())) @ push
         assert (levels[k] - expected).abs().max() < 1e-9
+
+
+def test_an_outlet_above_the_level_passes_nothing() -> None:
+    plant = PlantDescription(
+        "one",
+        (Tank("T", 0.02, 1.0, 0.1),),
+        (Pipe("O", "T", OUTSIDE, 1e-4, 0.6, elevation=0.3),),
+        (),
+        (Sensor("h", "T"),),
+    )
+    recording = blank_recording(plant, torch.zeros(3, 0, dtype=torch.float64), torch.arange(3, dtype=torch.float64))
+    space, theta = nothing()
+    levels = ReferenceEngine(build_network(plant), space, lay_out(recording, (), 0.5)).levels(theta)
+    assert torch.equal(levels, torch.full_like(levels, 0.1))
+
+
+@pytest.mark.parametrize("levels", [(0.5, 0.1), (0.1, 0.5), (0.5, 0.4), (0.2, 0.1)])
+def test_a_raised_pipe_is_driven_by_the_water_above_it(levels: tuple[float, float]) -> None:
+    """Torricelli with the water above a pipe at 0.3 m: a level below it is no head."""
+    plant = PlantDescription(
+        "two",
+        (Tank("A", 0.02, 1.0), Tank("B", 0.02, 1.0)),
+        (Pipe("P", "A", "B", 1e-4, 0.6, elevation=0.3),),
+        (),
+        (Sensor("h", "A", gain=2.0, offset=0.1),),
+    )
+    network = build_network(plant)
+    state = torch.tensor(levels, dtype=torch.float64)
+    rates = network(state, state[:0], clock(), network.bind(*(nothing()[0], state[:0])))
+    head = max(levels[0] - 0.3, 0.0) - max(levels[1] - 0.3, 0.0)
+    flow = 0.6 * 1e-4 * math.copysign(math.sqrt(2 * 9.81 * abs(head)), head)
+    assert (0.02 * rates).tolist() == pytest.approx([-flow, flow], rel=1e-6, abs=1e-12)
+
+
+def test_a_reading_is_gain_times_level_plus_offset_and_shows_its_level() -> None:
+    plant = replace(three_tank(), sensors=(Sensor("h1", "T1", gain=2.0, offset=0.1),))
+    network, level = build_network(plant), torch.tensor(0.4, dtype=torch.float64)
+    values = network.bind(ParameterSpace(), level.new_zeros(0))
+    (reading,), _ = network.read([level], (), clock(), values)
+    assert float(reading) == pytest.approx(2.0 * 0.4 + 0.1)
+    shown = levels_from_readings(network, [reading], [0.0 * level] * 3, 0.0 * level, values)
+    assert [float(h) for h in shown] == pytest.approx([0.4, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("draw", [1e-3, 1e-5])
+def test_a_tank_that_is_drawn_empty_loses_no_more_than_it_holds(draw: float) -> None:
+    """The law -2 h / step, 0 below the floor, leads the 3/8 rule from h to h (1 - (2 + 3 (2/3 + 2)) / 8) = -h / 4."""
+    tanks = (Tank("A", 0.02, 1.0, 0.01), Tank("B", 0.02, 1.0, 0.0))
+    plant = PlantDescription("two", tanks, (), (), (Sensor("h", "A"),), transfers=(Transfer("Q", "A", "B", 1e-2),))
+    time = 5.0 * torch.arange(9, dtype=torch.float64)
+    recording = blank_recording(plant, torch.full((9, 1), draw, dtype=torch.float64), time)
+    space, theta = nothing()
+    levels = ReferenceEngine(build_network(plant), space, lay_out(recording, ("Q",), 5.0)).levels(theta)[0]
+    assert bool((levels[:, 0] >= -0.01 / 4 - 1e-12).all()) and bool((levels[1:, 0] <= levels[:-1, 0]).all())
+    assert torch.allclose(levels.sum(1), torch.full_like(levels[:, 0], 0.01), rtol=1e-12)
 
 
 def test_rest_is_where_the_paper_reading_has_it() -> None:
@@ -222,6 +288,13 @@ def test_switches_between_steps_are_hit() -> None:
         assert float((experiment.nodes - instant).abs().min()) < 1e-9
 
 
+def test_square_roots_are_smoothed_for_the_longest_step() -> None:
+    plant, time = three_tank(), torch.tensor([0.0, 1.0, 2.0, 7.0], dtype=torch.float64)
+    switched = torch.tensor([0.0, 0.0, 1e-5, 1e-5], dtype=torch.float64).unsqueeze(1).expand(4, 2)
+    layout = lay_out(blank_recording(plant, switched, time), plant.channels(), 5.0)
+    assert float(layout.steps.min()) < float(layout.resolution) == float(layout.steps.max())
+
+
 def test_samples_denser_than_steps_are_interpolated() -> None:
     plant = three_tank((0.8, 0.2, 0.5))
     network, space = paper_network(plant)
@@ -248,6 +321,29 @@ def test_overflow_goes_where_the_plant_says() -> None:
     levels = ReferenceEngine(build_network(plant), space, lay_out(recording, plant.channels(), 0.1)).levels(theta)[0]
     assert float(levels.sum(1)[-1]) == pytest.approx(0.3 + 5e-5 * 100 / 0.02, rel=1e-9)
     assert 0.3 < float(levels[-1, 0]) < 0.31
+
+
+def test_a_weir_follows_poleni() -> None:
+    """Q = (2/3) C_d b sqrt(2 g) x^(3/2) at x = 9 cm above the crest."""
+    tanks = (Tank("A", 0.02, 1.0), Tank("B", 0.02, 1.0))
+    plant = PlantDescription("two", tanks, (), (), (Sensor("h", "A"),), weirs=(Weir("W", "A", "B", 0.2, 0.05, 0.6),))
+    network, levels = build_network(plant), torch.tensor([0.29, 0.0], dtype=torch.float64)
+    rates = network(levels, levels[:0], clock(), network.bind(ParameterSpace(), levels[:0]))
+    flow = 2.0 / 3.0 * 0.6 * 0.05 * math.sqrt(2 * 9.81) * 0.09**1.5
+    assert (0.02 * rates).tolist() == pytest.approx([-flow, flow], rel=1e-6)
+
+
+def test_the_slope_of_the_flow_over_a_rim_is_its_derivative() -> None:
+    excess, one = torch.tensor(0.04, dtype=torch.float64, requires_grad=True), torch.ones((), dtype=torch.float64)
+    flow, slope = weir_law(excess, 3.0 * one)
+    (derivative,) = torch.autograd.grad(flow, excess)
+    assert float(slope.detach()) == pytest.approx(float(derivative), rel=1e-6)
+
+
+def test_in_endless_steps_a_brimful_tank_spills_and_a_dry_one_gives_what_flows_in() -> None:
+    excess, inflow, one = (torch.tensor(x, dtype=torch.float64) for x in (1e-3, 2e-4, 1.0))
+    assert float(weir_flow(excess, inflow, 0.02 * one, 0.8 * one, 1e12 * one)) == pytest.approx(2e-4)
+    assert float(limit_draw(one, excess, inflow, 0.02 * one, 1e12 * one)) == pytest.approx(2e-4)
 
 
 def test_nothing_runs_over_a_rim_that_is_not_reached_however_coarse_the_steps() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 import pytest
 
@@ -11,7 +12,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.reading_noise import reading_noise
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import PlantDescription, Sensor
 
 
 def tower() -> PlantDescription:
@@ -33,6 +34,11 @@ def tower() -> PlantDescription:
 
 def test_noise_of_the_level_goes_through_each_sensor() -> None:
     assert reading_noise("2 mm", tower()) == pytest.approx([2e-3 * 2.66667e-3, 2e-3 * 0.166667])
+
+
+def test_noise_of_a_sensor_that_looks_down_is_positive() -> None:
+    down = replace(tower(), sensors=(Sensor("LT", "A", unit="V", gain=-20.0, offset=9.0),))
+    assert reading_noise("2 mm", down) == pytest.approx([0.04])
 
 
 def test_noise_by_sensor_is_in_its_own_unit() -> None:

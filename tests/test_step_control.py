@@ -21,6 +21,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings, gram_of
 from fdi_torch.simulate.experiment import Experiment, lay_out
+from fdi_torch.simulate.implicit import DIAGONAL, EMBEDDED, STAGES
 from fdi_torch.simulate.reference_engine import ReferenceEngine
 from fdi_torch.simulate.step_control import StepControl, accept_steps, next_step
 from fdi_torch.simulate.traced_engine import TracedEngine
@@ -125,6 +126,23 @@ def test_every_effect_keeps_its_meaning() -> None:
     short = experiment(1e-7, samples=7)
     traced = TracedEngine(network, space, short).levels(theta)
     torch.testing.assert_close(CompiledEngine(network, space, short).levels(theta), traced, rtol=0, atol=1e-10)
+
+
+def test_the_implicit_method_satisfies_its_order_conditions() -> None:
+    """ESDIRK4(3)6L[2]SA: c by Kennedy and Carpenter (2003); sum b c^k = 1 / (k + 1) up to order 4, embedded up to 3."""
+    rows = [(0.0,), *((*row, DIAGONAL) for row in STAGES)]
+    c = [sum(row) for row in rows]
+    assert c == pytest.approx([0.0, 1 / 2, 83 / 250, 31 / 50, 17 / 20, 1.0], abs=1e-14)
+    for weights, order in ((rows[-1], 4), (EMBEDDED, 3)):
+        moments = [sum(b * x**k for b, x in zip(weights, c, strict=True)) for k in range(order)]
+        assert moments == pytest.approx([1 / (k + 1) for k in range(order)], abs=1e-14)
+        # sum b a c = 1 / 6
+        inner = [sum(a * x for a, x in zip(row, c, strict=False)) for row in rows]
+        assert sum(b * x for b, x in zip(weights, inner, strict=True)) == pytest.approx(1 / 6, abs=1e-14)
+
+
+def test_the_errors_of_a_hundred_steps_add_up_to_the_tolerance() -> None:
+    assert 100.0 * StepControl.for_tolerance(1e-6, three_tank()).tolerance == pytest.approx(1e-6)
 
 
 def test_the_control_by_hand() -> None:

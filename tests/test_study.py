@@ -199,10 +199,36 @@ def test_isolation_counts_what_is_missed_and_what_is_false(plan: Plan) -> None:
     assert (found.right, found.missed, found.false) == (2, 1, 1)
 
 
+def test_five_parameters_are_stated_with_95_percent_together(plan: Plan) -> None:
+    """Bonferroni: 2.58 standard errors for each of five, not 1.96."""
+    space = plan.fitting.space
+    nominal = space.nominal()
+
+    def away(errors: float) -> Trial:
+        free = nominal + torch.tensor([0.01 * errors, 0.0, 0.0, 0.0, 0.0])
+        return Trial(0, "", "", {"truth": nominal.tolist(), "free": free.tolist(), "free_std": [0.01] * 5})
+
+    assert [count_modes(space, [away(errors)]).false for errors in (2.5, 2.6)] == [0, 1]
+
+
+def test_each_estimator_fails_beyond_six_of_its_own_bounds(plan: Plan) -> None:
+    truth, bound = plan.fitting.space.nominal(), torch.full((5,), 1e-3, dtype=torch.float64)
+
+    def trial(errors: float) -> Trial:
+        numbers = {"truth": truth, "free": truth + errors * bound, "correlation": truth + errors * bound}
+        numbers |= {"bound": bound, "correlation_bound": 2.0 * bound, "rho": torch.ones(3)}
+        return Trial(0, "", "converged", {name: value.tolist() for name, value in numbers.items()})
+
+    trials = [trial(errors) for errors in (5.0, 7.0, 11.0, 13.0)]
+    assert summarise(plan, Setting("", truth.expand(4, -1), 30.0), trials).failures == {"free": 3, "correlation": 1}
+
+
 def test_distant_members_are_apart_or_the_best_again() -> None:
     population = torch.tensor([[[0.0], [0.01], [0.5]], [[0.0], [0.01], [0.02]]])
     taken = distant(population, torch.zeros(2, 3), torch.ones(1), 2)
     assert taken[..., 0].tolist() == [[0.0, 0.5], [0.0, 0.0]]
+    population = torch.tensor([[[0.0], [0.5], [0.52], [0.9]]])
+    assert distant(population, torch.zeros(1, 4), torch.ones(1), 3)[0, :, 0].tolist() == pytest.approx([0.0, 0.5, 0.9])
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:

@@ -11,13 +11,18 @@ from scipy import stats
 from torch import Tensor
 
 from fdi_torch.estimate.combinations import Combination
+from fdi_torch.estimate.fitting import set_up
+from fdi_torch.estimate.hybrid import search_box
 from fdi_torch.estimate.information import (
     certainty,
     determined_combinations,
     fisher_information,
 )
+from fdi_torch.estimate.refined import STALLED, unfinished
+from fdi_torch.estimate.refinement import status_of
 from fdi_torch.estimate.uncertainty import make_estimate, parameters_at_bounds
 from fdi_torch.parameters import Parameter, ParameterSpace
+from tests.rigs import constant_inputs, three_tank
 
 DOUBLE = torch.float64
 TIME = torch.linspace(0.0, 10.0, 51, dtype=DOUBLE)
@@ -126,6 +131,30 @@ def test_parameter_without_effect_and_a_group_of_three_are_told_apart() -> None:
         "e is not determined: the readings do not depend on it",
     )
     assert torch.isinf(estimate.std).tolist() == [True, True, True, False, True]
+
+
+def test_a_parameter_with_a_small_part_in_an_undetermined_direction_is_undetermined() -> None:
+    """The sensitivities s, u and s + 0.2 u: along (1, 0.2, -1) nothing changes, of which b is 2 %."""
+    s, u = torch.sin(TIME), torch.exp(-TIME)
+    information = columns(s / s.norm(), u / u.norm(), s / s.norm() + 0.2 * u / u.norm(), TIME)
+    estimate = make_estimate(space("a", "b", "c", "d"), torch.full((4,), 0.5, dtype=DOUBLE), information)
+    assert torch.isinf(estimate.std).tolist() == [True, True, True, False]
+
+
+def test_a_search_covers_four_standard_deviations_of_a_prior_within_the_range() -> None:
+    plant = replace(three_tank(), tolerances={"P13.discharge_coefficient": 0.03, "P32.area": 0.5})
+    names = ["P13.discharge_coefficient", "P32.area", "T1.leak.size"]
+    low, high = search_box(set_up(plant, [constant_inputs(plant, 10.0)], names, start=0.5))
+    assert low.tolist() == pytest.approx([0.6 - 4 * 0.018, 0.06e-4, 0.0])
+    assert high.tolist() == pytest.approx([0.6 + 4 * 0.018, 1.8e-4, 1.0])
+
+
+@pytest.mark.parametrize(("errors", "status"), [(0.09, "converged"), (0.11, "stalled")])
+def test_a_stalled_refinement_within_a_tenth_of_a_standard_error_has_converged(errors: float, status: str) -> None:
+    """At x standard errors from the optimum, the log-likelihood is x^2 / 2 below its maximum."""
+    one = torch.ones(1, dtype=DOUBLE)
+    stopped = replace(unfinished(one[:, None], None), status=torch.tensor([STALLED]), promised=0.5 * errors**2 * one)
+    assert status_of(stopped) == status
 
 
 def test_determined_combinations_are_those_the_readings_depend_on() -> None:

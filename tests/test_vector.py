@@ -84,3 +84,39 @@ def test_the_inverse_fourth_root_is_right_to_two_units_in_the_last_place(process
     # y s^(1/4) = 1 up to rounding: what is left over is small against the four factors' own rounding
     off = (found.square() * torch.sqrt(x) - 1.0).abs()
     assert float(off.max()) < 4 * 2.2e-16 + 2.2e-16
+
+
+class Eager:
+    """A graph whose nodes are numbers."""
+
+    def __init__(self) -> None:
+        self.numbers: list[Tensor] = []
+
+    def literal(self, value: float) -> int:
+        return self.add(torch.tensor(value, dtype=torch.float64))
+
+    def add(self, number: Tensor) -> int:
+        self.numbers.append(number)
+        return len(self.numbers) - 1
+
+    def apply(self, operation: str, *arguments: int) -> int:
+        return self.add(OPERATIONS[operation].torch(*(self.numbers[a] for a in arguments)))
+
+    def value(self, node: int) -> float | None:
+        return None
+
+
+@pytest.mark.parametrize("name", [n for n, operation in OPERATIONS.items() if operation.partials is not None])
+@pytest.mark.parametrize("first", [1.3, 0.4])
+def test_partial_derivatives_of_operations_are_those_of_torch(name: str, first: float) -> None:
+    graph, count = Eager(), OPERATIONS[name].c.count("{")
+    given = [torch.tensor(x, dtype=torch.float64) for x in (first, 0.7, 2.1)[:count]]
+    if name == "where":
+        given[0] = given[0] > 1.0
+    nodes = tuple(graph.add(x) for x in given)
+    partials = OPERATIONS[name].partials(graph, graph.apply(name, *nodes), nodes)  # type: ignore[misc]
+    for k, partial in enumerate(partials):
+        if partial is not None:
+            function = lambda x, k=k: OPERATIONS[name].torch(*given[:k], x, *given[k + 1 :])  # noqa: E731
+            slope = torch.autograd.functional.jacobian(function, given[k])
+            assert float(graph.numbers[partial]) == pytest.approx(float(slope), rel=1e-12, abs=1e-15)

@@ -26,6 +26,12 @@ def test_neighbouring_windows_with_the_fault_are_one_stretch() -> None:
     assert found[0].size == pytest.approx(0.5) and found[0].std == pytest.approx(0.1 / 2**0.5)
 
 
+def test_windows_that_scatter_by_more_than_their_errors_have_a_larger_error() -> None:
+    """Two sizes of equal flow, 0.4 and 0.8 +- 0.1: sqrt((0.1^2 + 0.2^2) / 2) for their mean."""
+    (found,) = stretches_of([window(0.0, "present", 0.4), window(10.0, "present", 0.8)])
+    assert (found.size, found.std) == (pytest.approx(0.6), pytest.approx((0.05 / 2) ** 0.5))
+
+
 def test_windows_at_the_end_of_the_range_have_no_say_in_the_size() -> None:
     beyond = Window(10.0, 20.0, (WindowFault("T1.leak.size", 1.0, float("inf"), "present", 1e-6),), 1.0)
     (found,) = stretches_of([window(0.0, "present"), beyond])
@@ -46,6 +52,7 @@ def test_windows_of_another_recording_go_on_with_nothing() -> None:
 def test_a_size_that_its_error_covers_is_absent_and_one_that_nothing_tells_is_unknown() -> None:
     assert state_of(0.2, 0.01, 1.0) == "present"
     assert state_of(0.2, 0.12, 1.0) == "absent"
+    assert [state_of(size, 0.1, 1.0) for size in (0.19, 0.2)] == ["absent", "present"], "1.96 standard errors"
     assert state_of(0.01, 0.001, 1.0) == "absent"
     assert state_of(0.2, 0.3, 1.0) == "cannot tell"
 

@@ -133,6 +133,13 @@ def test_a_replay_within_tolerance(finished: Path) -> None:
     assert "numpy" in found.versions and found.versions["python"][0] == "3.11"
 
 
+@pytest.mark.parametrize(("deviation", "outcome"), [(5e-10, "within tolerance"), (2e-9, "differs")])
+def test_the_tolerance_of_a_replay_is_relative(finished: Path, deviation: float, outcome: str) -> None:
+    cost = 1 / 3 * (1 + deviation)
+    found = replay(finished, lambda run: changed(run, "/estimator/de/generation", best_cost=cost), relative=1e-9)
+    assert found.outcome == outcome
+
+
 @pytest.mark.parametrize(
     ("topic", "fields", "field"),
     [

@@ -201,6 +201,25 @@ def test_a_damaged_chunk_stops_the_reading_unless_salvage_is_asked_for(tmp_path:
     assert len(salvaged.damages) == 1
 
 
+def test_a_chunk_of_ours_without_a_checksum_is_damaged(tmp_path: Path) -> None:
+    """0 says that there is none, which MCAP allows; this program writes one into every chunk."""
+    data = bytearray(write_chunks(tmp_path / "a.mcap").read_bytes())
+    second = [part for part in read_run(tmp_path / "a.mcap").parts if getattr(part, "opcode", 0) == 6][1]
+    data[second.start + 33 : second.start + 37] = bytes(4)
+    (tmp_path / "bare.mcap").write_bytes(data)
+    with pytest.raises(LogError, match="CRC differs"):
+        list(read_run(tmp_path / "bare.mcap").messages())
+
+
+def test_a_file_with_a_hole_ends_and_is_not_complete(tmp_path: Path) -> None:
+    data = bytearray(write_chunks(tmp_path / "a.mcap").read_bytes())
+    second = [part for part in read_run(tmp_path / "a.mcap").parts if getattr(part, "opcode", 0) == 6][1]
+    data[second.start : second.end] = bytes(second.end - second.start)
+    (tmp_path / "hole.mcap").write_bytes(data)
+    run = read_run(tmp_path / "hole.mcap")
+    assert run.ended and not run.complete and "fdi recover" in run.advice
+
+
 def bomb(path: Path, size: int, claimed: int) -> Path:
     """A log whose only chunk unpacks to `size` zero bytes while it claims `claimed`."""
     import struct

@@ -147,6 +147,15 @@ def test_the_report_tells_what_was_lost(tmp_path: Path) -> None:
     assert run.complete and run.config_text == "a: 1\n"
 
 
+def test_a_file_cut_between_two_chunks_has_no_damage_and_yet_no_end(tmp_path: Path) -> None:
+    source = write_chunks(tmp_path / "a.mcap")
+    third = truth(source)[2][0]
+    source.write_bytes(source.read_bytes()[:third])
+    done = recover(source)
+    assert done.messages == 40 and not done.lost and not done.ended and not done.whole
+    assert "did not come to its end" in done.sentence
+
+
 def test_a_whole_file_is_said_to_be_whole(finished: Path) -> None:
     done = recover(finished)
     assert done.whole and "the file is whole" in done.sentence

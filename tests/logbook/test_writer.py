@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -11,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import orjson
 import pytest
-from example_logs import FIXED, VERDICT, log_generation, write_everything, write_finished
+from example_logs import FIXED, VERDICT, log_generation, write_chunks, write_everything, write_finished
 from mcap.reader import make_reader
 
 from fdi_torch.logbook import DeferredTopic, RunLog, read_run, sink
 from fdi_torch.logbook.provenance import environment, git_state
+from fdi_torch.logbook.sink import EPOCH_NS, log_time_of
 from fdi_torch.logbook.topic_definitions import TOPICS
 
 
@@ -53,6 +55,20 @@ def test_units_stand_in_the_channel(finished: Path) -> None:
     assert channels["/plant/output"]["unit.h3"] == "m" and channels["/plant/output"]["unit.t"] == "s"
     assert channels["/diagnosis/fault"]["unit.flow"] == "m^3/s"
     assert channels["/study/trial"]["schema_version"] == "1"
+
+
+def test_the_summary_counts_the_messages_of_all_chunks(tmp_path: Path) -> None:
+    with open(write_chunks(tmp_path / "a.mcap"), "rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None and summary.statistics.chunk_count > 1
+        found = Counter(channel.id for _, channel, _ in reader.iter_messages())
+    assert summary.statistics.channel_message_counts == found
+
+
+def test_a_log_time_is_the_nearest_nanosecond() -> None:
+    times = [0.3 * k for k in range(1000)]
+    assert [log_time_of(t) - EPOCH_NS for t in times] == [300_000_000 * k for k in range(1000)]
 
 
 def test_equal_runs_are_equal_byte_for_byte(tmp_path: Path) -> None:
