@@ -41,7 +41,7 @@ def answer(cause: str, left_out: tuple[str, ...], metres: float, seconds: float)
 
 
 def expect_same(found: Answer, usual: Answer, metres: float, seconds: float) -> None:
-    """Equal to within what iterations leave: a millionth of probabilities, of standard errors, and of sizes in these."""
+    """Equal to within what iterations leave: a millionth of probabilities, standard errors, and sizes in these."""
     assert found.verdict == usual.verdict
     assert dict(found.where) == pytest.approx(dict(usual.where), rel=1e-6, abs=1e-9)
     assert [(c.effect, c.location) for c in found.causes] == [(c.effect, c.location) for c in usual.causes]
