@@ -186,7 +186,9 @@ def monitored(metres: float, seconds: float) -> list[tuple[str, tuple[str, ...],
         Samples(run.time * seconds, run.inputs * metres**3 / seconds, run.readings * metres, run.hold) for run in runs
     )
     names = ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3
-    settings = MonitorSettings(120.0 * seconds, 40.0 * seconds, longest=400.0 * seconds, incipient=False, together=1)
+    # Windows end between two samples, so that rounding does not decide which samples they hold.
+    lookback, confirm, longest = 119.5 * seconds, 39.5 * seconds, 399.5 * seconds
+    settings = MonitorSettings(lookback, confirm, longest=longest, incipient=False, together=1)
     learnt = Recording(quiet.time, quiet.inputs, quiet.readings, *names)
     plant = rescaled(load_plant("three_tank"), metres, seconds)
     every = 20000.0 * seconds
