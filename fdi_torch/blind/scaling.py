@@ -2,16 +2,20 @@
 
 The units are `length` m for lengths, `time` s for times and `area` m^2 for cross-sections of tanks. The balance
 A dh/dt = q and the orifice law q = C_d a sqrt(2 g h) keep their form if flows are measured in area x length / time and
-cross-sections a of pipes in area x sqrt(length) / time. All units are powers of ten, so that round numbers stay round.
+cross-sections a of pipes in area x sqrt(length) / time. All units are powers of ten, so that a recording of another
+size has the same digits: its samples are at round times, and its readings have as many digits as on the bench.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from statistics import geometric_mean
 
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription, Pump, Sensor
+
+BENCH_HEIGHT, BENCH_AREA = 0.5, 0.01  # m, m^2
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,13 @@ class Scales:
 
 
 SAME = Scales()
+
+
+def scales_of(plant: PlantDescription, time_scale: float) -> Scales:
+    """The powers of ten nearest to the size of a plant, and to its time scale, s, that of the bench being 1 s."""
+    height = geometric_mean(tank.height / BENCH_HEIGHT for tank in plant.tanks)
+    area = geometric_mean(tank.area / BENCH_AREA for tank in plant.tanks)
+    return Scales(*(10.0 ** round(math.log10(ratio)) for ratio in (time_scale, height, area)))
 
 
 def decimals(on_bench: int, scale: float) -> int:

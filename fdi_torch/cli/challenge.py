@@ -15,7 +15,7 @@ from fdi_torch.blind import Networks, Row, Tables, blind_benchmark, joined
 from fdi_torch.blind.benchmark import Diagnosis, Each
 from fdi_torch.blind.conditions import exercised
 from fdi_torch.blind.plants import RIGS, Rig
-from fdi_torch.blind.scaling import Scales
+from fdi_torch.blind.scaling import scales_of
 from fdi_torch.blind.score_tables import misses, sheets
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
@@ -26,7 +26,7 @@ from fdi_torch.interruption import Terminated
 from fdi_torch.jobs.blind_results import LOG, write_plants, write_results
 from fdi_torch.logbook.provenance import git_state
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.scales import area_scale, length_scale, time_scale
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.study.cluster import connected, each_on
 
@@ -96,7 +96,10 @@ def _rig(arguments: argparse.Namespace) -> Rig | Networks:
         raise ValueError(f"--tanks: expected --plant {NETWORK} with it; add that or leave --tanks out")
     if arguments.plant == NETWORK:
         return _networks(arguments.tanks) if arguments.tanks else Networks()
-    return _rig_like(chosen_plant(arguments.plant)) if arguments.plant else RIGS[arguments.rig or "three_tank"]()
+    if not arguments.plant:
+        return RIGS[arguments.rig or "three_tank"]()
+    plant = chosen_plant(arguments.plant)
+    return exercised(plant, scales_of(plant, time_scale(plant)))
 
 
 def _networks(tanks: str) -> Networks:
@@ -104,10 +107,6 @@ def _networks(tanks: str) -> Networks:
     if not all(end.isdigit() for end in ends) or len(ends) > 2:
         raise ValueError(f"--tanks: expected a number or a range, got '{tanks}'; write for example 6 or 3..12")
     return Networks(int(ends[0]), int(ends[-1]))
-
-
-def _rig_like(plant: PlantDescription) -> Rig:
-    return exercised(plant, Scales(time_scale(plant), length_scale(plant), area_scale(plant)))
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 
-from fdi_torch.config.strict import Strict, has_bench_default
+from fdi_torch.config.strict import Strict, is_scaled
 
 Key = tuple[str, str, str]
 """Path of the key, its default in YAML notation ('required' if it has none), its meaning."""
@@ -21,7 +21,7 @@ def keys(model: type[BaseModel], prefix: str = "") -> Iterator[Key]:
         inner, step = _inner(field.annotation)
         if inner is None:
             default = "required" if field.is_required() else _shown(field.get_default(call_default_factory=True))
-            default += " on a bench" if has_bench_default(field) else ""
+            default += " on three_tank" if is_scaled(field) else ""
             yield path, default, field.description or ""
         elif field.description:
             yield path, "", field.description

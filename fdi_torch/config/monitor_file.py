@@ -15,7 +15,7 @@ from fdi_torch.config.loaded_recordings import separate_recordings
 from fdi_torch.config.problems import naming_source
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
-from fdi_torch.config.strict import BenchSeconds, Seconds, Strict
+from fdi_torch.config.strict import ScaledSeconds, Seconds, Strict
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import GainSpecification
 from fdi_torch.plant.description import PlantDescription
@@ -23,13 +23,11 @@ from fdi_torch.recording import Recording
 
 
 class WindowConfig(Strict):
-    """Default times are those of a bench-top rig, and are multiplied by the time scale of the plant
-    (`plant.scales`).
-    """
+    """Default times are those of three_tank, and are multiplied by the time scale of the plant (`plant.scales`)."""
 
-    lookback: BenchSeconds = Field(300.0, description="length before an alarm in which its onset is searched, s")
-    confirm: BenchSeconds = Field(60.0, description="time after an alarm until the fault is isolated, s")
-    longest: BenchSeconds = Field(1000.0, description="greatest length of a window, s")
+    lookback: ScaledSeconds = Field(300.0, description="length before an alarm in which its onset is searched, s")
+    confirm: ScaledSeconds = Field(60.0, description="time after an alarm until the fault is isolated, s")
+    longest: ScaledSeconds = Field(1000.0, description="greatest length of a window, s")
     stride: Seconds | None = Field(
         None, description="distance of windows that are fitted separately, s; by default longest"
     )
@@ -72,10 +70,12 @@ class MonitorConfig(Strict):
         "changes", description="isolate changes after alarms, or estimate all faults in each window by that method"
     )
     detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="detector that raises alarms")
-    false_alarms_every: BenchSeconds = Field(20000.0, description="mean time between false alarms, s")
+    false_alarms_every: ScaledSeconds = Field(20000.0, description="mean time between false alarms, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
     observer: ObserverConfig = Field(default_factory=ObserverConfig, description="gain; by default from the noise")
-    step: BenchSeconds = Field(1.0, description="longest integration step, s")
+    step: Seconds | None = Field(
+        None, description="longest integration step, s; by default about a hundredth of the tanks' emptying time"
+    )
     output: OutputConfig = Field(default_factory=OutputConfig)
     seed: int = Field(0, ge=0, description="seed of the simulation that sets the threshold of the GLR")
 

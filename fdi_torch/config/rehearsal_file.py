@@ -15,7 +15,7 @@ from fdi_torch.config.estimation import full_name
 from fdi_torch.config.monitor_file import WindowConfig
 from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
-from fdi_torch.config.strict import BenchSeconds, Decibel, Share, Strict, quantity
+from fdi_torch.config.strict import Decibel, ScaledSeconds, Share, Strict, quantity
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.monitor.monitor_setup import with_shapes
@@ -42,7 +42,7 @@ class NoiseConfig(Strict):
 class FalseAlarmConfig(Strict):
     noises: dict[str, NoiseConfig] = Field(min_length=1, description="each by a name")
     runs: int = Field(500, ge=1, description="number of fault-free runs")
-    lasts: BenchSeconds = Field(3600.0, gt=0, description="duration of each run, and of runs for noise estimation, s")
+    lasts: ScaledSeconds = Field(3600.0, gt=0, description="duration of each run, and of runs for noise estimation, s")
     calibrations: int = Field(8, ge=1, description="number of runs from which the noise is estimated")
 
 
@@ -51,8 +51,8 @@ class FaultsFoundConfig(Strict):
     sizes: list[Share] = Field([0.02, 0.05, 0.1, 0.2], min_length=1, description="shares of the fault's range")
     runs: int = Field(500, ge=1, description="number of runs of each size")
     named: int = Field(100, ge=0, description="number of these runs in which the monitor also isolates the fault")
-    onset: BenchSeconds = Field(300.0, description="onset of the fault, s")
-    lasts: BenchSeconds = Field(900.0, description="duration of each run, s")
+    onset: ScaledSeconds = Field(300.0, description="onset of the fault, s")
+    lasts: ScaledSeconds = Field(900.0, description="duration of each run, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
 
 
@@ -63,8 +63,8 @@ class NamingConfig(Strict):
     share: Share = Field(0.5, description="relative change of the commands each minute")
     runs: int = Field(200, ge=1, description="number of runs of each loop")
     times: float = Field(3.0, gt=0, description="size of the faults as a multiple of the smallest isolable size")
-    onset: BenchSeconds = Field(300.0, description="onset of the fault, s")
-    lasts: BenchSeconds = Field(900.0, description="duration of each run, s")
+    onset: ScaledSeconds = Field(300.0, description="onset of the fault, s")
+    lasts: ScaledSeconds = Field(900.0, description="duration of each run, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
 
 
@@ -81,8 +81,8 @@ class RehearsalConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
     inputs: list[str] = Field(description="constant commands, one per channel")
     reading_noise: str = Field("1 mm", description="standard deviation: 1 mm (of the level), or h1 = 1 mm, p2 = 2 mV")
-    sampling: BenchSeconds = Field(1.0, gt=0, description="sampling interval, s")
-    false_alarms_every: BenchSeconds = Field(20000.0, description="design mean time between false alarms, s")
+    sampling: ScaledSeconds = Field(1.0, gt=0, description="sampling interval, s")
+    false_alarms_every: ScaledSeconds = Field(20000.0, description="design mean time between false alarms, s")
     detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="detector that raises alarms under naming")
     false_alarms: FalseAlarmConfig | None = Field(None, description="measure the false alarm rate")
     faults_found: FaultsFoundConfig | None = Field(None, description="measure detection delay, power and isolation")
@@ -163,7 +163,7 @@ def _rig(
     std = torch.tensor(reading_noise(c.reading_noise, plant), dtype=torch.float64)
     controller = None
     if loop == "open":
-        controller = moving_commands(inputs, c.naming.share if c.naming else 0.0)
+        controller = moving_commands(plant, inputs, c.naming.share if c.naming else 0.0)
     elif loop == "closed":
         controller = moving_set_points(plant, inputs, levels, c.naming.swing if c.naming else 0.0)
     return SimulatedRig(network, space, inputs, levels, std, c.sampling, noise.wander, noise.colour, controller)

@@ -62,9 +62,9 @@ Length = Annotated[float, *quantity_of("m")]
 Area = Annotated[float, *quantity_of("m^2")]
 Seconds = Annotated[float, *quantity_of("s")]
 Decibel = Annotated[float, Field(ge=-300, le=300)]
-_ON_A_BENCH = "the default is for a bench-top rig"
-BenchSeconds = Annotated[Seconds, _ON_A_BENCH]
-BenchSteps = Annotated[list[float], BeforeValidator(_each_in_seconds), _ON_A_BENCH]
+_SCALED = "the default is for three_tank"
+ScaledSeconds = Annotated[Seconds, _SCALED]
+ScaledSteps = Annotated[list[float], BeforeValidator(_each_in_seconds), _SCALED]
 Acceleration = Annotated[float, *quantity_of("m/s^2")]
 
 Amount = float | str
@@ -74,18 +74,18 @@ Amount = float | str
 Config = TypeVar("Config", bound=Strict)
 
 
-def has_bench_default(field: FieldInfo) -> bool:
+def is_scaled(field: FieldInfo) -> bool:
     """Whether the default is multiplied by the plant's time scale."""
-    return _ON_A_BENCH in field.metadata
+    return _SCALED in field.metadata
 
 
 def scaled_to_plant(config: Config, scale: float) -> Config:
-    """The configuration with all default times for a bench-top rig multiplied by the plant's time scale."""
+    """The configuration with all default times for three_tank multiplied by the plant's time scale."""
     changes: dict[str, Any] = {}
     for name, field in type(config).model_fields.items():
         value = getattr(config, name)
         if isinstance(value, Strict):
             changes[name] = scaled_to_plant(value, scale)
-        elif has_bench_default(field) and name not in config.model_fields_set:
+        elif is_scaled(field) and name not in config.model_fields_set:
             changes[name] = [scale * v for v in value] if isinstance(value, list) else scale * value
     return config.model_copy(update=changes) if scale != 1.0 else config

@@ -17,7 +17,7 @@ from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.resolved_config import values_in
 from fdi_torch.config.run_file import Run, RunConfig, build_run
 from fdi_torch.config.simulation import planned_recording
-from fdi_torch.config.strict import BenchSeconds, BenchSteps, Decibel, Share, Strict, scaled_to_plant
+from fdi_torch.config.strict import Decibel, ScaledSeconds, ScaledSteps, Share, Strict, scaled_to_plant
 from fdi_torch.config.yaml_files import write_yaml
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
@@ -53,12 +53,12 @@ class StudyConfig(Strict):
     )
     starts: int = Field(2, ge=1, description="number of members of the search that are refined")
     searches: int = Field(3, ge=1, description="greatest number of searches, for trials with residuals above the noise")
-    search_step: BenchSeconds = Field(5.0, gt=0, description="integration step of the search, s")
+    search_step: ScaledSeconds = Field(5.0, gt=0, description="integration step of the search, s")
     search_every: int = Field(5, ge=1, description="decimation of the readings in the search")
-    steps: BenchSteps = Field(
+    steps: ScaledSteps = Field(
         [1.0, 0.1], min_length=1, description="integration steps of the refinement, coarse to fine, s"
     )
-    data_step: BenchSeconds = Field(0.01, gt=0, description="integration step of the noise-free readings, s")
+    data_step: ScaledSeconds = Field(0.01, gt=0, description="integration step of the noise-free readings, s")
     population: int = Field(40, ge=4, description="population of the search")
     evaluations: int = Field(2000, ge=4, description="cost evaluations of each search")
     tolerance: float = Field(1e-5, gt=0, description="without noise: error, relative to the range, that is a failure")

@@ -23,6 +23,7 @@ from fdi_torch.simulate.engine_choice import adaptive_engine, make_engine
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.step_control import StepControl
+from fdi_torch.simulate.step_length import commensurate_step
 
 StartLevel = Literal["equilibrium", "free"] | float
 StartLevels = StartLevel | Mapping[str, StartLevel]
@@ -32,9 +33,9 @@ EngineKind = Literal["auto", "reference", "compiled"]
 # first readings show (their median).
 START_SEARCH_SHARE = 0.05
 FIRST_READINGS = 5
-# An adaptive solver receives linearly interpolated inputs as means over intervals of at most this length, in units of
-# the plant's time scale.
-LONGEST_STEP = 1.0
+# An adaptive solver receives linearly interpolated inputs as means over intervals of about this length, in units of the
+# plant's time scale.
+INPUT_STEP = 1.0
 # Cost of one step with individual step control per lane, in units of a fixed RK4 step common to all lanes.
 OWN_STEP_COST = 16
 
@@ -80,7 +81,8 @@ class Fitting:
         engines = []
         for network, space, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True):
             uses_own_steps = not adaptive and self._takes_own_steps(recording, network, step)
-            longest = LONGEST_STEP * time_scale(self.plant) if adaptive or uses_own_steps else step
+            input_step = commensurate_step(INPUT_STEP * time_scale(self.plant), recording.interval)
+            longest = input_step if adaptive or uses_own_steps else step
             step_control = _step_control(step, recording, self.plant) if uses_own_steps else None
             experiment = lay_out(recording, self.plant.channels(), longest, step_control)
             if adaptive:

@@ -30,7 +30,7 @@ from fdi_torch.estimate.refinement import (
 from fdi_torch.estimate.uncertainty import Estimate, make_estimate
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.engine import Engine
-from fdi_torch.simulate.step_length import choose_step, probe_points
+from fdi_torch.simulate.step_length import choose_step, probe_points, step_ladder
 
 # The longest step of the first probing simulation, in units of the plant's time scale.
 FIRST_STEP = 5.0
@@ -114,6 +114,7 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
     spans = [float(r.time[-1] - r.time[0]) for r in fitting.recordings]
     longest, scale = max(min(spans) / 20.0, 1e-6), time_scale(fitting.plant)
     shortest = min(range(len(spans)), key=spans.__getitem__)
+    interval = fitting.recordings[shortest].interval
     beginning = fitting.beginning(PROBE_SAMPLES)
 
     def engine_at(step: float) -> Engine:
@@ -125,10 +126,12 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
     readings = engine_at(min(longest, FIRST_STEP * scale)).readings(recording_points)
     std = readings.flatten(0, 1).std(dim=0).clamp(min=1e-12)
     if coarse is None:
-        coarse = choose_step(engine_at, recording_points, settings.search_tolerance * std, longest, scale, 0.9)
+        ladder = step_ladder(interval, scale, longest)
+        coarse = choose_step(engine_at, recording_points, settings.search_tolerance * std, ladder, 0.9)
     fine = ADAPTIVE_STEPS[-1] * scale if settings.adaptive else settings.refine_step
     if fine is None:
-        fine = choose_step(engine_at, recording_points, settings.refine_tolerance * std, coarse, scale, 0.9)
+        ladder = step_ladder(interval, scale, coarse)
+        fine = choose_step(engine_at, recording_points, settings.refine_tolerance * std, ladder, 0.9)
     return coarse, fine
 
 

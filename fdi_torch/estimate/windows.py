@@ -22,7 +22,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.engine import Engine, Readings
-from fdi_torch.simulate.step_length import choose_step, probe_points
+from fdi_torch.simulate.step_length import choose_step, probe_points, step_ladder
 
 REFINE = RefineSettings(iterations=40, decrease_tolerance=1e-6)
 START_SIZE = 0.3  # initial size of a fault, as a fraction of its range above nominal
@@ -87,14 +87,15 @@ def window_step(fittings: Sequence[Fitting], std: Tensor) -> float:
     It is determined on the window with the largest total variation of the inputs.
     """
     most_excited = max(fittings, key=lambda f: float(f.recordings[0].inputs.diff(dim=0).abs().sum()))
-    time = most_excited.recordings[0].time
+    recording = most_excited.recordings[0]
 
     def engine_at(step: float) -> Engine:
         return most_excited.engines(step)[0]
 
     points = probe_points(*search_box(most_excited))
-    longest, scale = float(time[-1] - time[0]) / 20.0, time_scale(most_excited.plant)
-    return choose_step(engine_at, points, STEP_ERROR * std, longest, scale, quantile=0.9)
+    longest = float(recording.time[-1] - recording.time[0]) / 20.0
+    ladder = step_ladder(recording.interval, time_scale(most_excited.plant), longest)
+    return choose_step(engine_at, points, STEP_ERROR * std, ladder, quantile=0.9)
 
 
 def window_of(fitting: Fitting, std: Tensor, suspects: Collection[str], step: float) -> Window:

@@ -23,7 +23,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import lay_out
 
 DESIGNS, SEED = 6, 0
-DURATION, HOLDS = 1500.0, (60.0, 120.0, 250.0)  # s, for bench-scale tanks
+DURATION, HOLDS = 1500.0, (60.0, 120.0, 250.0)  # in units of the plant's time scale
 PARTED = 20.0  # chi-square units: odds of 20000 to 1
 HIGH, FULL = 0.8, 0.95  # highest share of a pump's limit, and of a tank's height
 TINY = 1e-10

@@ -21,13 +21,13 @@ from fdi_torch.plant.effect import Effect, Local, Memory, Placement, Stage, Valu
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.plant.operating_range import OperatingRange, Range
-from fdi_torch.plant.scales import area_scale, length_scale, time_scale
+from fdi_torch.plant.scales import length_scale, time_scale
 from fdi_torch.plant.signals import Clock
 
 LOCAL_NODES, TIME_NODES = 8, 16
 HEAD_NODES = 14
 PRIOR = 0.2  # standard deviation of a coefficient
-NARROWEST = 1e-6  # width of a grid, in units of the plant's scales
+NARROWEST = 1e-6  # width of a grid, in units of the plant's scales or of its greatest command
 UNIT = 0.01  # size of a coefficient at which its influence on the readings is computed
 
 
@@ -183,8 +183,7 @@ def _free_at(place: str, plant: PlantDescription, reach: OperatingRange, periods
         readings = _grid(reach.readings[place], LOCAL_NODES, length if component.unit == "m" else 1.0)
         return [FreeReading({"reading": readings, "time": time}, 0.2 * reading_span(plant, component), periods)]
     if isinstance(component, MeteredFlow):
-        flows = area_scale(plant) * length / time_scale(plant) if component.gain_unit == "1" else 1.0
-        command = _grid(reach.commands[component.channel], LOCAL_NODES, flows)
+        command = _grid(reach.commands[component.channel], LOCAL_NODES, component.max_flow / component.gain)
         nodes = {"command": command, "level": _grid(reach.levels[component.near_tank], 5, length), "time": time}
         return [FreeFlow(nodes, component.gain * max(abs(command[0]), abs(command[-1])), periods)]
     assert isinstance(component, FlowComponent)

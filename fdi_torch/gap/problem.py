@@ -18,13 +18,15 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.step_length import commensurate_step
 
 LEAST = 60
 """Fewest readings of a sensor; with fewer, noise cannot be separated from a model error. Two of the slowest periods
 that count as noise."""
 
-SHORTEST_STEP = 0.5  # s, for bench-scale tanks; a quarter of the shortest period and lag that an effect describes
-LONGEST_STEP = 2.5  # s, for bench-scale tanks; with longer steps, fits that meet a rim depend on their start
+# Range of integration steps, in units of the plant's time scale. The shortest is a quarter of the shortest period and
+# lag that an effect describes; with steps longer than the longest, fits that meet a rim depend on their start.
+SHORTEST_STEP, LONGEST_STEP = 0.5, 2.5
 
 
 @dataclass(frozen=True)
@@ -185,10 +187,8 @@ def checked_data_set(
 
 def _step(plant: PlantDescription, recording: Recording) -> float:
     """A whole multiple, or a whole fraction, of the sampling interval, s."""
-    interval = recording.interval
-    if interval < SHORTEST_STEP * time_scale(plant):
-        return interval * math.floor(SHORTEST_STEP * time_scale(plant) / interval + 1e-9)
-    return interval / math.ceil(interval / (LONGEST_STEP * time_scale(plant)) - 1e-9)
+    interval, scale = recording.interval, time_scale(plant)
+    return commensurate_step(min(max(interval, SHORTEST_STEP * scale), LONGEST_STEP * scale), interval)
 
 
 def check_enough_readings(data: DataSet) -> None:

@@ -27,6 +27,7 @@ from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.step_length import commensurate_step
 
 
 @dataclass(frozen=True)
@@ -78,12 +79,14 @@ def prepare_monitor(
     """A monitor for `faults` (parameters such as 'T1.leak.size'; the usual ones by default).
 
     calibrate: constants that are first fitted to the fault-free recording, with their tolerances as priors. start:
-    knowledge of the initial levels. step: longest integration step, s. ranges: replace the usual ranges of faults.
+    knowledge of the initial levels. step: longest integration step, s; by default `usual_step`, or the fraction of the
+    sampling interval next to it. ranges: replace the usual ranges of faults.
     Raises ValueError.
     """
     # The step is at most the usual sampling interval, because it also sets how sharply square roots and rims are
     # resolved.
-    step = min(usual_step(plant) if step is None else step, 1.25 * usual_interval(fault_free.time))
+    interval = usual_interval(fault_free.time)
+    step = min(commensurate_step(usual_step(plant), interval) if step is None else step, 1.25 * interval)
     watched = with_shapes(list(faults) or usual_faults(plant), plant)
     network = build_network(plant, placements_for(watched))
     running = without_startup_effects(plant, fault_free.ran)  # the fault-free part need not be the start of the run

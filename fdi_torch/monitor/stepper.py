@@ -17,7 +17,7 @@ from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 
-# In units of the plant's time scale. RK4 with this step has an error of 1e-3 cm on the paper's plant, far below sensor
+# In units of the plant's time scale. RK4 with this step has an error of 1e-3 cm on three_tank, far below sensor
 # resolution.
 _USUAL_STEP = 1.0
 

@@ -13,8 +13,9 @@ from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Recording
 
-RESOLUTION = 0.01  # smoothing of square roots and rims, in units of the plant's time scale
-INSTANT = 1e-3  # s; time-dependent effects are averaged over this interval about t
+# In units of the plant's time scale.
+RESOLUTION = 0.01  # smoothing of square roots and rims
+INSTANT = 1e-3  # time-dependent effects are averaged over this interval about t
 
 Inputs = Recording | Tensor | Callable[[Tensor], Tensor]
 """A recording, whose inputs are used with its hold; constant inputs (channels,); or a function of time (s) to them."""
@@ -53,7 +54,8 @@ class PlantOde(nn.Module):
                 f"expected actuators without memory or dead time, got {', '.join(names)}; leave them out, or use an "
                 "engine of fdi_torch.set_up"
             )
-        self._resolution = like.new_tensor(resolution or RESOLUTION * time_scale(network.description))
+        scale = time_scale(network.description)
+        self._instant, self._resolution = INSTANT * scale, like.new_tensor(resolution or RESOLUTION * scale)
         self._inputs = _function_of_time(inputs, network, like)
 
     @property
@@ -72,7 +74,8 @@ class PlantOde(nn.Module):
 
     def _driven(self, instant: Tensor) -> tuple[list[Tensor], Clock]:
         """Outputs of the actuators at an instant, s, and the clock there."""
-        clock = Clock(instant - 0.5 * INSTANT, torch.full_like(instant, INSTANT), self._resolution.to(instant))
+        step = torch.full_like(instant, self._instant)
+        clock = Clock(instant - 0.5 * step, step, self._resolution.to(instant))
         channels = self._inputs(instant).unbind(-1)
         actuator_inputs = [channels[channel] for _, channel in self.network.actuators()]
         return self.network.commands(actuator_inputs, (), clock, self._values)[0], clock

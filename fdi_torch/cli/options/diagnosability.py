@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--duration",
         metavar="TIME",
         type=seconds,
-        help="duration of constant inputs, such as '2 h' (default: 1000 s for a bench plant, longer for slower ones)",
+        help="duration of constant inputs, such as '2 h' (default: 1000 s for three_tank, longer for slower plants)",
     )
     parser.add_argument(
         "--noise",

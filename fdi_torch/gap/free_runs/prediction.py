@@ -34,7 +34,7 @@ from fdi_torch.simulate.collocation import Collocation
 
 START_SAMPLES = 50  # for the initial levels
 CORRECTIONS, HALVINGS = 80, 4  # Newton steps, and halvings of the simulation step
-CONVERGED = 1e-5  # largest defect of a converged trajectory, m, for bench-scale tanks
+CONVERGED = 1e-5  # largest defect of a converged trajectory, in units of the plant's length scale
 NEARLY = 10.0  # in units of CONVERGED: a defect that shorter steps need not improve
 MOST_STEPS = 4000  # in the first attempt; levels change more slowly than close samples
 UNMEASURED_STARTS = (0.1, 0.25, 0.5, 0.8)  # initial levels, as shares of the height, of a tank without a sensor

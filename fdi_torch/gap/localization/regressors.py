@@ -4,7 +4,7 @@
 - Functions with memory: lags, delays, backlash, stiction, rate limits, relays, decays after a change.
 - Functions of time: steps, ramps, and sinusoids.
 
-Times are those of bench-scale tanks; `scale` multiplies them for other plants (`plant.scales.time_scale`).
+Times are those of three_tank; `scale` multiplies them for other plants (`plant.scales.time_scale`).
 """
 
 from __future__ import annotations

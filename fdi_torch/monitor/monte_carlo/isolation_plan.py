@@ -24,11 +24,13 @@ from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.state_update import advance_observer
 from fdi_torch.parameters import ParameterName
+from fdi_torch.plant.scales import time_scale
 
 RUNS_PER_TASK = 10
 NAME = "naming"
 LARGEST_SHARE = 0.9  # of a parameter's range; faults that need a larger size are left out
-PERIOD = 40.0  # s, of a simulated oscillation
+# Period of a simulated oscillation, and what a window shows before the onset, in units of the plant's time scale.
+PERIOD, BEFORE_ONSET = 40.0, 60.0
 
 
 @dataclass(frozen=True)
@@ -69,15 +71,16 @@ class IsolationPlan:
         scenarios = self._scenarios(monitor)
         free = training.segment(0, self.samples)
         state = advance_observer(monitor.observer, monitor.start(free, levels=rig.levels), free.segment(1, len(free)))
-        smallest = smallest_isolable(monitor.observer, state.window(self.onset - 60.0), nominal, scenarios, self.onset)
+        window = state.window(self.onset - BEFORE_ONSET * time_scale(rig.network.description))
+        smallest = smallest_isolable(monitor.observer, window, nominal, scenarios, self.onset)
         isolable = [(k, s) for k, s in zip(scenarios, smallest, strict=True) if self._in_range(k, s)]
         return noise, monitor, [k for k, _ in isolable], [s for _, s in isolable]
 
     def _scenarios(self, monitor: Monitor) -> list[FaultScenario]:
-        scenarios = []
+        scenarios, period = [], PERIOD * time_scale(self.rig.network.description)
         for fault in monitor.faults:
             names = [ParameterName.parse(self.rig.space.names[c]).field for c in fault.shape]
-            shape = tuple((c, PERIOD if n == "period" else 0.7) for c, n in zip(fault.shape, names, strict=True))
+            shape = tuple((c, period if n == "period" else 0.7) for c, n in zip(fault.shape, names, strict=True))
             stuck = "stuck" in self.rig.space.names[fault.size]
             manners = (False,) if shape or stuck else (False, True)
             scenarios += [FaultScenario(fault, shape, incipient) for incipient in manners]

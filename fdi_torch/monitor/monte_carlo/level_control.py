@@ -9,9 +9,12 @@ from torch import Tensor
 
 from fdi_torch.monitor.monte_carlo.simulated_runs import Controller
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.scales import area_scale, time_scale
+from fdi_torch.plant.scales import time_scale
 
-GAIN, RESET = 1.5e-3, 0.01  # m^2/s and 1/s, of a level control on a bench-scale plant
+# Closed-loop rate of a level control (flow per level error, over the tank's area) and its reset rate, 1/s, on a plant
+# whose time scale is 1 s.
+RATE, RESET = 0.09375, 0.01
+MINUTE, ROUNDING = 60.0, 1e-9  # time between changes, in units of the plant's time scale
 
 
 class LevelControl:
@@ -44,7 +47,8 @@ class LevelControl:
 def moving_set_points(
     plant: PlantDescription, steady: Tensor, levels: Tensor, swing: float
 ) -> Callable[[], Controller]:
-    """Level control of the pumped tanks with set points that change by up to `swing` m every minute of bench time.
+    """Level control of the pumped tanks with set points that change by up to `swing` m every minute, on a plant
+    whose time scale is 1 s.
 
     steady (channels,): commands at equilibrium, one for each pump; levels (tanks,) m there. Raises ValueError if pumps
     share a channel, or a pumped tank has no sensor.
@@ -57,18 +61,19 @@ def moving_set_points(
         tank = pumps[reading.index(-1)].target
         raise ValueError(f"closed loop: expected a sensor at every tank that is pumped into, got none at {tank}")
     sensors, pace = [plant.sensors[i] for i in reading], time_scale(plant)
-    resting = levels[[tanks.index(p.target) for p in pumps]]
+    fed = [tanks.index(p.target) for p in pumps]
+    resting, area = levels[fed], levels.new_tensor([plant.tanks[i].area for i in fed])
     slope, offset, pumped = (
         levels.new_tensor(x) for x in ([s.gain for s in sensors], [s.offset for s in sensors], [p.gain for p in pumps])
     )
-    gain, highest = GAIN * area_scale(plant) / pace / (slope * pumped), levels.new_tensor([p.max_flow for p in pumps])
+    gain, highest = RATE / pace * area / (slope * pumped), levels.new_tensor([p.max_flow for p in pumps])
 
     def make() -> Controller:
         controller, clock = LevelControl(steady, resting, reading, gain, RESET / pace, highest / pumped), [0.0]
 
         def command(readings: Tensor, span: Tensor) -> Tensor:
             clock[0] += float(span)
-            minute = int(clock[0] // (60.0 * pace))
+            minute = int(clock[0] / (MINUTE * pace) + ROUNDING)
             signs = torch.tensor([1.0 if (minute + i) % 2 else -1.0 for i in range(len(pumps))], dtype=levels.dtype)
             controller.set_points = slope * (resting + swing * signs * (0.4 + 0.3 * (minute % 3))) + offset
             return controller(readings, span)
@@ -78,15 +83,18 @@ def moving_set_points(
     return make
 
 
-def moving_commands(steady: Tensor, share: float) -> Callable[[], Controller]:
-    """Open loop: commands (channels,) that change by up to `share` of themselves every minute."""
+def moving_commands(plant: PlantDescription, steady: Tensor, share: float) -> Callable[[], Controller]:
+    """Open loop: commands (channels,) that change by up to `share` of themselves every minute, on a plant whose time
+    scale is 1 s.
+    """
+    pace = time_scale(plant)
 
     def make() -> Controller:
         clock = [0.0]
 
         def command(readings: Tensor, span: Tensor) -> Tensor:
             clock[0] += float(span)
-            minute = int(clock[0] // 60.0)
+            minute = int(clock[0] / (MINUTE * pace) + ROUNDING)
             signs = torch.tensor([1.0 if (minute + i) % 2 else -1.0 for i in range(len(steady))], dtype=steady.dtype)
             now = steady * (1.0 + share * signs * (0.4 + 0.3 * (minute % 3)))
             return now.expand(len(readings), -1)

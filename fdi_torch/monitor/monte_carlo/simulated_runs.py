@@ -14,6 +14,7 @@ from fdi_torch.monitor.stepper import PlantState, Stepper, usual_step
 from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.simulate.step_length import commensurate_step
 
 Controller = Callable[[Tensor, Tensor], Tensor]
 """(last readings (R, sensors), seconds since they were taken) -> inputs (R, channels)."""
@@ -58,7 +59,8 @@ class SimulatedRig:
         self.network, self.switched = network, SwitchedNetwork(network, space.names)
         self.space, self.inputs, self.levels, self.reading_std = space, inputs, levels, reading_std
         self.sampling, self.wander, self.colour, self.controller = sampling, wander, colour, controller
-        self._stepper = Stepper(self.switched, min(sampling, usual_step(network.description)))
+        step = commensurate_step(usual_step(network.description), sampling)
+        self._stepper = Stepper(self.switched, min(sampling, step))
         onsets = [str(ParameterName.parse(name).sibling("onset")) for name in space.names]
         known = [name for name in dict.fromkeys(onsets) if name in self.switched.constants]
         self._onsets = [name for name in known if self._has_memory(name)]
