@@ -19,7 +19,7 @@ from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.fault_recovery import recovered_columns, recovery_is_observable, reset_to_nominal
 from fdi_torch.monitor.fault_tracking import STRONG_EVIDENCE, size_change, updated_tracks, with_new_sizes
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
-from fdi_torch.monitor.isolation import isolate, refit
+from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState, PendingAlarm
 from fdi_torch.monitor.observer_bank import ObserverBank
@@ -43,7 +43,6 @@ class AlarmHandler:
     ) -> None:
         self.observer, self.space, self.detector = observer, observer.space, detector
         self.faults, self.watched, self.settings, self.writer = faults, watched, settings, writer
-        self.single_changes = len(faults) * (2 if settings.incipient else 1)
 
     # Schedule
 
@@ -71,19 +70,11 @@ class AlarmHandler:
         """
         change = state.change
         if change is not None and self._within_window(state, change):
-            window = state.window(self._window_start(state, change))
-            same = refit(self.observer, window, change.before, change.explanations, self.single_changes)
-            if same[0].fits and same[0].hypothesis.columns:
-                scheduled = change.next_fit
+            fits = self._explanations(state, self._window_start(state, change), change.before, change.explanations)
+            if fits[0].fits and fits[0].hypothesis.columns:
                 state = state.with_alarm(state.alarm(change.number).raised_again(state.now))
-                revised, events = self._revise(state, change, "revised", same, announce=False)
-                assert revised.change is not None
-                # The full comparison of explanations must not be postponed by this refit.
-                next_fit = min(scheduled, revised.change.next_fit)
-                return replace(revised, change=replace(revised.change, next_fit=next_fit)), events
-        resized = size_change(
-            self.observer, state, self._search_start(state, state.now), self.faults, self.single_changes
-        )
+                return self._revise(state, change, "revised", fits, announce=False)
+        resized = size_change(self.observer, state, self._search_start(state, state.now), self.faults)
         if resized is not None:
             moved = adopt_sizes(self.observer, state, resized)
             moved, announced = with_new_sizes(moved, resized, self.settings.revise)
