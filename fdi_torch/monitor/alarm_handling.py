@@ -21,7 +21,7 @@ from fdi_torch.monitor.fault_tracking import STRONG_EVIDENCE, size_change, updat
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState, PendingAlarm
+from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState, PendingAlarm
 from fdi_torch.monitor.observer_bank import ObserverBank
 from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, fault_effect_rms, normalized_residuals
 
@@ -166,7 +166,8 @@ class AlarmHandler:
         )
         if not best.fits and not_better:
             later = self._next_revision(change.best, state.now)
-            return replace(state, change=replace(change, next_fit=later)), []
+            change = replace(change, next_fit=later, hidden=self._hidden(state, change, change.ended))
+            return self._end_recovered(replace(state, change=change), change, self._reported(change.explanations))
         return self._revise(state, change, "revised", fits)
 
     def _unexplained(self, state: MonitorState, fits: Sequence[HypothesisFit]) -> tuple[MonitorState, list[Event]]:
@@ -223,9 +224,10 @@ class AlarmHandler:
         change = replace(change, explanations=kept)
         back = recovered_columns(self.space, change)
         ended = tuple(t for t in (change.ended or state.tracks) if t.column in back)
-        observable = all(recovery_is_observable(self.observer, state, change, t) for t in ended)
+        hidden = self._hidden(state, change, ended)
         names = tuple(tuple(self.space.names[c] for c in f.hypothesis.columns) for f in reported)
-        announce, change = announce or names != change.reported, replace(change, ended=ended, reported=names)
+        announce = announce or names != change.reported
+        change = replace(change, ended=ended, hidden=hidden, reported=names)
         state = adopt_change(self.observer, state, change, reset_to_nominal(self.space, change, back))
         state = updated_tracks(
             state,
@@ -233,7 +235,7 @@ class AlarmHandler:
             [fault.size for fault in self.faults],
             lambda c: fault_effect_rms(self.observer, state, c, change.best.onset),
         )
-        state, events = self._end_recovered(state, change, reported, observable)
+        state, events = self._end_recovered(state, change, reported)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:
             numbers = [t.number for t in ended]
@@ -248,17 +250,23 @@ class AlarmHandler:
         kind = kind if kind == "revised" and alarm.state is answer else str(answer)  # type: ignore[assignment]
         return state, [*events, self.writer.answered(state, change, reported, kind, announce or kind != "revised")]
 
+    def _hidden(self, state: MonitorState, change: DetectedChange, ended: Sequence[FaultTrack]) -> tuple[int, ...]:
+        """Columns of the recovered faults of which the readings would not show that they still stand."""
+        return tuple(t.column for t in ended if not recovery_is_observable(self.observer, state, change, t))
+
     def _end_recovered(
-        self, state: MonitorState, change: DetectedChange, reported: Sequence[HypothesisFit], observable: bool
+        self, state: MonitorState, change: DetectedChange, reported: Sequence[HypothesisFit]
     ) -> tuple[MonitorState, list[Event]]:
-        """End the alarms of recovered faults; "cannot tell" if the readings would not show the fault any more."""
-        answer, events = State.RECOVERED if observable else State.CANNOT_TELL, []
+        """End the alarms of recovered faults; "cannot tell" if the readings would not show one of them any more."""
+        events = []
         for number in sorted({t.number for t in change.ended}):
-            alarm = state.alarm(number)
+            columns, alarm = [t.column for t in change.ended if t.number == number], state.alarm(number)
+            hidden = [c for c in columns if c in change.hidden]
+            answer = State.CANNOT_TELL if hidden else State.RECOVERED
             if alarm.state is not answer:
                 state = state.with_alarm(alarm.with_state(answer))
-                names = [self.space.names[t.column] for t in change.ended if t.number == number]
-                events.append(self.writer.ended(state, change, reported, number, names, observable))
+                names = [self.space.names[c] for c in hidden or columns]
+                events.append(self.writer.ended(state, change, reported, number, names, not hidden))
         return state, events
 
     @staticmethod
