@@ -166,7 +166,8 @@ class AlarmHandler:
         )
         if not best.fits and not_better:
             later = self._next_revision(change.best, state.now)
-            change = replace(change, next_fit=later, hidden=self._hidden(state, change, change.ended))
+            doubtful = [t for t in change.ended if t.column in change.hidden]
+            change = replace(change, next_fit=later, hidden=self._hidden(state, change, doubtful))
             return self._end_recovered(replace(state, change=change), change, self._reported(change.explanations))
         return self._revise(state, change, "revised", fits)
 
