@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 
 from benchmarks.monitor_rigs import GROWTH, KINDS, SIZES, Case, recordings
@@ -34,9 +34,10 @@ def is_true(names: Sequence[str], fault: str) -> bool:
     return len(names) == 1 and names[0] in same
 
 
-def scored(case: Case, events: Sequence[Event]) -> Counter[str]:
+def scored(case: Case, events: Sequence[Event]) -> dict[str, float]:
     """Counts of events after the onset."""
-    count = Counter(early=sum(e.kind == "alarm" and e.time < case.onset for e in events), runs=1)
+    count: dict[str, float] = defaultdict(float)
+    count["runs"], count["early"] = 1, sum(e.kind == "alarm" and e.time < case.onset for e in events)
     count["detected"] = any(e.kind == "alarm" and e.time >= case.onset for e in events)
     for e in events:
         if e.kind not in ANSWERS or e.time < case.onset or not e.explanations:
@@ -45,6 +46,10 @@ def scored(case: Case, events: Sequence[Event]) -> Counter[str]:
         count["events"] += 1
         count["in set"] += held
         count["top"] += is_true(e.faults, case.name)
+        first = [
+            x for x in e.explanations if x.names == e.faults or (len(e.faults) == 1 and is_true(x.names, e.faults[0]))
+        ]
+        count["top by its own probability"] += sum(x.mass for x in first)
         count["certain, wrong"] += not held and str(e.state) == "isolated"
         count["certain"] += str(e.state) == "isolated"
     return count
@@ -66,12 +71,13 @@ def main() -> None:
     parser.add_argument("--show", action="store_true", help="print the events")
     a = parser.parse_args()
     chosen = cases(a.seed, a.learn, a.faults, a.kinds)[:: a.every]
-    total: Counter[str] = Counter()
+    total: dict[str, float] = defaultdict(float)
     started = time.process_time()
     for case, (recording, _) in zip(chosen, recordings(chosen), strict=True):
         events = events_of(recording, case.learn)
         count = scored(case, events)
-        total += count
+        for name, number in count.items():
+            total[name] += number
         print(f"{case.fault:26} {case.ramp:6.0f} {case.kind:6}", dict(count), flush=True)
         if a.show or count["certain, wrong"]:
             for e in events:

@@ -25,13 +25,14 @@ from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.fault_free_checks import residual_warnings
 from fdi_torch.monitor.hypothesis import Fault, faults_of
 from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.level_forecast import DRAWS, limit_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor, usual_faults
 from fdi_torch.monitor.monitor_state import MonitorState
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observation, bind_parameters
-from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
+from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow
 from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
 from fdi_torch.monitor.stepper import Stepper
@@ -432,6 +433,47 @@ def test_the_forecast_interval_contains_the_time_to_overflow() -> None:
     assert all(time + limit.low < truth < time + limit.high for time, limit in told)
     widths = [limit.high - limit.low for _, limit in told]
     assert widths == sorted(widths, reverse=True)
+
+
+def test_a_tank_that_reached_its_rim_overflowed_whatever_the_random_flows_do_later() -> None:
+    """The forecast interval is about as wide after the median as before it."""
+    flows = noise().whitening.flows
+    assert flows is not None
+    disturbed = replace(flows, noise=replace(flows.noise, intensity=torch.full((3,), 4e-4, dtype=torch.float64)))
+    watch = monitor(confirm=20.0)
+    watch.observer.whitening = replace(noise().whitening, flows=disturbed)
+    _, events = followed(watch, recorded(step_to("P13.plugging.size", 0.6, 200.0), 330))
+    limits = [limit for e in events for limit in e.limits if limit.tank == "T1"]
+    assert limits
+    assert all(limit.high - limit.time < 3.0 * (limit.time - limit.low) for limit in limits)
+
+
+def test_shocks_are_added_to_the_levels_of_a_simulation() -> None:
+    bank, samples = monitor().observer, from_rest(recorded(lambda t: SPACE.nominal(), 31))
+    quiet = replace(samples.samples, readings=torch.full_like(samples.samples.readings, torch.nan))
+    shocks = torch.zeros(2, 30, 3, dtype=torch.float64)
+    shocks[1, 9] = torch.tensor([0.02, -0.01, 0.03])
+    both = ChangeHypotheses(
+        SPACE.nominal().expand(2, -1), torch.full((2,), 1e30, dtype=torch.float64), shocks[:, 0, 0] > 1
+    )
+    start = REST.expand(2, -1) + 0.01
+    plain, moved = bank.simulate(quiet, start, SPACE.nominal(), both, shocks)
+    alone = bank.run(replace(samples, samples=quiet, state=start[0]), SPACE.nominal(), both)[0][0]
+    assert torch.allclose(plain, alone, atol=1e-12)
+    assert torch.allclose(moved[:9], plain[:9], atol=1e-12)
+    assert torch.allclose(moved[9] - plain[9], shocks[1, 9], atol=1e-12)
+    rest = quiet.segment(10, 31)
+    later = bank.simulate(rest, moved[9][None], SPACE.nominal(), both.subset(0, 1), shocks[:1, 10:])
+    assert torch.allclose(moved[10:], later[0], atol=1e-12)
+
+
+def test_the_interval_of_a_forecast_holds_a_further_draw_in_90_percent() -> None:
+    draws = torch.rand(4000, DRAWS + 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    limits = [limit_of("T1", "overflows", row[1:]) for row in draws]
+    inside = [limit.low <= float(row[0]) <= limit.high for limit, row in zip(limits, draws, strict=True)]
+    assert sum(inside) / len(inside) == pytest.approx(0.9, abs=0.015)
+    never = torch.where(torch.arange(DRAWS) < DRAWS // 4, torch.inf, draws[0, 1:])
+    assert limit_of("T1", "overflows", never).high == torch.inf
 
 
 @pytest.mark.parametrize("onset", [203.0, 206.0, 209.0, 213.0])

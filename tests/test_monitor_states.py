@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.monitor.alarm_state import FOLLOWS, Alarm, State
 from fdi_torch.monitor.detection import CHARTS, make_detector
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.monitor import Monitor
-from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
+from fdi_torch.monitor.samples import Samples, samples_of_recording
+from fdi_torch.recording import Recording
 from tests.test_monitor import SPACE, followed, monitor, recorded
 
 
@@ -96,3 +101,34 @@ def test_a_statistic_updated_in_parts_equals_that_of_the_whole(chart: str) -> No
         parts.append(part)
     assert torch.equal(torch.cat(parts), whole)
     assert torch.allclose(whole[300:], detector.statistic(white)[300:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("mouth", [0.014, 0.02])
+def test_a_drain_is_not_told_as_closed_while_its_tank_is_dry(mouth: float, tmp_path: Path) -> None:
+    """A drain opens at 400 s. Its mouth lies above the floor: water stays, and Torricelli's law does not hold."""
+    (tmp_path / "tank.yaml").write_text(
+        "tanks: {T: {area: 100 cm^2, height: 60 cm}}\n"
+        "pumps: {Q: {target: T, max_flow: 200 cm^3/s}}\n"
+        "pipes: {OUT: {source: T, area: 0.02 cm^2, discharge_coefficient: 0.8}}\n"
+        "sensors: {h: {tank: T}}\n"
+    )
+    plant, outlet, level = load_plant(tmp_path / "tank.yaml"), 0.8 * 2e-6 * (2.0 * 9.81) ** 0.5, 0.3
+    time, levels, generator = torch.arange(600, dtype=torch.float64), [], torch.Generator().manual_seed(4)
+    pumped = torch.where(time < 400.0, outlet * level**0.5, 0.0)
+    disturbed, noise = 1e-4 * torch.randn(600, generator=generator), 5e-4 * torch.randn(600, generator=generator)
+    for k in range(len(time)):
+        levels.append(level)
+        for _ in range(20):
+            drained = 60.0 * outlet * max(level - mouth, 0.0) ** 0.5 if k >= 400 else 0.0
+            level = max(level + 0.05 * (float(pumped[k]) - outlet * level**0.5 - drained) / 0.01, 0.0)
+        level = max(level + float(disturbed[k]), 0.0)
+    noisy = torch.tensor(levels) + noise
+    recording = Recording(time, pumped[:, None], noisy.double()[:, None], ("Q",), ("h",), ("m^3/s",), ("m",))
+    settings = MonitorSettings(lookback=60.0, confirm=20.0, longest=400.0, incipient=False, together=1)
+    free, wide = fault_free_part(recording, 0.0, 390.0), {"T.leak.size": (0.0, 100.0)}
+    ready = prepare_monitor(plant, free, ["T.leak.size"], ranges=wide, settings=settings)
+    samples = samples_of_recording(recording, plant)
+    start = ready.monitor.start(samples, ready.believed, learning_until=390.0)
+    _, events = ready.monitor.advance(start, samples.segment(1, len(samples)))
+    assert [event.alarm for event in events if event.kind == "cannot tell"] == [1]
+    assert not [event for event in events if event.kind == "recovered"]

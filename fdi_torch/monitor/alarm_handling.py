@@ -19,9 +19,9 @@ from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.fault_recovery import recovered_columns, recovery_is_observable, reset_to_nominal
 from fdi_torch.monitor.fault_tracking import STRONG_EVIDENCE, size_change, updated_tracks, with_new_sizes
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
-from fdi_torch.monitor.isolation import isolate, refit
+from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState, PendingAlarm
+from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState, PendingAlarm
 from fdi_torch.monitor.observer_bank import ObserverBank
 from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, fault_effect_rms, normalized_residuals
 
@@ -43,7 +43,6 @@ class AlarmHandler:
     ) -> None:
         self.observer, self.space, self.detector = observer, observer.space, detector
         self.faults, self.watched, self.settings, self.writer = faults, watched, settings, writer
-        self.single_changes = len(faults) * (2 if settings.incipient else 1)
 
     # Schedule
 
@@ -71,19 +70,11 @@ class AlarmHandler:
         """
         change = state.change
         if change is not None and self._within_window(state, change):
-            window = state.window(self._window_start(state, change))
-            same = refit(self.observer, window, change.before, change.explanations, self.single_changes)
-            if same[0].fits and same[0].hypothesis.columns:
-                scheduled = change.next_fit
+            fits = self._explanations(state, self._window_start(state, change), change.before, change.explanations)
+            if fits[0].fits and fits[0].hypothesis.columns:
                 state = state.with_alarm(state.alarm(change.number).raised_again(state.now))
-                revised, events = self._revise(state, change, "revised", same, announce=False)
-                assert revised.change is not None
-                # The full comparison of explanations must not be postponed by this refit.
-                next_fit = min(scheduled, revised.change.next_fit)
-                return replace(revised, change=replace(revised.change, next_fit=next_fit)), events
-        resized = size_change(
-            self.observer, state, self._search_start(state, state.now), self.faults, self.single_changes
-        )
+                return self._revise(state, change, "revised", fits, announce=False)
+        resized = size_change(self.observer, state, self._search_start(state, state.now), self.faults)
         if resized is not None:
             moved = adopt_sizes(self.observer, state, resized)
             moved, announced = with_new_sizes(moved, resized, self.settings.revise)
@@ -175,7 +166,9 @@ class AlarmHandler:
         )
         if not best.fits and not_better:
             later = self._next_revision(change.best, state.now)
-            return replace(state, change=replace(change, next_fit=later)), []
+            doubtful = [t for t in change.ended if t.column in change.hidden]
+            change = replace(change, next_fit=later, hidden=self._hidden(state, change, doubtful))
+            return self._end_recovered(replace(state, change=change), change, self._reported(change.explanations))
         return self._revise(state, change, "revised", fits)
 
     def _unexplained(self, state: MonitorState, fits: Sequence[HypothesisFit]) -> tuple[MonitorState, list[Event]]:
@@ -232,9 +225,10 @@ class AlarmHandler:
         change = replace(change, explanations=kept)
         back = recovered_columns(self.space, change)
         ended = tuple(t for t in (change.ended or state.tracks) if t.column in back)
-        observable = all(recovery_is_observable(self.observer, state, change, t) for t in ended)
+        hidden = self._hidden(state, change, ended)
         names = tuple(tuple(self.space.names[c] for c in f.hypothesis.columns) for f in reported)
-        announce, change = announce or names != change.reported, replace(change, ended=ended, reported=names)
+        announce = announce or names != change.reported
+        change = replace(change, ended=ended, hidden=hidden, reported=names)
         state = adopt_change(self.observer, state, change, reset_to_nominal(self.space, change, back))
         state = updated_tracks(
             state,
@@ -242,7 +236,7 @@ class AlarmHandler:
             [fault.size for fault in self.faults],
             lambda c: fault_effect_rms(self.observer, state, c, change.best.onset),
         )
-        state, events = self._end_recovered(state, change, reported, observable)
+        state, events = self._end_recovered(state, change, reported)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:
             numbers = [t.number for t in ended]
@@ -257,17 +251,23 @@ class AlarmHandler:
         kind = kind if kind == "revised" and alarm.state is answer else str(answer)  # type: ignore[assignment]
         return state, [*events, self.writer.answered(state, change, reported, kind, announce or kind != "revised")]
 
+    def _hidden(self, state: MonitorState, change: DetectedChange, ended: Sequence[FaultTrack]) -> tuple[int, ...]:
+        """Columns of the recovered faults of which the readings would not show that they still stand."""
+        return tuple(t.column for t in ended if not recovery_is_observable(self.observer, state, change, t))
+
     def _end_recovered(
-        self, state: MonitorState, change: DetectedChange, reported: Sequence[HypothesisFit], observable: bool
+        self, state: MonitorState, change: DetectedChange, reported: Sequence[HypothesisFit]
     ) -> tuple[MonitorState, list[Event]]:
-        """End the alarms of recovered faults; "cannot tell" if the readings would not show the fault any more."""
-        answer, events = State.RECOVERED if observable else State.CANNOT_TELL, []
+        """End the alarms of recovered faults; "cannot tell" if the readings would not show one of them any more."""
+        events = []
         for number in sorted({t.number for t in change.ended}):
-            alarm = state.alarm(number)
+            columns, alarm = [t.column for t in change.ended if t.number == number], state.alarm(number)
+            hidden = [c for c in columns if c in change.hidden]
+            answer = State.CANNOT_TELL if hidden else State.RECOVERED
             if alarm.state is not answer:
                 state = state.with_alarm(alarm.with_state(answer))
-                names = [self.space.names[t.column] for t in change.ended if t.number == number]
-                events.append(self.writer.ended(state, change, reported, number, names, observable))
+                names = [self.space.names[c] for c in hidden or columns]
+                events.append(self.writer.ended(state, change, reported, number, names, not hidden))
         return state, events
 
     @staticmethod

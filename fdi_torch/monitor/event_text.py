@@ -134,6 +134,9 @@ class EventWriter:
         h, sizes = fit.hypothesis, []
         for c in h.columns:
             p, size, std = self.space.parameters[c], float(fit.value[c]), float(fit.std[c])
+            if change is not None and c in change.hidden:
+                sizes.append(Size(p.name, size, float("inf"), p.unit, f"{p.name} unknown"))
+                continue
             at_bound = c in fit.at_bound
             grows = change is not None and h.incipient and c in h.sizes and now > fit.onset
             rate = (size - float(change.before[c])) / (now - fit.onset) if grows and change else None

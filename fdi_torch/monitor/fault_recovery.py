@@ -24,8 +24,8 @@ def recovery_is_observable(
 ) -> bool:
     """Whether the readings since the recovery would show the fault if it were still present.
 
-    They would not if it adds less to the white innovations than the share FAULT_MODEL_ERROR of its earlier effect, for
-    example in a dry tank or behind a closed valve.
+    They would not if it adds less to the white innovations than three standard deviations of its model's error, the
+    share FAULT_MODEL_ERROR of its earlier effect, for example in a dry tank or behind a closed valve.
     """
     window = state.window(change.best.onset)
     persisting = change.best.value.clone()
@@ -36,7 +36,7 @@ def recovery_is_observable(
     without, with_fault = observer.white_innovations(window, change.before, lanes)
     since = window.times > change.best.onset
     rms = float((without - with_fault)[since].square().mean().sqrt()) if bool(since.any()) else 0.0
-    return rms >= FAULT_MODEL_ERROR * track.effect_rms
+    return rms >= 3.0 * FAULT_MODEL_ERROR * track.effect_rms
 
 
 def reset_to_nominal(space: ParameterSpace, change: DetectedChange, recovered: Sequence[int]) -> Tensor:

@@ -20,7 +20,7 @@ STRONG_EVIDENCE = 5.0
 
 
 def size_change(
-    observer: ObserverBank, state: MonitorState, start: float, faults: Sequence[Fault], single_changes: int
+    observer: ObserverBank, state: MonitorState, start: float, faults: Sequence[Fault]
 ) -> HypothesisFit | None:
     """New sizes of the known faults since `start` s or later, or None if that does not explain the residual.
 

@@ -127,30 +127,40 @@ def with_posterior(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
 
 
 def merged(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
-    """One fit for each set of changed parameters, with the summed probability, likeliest first.
+    """One fit for each set of changed parameters, with the summed probability.
 
-    Sudden and incipient changes of the same parameters count as one explanation.
+    Sudden and incipient changes of the same parameters count as one explanation. Explanations that no reading
+    distinguishes share their probability: they follow one another, and the likeliest such group comes first.
     """
-    groups: dict[tuple[tuple[int, ...], tuple[int, ...]], HypothesisFit] = {}
+    each: dict[tuple[tuple[int, ...], tuple[int, ...]], HypothesisFit] = {}
     for f in sorted(fits, key=lambda fit: -fit.probability):
         key = f.hypothesis.columns, f.hypothesis.recovered
-        groups[key] = replace(groups[key], probability=groups[key].probability + f.probability) if key in groups else f
-    return sorted(groups.values(), key=lambda fit: -fit.probability)
+        each[key] = replace(each[key], probability=each[key].probability + f.probability) if key in each else f
+    groups: list[list[HypothesisFit]] = []
+    for f in sorted(each.values(), key=lambda fit: -fit.probability):
+        same = next((group for group in groups if _indistinguishable(f, group[0])), None)
+        if same is None:
+            groups.append([f])
+        else:
+            same.append(f)
+    return [f for group in sorted(groups, key=_total, reverse=True) for f in group]
 
 
 def credible_set(fits: Sequence[HypothesisFit], level: float = 0.95) -> list[HypothesisFit]:
-    """The fewest fits, likeliest first, that together have `level` of the probability.
+    """The first of the merged fits, as many as together have `level` of the probability.
 
     Fits that no reading can distinguish from one of these are included as well.
     """
-    total = 0.0
     chosen: list[HypothesisFit] = []
     for f in fits:
-        if total >= level and not any(_indistinguishable(f, c) for c in chosen):
+        if _total(chosen) >= level and not any(_indistinguishable(f, c) for c in chosen):
             continue
         chosen.append(f)
-        total += f.probability
     return chosen
+
+
+def _total(fits: Sequence[HypothesisFit]) -> float:
+    return sum(f.probability for f in fits)
 
 
 def _indistinguishable(a: HypothesisFit, b: HypothesisFit) -> bool:

@@ -83,24 +83,6 @@ def isolate(
     return with_posterior([*fits, no_change_fit(observer, window, believed, base)])
 
 
-def refit(
-    observer: ObserverBank,
-    window: ObserverWindow,
-    believed: Tensor,
-    fits: Sequence[HypothesisFit],
-    single_changes: int,
-) -> list[HypothesisFit]:
-    """The hypotheses of earlier fits, fitted to another window from their earlier values; likeliest first.
-
-    believed (P,): parameters before the change. single_changes: number of single changes considered originally.
-    """
-    base = observer.white_innovations(window, believed, no_change(believed))
-    earlier = [f for f in fits if f.hypothesis.columns]
-    starts, prior = torch.stack([_point(f) for f in earlier]), Prior(observer.space.names, single_changes)
-    again = fit(observer, window, believed, [f.hypothesis for f in earlier], starts, _misfit(base), prior)
-    return with_posterior([*again, no_change_fit(observer, window, believed, base)])
-
-
 @dataclass(frozen=True)
 class Prior:
     """Prior odds of a hypothesis. names: of the parameter space. single_changes: number of possible single changes."""

@@ -1,8 +1,8 @@
 """Forecast of overflow and dry tanks if nothing changes, by Monte Carlo simulation from the monitor's present state.
 
 The draws are spread over the explanations in proportion to their probability, with sizes drawn from their standard
-deviations. The inputs keep their recent average, faults that grow continue to grow, and the random flows of the
-fault-free recording go on from their present estimate.
+deviations, and start from the levels that each explanation implies. The inputs keep their recent average, faults that
+grow continue to grow, and the random flows of the fault-free recording go on from their present estimate.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from fdi_torch.monitor.events import Limit
 from fdi_torch.monitor.flow_filter import FlowFilter
 from fdi_torch.monitor.hypothesis import HypothesisFit
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
-from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow
+from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank
 from fdi_torch.monitor.samples import Samples
 
 DRAWS = 40
-POINTS = 200  # times at which levels are computed
+POINTS = 1000  # times at which levels are computed
 EMPTY = 0.01  # share of a tank's height below which its outlet draws air
 SMALLEST_CHANCE = 0.05  # less likely limits are not reported
 
@@ -54,43 +54,59 @@ def forecast_limits(
 
     fits: the explanations with their probabilities. recent: s over which the inputs are averaged.
     """
-    now, tanks = state.now, len(observer.network.description.tanks)
+    now, order = state.now, observer.network.order
     latest = state.samples.time > now - recent
     inputs = state.samples.inputs[latest].mean(dim=0)
     time = now + torch.linspace(0.0, horizon, POINTS + 1, dtype=torch.float64)
-    no_readings = torch.full((POINTS + 1, state.samples.readings.shape[-1]), torch.nan, dtype=torch.float64)
-    future = Samples(time, inputs.expand(POINTS + 1, -1), no_readings)
-    window = ObserverWindow(future, state.state[-1], state.number)
-    before, changes = _drawn_parameters(observer, change, fits, now, horizon, generator)
-    paths, start = observer.run(window, before, changes)[0][..., :tanks], state.state[-1, :tanks]
-    levels = torch.cat([start.expand(DRAWS, 1, tanks), paths], dim=1)
-    levels[:, 1:] += _random_flows(observer.whitening.flows, state, horizon / POINTS, generator)[..., :tanks]
+    chosen = _drawn_explanations(fits)
+    before, changes = _drawn_parameters(observer, change, [fits[k] for k in chosen], now, horizon, generator)
+    start, memory = _present_states(observer, state, change, fits)
+    deviation, shocks = _random_flows(observer.whitening.flows, memory[chosen], horizon / POINTS, generator)
+    start = torch.cat([(start[chosen, :order] + deviation).clamp(min=0.0), start[chosen, order:]], dim=1)
+    future = Samples(time, inputs.expand(POINTS + 1, -1), state.samples.readings.new_full((POINTS + 1, 1), torch.nan))
+    levels = torch.cat([start.unsqueeze(1), observer.simulate(future, start, before, changes, shocks)], dim=1)
     limits = []
     for index, tank in enumerate(observer.network.description.tanks):
         path = levels[..., index]
-        limits.append(_limit(tank.name, "overflows", _crossing_time(path, tank.height, time - now)))
-        limits.append(_limit(tank.name, "runs dry", _crossing_time(-path, -EMPTY * tank.height, time - now)))
+        limits.append(limit_of(tank.name, "overflows", _crossing_time(path, tank.height, time - now)))
+        limits.append(limit_of(tank.name, "runs dry", _crossing_time(-path, -EMPTY * tank.height, time - now)))
     likely = (f for f in limits if f.chance >= SMALLEST_CHANCE and f.time > 0.0)
     return tuple(sorted(likely, key=lambda limit: limit.time))
+
+
+def _drawn_explanations(fits: Sequence[HypothesisFit]) -> list[int]:
+    """The explanation of each draw, in proportion to their probabilities."""
+    probabilities = torch.tensor([f.probability for f in fits], dtype=torch.float64)
+    edges = torch.cumsum(probabilities, 0) / probabilities.sum()
+    quantiles = (torch.arange(DRAWS, dtype=torch.float64) + 0.5) / DRAWS
+    chosen: list[int] = torch.searchsorted(edges, quantiles).clamp(max=len(fits) - 1).tolist()
+    return chosen
+
+
+def _present_states(
+    observer: ObserverBank, state: MonitorState, change: DetectedChange, fits: Sequence[HypothesisFit]
+) -> tuple[Tensor, Tensor]:
+    """The observer's state (fits, order + M) and that of the flow filter (fits, F) now, under each explanation."""
+    window = state.window(min(f.onset for f in fits))
+    theta, onset = torch.stack([f.value for f in fits]), torch.tensor([f.onset for f in fits], dtype=torch.float64)
+    changes = ChangeHypotheses(theta, onset, torch.tensor([f.hypothesis.incipient for f in fits]))
+    path, residual = observer.run(window, change.before, changes)
+    memory = observer.whitening.innovations(residual, window.number, window.memory)[1]
+    return path[:, -1], memory[:, -1]
 
 
 def _drawn_parameters(
     observer: ObserverBank,
     change: DetectedChange,
-    fits: Sequence[HypothesisFit],
+    drawn: Sequence[HypothesisFit],
     now: float,
     horizon: float,
     generator: torch.Generator,
 ) -> tuple[Tensor, _ContinuedRamps]:
-    """Parameters now (DRAWS, P), and their change over the horizon."""
-    probabilities = torch.tensor([f.probability for f in fits], dtype=torch.float64)
-    edges = torch.cumsum(probabilities, 0) / probabilities.sum()
-    quantiles = (torch.arange(DRAWS, dtype=torch.float64) + 0.5) / DRAWS
-    chosen = torch.searchsorted(edges, quantiles).clamp(max=len(fits) - 1)
+    """Parameters now (DRAWS, P), and their change over the horizon. drawn: the explanation of each draw."""
     low, high = observer.space.low(change.before), observer.space.high(change.before)
     values, after = [], []
-    for k in chosen.tolist():
-        f = fits[k]
+    for f in drawn:
         error = torch.randn(len(f.value), generator=generator, dtype=torch.float64)
         value = (f.value + torch.nan_to_num(f.std, posinf=0.0) * error).clamp(low, high)
         rate = (value - change.before) / max(now - f.onset, 1.0) if f.hypothesis.incipient else torch.zeros_like(value)
@@ -101,21 +117,26 @@ def _drawn_parameters(
     return torch.stack(values), _ContinuedRamps(torch.stack(after), onset, growing, duration)
 
 
-def _random_flows(flows: FlowFilter | None, state: MonitorState, span: float, generator: torch.Generator) -> Tensor:
-    """Deviations of the states by random flows (DRAWS, POINTS, order) m, from their present estimate and its error.
+def _random_flows(
+    flows: FlowFilter | None, memory: Tensor, span: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Deviations (DRAWS, order) of the states from those of the observer now, and what random flows add to the states
+    between the points (DRAWS, POINTS, order), m.
 
-    span: s between the points.
+    memory (DRAWS, F): state of the flow filter. span: s between the points.
     """
     if flows is None:
-        return state.healthy.new_zeros(1, 1, 1)
-    transition, shocks = flows.over(max(round(span / flows.interval), 1))
-    root = _root(flows.covariance)
-    now = state.memory[-1] + torch.randn(DRAWS, len(root), generator=generator, dtype=root.dtype) @ root.mT
-    path, step = [], _root(shocks)
-    for _ in range(POINTS):
-        now = now @ transition.mT + torch.randn(DRAWS, len(root), generator=generator, dtype=root.dtype) @ step.mT
-        path.append(now[:, : len(root) // 2])
-    return torch.stack(path, dim=1)
+        return memory.new_zeros(1, 1), memory.new_zeros(1, 1, 1)
+    transition, covariance = flows.over(max(round(span / flows.interval), 1))
+    n = len(transition) // 2
+    normal = torch.randn(POINTS + 1, DRAWS, 2 * n, generator=generator, dtype=memory.dtype)
+    deviation, flow = (memory + normal[0] @ _root(flows.covariance).mT).split(n, dim=1)
+    level_shocks, flow_shocks = (normal[1:] @ _root(covariance).mT).split(n, dim=2)
+    added = []
+    for level_shock, flow_shock in zip(level_shocks, flow_shocks, strict=True):
+        added.append(flow @ transition[:n, n:].mT + level_shock)
+        flow = flow @ transition[n:, n:].mT + flow_shock
+    return deviation, torch.stack(added, dim=1)
 
 
 def _root(covariance: Tensor) -> Tensor:
@@ -135,7 +156,15 @@ def _crossing_time(path: Tensor, height: float, time: Tensor) -> Tensor:
     return torch.where(above.any(dim=1), torch.where(first == 0, 0.0, crossing), torch.inf)
 
 
-def _limit(tank: str, what: Literal["overflows", "runs dry"], times: Tensor) -> Limit:
-    ordered, count = times.sort().values, len(times)
-    low, middle, high = (float(ordered[min(int(q * count), count - 1)]) for q in (0.05, 0.5, 0.95))
+def limit_of(tank: str, what: Literal["overflows", "runs dry"], times: Tensor) -> Limit:
+    """The forecast from times (DRAWS,) of equal probability, s; infinite where it does not happen."""
+    ordered = times.sort().values
+    low, middle, high = (_quantile(ordered, q) for q in (0.05, 0.5, 0.95))
     return Limit(tank, what, middle, low, high, float(torch.isfinite(times).double().mean()))
+
+
+def _quantile(ordered: Tensor, q: float) -> float:
+    """The value below which a further draw lies with probability q (Weibull's plotting positions)."""
+    first = int(q * (len(ordered) + 1)) - 1
+    below, above = ordered[first : first + 2].tolist()
+    return below if below == above else below + (q * (len(ordered) + 1) - 1 - first) * (above - below)

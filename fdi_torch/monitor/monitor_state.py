@@ -45,8 +45,9 @@ class DetectedChange:
 
     number: of its alarm. before (P,): the parameters before the change, valid since `since` s. explanations: all with
     more than 0.1 % of the posterior probability, likeliest first; the observer uses the first. alarm_time: s. next_fit:
-    when all explanations are fitted again, s. ended: tracks of the faults that recovered at this change. reported:
-    parameter names of each explanation in the last event.
+    when all explanations are fitted again, s. ended: tracks of the faults that recovered at this change. hidden: their
+    columns of which the readings since would not show that they still stand. reported: parameter names of each
+    explanation in the last event.
     """
 
     number: int
@@ -56,6 +57,7 @@ class DetectedChange:
     alarm_time: float
     next_fit: float
     ended: tuple[FaultTrack, ...] = ()
+    hidden: tuple[int, ...] = ()
     reported: tuple[tuple[str, ...], ...] = ()
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from fdi_torch.plant.network import TankNetwork
 NEVER, LONG_AGO = 1e30, -1e30  # s
 # Readings of all hypotheses processed at once; limits the memory, and fits a processor's cache.
 LARGEST_BATCH = 2_000_000
+SHOCK_READING = 1e15  # far above any reading, in any unit
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,30 @@ class ObserverBank:
             from_first=False,
         )
         return ran.state, (samples.readings[1:] - ran.expected) / self.gain.spread(window.number, count)
+
+    def simulate(
+        self, samples: Samples, start: Tensor, believed: Tensor, changes: ChangeHypotheses, shocks: Tensor
+    ) -> Tensor:
+        """States (L, S, order + M) without corrections at all samples but the first, from `start` (L, order + M).
+
+        shocks (L, S, order) are added to the network's states, in m, at these samples. The engines inject them as the
+        corrections of a reading so large that the prediction does not matter.
+        """
+        sensors = len(self.network.description.sensors)
+        readings = start.new_full((len(samples), sensors), torch.nan)
+        readings[:, 0] = SHOCK_READING
+        gains = start.new_zeros(len(changes), len(samples) - 1, self.network.order, sensors)
+        gains[..., 0] = shocks / SHOCK_READING
+        return run_observers(
+            self.changing,
+            self._columns,
+            self._lanes(believed, changes, float(samples.time[-1])),
+            replace(samples, readings=readings),
+            start,
+            gains,
+            self.stepper.longest,
+            from_first=False,
+        ).state
 
     def first_state(self, samples: Samples, believed: Tensor, levels: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """State (order + M,) after the first sample and the residual there. levels: from the readings if None."""
