@@ -21,7 +21,8 @@ def equilibrium(network: TankNetwork, inputs: Tensor, start: Tensor | None = Non
 
     Pseudo-transient continuation (Kelley and Keyes, 1998): implicit Euler steps that double until they equal Newton's.
     Along the trajectory, the tanks' volume rates never grow in sum (Jacquez and Simon, 1993); a step that makes them
-    grow, as Newton's beyond a kink at equal levels, is repeated with a quarter of its length. Raises ValueError if none is found.
+    grow, as Newton's beyond a kink at equal levels, is repeated with a quarter of its length.
+    Raises ValueError if none is found.
     """
     values = network.bind(ParameterSpace(), inputs.new_zeros(0))
     plant = network.description
