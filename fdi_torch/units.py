@@ -52,14 +52,6 @@ def number_and_unit(text: str) -> tuple[float, str]:
     return float(number), f"1{unit}" if unit.startswith("/") else unit or "1"
 
 
-def is_unit(text: str) -> bool:
-    try:
-        _parsed(text)
-    except UnitError:
-        return False
-    return True
-
-
 def spelled(text: str) -> str:
     """A unit from a header as people write it: 'cm3_s' -> 'cm^3/s', 'pct' -> '%'."""
     return _CUBE.sub(r"^\1", _VOLUME_A_TIME.sub(r"\1/\2", _HEADER_WORDS.get(text, text)))
@@ -69,6 +61,19 @@ def spelled(text: str) -> str:
 def factor(unit: str, target: str) -> float:
     """The value of one `unit` in `target`. Raises UnitError for an unknown unit or different dimensions."""
     return in_unit(1.0, unit, target)
+
+
+@lru_cache(maxsize=4096)
+def same_kind(unit: str, among: tuple[str, ...]) -> str | None:
+    """The first unit of `among` with the dimension of `unit`; None for another dimension or a text that is no unit."""
+    try:
+        dimension = _parsed(unit).dimensionality
+        found = next((other for other in among if _parsed(other).dimensionality == dimension), None)
+        if found is not None:
+            factor(unit, found)  # of a finite size
+    except UnitError:
+        return None
+    return found
 
 
 def in_unit(number: float, unit: str, target: str) -> float:

@@ -23,6 +23,7 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     noise_of,
     thinned,
 )
+from fdi_torch.jobs.logged_monitor import usable_part
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 from tests.test_gap import SMALL, noise, nominal_plant, recorded
@@ -211,6 +212,12 @@ def test_a_stuck_sensor_is_the_cause_and_hides_no_other() -> None:
     whole = diagnose(nominal_plant(), from_sample(leaking, 1, 0), settings=library)
     assert {(c.effect, c.location) for c in whole.causes} == {("sensor_stuck", "h2"), ("leak", "T1")}
     assert whole.verdict == "named"
+
+
+def test_a_monitor_learns_of_no_part_in_which_a_sensor_is_stuck() -> None:
+    with pytest.raises(ValueError, match=r"fault-free part in which every sensor reads its level, but h1 is stuck at"):
+        usable_part(nominal_plant(), from_sample(sound(), 0, 700))
+    assert len(usable_part(nominal_plant(), sound())) == 2000
 
 
 def test_a_sensor_that_is_stuck_for_a_while_is_unknown() -> None:

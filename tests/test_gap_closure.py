@@ -173,6 +173,24 @@ def test_a_recording_too_short_is_refused_in_one_sentence() -> None:
         diagnose(nominal_plant(), recording, short(recording, 40), Settings(("leak@T1",)))
 
 
+@pytest.mark.parametrize(
+    ("columns", "value", "sentence"),
+    [
+        ((1,), math.nan, "run.csv: expected at least 60 readings of every sensor, got 0 of h2"),
+        ((0, 1, 2), math.nan, "run.csv: expected at least 60 readings of every sensor, got 0 of h1"),
+        ((0, 1, 2), 0.3, "run.csv: expected readings that vary, got one value of each sensor throughout"),
+    ],
+)
+def test_readings_that_are_missing_or_constant_are_refused(
+    columns: tuple[int, ...], value: float, sentence: str
+) -> None:
+    run = short(recorded({}, 3, samples=70), 60)
+    outputs = run.outputs.clone()
+    outputs[:, columns] = value
+    with pytest.raises(ValueError, match=sentence):
+        diagnose(nominal_plant(), replace(run, source="run.csv", outputs=outputs, mask=torch.isfinite(outputs)))
+
+
 def test_an_unknown_input_is_refused_in_one_sentence() -> None:
     recording = recorded(LAMINAR, 3, samples=200)
     inputs = recording.inputs.clone()

@@ -1,8 +1,10 @@
-"""Fuzzing of file readers: each generated file is read, or refused in sentences, without a traceback or a hang.
+"""Fuzzing of file readers: each generated file is read, or refused in sentences, without a traceback, a hang or too
+much memory.
 
-The quick profile draws a few hundred files. The long one runs for two minutes, or as long as `--fuzz-minutes` states:
+The quick profile draws a few hundred files. The long one runs for half a minute, or as long as `--fuzz-minutes` states,
+in rounds of 4000 files:
 
-    python -m pytest tests/test_hostile_files.py -m slow -s --fuzz-minutes 60
+    python -m pytest tests/test_hostile_files.py -m slow -s --fuzz-minutes 60 --fuzz-seed 2
 
 Reduced counterexamples are kept in tests/corpus.
 """
@@ -11,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import resource
 import signal
 import time
 import warnings
@@ -47,7 +50,9 @@ from fdi_torch.recordings.check import check_recording
 from fdi_torch.report.material import gather
 
 CORPUS = Path(__file__).with_name("corpus")
-MOST_SECONDS = 10
+MOST_SECONDS, MOST_WAITED = 10, 600
+"""Of CPU for a file, and of time, on a machine that may have other work."""
+MOST_BYTES = 2**30
 PLANT = load_plant("three_tank")
 CSV = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n" + "".join(
     f"{t},{50 + t % 7},50,{40 + t % 11},{30 + t % 5},{35 + t % 3}\n" for t in range(50)
@@ -148,33 +153,43 @@ def as_json(payload: dict[str, Any]) -> bytes:
     )
 
 
-Kind = tuple[Callable[[bytes, Path], None], Callable[[Path], st.SearchStrategy[bytes]]]
+Kind = tuple[Callable[[bytes, Path], None], Callable[[Path], st.SearchStrategy[bytes]], int]
 KINDS: dict[str, Kind] = {
-    "plants": (read_plant, lambda folder: drawn.spoiled(drawn.plants())),
-    "runs": (read_run_file, lambda folder: drawn.spoiled(drawn.run_files())),
-    "studies": (read_study, lambda folder: drawn.spoiled(drawn.run_files(study=True))),
-    "recordings": (read_csv, lambda folder: drawn.csv_files()),
-    "logs": (read_log, logs),
+    "plants": (read_plant, lambda folder: drawn.spoiled(drawn.plants()), 600),
+    "runs": (read_run_file, lambda folder: drawn.spoiled(drawn.run_files()), 600),
+    "studies": (read_study, lambda folder: drawn.spoiled(drawn.run_files(study=True)), 60),
+    "recordings": (read_csv, lambda folder: drawn.csv_files(), 2400),
+    "logs": (read_log, logs, 340),
 }
+"""Reader, strategy, and files in a round, fewer of those that take longer."""
 
 
 @contextmanager
-def at_most(seconds: int) -> Iterator[None]:
-    def stop(*_: Any) -> None:
-        raise AssertionError(f"took longer than {seconds} s")
+def limited() -> Iterator[None]:
+    """Raises AssertionError after too long, and MemoryError at more memory beyond what the process has."""
 
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(seconds)
+    def stop(number: int, _: Any) -> None:
+        raise AssertionError(f"took too long: {signal.Signals(number).name}")
+
+    timers = {signal.SIGPROF: (signal.ITIMER_PROF, MOST_SECONDS), signal.SIGALRM: (signal.ITIMER_REAL, MOST_WAITED)}
+    handlers = {number: signal.signal(number, stop) for number in timers}
+    memory, pages = resource.getrlimit(resource.RLIMIT_AS), int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MOST_BYTES, memory[1]))
+    for timer, seconds in timers.values():
+        signal.setitimer(timer, seconds)
     try:
         yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
+        for timer, _ in timers.values():
+            signal.setitimer(timer, 0)
+        resource.setrlimit(resource.RLIMIT_AS, memory)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def taken(read: Callable[[bytes, Path], None], data: bytes, folder: Path) -> bool:
     """Whether the file was taken; refused is what raises ValueError or OSError with sentences that are not empty."""
-    with at_most(MOST_SECONDS), warnings.catch_warnings():
+    with limited(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             read(data, folder)
@@ -186,7 +201,7 @@ def taken(read: Callable[[bytes, Path], None], data: bytes, folder: Path) -> boo
 
 def fuzz(kind: str, folder: Path, examples: int, start: int, quick: bool) -> Counter[str]:
     """Draws files of a kind and reads them. Returns how many were taken and refused."""
-    read, strategy = KINDS[kind]
+    read, strategy, _ = KINDS[kind]
     (folder / "rig.csv").write_text(CSV)
     seen: Counter[str] = Counter()
 
@@ -208,8 +223,16 @@ def fuzz(kind: str, folder: Path, examples: int, start: int, quick: bool) -> Cou
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_file_is_taken_or_refused_in_sentences(kind: str, tmp_path: Path) -> None:
-    seen = fuzz(kind, tmp_path, 30, 1, quick=True)
+    seen = fuzz(kind, tmp_path, max(30, KINDS[kind][2] // 10), 1, quick=True)
     assert seen["taken"] >= 0.5 * seen.total(), f"{dict(seen)}: too few reach what lies behind the schema"
+
+
+def test_a_file_may_take_so_much_time_and_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(MemoryError):
+        taken(lambda data, folder: bytearray(2 * MOST_BYTES) and None, b"", tmp_path)
+    monkeypatch.setattr("test_hostile_files.MOST_SECONDS", 0.05)
+    with pytest.raises(AssertionError, match="took too long: SIGPROF"):
+        taken(lambda data, folder: next(k for k in itertools.count() if k < 0), b"", tmp_path)
 
 
 @pytest.mark.parametrize("path", sorted(p for p in CORPUS.glob("*/*")), ids=lambda p: f"{p.parent.name}/{p.name}")
@@ -222,10 +245,12 @@ def test_what_once_went_wrong_is_taken_or_refused_in_sentences(path: Path, tmp_p
 def test_files_for_minutes(tmp_path: Path, pytestconfig: pytest.Config) -> None:
     ends = time.monotonic() + 60.0 * pytestconfig.getoption("--fuzz-minutes")
     seen = {kind: Counter[str]() for kind in KINDS}
-    for start in itertools.count(2):
+    for start in itertools.count(pytestconfig.getoption("--fuzz-seed")):
         for kind, counts in seen.items():
-            counts += fuzz(kind, tmp_path, 500, start, quick=False)
-            print(start, kind, dict(counts), flush=True)
+            begun = time.process_time()
+            counts += fuzz(kind, tmp_path, KINDS[kind][2], start, quick=False)
+            memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+            print(start, kind, dict(counts), f"{time.process_time() - begun:.1f} s, {memory} MB", flush=True)
             if time.monotonic() > ends:
                 assert all(c["taken"] >= 0.5 * c.total() for c in seen.values() if c)
                 return

@@ -161,6 +161,15 @@ def test_rest_is_where_the_paper_reading_has_it() -> None:
     assert (rest - torch.tensor(REST, dtype=torch.float64)).abs().max() < 1e-6
 
 
+@pytest.mark.parametrize("first", [0.0, 6e-11, 1e-8])
+def test_tanks_beyond_a_pump_that_hardly_runs_rest_at_the_level_of_their_neighbour(first: float) -> None:
+    plant = three_tank()
+    outlet = next(p for p in plant.pipes if p.target is None or p.target == "outside")
+    rest = equilibrium(build_network(plant), torch.tensor([first, 84e-6], dtype=torch.float64))
+    level = ((84e-6 + first) / (outlet.discharge_coefficient * outlet.area)) ** 2 / (2.0 * plant.gravity)
+    assert rest.tolist() == pytest.approx([level] * 3, rel=1e-6)
+
+
 @pytest.mark.parametrize("theta", [(0.3, 0.3, 0.5, 0.6, 1.0), (0.1, 0.6, 0.0, 1.0, 1.0)])
 def test_agrees_with_scipy(theta: tuple[float, ...]) -> None:
     plant = three_tank()
@@ -380,10 +389,17 @@ def test_a_pump_delivers_nothing_for_a_negative_command_and_no_more_than_it_can(
     assert levels[0, -1].tolist() == pytest.approx([0.2, 0.2 + 90e-6 * 100.0 / 160e-4, 0.0])
 
 
-def test_no_steady_state_is_said() -> None:
-    plant = PlantDescription("closed", (Tank("T", 0.02, 1e9, None),), (), (Pump("Q", "T", 1e-4),), (Sensor("h", "T"),))
-    with pytest.raises(ValueError, match="level of tank T keeps changing; give its start_level"):
-        equilibrium(build_network(plant), torch.tensor([5e-5], dtype=torch.float64))
+def test_a_tank_without_an_outlet_rests_above_its_rim() -> None:
+    plant = PlantDescription("closed", (Tank("T", 0.02, 1.0, None),), (), (Pump("Q", "T", 1e-4),), (Sensor("h", "T"),))
+    strength = rim_strength(*torch.tensor([0.02, plant.gravity], dtype=torch.float64))
+    rest = equilibrium(build_network(plant), torch.tensor([5e-5], dtype=torch.float64))
+    assert float(rest - 1.0) == pytest.approx(float(5e-5 / strength) ** (2.0 / 3.0), rel=1e-3)
+
+
+def test_that_no_steady_state_is_found_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdi_torch.simulate.equilibrium.MOST_STEPS", 3)
+    with pytest.raises(ValueError, match=r"level of tank T\d keeps changing; give its start_level"):
+        equilibrium(build_network(three_tank()), torch.tensor([5e-5, 0.0], dtype=torch.float64))
 
 
 def test_unknown_inputs_must_be_masked() -> None:

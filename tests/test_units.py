@@ -52,6 +52,12 @@ def test_whatever_else_is_no_quantity_and_is_said_in_one_short_sentence(text: st
         si_unit_of(f"{text}^^")
 
 
+def test_a_unit_beyond_all_numbers_is_none() -> None:
+    assert si_unit_of("(Qm/m)^9") == "1"
+    with pytest.raises(ValueError, match="expected a unit of level"):
+        si_unit_of("((Qm/m)^9)^9")
+
+
 def test_no_unit_text_takes_long() -> None:
     """In a process of its own: what hangs, hangs in C, where no signal ends it."""
     texts = ["h1 [9**9**9]", "h_" + "_" * 3000, "h_" + "m_" * 3000, "h (" + "m*" * 10**6 + "m)", "_" * 10**6]

@@ -95,6 +95,13 @@ def test_a_csv_file_of_odd_size_or_numbers_is_refused(text: str, sentence: str, 
     assert sentence in capsys.readouterr().err
 
 
+def test_the_name_of_a_column_is_cut_in_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rig.csv").write_text(HEADER.replace("h1_cm", "h1" + "_" * 3000) + ROWS)
+    assert cli.main(["check", str(tmp_path / "rig.csv"), "--plant", "three_tank"]) == cli.MISUSE
+    error = capsys.readouterr().err
+    assert "expected a column for h1" in error and len(error) < 1000
+
+
 def log_with(path: Path, **attachments: bytes) -> Path:
     sink = Sink(path, "x")
     for name, content in attachments.items():

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from fdi_torch.parameters import SI_UNITS, unit_factor
+from fdi_torch.parameters import SI_UNITS
 from fdi_torch.plant.description import READING_UNITS
-from fdi_torch.units import UnitError, number_and_unit, spelled
+from fdi_torch.units import UnitError, number_and_unit, same_kind, spelled
 
 _FIRST = ("tanks", "sensors", "pumps")
 _NOT_CHOSEN = ("1", "s")  # a share is written in % where it is a tolerance, and times are displayed in s
@@ -21,7 +21,7 @@ def written_units(data: Mapping[str, Any]) -> dict[str, str]:
     """
     units: dict[str, str] = {}
     for unit in _units_in([data.get(part) for part in _FIRST] + [v for k, v in data.items() if k not in _FIRST]):
-        si_unit = _si_unit(unit, (*SI_UNITS, *READING_UNITS))
+        si_unit = same_kind(unit, (*SI_UNITS, *READING_UNITS))
         if si_unit is not None and si_unit not in _NOT_CHOSEN:
             units.setdefault(si_unit, spelled(unit))
     sensors = data.get("sensors")
@@ -49,18 +49,8 @@ def _reading_unit(sensor: Any) -> str | None:
     if not isinstance(sensor, Mapping):
         return None
     for unit in _units_in([sensor.get(key) for key in ("offset", "low", "high")]):
-        return unit if _si_unit(unit, (*READING_UNITS.values(),)) else None
+        return unit if same_kind(unit, (*READING_UNITS.values(),)) else None
     for unit in _units_in(sensor.get("gain")):
         reading, divided, _ = unit.rpartition("/")
-        return reading if divided and _si_unit(reading, (*READING_UNITS.values(),)) else None
-    return None
-
-
-def _si_unit(unit: str, among: tuple[str, ...]) -> str | None:
-    for si_unit in among:
-        try:
-            unit_factor(unit, si_unit)
-        except ValueError:
-            continue
-        return si_unit
+        return reading if divided and same_kind(reading, (*READING_UNITS.values(),)) else None
     return None

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import torch
+
 from fdi_torch.effects import effect
 from fdi_torch.gap.dataset import DataSet, data_set_of
 from fdi_torch.gap.library import library_of
@@ -84,6 +86,7 @@ def problem_of(
     offered = {p.prefix for p in library}
     stuck_for_good = {s.sensor.name: s for s in stuck if s.for_good and f"{s.sensor.name}.sensor_stuck" in offered}
     plant = _without_stuck_sensors(plant, recordings, stuck)
+    _check_readings(plant, recordings)
     library = tuple(p for p in library if p.location in plant.locations())
     nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     recordings, outliers = _without_outliers(plant, nominal_effects, recordings, settings.step)
@@ -149,6 +152,30 @@ def _without_stuck_sensors(
     return without_sensors(plant, silent)
 
 
+def _check_readings(plant: PlantDescription, recordings: Sequence[Recording]) -> None:
+    """Raises ValueError if a sensor has too few readings, or if no sensor's readings vary."""
+    source, constant = recordings[0].source, []
+    for sensor in plant.sensors:
+        columns = [(r, r.output_names.index(sensor.column)) for r in recordings if sensor.column in r.output_names]
+        readings = [r.outputs[r.mask[:, i], i] for r, i in columns]
+        if columns:
+            _expect_enough(source, sensor.name, sum(map(len, readings)))
+            constant.append(len(torch.cat(readings).unique()) == 1)
+    if constant and all(constant):
+        raise ValueError(
+            f"{source}: expected readings that vary, got one value of each sensor throughout, which does not show its "
+            "noise; check the wiring, or record with inputs that change"
+        )
+
+
+def _expect_enough(source: str, sensor: str, count: int) -> None:
+    if count < LEAST:
+        raise ValueError(
+            f"{source}: expected at least {LEAST} readings of every sensor, got {count} of {sensor}; record longer or "
+            "more often, or leave the sensor out of the plant file"
+        )
+
+
 def _as_outliers(stuck: Sequence[StuckSegment]) -> list[SensorOutliers]:
     """Segments in which a sensor is stuck for some time, as outliers of that sensor."""
     by_sensor: dict[str, list[Outlier]] = {}
@@ -181,7 +208,8 @@ def checked_data_set(
     SHORTEST_STEP and LONGEST_STEP.
     """
     data = data_set_of(plant, nominal_effects, recordings, step or _step(plant, recordings[0]), averaged=True)
-    check_enough_readings(data)
+    for sensor, count in zip(plant.sensors, data.mask.sum(dim=0).tolist(), strict=True):
+        _expect_enough(data.recording.source, sensor.name, count)
     return data
 
 
@@ -189,14 +217,3 @@ def _step(plant: PlantDescription, recording: Recording) -> float:
     """A whole multiple, or a whole fraction, of the sampling interval, s."""
     interval, scale = recording.interval, time_scale(plant)
     return commensurate_step(min(max(interval, SHORTEST_STEP * scale), LONGEST_STEP * scale), interval)
-
-
-def check_enough_readings(data: DataSet) -> None:
-    """Raises ValueError if a sensor has too few readings."""
-    recording, plant = data.recording, data.plant
-    for sensor, count in zip(plant.sensors, data.mask.sum(dim=0).tolist(), strict=True):
-        if count < LEAST:
-            raise ValueError(
-                f"{recording.source}: expected at least {LEAST} readings of every sensor, got {count} of "
-                f"{sensor.name}; record longer or more often, or leave the sensor out of the plant file"
-            )

@@ -265,7 +265,7 @@ def event_fields(event: Event) -> dict[str, Any]:
 
 def _prepare(run: MonitorRun, whole: Recording) -> PreparedMonitor:
     c = run.config
-    part = _usable_part(run.plant, fault_free_part(whole, *c.fault_free))
+    part = usable_part(run.plant, fault_free_part(whole, *c.fault_free))
     # The configured initial levels are valid only if the fault-free part starts with the recording.
     at_start = float(part.time[0]) == float(whole.time[0])
     return prepare_monitor(
@@ -284,7 +284,7 @@ def _prepare(run: MonitorRun, whole: Recording) -> PreparedMonitor:
     )
 
 
-def _usable_part(plant: PlantDescription, part: Recording) -> Recording:
+def usable_part(plant: PlantDescription, part: Recording) -> Recording:
     """The fault-free part. Raises ValueError for wrong units, channels or clocks, and for a stuck sensor."""
     checked = usable(plant, part)
     if checked.stuck:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from math import isnan
 from pathlib import Path
 
+from fdi_torch.names import shortened
 from fdi_torch.parameters import header_unit, si_unit_of, unit_factor
 from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
 from fdi_torch.recordings.csv_text import Heading
@@ -119,9 +120,10 @@ def _find_column(path: Path, header: Sequence[str], name: str, column: str | Non
     nearest = (
         [h for h in header if h.lower().startswith(requested.lower())] or nearest if len(requested) > 1 else nearest
     )
-    hint = f"; the nearest is {names.get(nearest[0], nearest[0])}" if nearest else ""
+    hint = f"; the nearest is {shortened(names.get(nearest[0], nearest[0]))}" if nearest else ""
     raise ValueError(
-        f"{path}: expected a column for {name} ('{requested}' or '{requested}_UNIT'), got {', '.join(header)}{hint}; "
+        f"{path}: expected a column for {name} ('{requested}' or '{requested}_UNIT'), got "
+        f"{', '.join(map(shortened, header))}{hint}; "
         f"map it under columns: {{{name}: {{column: ..., unit: ...}}}}"
     )
 
