@@ -41,7 +41,6 @@ figure.wide { grid-column: 1 / -1; width: 100%; }
 figure svg { display: block; width: 100%; height: auto; }
 figure.wide svg text { paint-order: stroke; stroke: var(--paper); stroke-width: .22em; stroke-linejoin: round; }
 .column { display: grid; gap: .8rem; min-width: 0; align-content: start; }
-figure { position: relative; }
 figure > svg { cursor: zoom-in; }
 .live > svg { display: none; }
 .chart-head { display: flex; flex-wrap: wrap; justify-content: space-between; gap: 0 .6rem; min-height: 1.7rem; }
@@ -61,7 +60,7 @@ figure > svg { cursor: zoom-in; }
 button { font: inherit; font-size: .78rem; line-height: 1.3; color: var(--model); background: var(--paper);
   border: 1px solid var(--faint); border-radius: 5px; padding: .1rem .45rem; cursor: pointer; }
 .tools .pan { display: none; } .zoomed .pan { display: inline-block; }
-figure > .larger { position: absolute; top: 0; right: 0; z-index: 1; }
+figure > .larger { display: block; margin: 0 0 .2rem auto; }
 @media (hover: hover) { .larger, .near { opacity: 0; } figure:hover .larger, figure:hover .near, .larger:focus-visible,
   .near:focus-visible { opacity: 1; } }
 dialog.enlarged { width: 96vw; max-width: none; height: 96vh; max-height: none; border: 1px solid var(--faint);
