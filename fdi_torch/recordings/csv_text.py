@@ -126,8 +126,8 @@ def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[H
 
     Lines that start with #, Excel's `sep=;`, and titles may precede the header; a row of units may follow names
     without units. A title is a row with one cell.
-    header: False if the file has none; columns are then named by their numbers 1, 2 ..., and the data begin in the first
-    row with a number.
+    header: False if the file has none; columns are then named by their numbers 1, 2 ..., and the data begin in the
+    first row with a number.
     """
     remaining, separator = _short_lines(path, lines), getattr(lines, "delimiter", "")
     title = "an empty file"
