@@ -147,7 +147,11 @@ def probability_of_deviation(value: float, std: float, nominal: float) -> float:
 
 
 def is_fault_size(network: TankNetwork, parameter: Parameter) -> bool:
-    """Whether the parameter is the size of an effect, as opposed to a shape parameter or a constant of the plant."""
+    """Whether the parameter is the size of a suspected effect, as opposed to a shape parameter or a constant of the
+    plant. A known effect whose size has a tolerance is a constant.
+    """
+    if math.isfinite(parameter.std):
+        return False
     name = common_name(parameter.name)
     for placement in network.placements:
         if ParameterName.parse(name).prefix == placement.prefix:
