@@ -15,7 +15,7 @@ _CAUSES = {
     errno.EACCES: "the folder or file may not be written or read; choose another or change its permissions",
     errno.EPERM: "the folder or file may not be written or read; choose another or change its permissions",
     errno.EROFS: "the file system is read-only; choose another folder",
-    errno.ENOENT: "there is no such file or folder, and none can be made there; check the path",
+    errno.ENOENT: "there is no such file or folder; check the path",
     errno.EEXIST: "a part of the path is a file, not a folder; choose another folder",
     errno.ENOTDIR: "a part of the path is a file, not a folder; choose another folder",
     errno.EISDIR: "it is a folder; name a file",

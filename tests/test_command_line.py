@@ -183,9 +183,10 @@ def test_short_options_become_overrides_and_win() -> None:
 def test_progress_is_plain_lines_on_standard_error_when_nobody_watches(capsys: pytest.CaptureFixture[str]) -> None:
     with Screen(json=True).progress("searching") as advance:
         advance(0.5, "best 1.0")
+        advance(0.6, "best 0.6")
         advance(1.0, "best 0.5")
     shown = capsys.readouterr()
-    assert shown.err.splitlines() == ["searching ...", "searching 100% best 0.5"]
+    assert shown.err.splitlines() == ["searching ...", "searching  50% best 1.0", "searching 100% best 0.5"]
     assert shown.out == ""
 
 

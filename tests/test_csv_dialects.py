@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.csv_files import read_csv
+from fdi_torch.recordings.csv_files import read_csv, read_csv_files
 from fdi_torch.recordings.csv_growing import GrowingCsv
-from fdi_torch.recordings.source import ChannelSource
+from fdi_torch.recordings.source import ChannelSource, FileSource
 
 PLAIN = "t_s,Q1_cm3_s,h1_cm\n0,50.5,10\n5,50.5,11\n10,20,12.5\n"
 STAMPED = "time;Q1_cm3_s;h1_cm\n{};50,5;10\n{};50,5;11\n{};20;12,5\n"
@@ -33,6 +33,7 @@ def read(folder: Path, text: str | bytes, encoding: str = "utf-8", **mapping: Ch
         (PLAIN.replace(",", ";").replace(".", ","), "utf-8"),
         ("sep=;\n" + PLAIN.replace(",", ";"), "utf-8"),
         (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "t,Q1,h1\ns,cm3/s,cm"), "utf-8"),
+        ("Logger 7\nRun 12 of 2026,,\n\n" + PLAIN, "utf-8"),
         (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "n,Time [s],Q1 (cm3/s),h1 [cm]").replace("\n", "\n1,")[:-2], "utf-8"),
         ("time_ms,Q1_cm3_s,h1_cm\n1790000000500,50.5,10\n1790000005500,50.5,11\n1790000010500,20,12.5\n", "utf-8"),
         (STAMPED.format("2026-03-29 00:30:00", "2026-03-29 00:30:05", "2026-03-29T00:30:10.000"), "utf-8"),
@@ -65,7 +66,7 @@ def test_words_for_nothing_read_are_missing_readings(tmp_path: Path, word: str) 
             "expected one column for h1, got h1_cm and h1_mm",
         ),
         (PLAIN.replace("Q1_cm3_s", "h1_cm"), "expected a column for Q1"),
-        ("Logger 7\n" + PLAIN, "row 1: expected a header line .* put # before what stands above"),
+        (PLAIN.replace(",", "|"), r"expected a header line .* got 't_s\|Q1_cm3_s\|h1_cm'; separate columns by"),
         (
             STAMPED.format("2026-10-25 02:59:55", "2026-10-25 02:00:00", "2026-10-25 02:00:05"),
             r"say in which zone this is: columns: \{t: \{zone: Europe/Berlin\}\}",
@@ -116,3 +117,20 @@ def test_a_file_without_a_header_is_told_how_to_be_read(tmp_path: Path, row: str
     path.write_text(f"{row}\n{row}\n")
     with pytest.raises(ValueError, match=r"row 1: expected a header line .* got numbers; .* write header: false"):
         read_csv(path, ("Q1",), ("h1",))
+
+
+@pytest.mark.parametrize("above", ["", "t [s] || flow [ml.s^-1] || level [cm]\r\n", "Zeit\tFluss\tStand\n"])
+def test_titles_above_a_file_without_a_header_are_skipped(tmp_path: Path, above: str) -> None:
+    path = tmp_path / "lab.txt"
+    path.write_text(above + "0,0E+0\t1,5\t294\n5,0E+0\t1,5\t295\n")
+    columns = {"t": ChannelSource("1", "s"), "Q1": ChannelSource("2", "cm^3/s"), "h1": ChannelSource("3", "mm")}
+    recording = read_csv_files([FileSource(path, columns, header=False)], ("Q1",), ("h1",))
+    assert recording.time.tolist() == [0.0, 5.0]
+    assert recording.outputs.flatten().tolist() == pytest.approx([0.294, 0.295])
+
+
+def test_a_file_of_words_has_no_row_of_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "lab.txt"
+    path.write_text("idle\nidle\n")
+    with pytest.raises(ValueError, match="expected a row of numbers, got 'idle'"):
+        read_csv_files([FileSource(path, header=False)], ("Q1",), ("h1",))

@@ -13,7 +13,8 @@ from fdi_torch.jobs.fmu_export import export_fmu
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     columns = export_fmu(arguments.plant, arguments.fmu, effects=arguments.effect).columns
     counts = Counter(columns["causality"])
-    numbers = ", ".join(f"{counts[kind]} {kind}s" for kind in ("input", "output", "parameter"))
+    kinds = ("input", "output", "parameter")
+    numbers = ", ".join(f"{counts[kind]} {kind}{'' if counts[kind] == 1 else 's'}" for kind in kinds)
     screen.say(f"{arguments.fmu}: FMU for co-simulation (FMI 2.0) with {numbers}")
     variables = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     screen.result({"format": "fdi_torch.export/1", "fmu": str(arguments.fmu), "variables": variables})

@@ -163,8 +163,8 @@ def _confusability(impostors: Mapping[str, Any] | None) -> list[str]:
         return []
     confused, passed, draws = simulated["confused"], simulated["passed"], simulated["draws"]
     return [
-        f"if another of {simulated['rivals']} causes had made a gap of this size, this one would have been named in "
-        f"{confused} of {draws} simulated recordings, and in {passed} if the library lacked the true one (first order)"
+        f"check by simulation: a gap of this size from any of {simulated['rivals']} other causes would be given this "
+        f"name in {confused} of {draws} recordings, or in {passed} if the library lacked that cause"
     ]
 
 

@@ -10,12 +10,14 @@ from typing import Any
 import torch
 
 from fdi_torch.cli import DONE
+from fdi_torch.cli.gap_text import MOVED
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.channels import missing_inputs
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
 from fdi_torch.config.plant_file import chosen_plant, load_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.yaml_files import find_data
+from fdi_torch.effects import build_network
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
 from fdi_torch.parameters import display_unit, quantity_text
 from fdi_torch.plant.description import PlantDescription
@@ -48,6 +50,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         ),
         [_row(plant, recording, prediction) for recording, prediction in predictions],
     )
+    for recording, prediction in predictions:
+        _own_constants(plant, recording, prediction, screen)
     if arguments.picture:
         recording, prediction = predictions[-1]
         runs = {plant.name: prediction.readings}
@@ -124,6 +128,19 @@ def _expect_inputs(name: str, plant: PlantDescription, columns: Collection[str])
             f"constant, add {constants} (--from and --to select a part); if a column has another name, map it in a "
             f"YAML file: {mapping}"
         )
+
+
+def _own_constants(plant: PlantDescription, recording: Recording, prediction: Prediction, screen: Screen) -> None:
+    """Print the constants whose values in this run are far out of their tolerances."""
+    constants = build_network(plant).constants
+    for name, value in prediction.own.items():
+        constant = constants[name]
+        far = abs(value - constant.nominal) / constant.std
+        if far > MOVED:
+            screen.say(
+                f"- {Path(recording.source).name}: in its first samples {name} = "
+                f"{quantity_text(value, constant.unit, 3)}, {far:.2g} tolerances off: the plant file does not fit them"
+            )
 
 
 def _row(plant: PlantDescription, recording: Recording, prediction: Prediction) -> list[str]:

@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
+
 from fdi_torch.cli import DONE
 from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.options import names
@@ -13,11 +15,12 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.effects import build_network
+from fdi_torch.estimate.uncertainty import parameters_at_bounds
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import LeftOutRun, leave_one_file_out
 from fdi_torch.gap.free_runs.refit import Refit, refit
 from fdi_torch.jobs.gap import one_thread
-from fdi_torch.parameters import display_unit
+from fdi_torch.parameters import ParameterSpace, display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
@@ -72,7 +75,7 @@ def _show(result: Refit, screen: Screen) -> None:
     for sensor in result.plant.sensors:
         unit, scale = display_unit(sensor.unit, sensor.column)
         rows.append([sensor.name, *(f"{scale * of[sensor.name]:.4g}" for of in (result.before, result.rmse)), unit])
-    screen.table("error", ("sensor", "constants fitted", "effects too", "unit"), rows)
+    screen.table("root mean square error", ("sensor", "constants fitted", "effects too", "unit"), rows)
     constants = build_network(result.plant).constants
     rows = []
     for name, (value, error) in result.fitted.items():
@@ -80,6 +83,9 @@ def _show(result: Refit, screen: Screen) -> None:
         rows.append([name, f"{scale * value:.4g}", f"{scale * error:.2g}", "" if unit == "1" else unit])
     screen.table("fitted to all recordings", ("parameter", "value", "std error", "unit"), rows)
     screen.say(f"{result.parameters} values fitted, including initial levels")
+    values = torch.tensor([value for value, _ in result.fitted.values()], dtype=torch.float64)
+    for name, end in parameters_at_bounds(ParameterSpace([constants[name] for name in result.fitted]), values).items():
+        screen.say(f"- {name} lies at the {end} end of its range")
 
 
 def _show_run_specific(result: Refit, screen: Screen) -> None:

@@ -7,6 +7,7 @@ interpreted, and terminal control characters are escaped.
 from __future__ import annotations
 
 import io
+import math
 import os
 import sys
 import time
@@ -151,7 +152,7 @@ class Screen:
 
     def _lines(self, title: str) -> Advance:
         self.note(f"{title} ...")
-        last = time.monotonic()
+        last = -math.inf  # the first step of a job is shown at once
 
         def advance(share: float, text: str = "") -> None:
             nonlocal last

@@ -147,7 +147,11 @@ def probability_of_deviation(value: float, std: float, nominal: float) -> float:
 
 
 def is_fault_size(network: TankNetwork, parameter: Parameter) -> bool:
-    """Whether the parameter is the size of an effect, as opposed to a shape parameter or a constant of the plant."""
+    """Whether the parameter is the size of a suspected effect, as opposed to a shape parameter or a constant of the
+    plant. A known effect whose size has a tolerance is a constant.
+    """
+    if math.isfinite(parameter.std):
+        return False
     name = common_name(parameter.name)
     for placement in network.placements:
         if ParameterName.parse(name).prefix == placement.prefix:
@@ -162,7 +166,8 @@ def fault_flow(
     """Change of flow (m^3/s) that a fault causes, and the diameter (m) of the sharp-edged hole with the same flow.
 
     The change is the largest difference of any tank's net inflow between the value and the nominal value of the fault.
-    From Torricelli's law, flow = HOLE_COEFFICIENT * area * sqrt(2 g level). None where undefined.
+    From Torricelli's law, flow = HOLE_COEFFICIENT * area * sqrt(2 g level). None where undefined; only a fault of a
+    tank has a hole.
     which: index of the fault in `space`. levels (tanks,), m; channels (channels,): actuator inputs.
     """
     name = common_name(space.names[which])
@@ -180,9 +185,8 @@ def fault_flow(
     ]
     change = (inflows[0] - inflows[1]).abs()
     flow = float(change.max())
-    # For a pipe, both ends change equally up to rounding; the hole is then placed in the first of the two tanks.
-    head = float(levels[int((change > (1.0 - 1e-6) * flow).nonzero()[0])]) if flow > 0.0 else 0.0
-    if flow <= 0.0 or head <= 0.0:
+    head = float(levels[change.argmax()])
+    if placement.location not in {tank.name for tank in network.description.tanks} or flow <= 0.0 or head <= 0.0:
         return flow, None
     area = flow / (HOLE_COEFFICIENT * math.sqrt(2.0 * network.description.gravity * head))
     return flow, math.sqrt(4.0 * area / math.pi)

@@ -145,6 +145,8 @@ def set_up(
     inputs), 'free' (estimated) or a level in m.
     Raises ValueError for an unknown parameter and for a channel that is not recorded.
     """
+    if not isinstance(plant, PlantDescription):
+        raise TypeError(f"plant: expected a Plant, got {plant!r}; read a plant file by fdi_torch.load_plant")
     requested = list(parameters)
     names = [p if isinstance(p, str) else p.name for p in requested]
     placements = placements_for(names)

@@ -59,9 +59,10 @@ def run_monitor(
     run of the same file or source; the result is the same as without the interruption, and events in the earlier log
     are not reported again.
     """
-    callbacks.tell(0.0, "reading")
     path, unfinished = _log_to_write(run, resume)
     follow = follow or run.config.source is not None
+    if not follow:
+        callbacks.tell(0.0, "reading")
     whole = None if follow else read_recording(run.config.recording, run.plant, run.base, run.given)
     earlier_rows = logged_rows(unfinished, run) if follow and unfinished is not None else []
     origin = logged_origin(unfinished) if unfinished is not None else None
@@ -116,6 +117,7 @@ def _follow(
     """Process samples as they come, after waiting for the end of the fault-free part."""
     run = monitor.run
     batches = LiveBatches(resumed_rows(earlier_rows, source) if earlier_rows else source)
+    callbacks.tell(0.0, "waiting for samples")
     rows, notices = _wait_for_fault_free_part(run, callbacks, batches)
     monitor.learn(recording_of_rows(rows_until(rows, run.config.fault_free[1]) or rows, run))
     if isinstance(source, LiveRows) and source.origin is not None:
@@ -147,7 +149,7 @@ def _wait_for_fault_free_part(
         new_rows, new_notices = _rows_and_notices(batch)
         rows += new_rows
         notices += new_notices
-        callbacks.tell(0.0, f"{rows[-1][0]:g} s, learning until {end:g} s" if rows else "waiting")
+        callbacks.tell(0.0, f"{rows[-1][0]:g} s, learning until {end:g} s" if rows else "waiting for samples")
         if rows_until(rows, end):
             break
     return rows, notices

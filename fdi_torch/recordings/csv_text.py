@@ -124,33 +124,36 @@ def _encoding(path: Path, start: bytes) -> str:
 def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[Heading, Iterator[str]]:
     """The heading, and an iterator over the lines below it.
 
-    Lines that start with #, and Excel's `sep=;`, may precede the header; a row of units may follow names without units.
-    header: False if the file has none; columns are then named by their numbers 1, 2 ...
+    Lines that start with #, Excel's `sep=;`, and titles may precede the header; a row of units may follow names
+    without units. A title is a row with one cell.
+    header: False if the file has none; columns are then named by their numbers 1, 2 ..., and the data begin in the
+    first row with a number.
     """
-    remaining, delimiter = _short_lines(path, lines), getattr(lines, "delimiter", "")
+    remaining, separator = _short_lines(path, lines), getattr(lines, "delimiter", "")
+    title = "an empty file"
     for number, line in enumerate(remaining, start=1):
         if line.lower().startswith("sep=") and len(line.strip()) == 5:
-            delimiter = line[4]
+            separator = line[4]
         elif line.strip() and not line.startswith("#"):
-            delimiter = delimiter or _delimiter(line, header)
+            delimiter = separator or _delimiter(line, header)
             names = _cells(path, line, delimiter, number - 1)
             if header and _ALL_NUMBERS.fullmatch(line):
                 raise ValueError(
                     f"{path}: row {number}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got numbers; for a file "
                     "without one, write header: false, and number the columns: columns: {h1: {column: 4, unit: mm}}"
                 )
-            if not header:
+            if header and sum(map(bool, names)) > 1:
+                return _with_units(path, names, delimiter, number, remaining)
+            if not header and any(_BEGINS_AS_NUMBER.match(name) for name in names):
                 numbers = tuple(str(k + 1) for k in range(len(names)))
                 return Heading(numbers, delimiter, number - 1), chain([line], remaining)
-            if len(names) < 2:
-                raise ValueError(
-                    f"{path}: row {number}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got "
-                    f"'{line.strip()[:60]}'; put # before what stands above the header, and part columns by commas"
-                )
-            return _with_units(path, names, delimiter, number, remaining)
-    raise ValueError(f"{path}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got an empty file")
+            if title == "an empty file":
+                title = f"'{line.strip()[:60]}'"
+    expected = "a header line such as t_s,Q1_cm3_s,h1_cm" if header else "a row of numbers"
+    raise ValueError(f"{path}: expected {expected}, got {title}; separate columns by commas, semicolons or tabs")
 
 
+_BEGINS_AS_NUMBER = re.compile(r"[+-]?[.,]?\d")  # also time stamps
 _ALL_NUMBERS = re.compile(r"(?=.*\d)[\d\s.,;:+\-eE]+", re.DOTALL)  # also time stamps
 
 

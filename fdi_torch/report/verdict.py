@@ -47,7 +47,9 @@ def headline(material: Material) -> str:
         for words in (of(material) for of in (*sentences, windows_words)):
             if words:
                 return warning + words
-    return material.about("status").get("status", "did not end").replace("_", " ").capitalize()
+    status = material.about("status")
+    words = status.get("status", "did not end").replace("_", " ").capitalize()
+    return f"{words}: {status['reason']}" if status.get("reason") else words
 
 
 def fault_words(material: Material) -> str:

@@ -75,8 +75,8 @@ def _confusability_words(impostors: Mapping[str, Any]) -> list[str]:
         mostly = f", mostly for {', '.join(passed_for[:3])}" if passed_for else ""
         rivals, draws = simulated.get("rivals"), simulated.get("draws")
         sentences.append(
-            f"If another of {rivals} causes had made a gap of this size, this one would have been named in "
-            f"{simulated.get('confused')} of {draws} simulated recordings; with the true one missing from the library, "
-            f"in {simulated.get('passed')}{mostly} (simulated to first order)."
+            f"Check by simulation with linearized effects: a gap of this size from any of {rivals} other causes would "
+            f"be given this name in {simulated.get('confused')} of {draws} recordings, or in "
+            f"{simulated.get('passed')} if the library lacked that cause{mostly}."
         )
     return sentences

@@ -1,0 +1,41 @@
+"""Which estimated parameters count as faults, and which faults have an equivalent hole."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from fdi_torch.config.plant_file import chosen_plant
+from fdi_torch.effects import build_network, place
+from fdi_torch.estimate.diagnosis import Diagnosis, diagnose
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlacedEffect
+
+DEAD_ZONE = "Q1.pump_dead_zone.dead_zone"
+
+
+def diagnosis() -> Diagnosis:
+    """A leak and a plugging of 0.1, and a dead zone that is known as 5 ± 2 cm^3/s and estimated at 6 cm^3/s."""
+    known = PlacedEffect("pump_dead_zone", "Q1", {"dead_zone": 5e-6})
+    plant = replace(chosen_plant("three_tank"), effects=(known,), tolerances={DEAD_ZONE: 2e-6})
+    network = build_network(plant, (place("leak", "T1"), place("plugging", "P13")))
+    space = ParameterSpace([network.constants[n] for n in ("T1.leak.size", "P13.plugging.size", DEAD_ZONE)])
+    value = torch.tensor([0.1, 0.1, 6e-6], dtype=torch.float64)
+    std = torch.tensor([1e-3, 1e-3, 1e-8], dtype=torch.float64)
+    levels, channels = torch.tensor([0.5, 0.3, 0.4]).double(), torch.tensor([5e-5, 5e-5]).double()
+    return diagnose(network, space, value, std, levels, channels, unexplained_ratio=1.0)
+
+
+def test_a_known_effect_within_its_tolerance_is_no_fault() -> None:
+    assert [fault.name for fault in diagnosis().present] == ["T1.leak.size", "P13.plugging.size"]
+
+
+def test_only_a_fault_of_a_tank_has_a_hole() -> None:
+    """The flow of the hole by Torricelli's law is that of the leak."""
+    leak, plugging = diagnosis().present
+    assert leak.hole is not None and leak.flow is not None and plugging.flow is not None
+    assert 0.6 * math.pi / 4.0 * leak.hole**2 * math.sqrt(2 * 9.81 * 0.5) == pytest.approx(leak.flow)
+    assert plugging.flow > 0.0 and plugging.hole is None
