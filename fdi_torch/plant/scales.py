@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from statistics import geometric_mean
 
-from fdi_torch.plant.constants import flow_scale
+from fdi_torch.plant.constants import flow_scale, nominal_capacity
 from fdi_torch.plant.description import PlantDescription
 
 # Height, m, and emptying time A H / (C_d a sqrt(2 g H)), s, of the tanks of three_tank.
@@ -30,3 +30,18 @@ def time_scale(plant: PlantDescription) -> float:
 def length_scale(plant: PlantDescription) -> float:
     """Length scale of the plant, m: that of its tanks' height (geometric mean), 1 m for three_tank."""
     return geometric_mean(tank.height / _HEIGHT for tank in plant.tanks)
+
+
+def fastest_exchange(plant: PlantDescription) -> float:
+    """The shortest time in which the water of a full tank is exchanged, relative to three_tank.
+
+    Water enters a tank by some pipes and leaves by others, so that half of their flows at the head of a full tank
+    passes through it; or what its pumps deliver, if that is more.
+    """
+    times = []
+    for tank in plant.tanks:
+        pipes = sum(nominal_capacity(plant, p) for p in plant.pipes if tank.name in (p.source, p.target))
+        pumps = sum(p.max_flow for p in plant.pumps if p.target == tank.name)
+        through = max(0.5 * pipes * math.sqrt(tank.height), pumps)
+        times.append(tank.area * tank.height / (through or flow_scale(plant, tank.name)))
+    return min(times) / _EMPTYING_TIME

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.scales import length_scale, time_scale
+from fdi_torch.plant.scales import fastest_exchange, length_scale
 
 # The error of a step over the kink of a square root grows with step^1.5, and so does that of a root smoothed for this
-# step. It is 1 m for a step of this length, in units of the plant's time and length scales: the largest error of fixed
-# steps over random faults of the three-tank plant.
+# step. It is 1 m for a step of this length, in units of the plant's fastest exchange of water and its length scale: the
+# largest error of fixed steps over random faults of the three-tank plant.
 STEP_FOR_ONE_METRE = 2000.0
 # Steps across the kink, relative to the step for which the root is smoothed, that keep about the same accuracy.
 CROSSING = 0.25
@@ -66,7 +66,7 @@ class StepControl:
 
 def _step_of_unit_error(plant: PlantDescription) -> float:
     """The step whose error is the plant's length scale, s."""
-    return STEP_FOR_ONE_METRE * time_scale(plant)
+    return STEP_FOR_ONE_METRE * fastest_exchange(plant)
 
 
 def next_step(elapsed: Tensor, length: Tensor, span: Tensor) -> Tensor:
