@@ -6,12 +6,12 @@ import argparse
 from collections.abc import Collection, Mapping
 from typing import Any
 
+from benchmarks.blind_rivals.one_at_a_time import one_at_a_time
 from benchmarks.blind_rivals.regression_baselines import gaussian_process, sparse_regression, split_f_test
 from fdi_torch.blind.benchmark import Diagnosis
 from fdi_torch.cli import challenge
 from fdi_torch.cli.options.challenge import add_arguments
 from fdi_torch.cli.screen import Screen
-from fdi_torch.gap.one_at_a_time import one_at_a_time
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fdi_torch.gap.one_at_a_time import one_at_a_time
+from benchmarks.blind_rivals.one_at_a_time import one_at_a_time
 from tests.test_gap import SMALL, nominal_plant, recorded
 
 
