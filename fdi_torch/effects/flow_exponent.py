@@ -15,8 +15,8 @@ TYPICAL, LEAST, MOST = 0.2, 0.02, 2.0  # reference head, as a share of the tank'
 
 class FlowExponent(Effect):
     """The flow is q (|x| / x_r)^n, so that the head x has the exponent 1/2 + n (pipe friction: 4/7, Blasius, 1913;
-    laminar flow: 1). At the reference head x_r the flow is that of the nominal law; a discharge coefficient was perhaps
-    measured at some head.
+    laminar flow: 1). At the reference head x_r the flow is that of the nominal law, as at the head at which the
+    discharge coefficient was measured.
 
     Typical: n of -0.1 to 0.3. Nearly the same as laminar flow or an outlet at another height.
     """

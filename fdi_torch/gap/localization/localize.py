@@ -108,8 +108,10 @@ def localize(
         return evaluate(known.regression, at, known.location, likely)
 
     def with_finer_positions(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
-        """With further regressors under the same noise, until none is worth its selection. The noise falls only after
-        most of them were found: that one alone gains little says nothing about all of them."""
+        """With further regressors under the same noise, until none is worth its selection.
+
+        The estimated noise falls only after most of them were added, so that each alone seems to gain little.
+        """
         at, used = known.discrepancy, known.regressed.used
         positions = Positions(known.regression, known.location, known.under, at, used, generator)
         while finer := positions.best(known.discrepancy, known.regressed.used):
