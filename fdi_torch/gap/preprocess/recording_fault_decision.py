@@ -15,7 +15,8 @@ from itertools import islice
 
 import torch
 
-from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.candidate import Candidate
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.marginal_likelihood import log_prior
