@@ -15,6 +15,7 @@ from itertools import islice
 
 import torch
 
+from fdi_torch.estimate.evidence import RARE
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
@@ -28,7 +29,7 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     thinned,
 )
 from fdi_torch.gap.preprocess.channel_assignment import DECADES
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, WeightedFault
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Suspicion, WeightedFault
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault
 from fdi_torch.gap.preprocess.recording_faults import suspicions
 from fdi_torch.gap.screening import Option, options_of, screen
@@ -73,7 +74,7 @@ def recording_fault(
         rivals.append(rival)
         if most < rival:
             return None
-    faults = [s.weigh() for s in suspected]
+    faults = _weighed(suspected, as_is.log_likelihood, max(rivals))
     if not _surely_faulty(faults, rivals):
         return None
     for rival in others:
@@ -81,6 +82,24 @@ def recording_fault(
         if not _surely_faulty(faults, rivals):
             return None
     return max(faults, key=lambda f: f.log_weight).fault
+
+
+def _weighed(suspected: Sequence[Suspicion], base: float, rival: float) -> list[WeightedFault]:
+    """The fitted faults, without those that cannot be relevant against the likeliest fault or the likeliest rival.
+
+    base: log-likelihood of the recording as it is. A fit may gain more than its first-order estimate, by the largest
+    factor among all faults that were fitted so far.
+    """
+    faults: list[WeightedFault] = []
+    factor = 1.0
+    for s in sorted(suspected, key=lambda s: -s.log_weight):
+        best = max([rival, *(f.log_weight for f in faults)])
+        if faults and base + factor * (s.log_weight - base) < best + math.log(RARE):
+            continue
+        faults.append(s.weigh())
+        if s.log_weight > base:
+            factor = max(factor, (faults[-1].log_weight - base) / (s.log_weight - base))
+    return faults
 
 
 def log_odds(probability: float) -> float:
