@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import KalmanWhitening, Propagation, Score, SensorNoise, StateNoise, Wander
+from fdi_torch.estimate.kalman import KalmanWhitening, Propagation, SensorNoise, StateNoise, Wander
 from fdi_torch.estimate.state_noise import _Problem, estimate_state_noise
 
 DOUBLE = torch.float64
@@ -95,11 +95,6 @@ def problem(p: Propagation, sensors: SensorNoise, residual: Tensor, columns: int
     return _Problem(p, sensors, residual, jacobian, pull, 0.3 * pull, INTENSITY)
 
 
-def likelihood(whole: _Problem, noise: StateNoise) -> tuple[float, Score]:
-    """Profile likelihood, maximised over the linear parameters."""
-    return whole.likelihood(noise, *whole.without_parameters(noise))
-
-
 def one_order_of_magnitude(noise: StateNoise) -> float:
     """Log prior of two intensities: their logarithms differ from the mean by half of their difference each."""
     first, second = torch.log(noise.intensity).tolist()
@@ -116,7 +111,7 @@ def test_the_likelihood_is_that_of_a_dense_normal_distribution(time: float, corr
     covariance = dense(p, sensors, noise)[0][seen][:, seen]
     y = residual.flatten()[seen]
     expected = -0.5 * float(y @ torch.linalg.solve(covariance, y)) - 0.5 * float(torch.logdet(covariance))
-    value, _ = likelihood(problem(p, sensors, residual), noise)
+    value, _ = problem(p, sensors, residual).likelihood(noise)
     assert value == pytest.approx(expected + one_order_of_magnitude(noise), rel=1e-9)
     white = KalmanWhitening(p, sensors, noise)
     assert white.log_det == pytest.approx(float(torch.logdet(covariance)), rel=1e-9)
@@ -135,7 +130,7 @@ def test_a_sensor_that_wanders_has_the_likelihood_of_a_dense_normal_distribution
     covariance = dense(p, sensors, noise)[0][seen][:, seen]
     y = residual.flatten()[seen]
     expected = -0.5 * float(y @ torch.linalg.solve(covariance, y)) - 0.5 * float(torch.logdet(covariance))
-    value, _ = likelihood(problem(p, sensors, residual), noise)
+    value, _ = problem(p, sensors, residual).likelihood(noise)
     assert value == pytest.approx(expected + one_order_of_magnitude(noise), abs=1e-6)  # nats
 
 
@@ -147,10 +142,10 @@ def test_the_slope_by_a_wander_is_a_central_difference(correlation: Tensor, smoo
     whole = problem(p, sensors, simulated(p, sensors, noise, 3), columns=2)
 
     def value(log: float) -> float:
-        return likelihood(whole, replace(noise, wander=Wander(0, 3e-3 * math.exp(log), 20.0, smooth)))[0]
+        return whole.likelihood(replace(noise, wander=Wander(0, 3e-3 * math.exp(log), 20.0, smooth)))[0]
 
     expected = (value(1e-4) - value(-1e-4)) / 2e-4
-    assert float(likelihood(whole, noise)[1].slope[-1]) == pytest.approx(expected, rel=1e-5, abs=1e-5)
+    assert float(whole.likelihood(noise)[1].slope[-1]) == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
 @pytest.mark.parametrize("channel", [0, 1])
@@ -205,7 +200,7 @@ def test_parameters_beside_the_noise_are_at_their_most_likely_values() -> None:
 
     x = torch.linalg.solve(j.T @ precision @ j + torch.eye(3, dtype=DOUBLE), j.T @ precision @ y - whole.off)
     expected = -0.5 * float(cost(x)) + 0.5 * float(torch.logdet(precision)) + one_order_of_magnitude(noise)
-    assert likelihood(whole, noise)[0] == pytest.approx(expected, rel=1e-9)
+    assert whole.likelihood(noise)[0] == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("time", [0.0, 15.0])
@@ -222,11 +217,11 @@ def test_slopes_are_central_differences(
     def value(log: Tensor) -> float:
         factor = torch.exp(log)
         moved = replace(noise, intensity=noise.intensity * factor[:2], scale=noise.scale * factor[2:])
-        return likelihood(whole, moved)[0]
+        return whole.likelihood(moved)[0]
 
     step = 1e-4 * torch.eye(4, dtype=DOUBLE)
     expected = [(value(log + h) - value(log - h)) / 2e-4 for h in step]
-    assert likelihood(whole, noise)[1].slope.tolist() == pytest.approx(expected, rel=1e-5, abs=1e-5)
+    assert whole.likelihood(noise)[1].slope.tolist() == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
 @pytest.mark.parametrize("time", [0.0, 15.0])
@@ -326,7 +321,7 @@ def test_the_correlation_time_is_the_nearest_of_the_candidates(
     whole = problem(p, sensors, residual)
     found = estimate_state_noise(p, sensors, residual, whole.jacobian, whole.pull, whole.off, INTENSITY)
     assert found.converged and found.noise.correlation_time in chosen
-    assert found.log_likelihood > likelihood(whole, truth)[0] - 1.0
+    assert found.log_likelihood > whole.likelihood(truth)[0] - 1.0
 
 
 def test_intensities_are_tied_except_for_one_apart() -> None:
@@ -345,7 +340,7 @@ def standard_errors(whole: _Problem, noise: StateNoise) -> Tensor:
             replace(noise, intensity=noise.intensity * torch.exp(t * h[:2]), scale=noise.scale * torch.exp(t * h[2:]))
             for t in (1.0, -1.0)
         )
-        rows.append((likelihood(whole, up)[1].slope - likelihood(whole, down)[1].slope) / (2.0 * step))
+        rows.append((whole.likelihood(up)[1].slope - whole.likelihood(down)[1].slope) / (2.0 * step))
     return torch.sqrt(torch.diagonal(torch.linalg.inv(-torch.stack(rows))))
 
 

@@ -4,9 +4,7 @@ Intensities and scales maximise the likelihood of the innovations (kalman.py) ti
 are of one order of magnitude, since a significant diffusion term in one state equation shows where a model is deficient
 (Kristensen, Madsen and Jorgensen, 2004, Automatica 40, 225-237). The gradient comes from the disturbance
 smoother (Durbin and Koopman, 2012, "Time series analysis by state space methods", section 7.3.3). Plant parameters, in
-which the residuals are linear, and noise are maximised over in turn: parameters of the mean and of the covariance of a
-normal distribution are orthogonal (Cox and Reid, 1987), so that two or three rounds suffice. The correlation time is
-selected from a grid of candidates.
+which the residuals are linear, are profiled out. The correlation time is selected from a grid of candidates.
 """
 
 from __future__ import annotations
@@ -146,17 +144,7 @@ class _Problem:
         return best
 
     def solve(self, start: StateNoise) -> Likelihood:
-        """Maximise the likelihood over parameters and noise in turn, until a round gains less than the tolerance."""
-        while True:
-            remaining = self.without_parameters(start)
-            likely, gain = self._over_noise(start, *remaining)
-            if gain < LIKELIHOOD_TOLERANCE:
-                return likely
-            start = likely.noise
-
-    def _over_noise(self, start: StateNoise, residual: Tensor, prior_chi_square: float) -> tuple[Likelihood, float]:
-        """Maximise the likelihood of a residual (S, C) over the logarithms of intensities, scales and wander, by
-        L-BFGS-B; also returns its gain."""
+        """Maximise the profile likelihood over the logarithms of intensities, scales and wander, by L-BFGS-B."""
         tanks, start_wander = len(self.unit), start.wander
 
         def noise_at(x: np.ndarray) -> StateNoise:
@@ -167,7 +155,7 @@ class _Problem:
 
         # The variables are scaled to a curvature of about one per sample. The tolerance of L-BFGS-B is relative to
         # max(|cost|, 1), so the cost is taken relative to its initial value.
-        samples, likeliest = len(residual), self.likelihood(start, residual, prior_chi_square)
+        samples, likeliest = len(self.residual), self.likelihood(start)
         start_value, first_score = likeliest
         unit = torch.sqrt(2.0 * first_score.determined.clamp(min=MIN_DETERMINED) / samples).numpy()
 
@@ -177,10 +165,7 @@ class _Problem:
 
         def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
             nonlocal likeliest
-            known = (x == x_start).all()
-            value, score = (
-                (start_value, first_score) if known else self.likelihood(noise_at(x / unit), residual, prior_chi_square)
-            )
+            value, score = (start_value, first_score) if (x == x_start).all() else self.likelihood(noise_at(x / unit))
             likeliest = max(likeliest, (value, score), key=itemgetter(0))
             return (start_value - value) / samples, -score.slope.numpy() / samples / unit
 
@@ -193,19 +178,13 @@ class _Problem:
             options={"ftol": LIKELIHOOD_TOLERANCE / samples, "gtol": LIKELIHOOD_TOLERANCE / samples},
         )
         noise, value = noise_at(optimum.x / unit), start_value - float(optimum.fun) * samples
-        return Likelihood(noise, value, bool(optimum.success), likeliest[1].determined), value - start_value
+        return Likelihood(noise, value, bool(optimum.success), likeliest[1].determined)
 
-    def without_parameters(self, noise: StateNoise) -> tuple[Tensor, float]:
-        """The residual (S, C) that the most likely parameters under a noise model leave, and their prior chi-square."""
-        white = self.filter.under(noise).innovations(self.columns)
-        step = _most_likely(white, self.pull, self.off)
-        return self.residual - self.jacobian @ step, float((self.off + self.pull * step).square().sum())
-
-    def likelihood(self, noise: StateNoise, residual: Tensor, prior_chi_square: float) -> tuple[float, Score]:
-        """Log-likelihood of a residual (S, C) under a noise model with the log priors, and its score."""
+    def likelihood(self, noise: StateNoise) -> tuple[float, Score]:
+        """Profile log-likelihood of a noise model with the log prior of its intensities, and its score."""
         model = self.filter.under(noise)
-        innovations = model.innovations(residual.unsqueeze(-1)).squeeze(-1)
-        cost = float(innovations.square().sum()) + prior_chi_square + model.log_det
+        innovations, prior_residual = _profiled(model.innovations(self.columns), self.pull, self.off)
+        cost = float(innovations.square().sum()) + float(prior_residual.square().sum()) + model.log_det
         score, deviation = model.score(innovations), noise.scatter() / SCATTER
         slope, determined = score.slope.clone(), score.determined.clone()
         slope[: len(deviation)] -= deviation
@@ -213,14 +192,16 @@ class _Problem:
         return -0.5 * cost + noise.log_prior(), replace(score, slope=slope, determined=determined)
 
 
-def _most_likely(white: Tensor, pull: Tensor, off: Tensor) -> Tensor:
-    """The most likely change of the parameters (P,), by linear least squares.
+def _profiled(white: Tensor, pull: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:
+    """Regress the whitened residual on the whitened Jacobian and the priors, by linear least squares.
 
-    white (S, C, 1 + P): whitened residual and Jacobian. pull, off (P,): priors, as in `estimate_state_noise`.
+    white (S, C, 1 + P): whitened residual and Jacobian. Returns the regression residuals of the readings, (S, C), and
+    of the priors, (P,).
     """
     rows = white.flatten(0, 1)
     gram = rows.T @ rows
     curvature, right = gram[1:, 1:] + torch.diag(pull**2), gram[1:, 0] - pull * off
     scale = torch.diagonal(curvature).sqrt().clamp(min=1e-150)
     unit = curvature / scale / scale.unsqueeze(1) + RIDGE * torch.eye(len(pull), dtype=white.dtype)
-    return torch.linalg.solve(unit, (right / scale).unsqueeze(1)).squeeze(1) / scale
+    step = torch.linalg.solve(unit, (right / scale).unsqueeze(1)).squeeze(1) / scale
+    return white @ torch.cat([step.new_ones(1), -step]), -off - pull * step
