@@ -28,7 +28,7 @@ from fdi_torch.simulate.actuation import Actuation, with_parameters
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.midpoint import newton_step
 from fdi_torch.simulate.output_map import LinearisedOutputs, OutputMap
-from fdi_torch.simulate.pointwise import Partials, partials
+from fdi_torch.simulate.pointwise import partials, partials_of
 from fdi_torch.simulate.scan import scan_in_time
 
 # Newton's method has converged at corrections below these, in units of the plant's length scale: of the whole plant,
@@ -88,7 +88,6 @@ class Collocation:
         self._actuation = Actuation(network, experiment, self._names)
         self._output_map = OutputMap(network, experiment, self._names)
         self._fixed_commands: list[Tensor] | None = None
-        self._partials: dict[tuple[object, ...], Partials] = {}
 
     def linearise(self, theta: Tensor, levels: Tensor) -> Linearised:
         """One Newton step from the trajectories levels (L, K+1, n), with derivatives; theta (L, P).
@@ -270,8 +269,11 @@ class Collocation:
             return network.rates(x[:n], commands_at, self._actuation.clock, bound)
 
         inputs = [*middle.unbind(1), *(commands[i] for i in driven), *moving]
-        dependences = (reaches_rim, len(moving), tuple(driven))
-        values_at, rows = self._partials.setdefault(dependences, Partials())(rates, inputs, shape)
+        moved = tuple(self._names) if moving else ()
+        plant, placements = network.description, tuple(p.prefix for p in network.placements)
+        components = plant.tanks, plant.pipes, plant.pumps, plant.weirs, plant.transfers
+        known = partials_of(components, placements, moved, tuple(driven), reaches_rim)
+        values_at, rows = known(rates, inputs, shape)
         by_level, by_theta = (middle.new_zeros(lanes, n, m, steps) for m in (n, width))
         for i, row in enumerate(rows):
             for j in range(n):
