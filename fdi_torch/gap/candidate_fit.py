@@ -9,7 +9,7 @@ fitted together with the parameters (`trajectory_problem.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -21,7 +21,7 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
 from fdi_torch.gap.dataset import DataSet, RecordingPart
 from fdi_torch.gap.resampling import interpolate
-from fdi_torch.gap.start_choice import likeliest_starts
+from fdi_torch.gap.start_choice import Start, likeliest_starts, vector_of
 from fdi_torch.gap.trajectory_problem import CAP, FAR, DescentResult, TrajectoryProblem, descend
 from fdi_torch.parameters import ParameterSpace, common_name, name_in_recording
 from fdi_torch.plant.effect import Placement
@@ -77,26 +77,38 @@ class Fitter:
 
         target: cost of the competitor; starts that approach it too slowly are given up. cap: most evaluations.
         """
-        by_free: dict[tuple[str, ...], list[Mapping[str, float]]] = {}
-        for start in candidate.starts:
-            by_free.setdefault(tuple(sorted(start)), []).append(start)
-        fits = [self._fit(candidate, free, starts, base, target, cap) for free, starts in by_free.items()]
+        by_free: dict[tuple[str, ...], list[Start]] = {}
+        for start in self._starts(candidate, base, target):
+            by_free.setdefault(start.free, []).append(start)
+        fits: list[Fit] = []
+        for free, starts in by_free.items():
+            fits.append(self._fit(candidate, free, starts, base, min([target, *(f.cost for f in fits)]), cap))
         return min(fits, key=lambda f: f.cost)
+
+    def _starts(self, candidate: Candidate, base: Fit | None, target: float) -> list[Start]:
+        """The starts of a candidate; of those about the base, only the one with the best prospects."""
+        starts = [Start(tuple(sorted(s)), s, base.linearised.levels if base else None) for s in candidate.starts]
+        free = sorted({name for start in starts for name in start.free})
+        if base is None or all(name in base.space for name in free):
+            return starts
+        engine = self.engine(candidate, free, [name for name in free if name not in base.space])
+        return likeliest_starts(self, base, engine, starts, target)
 
     def _fit(
         self,
         candidate: Candidate,
         free: tuple[str, ...],
-        starts: Sequence[Mapping[str, float]],
+        starts: Sequence[Start],
         base: Fit | None,
         target: float,
         cap: int,
     ) -> Fit:
         engine = self.engine(candidate, free)
-        theta, levels = self._initial_points(engine, starts, base)
-        new = [n for n in engine.space.names if base and n not in base.space]
-        if base and new and len(starts) > 1:
-            theta, levels = likeliest_starts(self, base, self.engine(candidate, free, new), theta, levels, target)
+        initial = base.values if base else self.first_levels()
+        theta = torch.stack([vector_of(engine.space, {**initial, **s.values}) for s in starts])
+        # The effects' states may be other ones than in the base.
+        guesses = [s.levels[..., : len(self.data.plant.tanks)] for s in starts if s.levels is not None]
+        levels = torch.cat(guesses) if guesses else self.first_trajectory(engine, theta)
         descents = self.descend(engine, theta, levels, target, cap)
         best = int(torch.nan_to_num(descents.cost, nan=torch.inf).argmin())
         linearised = descents.linearised.lanes(torch.tensor([best]))
@@ -108,17 +120,6 @@ class Fitter:
             linearised,
             bool(descents.converged[best]),
         )
-
-    def _initial_points(
-        self, engine: Collocation | JointCollocation, starts: Sequence[Mapping[str, float]], base: Fit | None
-    ) -> tuple[Tensor, Tensor]:
-        initial = base.values if base else self.first_levels()
-        rows = [engine.space.vector({n: v for n, v in {**initial, **s}.items() if n in engine.space}) for s in starts]
-        theta = torch.stack(rows)
-        if base is None:
-            return theta, self.first_trajectory(engine, theta)
-        levels = base.linearised.levels[..., : len(self.data.plant.tanks)]  # the effects' states may be other ones
-        return theta, levels.expand(len(starts), -1, -1)
 
     def first_trajectory(self, engine: Collocation | JointCollocation, theta: Tensor) -> Tensor:
         """The model's levels (L, K+1, n) at theta (L, P), found from the levels that the sensors show.

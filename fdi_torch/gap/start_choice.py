@@ -11,6 +11,7 @@ has entries, instead of 14 at three tanks and 60 at twelve. The full problem is 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -25,37 +26,64 @@ from fdi_torch.simulate.joint_collocation import JointCollocation
 NEAR = 1.0  # chi-square units; starts are compared when less than this remained to gain
 
 
+@dataclass(frozen=True)
+class Start:
+    """free: names of the effects' parameters that are fitted. values: of these, and of any others. levels (1, K+1, n),
+    m: guess of the trajectory."""
+
+    free: tuple[str, ...]
+    values: Mapping[str, float]
+    levels: Tensor | None = None
+
+
+def vector_of(space: ParameterSpace, values: Mapping[str, float]) -> Tensor:
+    """Values (P,) of a space; nominal ones for parameters that have none."""
+    return space.vector({n: v for n, v in values.items() if n in space})
+
+
 def likeliest_starts(
     objective: Objective,
     base: Fit,
     engine: Collocation | JointCollocation,
-    theta: Tensor,
-    levels: Tensor,
+    starts: Sequence[Start],
     target: float,
-) -> tuple[Tensor, Tensor]:
-    """Replace the starts theta (L, P) with trajectories (L, K+1, tanks) by the best end point of their descents.
+) -> list[Start]:
+    """The best end point of the reduced descents from all starts that share their other parameters with `base`, and the
+    other starts as they are.
 
-    base: fit of some of the effects. engine: differentiates by the parameters that `base` lacks. A start whose other
-    parameters are not those of `base` is kept. target: cost of the competitor.
+    base: fit of some of the effects. engine: of the union of the starts' parameters; differentiates by those that
+    `base` lacks. target: cost of the competitor.
     """
+    about, others = list[Start](), list[Start]()
+    for start in starts:
+        as_in_base = all(base.values[n] == v for n, v in start.values.items() if n in base.space)
+        (about if as_in_base else others).append(start)
+    if len(about) < 2:
+        return list(starts)
     shared = [n for n in engine.space.names if n in base.space]
     of_shared, in_base = (torch.tensor([s.index(n) for n in shared]) for s in (engine.space, base.space))
     varied = torch.tensor([engine.space.index(n) for n in engine.by])
-    about_base = (theta[:, of_shared] == base.theta[in_base]).all(-1)
-    if int(about_base.sum()) < 2:
-        return theta, levels
-    starts, tanks = theta[about_base], levels.shape[-1]
+    theta = torch.stack([vector_of(engine.space, {**base.values, **s.values}) for s in about])
     projected = _Projected.of(objective, base, in_base)
-    problem = TrajectoryProblem(projected, _Varied(engine, starts[0], varied), levels[about_base])
-    end = descend(problem, starts[:, varied], len(projected.basis), target, decrement=NEAR)
-    best = int(end.cost.nan_to_num(nan=torch.inf).argmin())
+    reduced = _Varied(engine, theta[0], varied)
     low, high, scale = objective.box(engine.space)
+    # A start that lacks a parameter of others has it at its nominal value.
+    fixed = torch.tensor([[n not in s.free for n in engine.by] for s in about])
+    own = theta[:, varied]
+    box = torch.where(fixed, own, low[varied]), torch.where(fixed, own, high[varied])
+    tanks = len(engine.network.description.tanks)  # the effects' states may be other ones than in the base
+    levels, slopes = base.linearised.levels[..., :tanks], base.linearised.slopes[..., :tanks, in_base]
+    problem = TrajectoryProblem(projected, reduced, levels.expand(len(about), -1, -1))
+    end = descend(problem, own, len(projected.basis), target, decrement=NEAR, box=box)
+    best = int(end.cost.nan_to_num(nan=torch.inf).argmin())
     change = projected.change(objective.residual(end.linearised.readings[best : best + 1])) * scale[of_shared]
-    found = starts[0].clone()
+    found = theta[best].clone()
     found[varied], found[of_shared] = end.theta[best], found[of_shared] + change
-    moved = end.linearised.levels[best, :, :tanks] + base.linearised.slopes[0][:, :tanks, in_base] @ change
     found = torch.minimum(torch.maximum(found, low), high)
-    return torch.cat([found[None], theta[~about_base]]), torch.cat([moved[None], levels[~about_base]])
+    moved = end.linearised.levels[best : best + 1].clone()
+    moved[..., :tanks] += slopes @ change
+    values = dict(zip(engine.space.names, found.tolist(), strict=True))
+    return [Start(about[best].free, values, moved), *others]
 
 
 @dataclass(frozen=True)

@@ -171,14 +171,15 @@ def descend(
     target: float = math.inf,
     cap: int = CAP,
     decrement: float = DECREMENT,
+    box: tuple[Tensor, Tensor] | None = None,
 ) -> DescentResult:
     """Least squares from theta (L, P). readings: number of valid ones. target: cost of a competitor, see BEHIND.
-    cap: most evaluations. decrement: as DECREMENT."""
+    cap: most evaluations. decrement: as DECREMENT. box: lower and upper bounds of each lane, (L, P) each."""
     # The optimiser's cost is a negative log-likelihood, half of chi-square.
     competition = Competition(0.5 * BEHIND, SHARE, 0.5 * target)
     share = decrement / max(readings, 1)
     settings = RefineSettings(cap, 0.5 * decrement, share, step_tolerance=0.0, competition=competition)
-    low, high, _ = problem.box
+    low, high = box or problem.box[:2]
     minimum = levenberg_marquardt(problem.linearise, theta, low, high, settings, neighbourhood=problem)
     assert isinstance(minimum.state, FittedTrajectory)
     return DescentResult(minimum.theta, 2.0 * minimum.cost, minimum.state.linearised, minimum.converged)
