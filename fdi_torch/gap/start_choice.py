@@ -18,12 +18,13 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.candidate import Fit
-from fdi_torch.gap.trajectory_problem import Objective, TrajectoryProblem, descend
+from fdi_torch.gap.trajectory_problem import NEARLY, Objective, TrajectoryProblem, corrected_trajectories, descend
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation
 
 NEAR = 1.0  # chi-square units; starts are compared when less than this remained to gain
+SHARES = (1.0, 0.5, 0.25, 0.0)  # of the change of the linear parameters, which is taken as far as it lowers chi-square
 
 
 @dataclass(frozen=True)
@@ -77,13 +78,18 @@ def likeliest_starts(
     end = descend(problem, own, len(projected.basis), target, decrement=NEAR, box=box)
     best = int(end.cost.nan_to_num(nan=torch.inf).argmin())
     change = projected.change(objective.residual(end.linearised.readings[best : best + 1])) * scale[of_shared]
-    found = theta[best].clone()
-    found[varied], found[of_shared] = end.theta[best], found[of_shared] + change
-    found = torch.minimum(torch.maximum(found, low), high)
-    moved = end.linearised.levels[best : best + 1].clone()
-    moved[..., :tanks] += slopes @ change
-    values = dict(zip(engine.space.names, found.tolist(), strict=True))
-    return [Start(about[best].free, values, moved), *others]
+    shares = torch.tensor(SHARES, dtype=theta.dtype)
+    tried = theta[best].repeat(len(SHARES), 1)
+    tried[:, varied] = end.theta[best]
+    tried[:, of_shared] += shares.unsqueeze(1) * change
+    tried = torch.minimum(torch.maximum(tried, low), high)
+    guesses = end.linearised.levels[best].repeat(len(SHARES), 1, 1)
+    guesses[..., :tanks] += shares[:, None, None] * (slopes @ change)
+    found, defect = corrected_trajectories(engine, tried, guesses, objective.far)
+    cost = objective.chi_square(engine.space, tried, objective.residual(engine.read(found, tried)))
+    likeliest = int(torch.where(defect <= NEARLY * objective.far, cost, torch.inf).argmin())
+    values = dict(zip(engine.space.names, tried[likeliest].tolist(), strict=True))
+    return [Start(about[best].free, values, found[likeliest : likeliest + 1]), *others]
 
 
 @dataclass(frozen=True)
