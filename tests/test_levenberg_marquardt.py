@@ -288,7 +288,7 @@ def test_a_lane_whose_quadratic_model_reaches_the_reference_is_not_given_up() ->
         return Linearisation(0.5 * x**2, x[:, None], (1.0 + 0.1 * x.abs())[:, None, None])
 
     start = torch.tensor([[100.0]], dtype=DOUBLE)
-    settings = RefineSettings(damping=30.0, competition=Competition(behind=1.0, share=0.25, target=3000.0))
+    settings = RefineSettings(damping=3000.0, competition=Competition(behind=1.0, share=0.25, target=3000.0))
     reaches = replace(settings, competition=Competition(behind=1.0, share=0.25, target=4600.0))
     kept = levenberg_marquardt(valley, start, -2.0 * start, 2.0 * start, reaches)
     assert kept.statuses() == ["converged"]
