@@ -28,7 +28,7 @@ from fdi_torch.blind.scored_rows import scores_of
 from fdi_torch.blind.sealed_files import lines_of, manifest, open_key, read_plant, read_recording
 from fdi_torch.blind.sizes import SAME
 from fdi_torch.blind.statistics import clopper_pearson
-from fdi_torch.gap.candidate_fit import Candidate
+from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.diagnose import diagnose, recalibrate
 from fdi_torch.gap.library import STANDARD as LIBRARY
 from fdi_torch.gap.problem import Settings, problem_of

@@ -12,7 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import BEHIND, Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.preprocess.acquisition import examined, usable
 from fdi_torch.gap.preprocess.blockwise_likelihood import (
@@ -23,6 +24,7 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     noise_of,
     thinned,
 )
+from fdi_torch.gap.trajectory_problem import BEHIND
 from fdi_torch.jobs.logged_monitor import usable_part
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs

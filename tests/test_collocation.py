@@ -14,6 +14,7 @@ from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.midpoint import newton_step
 from fdi_torch.simulate.output_map import SampleGrid
+from fdi_torch.simulate.pointwise import Partials
 from fdi_torch.simulate.reference_engine import ReferenceEngine
 from fdi_torch.simulate.scan import linear_scan, scan_in_time
 from tests.rigs import constant_inputs, three_tank
@@ -143,3 +144,30 @@ def test_levels_between_nodes_lie_on_the_line_through_them() -> None:
     line = 0.1 + 0.02 * experiment.nodes
     assert len(experiment.nodes) < len(experiment.sample_times)
     assert torch.allclose(SampleGrid(experiment).of(line), 0.1 + 0.02 * experiment.sample_times)
+
+
+def test_outputs_without_common_inputs_share_a_backward_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A chain of ten: each depends on itself and its neighbours, so that every third one shares no input."""
+    inputs = [torch.randn(2, 4, generator=torch.Generator().manual_seed(k), dtype=torch.float64) for k in range(10)]
+
+    def chain(x: list[torch.Tensor]) -> list[torch.Tensor]:
+        return [x[k] ** 2 * (x[k - 1] if k else 1.0) * (x[k + 1] if k < 9 else 1.0) for k in range(10)]
+
+    passes, gradient = 0, torch.autograd.grad
+
+    def counted(*arguments: object, **options: object) -> object:
+        nonlocal passes
+        passes += 1
+        return gradient(*arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("torch.autograd.grad", counted)
+    slopes = Partials()
+    values, rows = slopes(chain, inputs, (2, 4))
+    assert passes == 10
+    again, shared = slopes(chain, inputs, (2, 4))
+    assert passes == 13
+    for k in range(10):
+        assert torch.equal(values[k], again[k])
+        for j in range(10):
+            assert (rows[k][j] is None) == (shared[k][j] is None) == (abs(j - k) > 1)
+            assert rows[k][j] is None or torch.equal(rows[k][j], shared[k][j])  # type: ignore[arg-type]

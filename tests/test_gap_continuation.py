@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from fdi_torch.gap.candidate_fit import Candidate, Fit
+from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.free_runs import refit as module
 from fdi_torch.gap.free_runs.refit import WIDENINGS, fit_by_continuation, trajectory_found
 from fdi_torch.gap.problem import Settings, problem_of

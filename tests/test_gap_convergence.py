@@ -13,7 +13,8 @@ from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import effect
 from fdi_torch.estimate.fitting import set_up
-from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.diagnose import recalibrate
 from fdi_torch.gap.marginal_likelihood import log_evidence
 from fdi_torch.gap.problem import PLAIN, problem_of

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.candidate import Candidate
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.discrepancy_curves import curves_at
 from fdi_torch.gap.problem import checked_data_set

@@ -13,7 +13,7 @@ from fdi_torch.effects import effect
 from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import Answer
-from fdi_torch.gap.candidate_fit import Candidate
+from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.library import possible_places
 from fdi_torch.gap.localization.localize import localize

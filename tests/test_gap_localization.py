@@ -13,7 +13,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from fdi_torch.estimate.kalman import StateNoise
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.localize import localize

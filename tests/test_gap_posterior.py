@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from fdi_torch.estimate.evidence import ODDS, posterior
-from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.candidate import Candidate
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose, verdict_of

@@ -12,7 +12,8 @@ from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.effects import place
 from fdi_torch.gap.answer import adopted
-from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.candidate import Candidate
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose

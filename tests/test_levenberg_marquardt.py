@@ -280,6 +280,22 @@ def test_a_lane_that_catches_up_is_not_given_up() -> None:
     assert found.converged.all() and found.cost.item() < 1e-9
 
 
+def test_a_lane_whose_quadratic_model_reaches_the_reference_is_not_given_up() -> None:
+    """Strong damping makes the first step short. The model predicts 455 of the decrease of 400 that is missing."""
+
+    def valley(theta: Tensor, lanes: Tensor) -> Linearisation:
+        x = theta[:, 0]
+        return Linearisation(0.5 * x**2, x[:, None], (1.0 + 0.1 * x.abs())[:, None, None])
+
+    start = torch.tensor([[100.0]], dtype=DOUBLE)
+    settings = RefineSettings(damping=3000.0, competition=Competition(behind=1.0, share=0.25, target=3000.0))
+    reaches = replace(settings, competition=Competition(behind=1.0, share=0.25, target=4600.0))
+    kept = levenberg_marquardt(valley, start, -2.0 * start, 2.0 * start, reaches)
+    assert kept.statuses() == ["converged"]
+    given_up = levenberg_marquardt(valley, start, -2.0 * start, 2.0 * start, settings)
+    assert given_up.statuses() == ["abandoned"]
+
+
 def test_each_refusal_doubles_the_growth_of_the_damping() -> None:
     """Nielsen (1999): mu grows by nu = 2, 4, 8 ... with every step in succession that does not lower the cost."""
 

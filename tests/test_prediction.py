@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from fdi_torch.config.plant_file import build_plant, load_plant
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import leave_one_file_out, predict
 from fdi_torch.gap.free_runs.refit import refit

@@ -14,8 +14,11 @@ from fdi_torch.blind.inputs import FACTORS, command_unit
 from fdi_torch.blind.plants import RIGS
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.preprocess.acquisition import examined
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits
+from fdi_torch.gap.preprocess.recording_fault_decision import recording_fault
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 from tests.rigs import blank_recording, random_steps
+from tests.test_gap_convergence import recorded
 
 
 def test_a_swap_is_refused_although_the_constants_were_fitted_to_it() -> None:
@@ -67,6 +70,28 @@ def fits_with_all_sensors_stuck(count: int, monkeypatch: pytest.MonkeyPatch) -> 
     assert found.fault is None
     assert {s.sensor.name for s in found.stuck} == {s.name for s in plant.sensors}
     return fits
+
+
+def test_no_fault_is_fitted_where_one_effect_explains_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lag of a pump makes a shift of the clock a gain, to first order."""
+    plant, truth = chain(3), {"Q.pump_lag.time_constant": 60.0}
+    recording = recorded(plant, random_steps(plant, 1200.0), truth, seed=1)
+    suspected = 0
+    original = CorrectedFits.first_order_gain
+
+    def counted(self: CorrectedFits, *arguments: object) -> float:
+        nonlocal suspected
+        gain = original(self, *arguments)  # type: ignore[arg-type]
+        suspected += gain + self.prior > 0.0
+        return gain
+
+    def refused(self: CorrectedFits, *arguments: object) -> None:
+        raise AssertionError("expected no fit of a fault")
+
+    monkeypatch.setattr(CorrectedFits, "first_order_gain", counted)
+    monkeypatch.setattr(CorrectedFits, "fit", refused)
+    assert recording_fault(plant, recording) is None
+    assert suspected
 
 
 @pytest.mark.slow

@@ -15,7 +15,8 @@ import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.library import library_of

@@ -53,8 +53,9 @@ class Competition:
     """Rule that abandons hopeless lanes.
 
     The reference is the lowest cost of all lanes or `target`, whichever is less. A lane is abandoned if its cost
-    exceeds the reference by more than `behind` and its last accepted step reduced this excess by less than the fraction
-    `share`. The rule applies from the second step on. A refused step says nothing about what a lane can gain.
+    exceeds the reference by more than `behind`, its last accepted step reduced this excess by less than the fraction
+    `share`, and its quadratic model does not reach the reference either. The rule applies from the second step on. A
+    refused or strongly damped step says nothing about what a lane can gain.
     """
 
     behind: float
@@ -219,9 +220,8 @@ def _status(
     status = torch.full_like(lanes.lanes, MAX_ITERATIONS if iteration >= settings.iterations else RUNNING)
     if settings.competition is not None and iteration > 1:
         excess = lanes.model.cost - lowest_cost
-        hopeless = (excess > settings.competition.behind) & (
-            lanes.actual_decrease < settings.competition.share * excess
-        )
+        slow = lanes.actual_decrease < settings.competition.share * excess
+        hopeless = (excess > settings.competition.behind) & slow & (decrement < excess)
         status = torch.where(hopeless, ABANDONED, status)
     # With less damping, a negligible prediction may also be due to a bound that shortened the step.
     no_gain = (lanes.refused_decrease <= tolerance) & (lanes.damping > 1.0)

@@ -9,88 +9,26 @@ fitted together with the parameters (`trajectory_problem.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from fdi_torch.effects import EFFECTS
 from fdi_torch.estimate.kalman import KalmanWhitening
-from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, levenberg_marquardt
+from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
 from fdi_torch.gap.dataset import DataSet, RecordingPart
 from fdi_torch.gap.resampling import interpolate
-from fdi_torch.gap.trajectory_problem import FAR, FittedTrajectory, TrajectoryProblem
-from fdi_torch.parameters import ParameterName, ParameterSpace, common_name, is_effect_parameter, name_in_recording
+from fdi_torch.gap.start_choice import Start, likeliest_starts, vector_of
+from fdi_torch.gap.trajectory_problem import CAP, FAR, DescentResult, TrajectoryProblem, descend
+from fdi_torch.parameters import ParameterSpace, common_name, name_in_recording
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation
-
-# A fit has converged if a further step is predicted to gain less than this share of the chi-square per reading, or of
-# one if that is more. Parameters are then within a tenth of a standard error, misfit included.
-DECREMENT = 0.01
-CAP = 200  # evaluations, a guard against descents without an end
-# A start is given up if it is so many chi-square units behind and gains less than a quarter of that in a step.
-BEHIND, SHARE = 30.0, 0.25
-Key = frozenset[tuple[str, str]]
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """Effects at places. starts: the fitted parameters of these effects with initial values
-    ('Q1.pump_lag.time_constant')."""
-
-    placements: tuple[Placement, ...] = ()
-    starts: tuple[Mapping[str, float], ...] = ({},)
-
-    @property
-    def key(self) -> Key:
-        return frozenset((p.effect.name, p.location) for p in self.placements)
-
-
-@dataclass(frozen=True)
-class Fit:
-    """The best fit of a candidate: parameters theta (P,), cost (chi-square with priors), linearised trajectory.
-
-    converged: whether less than DECREMENT remained to gain. False if the fit was given up or ran out of evaluations.
-    """
-
-    candidate: Candidate
-    space: ParameterSpace
-    theta: Tensor
-    cost: float
-    linearised: Linearised
-    converged: bool
-
-    @property
-    def values(self) -> dict[str, float]:
-        return dict(zip(self.space.names, self.theta.tolist(), strict=True))
-
-    @property
-    def effect_values(self) -> dict[str, float]:
-        return {n: v for n, v in self.values.items() if is_effect_parameter(n)}
-
-    def values_of(self, placements: Iterable[Placement]) -> dict[str, float]:
-        """The fitted parameters of some of the effects, by full name."""
-        prefixes = {p.prefix for p in placements}
-        return {n: v for n, v in self.values.items() if ParameterName.parse(n).prefix in prefixes}
-
-    @property
-    def key(self) -> Key:
-        return self.candidate.key
-
-
-@dataclass(frozen=True)
-class DescentResult:
-    """End points of descents: theta (L, P), cost (L,) chi-square, linearised trajectories, converged (L,) bool."""
-
-    theta: Tensor
-    cost: Tensor
-    linearised: Linearised
-    converged: Tensor
 
 
 class Fitter:
@@ -107,14 +45,19 @@ class Fitter:
             return self.whitening.log_det
         return float((2.0 * torch.log(self.noise.innovation) * self.data.mask.sum(dim=0)).sum())
 
-    def engine(self, candidate: Candidate, free: Sequence[str]) -> Collocation | JointCollocation:
-        """The plant with the candidate's effects. Its parameters are the nuisance parameters and those in `free`."""
+    def engine(
+        self, candidate: Candidate, free: Sequence[str], by: Sequence[str] | None = None
+    ) -> Collocation | JointCollocation:
+        """The plant with the candidate's effects. Its parameters are the nuisance parameters and those in `free`.
+
+        by: the parameters of effects by which it differentiates; by all parameters by default.
+        """
         network = self.network(candidate.placements)
         names = tuple(dict.fromkeys([*self.data.nuisance, *free]))
         space = ParameterSpace(network.constants[n] for n in names if common_name(n) == n)
         if not self.data.further:
-            return Collocation(network, space, self.data.experiment)
-        parts = [Collocation(network, space, part.experiment) for part in self.data.parts]
+            return Collocation(network, space, self.data.experiment, by)
+        parts = [Collocation(network, space, part.experiment, by) for part in self.data.parts]
         return JointCollocation(parts, ParameterSpace(replace(space[common_name(n)], name=n) for n in names))
 
     def network(self, placements: Sequence[Placement]) -> TankNetwork:
@@ -134,23 +77,38 @@ class Fitter:
 
         target: cost of the competitor; starts that approach it too slowly are given up. cap: most evaluations.
         """
-        by_free: dict[tuple[str, ...], list[Mapping[str, float]]] = {}
-        for start in candidate.starts:
-            by_free.setdefault(tuple(sorted(start)), []).append(start)
-        fits = [self._fit(candidate, free, starts, base, target, cap) for free, starts in by_free.items()]
+        by_free: dict[tuple[str, ...], list[Start]] = {}
+        for start in self._starts(candidate, base, target):
+            by_free.setdefault(start.free, []).append(start)
+        fits: list[Fit] = []
+        for free, starts in by_free.items():
+            fits.append(self._fit(candidate, free, starts, base, min([target, *(f.cost for f in fits)]), cap))
         return min(fits, key=lambda f: f.cost)
+
+    def _starts(self, candidate: Candidate, base: Fit | None, target: float) -> list[Start]:
+        """The starts of a candidate; of those about the base, only the one with the best prospects."""
+        starts = [Start(tuple(sorted(s)), s, base.linearised.levels if base else None) for s in candidate.starts]
+        free = sorted({name for start in starts for name in start.free})
+        if base is None or all(name in base.space for name in free):
+            return starts
+        engine = self.engine(candidate, free, [name for name in free if name not in base.space])
+        return likeliest_starts(self, base, engine, starts, target)
 
     def _fit(
         self,
         candidate: Candidate,
         free: tuple[str, ...],
-        starts: Sequence[Mapping[str, float]],
+        starts: Sequence[Start],
         base: Fit | None,
         target: float,
         cap: int,
     ) -> Fit:
         engine = self.engine(candidate, free)
-        theta, levels = self._initial_points(engine, starts, base)
+        initial = base.values if base else self.first_levels()
+        theta = torch.stack([vector_of(engine.space, {**initial, **s.values}) for s in starts])
+        # The effects' states may be other ones than in the base.
+        guesses = [s.levels[..., : len(self.data.plant.tanks)] for s in starts if s.levels is not None]
+        levels = torch.cat(guesses) if guesses else self.first_trajectory(engine, theta)
         descents = self.descend(engine, theta, levels, target, cap)
         best = int(torch.nan_to_num(descents.cost, nan=torch.inf).argmin())
         linearised = descents.linearised.lanes(torch.tensor([best]))
@@ -162,17 +120,6 @@ class Fitter:
             linearised,
             bool(descents.converged[best]),
         )
-
-    def _initial_points(
-        self, engine: Collocation | JointCollocation, starts: Sequence[Mapping[str, float]], base: Fit | None
-    ) -> tuple[Tensor, Tensor]:
-        initial = base.values if base else self.first_levels()
-        rows = [engine.space.vector({n: v for n, v in {**initial, **s}.items() if n in engine.space}) for s in starts]
-        theta = torch.stack(rows)
-        if base is None:
-            return theta, self.first_trajectory(engine, theta)
-        levels = base.linearised.levels[..., : len(self.data.plant.tanks)]  # the effects' states may be other ones
-        return theta, levels.expand(len(starts), -1, -1)
 
     def first_trajectory(self, engine: Collocation | JointCollocation, theta: Tensor) -> Tensor:
         """The model's levels (L, K+1, n) at theta (L, P), found from the levels that the sensors show.
@@ -224,15 +171,7 @@ class Fitter:
         cap: int = CAP,
     ) -> DescentResult:
         """Least squares from theta (L, P), with guesses of the trajectories, levels (L, K+1, n)."""
-        problem = TrajectoryProblem(self, engine, levels)
-        competition = Competition(0.5 * BEHIND, SHARE, 0.5 * target)
-        # The optimiser's cost is a negative log-likelihood, half of chi-square.
-        share = DECREMENT / max(int(self.data.mask.sum()), 1)
-        settings = RefineSettings(cap, 0.5 * DECREMENT, share, step_tolerance=0.0, competition=competition)
-        low, high, _ = problem.box
-        minimum = levenberg_marquardt(problem.linearise, theta, low, high, settings, neighbourhood=problem)
-        assert isinstance(minimum.state, FittedTrajectory)
-        return DescentResult(minimum.theta, 2.0 * minimum.cost, minimum.state.linearised, minimum.converged)
+        return descend(TrajectoryProblem(self, engine, levels), theta, int(self.data.mask.sum()), target, cap)
 
     def normal(
         self, space: ParameterSpace, theta: Tensor, residual: Tensor, jacobian: Tensor, scale: Tensor
@@ -249,9 +188,8 @@ class Fitter:
         curvature = j @ j.mT + torch.diag_embed((weight * scale) ** 2)
         return cost, gradient, curvature
 
-    def chi_square(self, space: ParameterSpace, theta: Tensor, readings: Tensor) -> Tensor:
-        """Chi-square (L,) of modelled readings (L, S, C) at theta (L, P), with priors."""
-        residual = self.whiten(self.data.readings - readings)
+    def chi_square(self, space: ParameterSpace, theta: Tensor, residual: Tensor) -> Tensor:
+        """Chi-square (L,) of a whitened residual (L, S, C) at theta (L, P), with priors."""
         deviation = (theta - space.nominal(theta)) / space.std(theta)
         return (residual * residual).sum((-1, -2)) + (deviation * deviation).sum(-1)
 
@@ -262,12 +200,15 @@ class Fitter:
 
     def cost(self, fit: Fit) -> float:
         """Chi-square of a fit under this fitter's noise, with priors."""
-        return float(self.chi_square(fit.space, fit.theta, fit.linearised.readings))
+        return float(self.chi_square(fit.space, fit.theta, self.residual(fit.linearised.readings)))
 
     def white(self, linearised: Linearised) -> tuple[Tensor, Tensor]:
         """Whitened residual (L, S, C) and Jacobian (L, S, C, P)."""
-        residual = self.whiten(self.data.readings - linearised.readings)
-        return residual, self.whiten(linearised.jacobian)
+        return self.residual(linearised.readings), self.whiten(linearised.jacobian)
+
+    def residual(self, readings: Tensor) -> Tensor:
+        """Whitened residual (L, S, C) of modelled readings (L, S, C)."""
+        return self.whiten(self.data.readings - readings)
 
     def whiten(self, x: Tensor) -> Tensor:
         """Whiten x (*lanes, S, C) or (*lanes, S, C, P): unit variance, no correlation."""

@@ -10,7 +10,8 @@ import torch
 
 from fdi_torch.gap.answer import UNKNOWN, Answer, CauseName, Verdict
 from fdi_torch.gap.answer_assembly import build_answer
-from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise, estimate_noise, quantization_step
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.diagnosis_result import DiagnosisResult

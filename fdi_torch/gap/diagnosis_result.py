@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fdi_torch.gap.answer import CauseName, Verdict
-from fdi_torch.gap.candidate_fit import Fit, Fitter, unexplained_chi_square
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter, unexplained_chi_square
 from fdi_torch.gap.posterior import CauseHypothesis, Posterior
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
 from fdi_torch.gap.structure_search import SearchResult

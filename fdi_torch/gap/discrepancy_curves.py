@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.free_form import UNIT, free_form, is_free_coefficient
 from fdi_torch.gap.free_form_coefficients import coefficients_of, fitted_coefficients
 from fdi_torch.plant.description import OUTSIDE, Sensor, Tank

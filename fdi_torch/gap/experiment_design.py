@@ -14,7 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from fdi_torch.gap.candidate_fit import Candidate, Fit, Key
+from fdi_torch.gap.candidate import Candidate, Fit, Key
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult
 
 

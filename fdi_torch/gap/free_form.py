@@ -13,7 +13,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.parameters import Parameter, ParameterName
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription, Sensor

@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Fit, Fitter, covariance
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter, covariance
 from fdi_torch.gap.free_form import UNIT
 from fdi_torch.gap.screening import Option, effect_columns, options_of
 from fdi_torch.parameters import ParameterName

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise, estimate_noise, with_rounding
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.free_form import is_free_coefficient

@@ -21,7 +21,8 @@ from fdi_torch.estimate.evidence import log_prior as prior_of_set
 from fdi_torch.estimate.kalman import KalmanWhitening, Propagation, SensorNoise, StateNoise
 from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.resampling import interpolate
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation, Linearised

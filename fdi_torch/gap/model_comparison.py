@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Fit
+from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.dataset import DataSet, at_recorded_times
 from fdi_torch.gap.diagnosis_result import DiagnosisResult
 from fdi_torch.gap.free_form import free_form

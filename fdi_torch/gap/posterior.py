@@ -17,7 +17,8 @@ from dataclasses import dataclass, replace
 
 from fdi_torch.estimate.evidence import ODDS, RARE, posterior
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.library import canonical, tanks_of
 from fdi_torch.gap.localization.localize import FitBeside, localize
 from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy

@@ -10,7 +10,8 @@ from typing import Any
 import torch
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.channel_noise import low_frequency_excess
 from fdi_torch.gap.dataset import RecordingPart
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_square

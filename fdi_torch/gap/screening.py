@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.forcing import Forcing
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace
 from fdi_torch.plant.effect import Placement, Stage

@@ -22,11 +22,13 @@ from torch import Tensor
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.candidate_fit import BEHIND, SHARE, Candidate, Fit, Fitter, Key
+from fdi_torch.gap.candidate import Candidate, Fit, Key
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.extensions import ExpectedGain, best_pairs, extended, log_prior_width
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
 from fdi_torch.gap.onsets import fine_onsets, likeliest_intervals
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
+from fdi_torch.gap.trajectory_problem import BEHIND, SHARE
 
 # DEEPEST, BEAM, FITTED, STARTS, EVALUATED, TURNS and PAIRS are budgets of computing. An extension that FITTED,
 # EVALUATED and TURNS leave out keeps its share of the posterior, `SearchResult.unexamined`.

@@ -6,17 +6,24 @@ compared only where both trajectories satisfy the model: a step whose trajectory
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.linearisation import Linearisation
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.simulate.collocation import Collocation, Linearised
-from fdi_torch.simulate.joint_collocation import JointCollocation
+from fdi_torch.simulate.collocation import Linearised
 
+# A fit has converged if a further step is predicted to gain less than this share of the chi-square per reading, or of
+# one if that is more. Parameters are then within a tenth of a standard error, misfit included.
+DECREMENT = 0.01
+CAP = 200  # evaluations, a guard against descents without an end
+# A start is given up if it is so many chi-square units behind and gains less than a quarter of that in a step.
+BEHIND, SHARE = 30.0, 0.25
 CORRECTIONS = 6  # most Newton steps after the parameters moved a trajectory
 FAR = 1e-3  # largest defect of a converged trajectory, in units of the plant's length scale
 NEARLY = 10.0  # in units of FAR: a defect that one correction removes
@@ -29,11 +36,16 @@ class Objective(Protocol):
     far: largest defect (m) of a trajectory that counts as converged.
     """
 
-    far: float
+    @property
+    def far(self) -> float: ...
 
     def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]: ...
 
-    def chi_square(self, space: ParameterSpace, theta: Tensor, readings: Tensor) -> Tensor: ...
+    def priors(self, space: ParameterSpace, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]: ...
+
+    def chi_square(self, space: ParameterSpace, theta: Tensor, residual: Tensor) -> Tensor: ...
+
+    def residual(self, readings: Tensor) -> Tensor: ...
 
     def normal(
         self, space: ParameterSpace, theta: Tensor, residual: Tensor, jacobian: Tensor, scale: Tensor
@@ -80,10 +92,22 @@ class TrialTrajectory:
         return TrialTrajectory(*(mine.index_copy(0, which, other) for mine, other in pairs))
 
 
+class Engine(Protocol):
+    """Trajectories of a plant and their derivatives; see `Collocation`."""
+
+    space: ParameterSpace
+
+    def linearise(self, theta: Tensor, levels: Tensor) -> Linearised: ...
+
+    def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]: ...
+
+    def read(self, levels: Tensor, theta: Tensor) -> Tensor: ...
+
+
 class TrajectoryProblem:
     """Half of chi-square as a least-squares problem, in which every point keeps its linearised trajectory."""
 
-    def __init__(self, objective: Objective, engine: Collocation | JointCollocation, levels: Tensor) -> None:
+    def __init__(self, objective: Objective, engine: Engine, levels: Tensor) -> None:
         self.objective, self.engine, self.levels = objective, engine, levels
         self.box = objective.box(engine.space)
 
@@ -101,7 +125,7 @@ class TrajectoryProblem:
         guess = (near or linearised).levels + shift
         levels, defect = corrected_trajectories(self.engine, theta, guess, far)
         readings = self.engine.read(levels, theta)
-        cost = 0.5 * self.objective.chi_square(self.engine.space, theta, readings)
+        cost = 0.5 * self.objective.chi_square(self.engine.space, theta, self.objective.residual(readings))
         allowed = linearised.defect.clamp(min=far)
         cost = torch.where(defect <= allowed.clamp(min=NEARLY * far), cost, torch.inf)
         return TrialTrajectory(cost, levels, readings, allowed)
@@ -130,14 +154,43 @@ class TrajectoryProblem:
         return Linearisation(0.5 * cost, -descent / scale, curvature / (scale * scale.unsqueeze(-1)), state)
 
 
+@dataclass(frozen=True)
+class DescentResult:
+    """End points of descents: theta (L, P), cost (L,) chi-square, linearised trajectories, converged (L,) bool."""
+
+    theta: Tensor
+    cost: Tensor
+    linearised: Linearised
+    converged: Tensor
+
+
+def descend(
+    problem: TrajectoryProblem,
+    theta: Tensor,
+    readings: int,
+    target: float = math.inf,
+    cap: int = CAP,
+    decrement: float = DECREMENT,
+    box: tuple[Tensor, Tensor] | None = None,
+) -> DescentResult:
+    """Least squares from theta (L, P). readings: number of valid ones. target: cost of a competitor, see BEHIND.
+    cap: most evaluations. decrement: as DECREMENT. box: lower and upper bounds of each lane, (L, P) each."""
+    # The optimiser's cost is a negative log-likelihood, half of chi-square.
+    competition = Competition(0.5 * BEHIND, SHARE, 0.5 * target)
+    share = decrement / max(readings, 1)
+    settings = RefineSettings(cap, 0.5 * decrement, share, step_tolerance=0.0, competition=competition)
+    low, high = box or problem.box[:2]
+    minimum = levenberg_marquardt(problem.linearise, theta, low, high, settings, neighbourhood=problem)
+    assert isinstance(minimum.state, FittedTrajectory)
+    return DescentResult(minimum.theta, 2.0 * minimum.cost, minimum.state.linearised, minimum.converged)
+
+
 def _fitted(model: Linearisation) -> FittedTrajectory:
     assert isinstance(model.state, FittedTrajectory)
     return model.state
 
 
-def corrected_trajectories(
-    engine: Collocation | JointCollocation, theta: Tensor, guess: Tensor, far: float
-) -> tuple[Tensor, Tensor]:
+def corrected_trajectories(engine: Engine, theta: Tensor, guess: Tensor, far: float) -> tuple[Tensor, Tensor]:
     """Trajectories (L, K+1, n) after Newton steps from a guess while these converge, and their last defects (L,), m."""
     levels, lanes = guess, torch.arange(len(theta))
     defect = torch.full((len(theta),), torch.inf, dtype=guess.dtype)
@@ -154,7 +207,7 @@ def corrected_trajectories(
 
 
 def _correct(
-    engine: Collocation | JointCollocation,
+    engine: Engine,
     theta: Tensor,
     linearised: Linearised,
     far: float,

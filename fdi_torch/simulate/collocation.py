@@ -28,7 +28,7 @@ from fdi_torch.simulate.actuation import Actuation, with_parameters
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.midpoint import newton_step
 from fdi_torch.simulate.output_map import LinearisedOutputs, OutputMap
-from fdi_torch.simulate.pointwise import partials
+from fdi_torch.simulate.pointwise import partials, partials_of
 from fdi_torch.simulate.scan import scan_in_time
 
 # Newton's method has converged at corrections below these, in units of the plant's length scale: of the whole plant,
@@ -67,18 +67,24 @@ class Linearised:
 
 
 class Collocation:
-    """Readings of a plant and their Jacobian for many parameter vectors, from approximate trajectories."""
+    """Readings of a plant and their Jacobian for many parameter vectors, from approximate trajectories.
 
-    def __init__(self, network: TankNetwork, space: ParameterSpace, experiment: Experiment) -> None:
+    by: the P parameters by which it differentiates; all of the space by default.
+    """
+
+    def __init__(
+        self, network: TankNetwork, space: ParameterSpace, experiment: Experiment, by: Sequence[str] | None = None
+    ) -> None:
         self.network, self.space, self.experiment = network, space, experiment
+        self.by = space.names if by is None else tuple(by)
         tanks = [f"{t.name}.start_level" for t in network.description.tanks]
-        self._start_columns = {space.index(name): i for i, name in enumerate(tanks) if name in space}
-        self._moving = [j for j in range(len(space)) if j not in self._start_columns]
+        self._start_columns = {self.by.index(name): i for i, name in enumerate(tanks) if name in self.by}
+        self._moving = [q for q in range(len(self.by)) if q not in self._start_columns]
         self._without_overflow = network.without_overflow()
         self._rims = [t.height for t in network.description.tanks]
         self._effect_states = network.order - len(tanks)
         self._length = length_scale(network.description)
-        self._names = [space.names[j] for j in self._moving]
+        self._names = [self.by[q] for q in self._moving]
         self._actuation = Actuation(network, experiment, self._names)
         self._output_map = OutputMap(network, experiment, self._names)
         self._fixed_commands: list[Tensor] | None = None
@@ -89,16 +95,16 @@ class Collocation:
         A trajectory of the tanks' levels alone (n = tanks) is completed by the steady states of the effects.
         """
         lanes, nodes, _ = levels.shape
-        what = f"{lanes} trajectories of {nodes:.3g} steps with {len(self.space)} sensitivities each"
+        what = f"{lanes} trajectories of {nodes:.3g} steps with {len(self.by)} sensitivities each"
         expect_room(
-            float(lanes * nodes * self.network.order) * (self.network.order + len(self.space)),
+            float(lanes * nodes * self.network.order) * (self.network.order + len(self.by)),
             what,
             "choose a longer step",
         )
         path = self._path(theta, levels)
         middle = 0.5 * (path[..., :-1] + path[..., 1:])
         values = self.network.bind(self.space, theta.unsqueeze(-2))
-        rates, by_level, by_theta = self._rate_slopes(middle, values, self._columns(theta), len(self.space))
+        rates, by_level, by_theta = self._rate_slopes(middle, values, self._columns(theta), len(self.by))
         step = self.experiment.steps
         start, start_slopes = self._start(theta, values)
         corrected, slopes, transition, gain, defect = newton_step(
@@ -180,7 +186,7 @@ class Collocation:
 
     def _columns(self, theta: Tensor) -> list[Tensor]:
         """The parameters other than start levels, each (L, 1)."""
-        return [theta[:, j, None] for j in self._moving]
+        return [theta[:, self.space.index(name), None] for name in self._names]
 
     def _path(self, theta: Tensor, levels: Tensor) -> Tensor:
         """Trajectories (L, n, K+1) from levels (L, K+1, n) or (L, K+1, tanks)."""
@@ -198,7 +204,7 @@ class Collocation:
         """The state at the start (L, n) and its slopes (L, n, P), or zeros instead of them."""
         lanes = len(theta)
         start = torch.cat([h.expand(lanes, 1) for h in self.network.start_levels(values)], dim=1)
-        by_theta = theta.new_zeros(*start.shape, theta.shape[-1])
+        by_theta = theta.new_zeros(*start.shape, len(self.by))
         for column, tank in self._start_columns.items():
             by_theta[:, tank, column] = 1.0
         if not self._effect_states:
@@ -236,7 +242,7 @@ class Collocation:
 
     def _jacobian(self, look: LinearisedOutputs, slopes: Tensor) -> Tensor:
         """Slopes of the levels (L, tanks, P, K+1) -> slopes of the readings (L, C, P, S)."""
-        moves = [-1] * len(self.space)
+        moves = [-1] * len(self.by)
         for q, column in enumerate(self._moving):
             moves[column] = q
         return look.along(slopes, moves)
@@ -263,7 +269,11 @@ class Collocation:
             return network.rates(x[:n], commands_at, self._actuation.clock, bound)
 
         inputs = [*middle.unbind(1), *(commands[i] for i in driven), *moving]
-        values_at, rows = partials(rates, inputs, shape)
+        moved = tuple(self._names) if moving else ()
+        plant, placements = network.description, tuple(p.prefix for p in network.placements)
+        components = plant.tanks, plant.pipes, plant.pumps, plant.weirs, plant.transfers
+        known = partials_of(components, placements, moved, tuple(driven), reaches_rim)
+        values_at, rows = known(rates, inputs, shape)
         by_level, by_theta = (middle.new_zeros(lanes, n, m, steps) for m in (n, width))
         for i, row in enumerate(rows):
             for j in range(n):

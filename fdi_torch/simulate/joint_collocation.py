@@ -23,13 +23,16 @@ class JointCollocation:
     def __init__(self, parts: Sequence[Collocation], space: ParameterSpace) -> None:
         """parts: one collocation per recording, with names without '@' in its space."""
         self.parts, self.space = tuple(parts), space
-        self._columns = [
-            torch.tensor(
-                [space.index(n if (m := name_in_recording(n, k)) not in space else m) for n in part.space.names]
-            )
-            for k, part in enumerate(parts)
-        ]
+        own = [[self._joint_name(n, k) for n in part.space.names] for k, part in enumerate(parts)]
+        by = [[self._joint_name(n, k) for n in part.by] for k, part in enumerate(parts)]
+        self.by = tuple(n for n in space.names if any(n in names for names in by))
+        self._columns = [torch.tensor([space.index(n) for n in names]) for names in own]
+        self._slope_columns = [torch.tensor([self.by.index(n) for n in names], dtype=torch.int64) for names in by]
         self._nodes = [len(part.experiment.nodes) for part in parts]
+
+    def _joint_name(self, name: str, recording: int) -> str:
+        """The name of a parameter of one recording in the space of all."""
+        return own if (own := name_in_recording(name, recording)) in self.space else name
 
     @property
     def network(self) -> TankNetwork:
@@ -106,8 +109,8 @@ class JointCollocation:
 
     def _spread(self, slopes: Tensor, recording: int) -> Tensor:
         """Slopes by one recording's parameters (..., p) -> by all parameters (..., P)."""
-        full = slopes.new_zeros(*slopes.shape[:-1], len(self.space))
-        return full.index_copy_(-1, self._columns[recording], slopes)
+        full = slopes.new_zeros(*slopes.shape[:-1], len(self.by))
+        return full.index_copy_(-1, self._slope_columns[recording], slopes)
 
 
 def with_blanks(pieces: Sequence[Tensor], dim: int = 1) -> Tensor:

@@ -18,7 +18,8 @@ import torch
 
 from fdi_torch.effects import build_network, effect
 from fdi_torch.gap.answer import with_constants
-from fdi_torch.gap.candidate_fit import Candidate, Fit, Fitter, standard_errors
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.channel_noise import Noise, estimate_noise
 from fdi_torch.gap.dataset import DataSet, RecordingPart
 from fdi_torch.gap.free_runs.between_runs import DETERMINED, RunConstant

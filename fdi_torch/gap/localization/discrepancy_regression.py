@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.forcing import Forcing
 from fdi_torch.gap.localization.component_regressors import (
     DiscrepancyModel,

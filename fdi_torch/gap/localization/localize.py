@@ -17,7 +17,8 @@ from torch import Tensor
 
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import StateNoise
-from fdi_torch.gap.candidate_fit import SHARE, Candidate, Fit, Fitter
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import Positions, with_best_frequency
 from fdi_torch.gap.localization.localized_discrepancy import (
@@ -33,6 +34,7 @@ from fdi_torch.gap.localization.single_regressor_gain import largest_influence, 
 from fdi_torch.gap.localization.sparse_regression import SparseFit, column_costs
 from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import LinearParameters, estimate_disturbances, occam, with_disturbances
+from fdi_torch.gap.trajectory_problem import SHARE
 
 STEPS = 120  # step functions of time
 MOST_TURNS = 12  # alternations between the disturbance noise, one more regressor, and the parameters of the fit

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.kalman import StateNoise
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
 from fdi_torch.simulate.collocation import Linearised
 

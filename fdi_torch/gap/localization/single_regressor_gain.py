@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.component_regressors import discrepancy_model_at
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
 from fdi_torch.gap.localization.sparse_regression import column_costs

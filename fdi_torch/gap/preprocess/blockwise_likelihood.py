@@ -21,10 +21,11 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.candidate_fit import BEHIND, CAP, SHARE, Candidate, Fit, Fitter
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, data_set_of
-from fdi_torch.gap.trajectory_problem import corrected_trajectories
+from fdi_torch.gap.trajectory_problem import BEHIND, CAP, SHARE, corrected_trajectories
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription

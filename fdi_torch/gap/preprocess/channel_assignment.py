@@ -15,7 +15,7 @@ from itertools import combinations
 
 from torch import Tensor
 
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, WeightedFault
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Suspicion
 from fdi_torch.gap.preprocess.recording_fault_texts import swapped, wrong_unit
 from fdi_torch.recording import Recording
 
@@ -23,7 +23,7 @@ DECADES = (-3, -2, -1, 1, 2, 3)
 """Powers of ten by which a unit can be wrong; millimetres instead of metres at most."""
 
 
-def units_of_sensors(fits: CorrectedFits) -> Iterator[WeightedFault]:
+def units_of_sensors(fits: CorrectedFits) -> Iterator[Suspicion]:
     """Wrong units of sensors; the power of ten follows from the ratio of median readings."""
     r, readings, model = fits.thinned, fits.as_is.blocked.data.readings, fits.as_is.readings
     for i, sensor in enumerate(fits.plant.sensors):
@@ -40,18 +40,16 @@ def units_of_sensors(fits: CorrectedFits) -> Iterator[WeightedFault]:
         noise[i] /= 10.0**decade
         # Jacobian of the change of unit: an error of the level is 10^k times as large in the recorded numbers.
         jacobian = float(fits.as_is.means[i]) * decade * math.log(10.0)
-        if fits.worth_fitting(fits.first_order_gain(corrected, noise) - jacobian):
-            yield fits.weighted(wrong_unit(sensor.column, decade), corrected, noise, jacobian)
+        yield from fits.suspicion(wrong_unit(sensor.column, decade), corrected, noise, jacobian)
 
 
-def units_of_inputs(fits: CorrectedFits) -> Iterator[WeightedFault]:
+def units_of_inputs(fits: CorrectedFits) -> Iterator[Suspicion]:
     """The likeliest wrong unit of each input."""
     for channel in fits.plant.channels():
         corrected = {decade: _with_unit(fits.thinned, channel, decade) for decade in DECADES}
         gains = {decade: fits.first_order_gain(each) for decade, each in corrected.items()}
         decade = max(gains, key=gains.__getitem__)
-        if fits.worth_fitting(gains[decade]):
-            yield fits.weighted(wrong_unit(channel, decade), corrected[decade])
+        yield from fits.suspicion(wrong_unit(channel, decade), corrected[decade])
 
 
 def _with_unit(recording: Recording, channel: str, decade: int) -> Recording:
@@ -60,7 +58,7 @@ def _with_unit(recording: Recording, channel: str, decade: int) -> Recording:
     return replace(recording, inputs=inputs)
 
 
-def swapped_sensors(fits: CorrectedFits) -> Iterator[WeightedFault]:
+def swapped_sensors(fits: CorrectedFits) -> Iterator[Suspicion]:
     """The likeliest pair of swapped sensors of one calibration."""
     pairs = [
         (a.column, b.column)
@@ -76,7 +74,7 @@ def swapped_sensors(fits: CorrectedFits) -> Iterator[WeightedFault]:
     return _likeliest_swap(fits, pairs, correct)
 
 
-def swapped_inputs(fits: CorrectedFits) -> Iterator[WeightedFault]:
+def swapped_inputs(fits: CorrectedFits) -> Iterator[Suspicion]:
     """The likeliest pair of swapped inputs of one unit."""
     units, r = fits.plant.channel_units(), fits.thinned
     pairs = [(a, b) for a, b in combinations(fits.plant.channels(), 2) if units[a] == units[b]]
@@ -87,12 +85,12 @@ def swapped_inputs(fits: CorrectedFits) -> Iterator[WeightedFault]:
 
 def _likeliest_swap(
     fits: CorrectedFits, pairs: Iterable[tuple[str, str]], correct: Callable[[str, str], tuple[Recording, Tensor]]
-) -> Iterator[WeightedFault]:
-    """The pair with the largest gain, if it is worth a fit. correct: the recording with a pair exchanged, its noise."""
+) -> Iterator[Suspicion]:
+    """The pair with the largest gain. correct: the recording with a pair exchanged, its noise."""
     gains = {pair: fits.first_order_gain(*correct(*pair)) for pair in pairs}
     pair = max(gains, key=gains.__getitem__, default=None)
-    if pair and fits.worth_fitting(gains[pair]):
-        yield fits.weighted(swapped(*pair), *correct(*pair))
+    if pair:
+        yield from fits.suspicion(swapped(*pair), *correct(*pair))
 
 
 def _exchanged(names: tuple[str, ...], a: str, b: str) -> tuple[str, ...]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, WeightedFault
-from fdi_torch.gap.preprocess.recording_fault_texts import clock_offset
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Suspicion, WeightedFault
+from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, clock_offset
 from fdi_torch.gap.resampling import interpolate
 from fdi_torch.recording import Recording
 
@@ -23,25 +24,31 @@ DELAY_TOLERANCE = 0.05
 """Share of a sampling interval; a smaller correction of the clock offset ends the iteration."""
 
 
-def clock_offsets(fits: CorrectedFits) -> Iterator[WeightedFault]:
-    """Clock offsets of all sensors together and of each sensor alone; the delay by Gauss-Newton."""
+def clock_offsets(fits: CorrectedFits) -> Iterator[Suspicion]:
+    """Clock offsets of all sensors together and of each sensor alone."""
     sensors = range(len(fits.plant.sensors))
-    interval = fits.as_is.blocked.recording.interval
     for late in [list(sensors), *([i] for i in sensors if len(sensors) > 1)]:
-        delay = _initial_delay(fits.as_is, late)
-        if delay == 0.0 or not fits.worth_fitting(fits.first_order_gain(_shifted(fits, late, delay))):
-            continue
+        if delay := _initial_delay(fits.as_is, late):
+            weigh = partial(_weighted, fits, late, delay)
+            yield from fits.suspicion(_fault(fits, late, delay), _shifted(fits, late, delay), weigh=weigh)
+
+
+def _weighted(fits: CorrectedFits, late: list[int], delay: float) -> WeightedFault:
+    """A clock offset with the delay (s) by Gauss-Newton from an initial one."""
+    corrected = fits.fit(_shifted(fits, late, delay))
+    for _ in range(DELAY_CORRECTIONS):
+        correction = _remaining_delay(corrected, late)
+        delay += correction
         corrected = fits.fit(_shifted(fits, late, delay))
-        for _ in range(DELAY_CORRECTIONS):
-            correction = _remaining_delay(corrected, late)
-            delay += correction
-            corrected = fits.fit(_shifted(fits, late, delay))
-            if abs(correction) < DELAY_TOLERANCE * interval:
-                break
-        cost = 0.5 * math.log(float(corrected.means.sum()))
-        columns = tuple(fits.plant.sensors[i].column for i in late)
-        fault = clock_offset(columns, delay, len(late) == len(sensors))
-        yield WeightedFault(fault, fits.prior + corrected.log_likelihood - cost)
+        if abs(correction) < DELAY_TOLERANCE * fits.as_is.blocked.recording.interval:
+            break
+    cost = 0.5 * math.log(float(corrected.means.sum()))
+    return WeightedFault(_fault(fits, late, delay), fits.prior + corrected.log_likelihood - cost)
+
+
+def _fault(fits: CorrectedFits, late: list[int], delay: float) -> RecordingFault:
+    columns = tuple(fits.plant.sensors[i].column for i in late)
+    return clock_offset(columns, delay, len(late) == len(fits.plant.sensors))
 
 
 def _shifted(fits: CorrectedFits, late: list[int], delay: float) -> Recording:

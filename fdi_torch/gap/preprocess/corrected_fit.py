@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -26,6 +27,16 @@ class WeightedFault:
 
     fault: RecordingFault
     log_weight: float
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """A fault that is worth a fit. fault: what it would be; a fit may change its number. weigh: fits it.
+    log_weight: log posterior weight to first order in the constants."""
+
+    fault: RecordingFault
+    log_weight: float
+    weigh: Callable[[], WeightedFault]
 
 
 @dataclass(frozen=True)
@@ -55,11 +66,25 @@ class CorrectedFits:
         """The plant fitted to a corrected recording. noise (C,): of its sensors, if the correction changes it."""
         return blockwise_fit(self._blocked(corrected, noise), base=self.as_is)
 
-    def weighted(
-        self, fault: RecordingFault, corrected: Recording, noise: Tensor | None = None, cost: float = 0.0
-    ) -> WeightedFault:
-        """A fault whose correction is this recording. noise: as in `fit`. cost: subtracted from the log-likelihood."""
-        return WeightedFault(fault, self.prior + self.fit(corrected, noise).log_likelihood - cost)
+    def suspicion(
+        self,
+        fault: RecordingFault,
+        corrected: Recording,
+        noise: Tensor | None = None,
+        cost: float = 0.0,
+        weigh: Callable[[], WeightedFault] | None = None,
+    ) -> Iterator[Suspicion]:
+        """A fault whose correction is this recording, if its gain to first order exceeds the cost of its prior.
+
+        noise: as in `fit`. cost: subtracted from the log-likelihood. weigh: if one fit to this recording is not enough.
+        """
+        gain = self.first_order_gain(corrected, noise) - cost
+
+        def by_one_fit() -> WeightedFault:
+            return WeightedFault(fault, self.prior + self.fit(corrected, noise).log_likelihood - cost)
+
+        if gain + self.prior > 0.0:
+            yield Suspicion(fault, self.as_is.log_likelihood + gain + self.prior, weigh or by_one_fit)
 
     def first_order_gain(self, corrected: Recording, noise: Tensor | None = None) -> float:
         """Gain in log-likelihood to first order in the constants. noise: as in `fit`.
@@ -67,10 +92,6 @@ class CorrectedFits:
         The constants have to be free: those of the uncorrected fit were adapted to the wrong recording.
         """
         return first_order_log_likelihood(self._blocked(corrected, noise), self.as_is) - self.as_is.log_likelihood
-
-    def worth_fitting(self, gain: float) -> bool:
-        """Whether a gain in log-likelihood exceeds the cost of the prior."""
-        return gain + self.prior > 0.0
 
     def _blocked(self, corrected: Recording, noise: Tensor | None) -> BlockedRecording:
         return blocked_recording(self.plant, thinned(corrected), self.noise if noise is None else noise)

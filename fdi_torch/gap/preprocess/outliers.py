@@ -16,7 +16,8 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.gap.candidate import Candidate
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, at_recorded_times
 from fdi_torch.recording import Recording

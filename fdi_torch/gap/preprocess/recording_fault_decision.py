@@ -3,17 +3,21 @@
     P(fault) = sum of the weights of all faults / (that sum + weights of the recording as it is)
 
 The recording as it is competes without an effect and with one or two effects of the library, so that an unusual plant
-does not pass for a wrong recording. A fault is reported if P(fault) exceeds 95 %.
+does not pass for a wrong recording. A fault is reported if P(fault) exceeds 95 %. Single effects are fitted before any
+fault: with most deviations of a plant, one of them leaves no room for a fault.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import islice
 
 import torch
 
-from fdi_torch.gap.candidate_fit import Candidate, Fitter
+from fdi_torch.estimate.evidence import RARE
+from fdi_torch.gap.candidate import Candidate
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.marginal_likelihood import log_prior
@@ -25,9 +29,9 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     thinned,
 )
 from fdi_torch.gap.preprocess.channel_assignment import DECADES
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, WeightedFault
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Suspicion, WeightedFault
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault
-from fdi_torch.gap.preprocess.recording_faults import weighted_faults
+from fdi_torch.gap.preprocess.recording_faults import suspicions
 from fdi_torch.gap.screening import Option, options_of, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import operating_range_of_all, with_simulated_levels
@@ -56,19 +60,46 @@ def recording_fault(
     as_is = blockwise_fit(blocked_recording(plant, thinned(recording), noise))
     count = len(plant.sensors) + len(plant.channels())
     prior = math.log(FAULT_PROBABILITY / (len(DECADES) * count + math.comb(count, 2) + 2 * len(plant.sensors) + 1))
-    if as_is.most + prior < as_is.log_likelihood + log_odds(SURE):
-        return None  # even a perfect fit of a corrected recording would not reach 95 %
-    faults = list(weighted_faults(CorrectedFits(plant, recording, as_is, noise, prior), constant))
-    rivals = [as_is.log_likelihood]
-    if not faults or not _surely_faulty(faults, rivals):
+    most = as_is.most + prior - log_odds(SURE)  # what a perfect fit of a corrected recording allows the others
+    if most < as_is.log_likelihood:
         return None
-    silent = {c for f in faults if f.fault.silent for c in f.fault.channels}
-    target = max(f.log_weight for f in faults) - log_odds(SURE)
-    for rival in _weights_with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}, target):
+    suspected = list(suspicions(CorrectedFits(plant, recording, as_is, noise, prior), constant))
+    if not suspected:
+        return None
+    silent = {c for s in suspected if s.fault.silent for c in s.fault.channels}
+    target = max(s.log_weight for s in suspected) - log_odds(SURE)
+    others = _weights_with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}, target)
+    rivals = [as_is.log_likelihood]
+    for rival in islice(others, RIVALS):
+        rivals.append(rival)
+        if most < rival:
+            return None
+    faults = _weighed(suspected, as_is.log_likelihood, max(rivals))
+    if not _surely_faulty(faults, rivals):
+        return None
+    for rival in others:
         rivals.append(rival)
         if not _surely_faulty(faults, rivals):
             return None
     return max(faults, key=lambda f: f.log_weight).fault
+
+
+def _weighed(suspected: Sequence[Suspicion], base: float, rival: float) -> list[WeightedFault]:
+    """The fitted faults, without those that cannot be relevant against the likeliest fault or the likeliest rival.
+
+    base: log-likelihood of the recording as it is. A fit may gain more than its first-order estimate, by the largest
+    factor among all faults that were fitted so far.
+    """
+    faults: list[WeightedFault] = []
+    factor = 1.0
+    for s in sorted(suspected, key=lambda s: -s.log_weight):
+        best = max([rival, *(f.log_weight for f in faults)])
+        if faults and base + factor * (s.log_weight - base) < best + math.log(RARE):
+            continue
+        faults.append(s.weigh())
+        if s.log_weight > base:
+            factor = max(factor, (faults[-1].log_weight - base) / (s.log_weight - base))
+    return faults
 
 
 def log_odds(probability: float) -> float:

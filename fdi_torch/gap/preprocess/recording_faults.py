@@ -21,12 +21,12 @@ from fdi_torch.gap.preprocess.channel_assignment import (
     units_of_sensors,
 )
 from fdi_torch.gap.preprocess.clock_offset import clock_offsets
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, WeightedFault
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Suspicion
 from fdi_torch.gap.preprocess.silent_sensors import silent_sensors
 
 
-def weighted_faults(fits: CorrectedFits, constant: Collection[str]) -> Iterator[WeightedFault]:
-    """All fitted hypotheses. constant: columns of sensors that never move."""
+def suspicions(fits: CorrectedFits, constant: Collection[str]) -> Iterator[Suspicion]:
+    """All hypotheses that are worth a fit. constant: columns of sensors that never move."""
     yield from units_of_sensors(fits)
     yield from swapped_sensors(fits)
     yield from clock_offsets(fits)

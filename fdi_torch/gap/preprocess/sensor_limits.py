@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import effect
-from fdi_torch.gap.candidate_fit import Fit, Fitter
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.plant.description import PlantDescription

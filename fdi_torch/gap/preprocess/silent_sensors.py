@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 
+import torch
+
 from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, WeightedFault
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Suspicion, WeightedFault
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, stuck, unrelated
 
 
-def silent_sensors(fits: CorrectedFits, constant: Collection[str]) -> Iterator[WeightedFault]:
+def silent_sensors(fits: CorrectedFits, constant: Collection[str]) -> Iterator[Suspicion]:
     """Sensors whose noise exceeds the movement of their level, and sets of sensors that never move.
 
     constant: columns of the latter.
@@ -26,7 +28,7 @@ def silent_sensors(fits: CorrectedFits, constant: Collection[str]) -> Iterator[W
     still = [i for i in readable if fits.plant.sensors[i].column in constant]
     for i in readable:
         if i not in still and float(fits.noise[i]) > float(moves[i]):
-            yield _weighted(fits, unrelated(fits.plant.sensors[i]), [i], _fit_without(fits, [i]))
+            yield _suspicion(fits, unrelated(fits.plant.sensors[i]), [i])
     if not still:
         return
     model = _fit_without(fits, still).readings
@@ -38,14 +40,20 @@ def silent_sensors(fits: CorrectedFits, constant: Collection[str]) -> Iterator[W
     ordered = sorted(still, key=gain, reverse=True)
     for count in range(1, len(ordered) + 1):
         some = ordered[:count]
-        fault = stuck([fits.plant.sensors[i].column for i in some])
-        yield _weighted(fits, fault, some, _fit_without(fits, some))
+        yield _suspicion(fits, stuck([fits.plant.sensors[i].column for i in some]), some)
 
 
-def _weighted(fits: CorrectedFits, fault: RecordingFault, silent: list[int], others: BlockwiseFit) -> WeightedFault:
+def _suspicion(fits: CorrectedFits, fault: RecordingFault, silent: list[int]) -> Suspicion:
     """The hypothesis that these sensors are silent, each for a reason of its own."""
-    scatter = sum(_log_likelihood(fits, i) for i in silent)
-    return WeightedFault(fault, len(silent) * fits.prior + others.log_likelihood + scatter)
+    known = len(silent) * fits.prior + sum(_log_likelihood(fits, i) for i in silent)
+
+    def weigh() -> WeightedFault:
+        return WeightedFault(fault, known + _fit_without(fits, silent).log_likelihood)
+
+    # The other sensors are fitted at least as well as before.
+    others = [i for i in range(len(fits.plant.sensors)) if i not in silent]
+    as_before = -0.5 * float((fits.as_is.means * torch.log(fits.as_is.variance))[others].sum())
+    return Suspicion(fault, known + as_before - 0.5 * fits.as_is.prior_chi_square, weigh)
 
 
 def _fit_without(fits: CorrectedFits, sensors: list[int]) -> BlockwiseFit:
