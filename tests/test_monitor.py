@@ -55,9 +55,11 @@ Truth = Callable[[float], Tensor]
 
 
 def constant_parts(truth: Truth, samples: int) -> Iterator[tuple[Tensor, int, int]]:
-    """Parameters, first sample and the one after the last, of parts with constant parameters."""
-    first, theta = 0, truth(-0.5)
-    for k in range(1, samples):
+    """Parameters, first sample and the one after the last, of parts with constant parameters; the first sample has
+    those of the step after it.
+    """
+    first, theta = 0, truth(0.5)
+    for k in range(2, samples):
         if not torch.equal(following := truth(k - 0.5), theta):
             yield theta, first, k
             first, theta = k, following
