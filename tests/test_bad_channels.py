@@ -102,29 +102,24 @@ def test_a_stuck_sensor_is_masked_and_reported(column: int, value: float | None,
     assert f"h{column + 1} is stuck at" in found.recording.notes[-1]
 
 
-@pytest.mark.parametrize("factor", [1e-3, 0.1, *(pytest.param(f, marks=pytest.mark.slow) for f in (1e-2, 10.0, 1e3))])
+@pytest.mark.parametrize("factor", [0.1, *(pytest.param(f, marks=pytest.mark.slow) for f in (1e-3, 10.0))])
 def test_a_wrong_unit_is_refused(factor: float) -> None:
     run = sound()
     with pytest.raises(ValueError, match=r"h3: its unit seems wrong: its values are \d+ times too"):
         usable(nominal_plant(), with_channel(run, 2, factor * run.outputs[:, 2]))
 
 
-@pytest.mark.parametrize("pump", [0, 1])
-def test_a_command_in_the_wrong_unit_is_refused(pump: int) -> None:
+def test_a_command_in_the_wrong_unit_is_refused() -> None:
     run = sound()
-    inputs = run.inputs.clone()
-    inputs[:, pump] *= 0.1
-    with pytest.raises(ValueError, match=f"Q{pump + 1}: its unit seems wrong: its values are 10 times too small"):
+    inputs = run.inputs * torch.tensor([1.0, 0.1], dtype=torch.float64)
+    with pytest.raises(ValueError, match="Q2: its unit seems wrong: its values are 10 times too small"):
         usable(nominal_plant(), replace(run, inputs=inputs))
 
 
-@pytest.mark.parametrize("pair", [(0, 1), (0, 2)])
-def test_swapped_sensors_are_refused(pair: tuple[int, int]) -> None:
-    run, (i, j) = sound(), pair
-    outputs = run.outputs.clone()
-    outputs[:, [i, j]] = outputs[:, [j, i]]
-    with pytest.raises(ValueError, match=f"h{i + 1} and h{j + 1} seem to be swapped"):
-        usable(nominal_plant(), replace(run, outputs=outputs))
+def test_swapped_sensors_are_refused() -> None:
+    run = sound()
+    with pytest.raises(ValueError, match="h1 and h3 seem to be swapped"):
+        usable(nominal_plant(), replace(run, outputs=run.outputs[:, [2, 1, 0]]))
 
 
 def test_swapped_commands_are_refused() -> None:

@@ -30,11 +30,15 @@ def stepped(duration: float = 200.0) -> Recording:
     return replace(blank, inputs=inputs)
 
 
-@pytest.fixture(autouse=True, params=["compiled", "torch"])
-def loops(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(params=["compiled", "torch"])
+def loop(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Both ways through a recurrence: compiled where there is a compiler, and torch's."""
     if request.param == "torch":
         monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda tanks: None)
+    return request.param
+
+
+both_loops = pytest.mark.usefixtures("loop")
 
 
 @pytest.mark.parametrize("tanks", [1, 3, 7])
@@ -53,6 +57,7 @@ def test_both_ways_through_a_newton_step_are_one(tanks: int, monkeypatch: pytest
         torch.testing.assert_close(ours, torchs, rtol=1e-10, atol=1e-10, equal_nan=True)
 
 
+@both_loops
 @pytest.mark.parametrize("count", [1, 2, 7, 50])
 def test_the_scan_is_the_recurrence(count: int) -> None:
     generator = torch.Generator().manual_seed(1)
@@ -65,15 +70,12 @@ def test_the_scan_is_the_recurrence(count: int) -> None:
 
 
 @pytest.mark.parametrize("columns", [1, 3, 21])
-@pytest.mark.parametrize("loop", [True, False], ids=["compiled", "torch"])
-def test_a_scan_with_a_gain_is_one_of_the_product(columns: int, loop: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scan_with_a_gain_is_one_of_the_product(columns: int, loop: str) -> None:
     generator = torch.Generator().manual_seed(2)
     draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
     a, gain, b, first = 0.4 * draw(2, 3, 3, 150), draw(2, 3, 3, 150), draw(2, 3, columns, 150), draw(2, 3, columns)
     b[:, 1] = 0.0
     b[:, 2, :, :80] = 0.0
-    if not loop:
-        monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda tanks: None)
     state, expected = first, [first]
     for k in range(150):
         state = a[..., k] @ state + gain[..., k] @ b[..., k]
@@ -81,7 +83,7 @@ def test_a_scan_with_a_gain_is_one_of_the_product(columns: int, loop: bool, monk
     found = scan_in_time(a, b, first, gain)
     torch.testing.assert_close(found, torch.stack(expected, dim=-1), rtol=1e-12, atol=1e-12)
     alone = scan_in_time(a[:1], b[:1, :, :1], first[:1, :, :1], gain[:1])
-    if loop:
+    if loop == "compiled":
         assert torch.equal(alone, found[:1, :, :1])
 
 
@@ -114,6 +116,7 @@ def test_levels_and_slopes_are_those_of_the_reference_and_of_finite_differences(
         assert float(error) < 1e-3, name
 
 
+@both_loops
 def test_what_runs_over_a_rim_is_the_references() -> None:
     low = three_tank(start=(0.38, 0.2, 0.3), tank_height=0.4)
     recording = replace(stepped(), inputs=stepped().inputs * 1.1)
@@ -127,6 +130,7 @@ def test_what_runs_over_a_rim_is_the_references() -> None:
     assert float((found.readings - exact).abs().max()) < 1e-3  # m
 
 
+@both_loops
 def test_a_tank_simulated_alone_between_the_levels_of_the_others_has_its_own_level() -> None:
     network = build_network(three_tank(), [])
     space = ParameterSpace([network.constants["T1.start_level"]])

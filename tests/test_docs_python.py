@@ -1,4 +1,4 @@
-"""The blocks of docs/how-to/python.md run one after the other and give what the page says."""
+"""The blocks of docs/how-to/python.md run one after the other and give what the page says; in short: test_in_python."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 PAGE = (Path(__file__).parent.parent / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_page_runs_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"__name__": "page"}

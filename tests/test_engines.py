@@ -117,6 +117,10 @@ EXPERIMENTS = {
 }
 
 
+# The plant with delays and slow sensors has all that one without them has; of that, times of every kind are enough.
+EVERYWHERE = [(slow_rig, name) for name in EXPERIMENTS] + [(rig, "irregular")]
+
+
 def experiment(name: str = "samples at steps") -> Experiment:
     time, hold, step = EXPERIMENTS[name]
     return lay_out(recording(time, hold), ("Q1", "Q2"), step)
@@ -134,8 +138,7 @@ def relative(a: Tensor, b: Tensor) -> float:
     return float((a - b).abs().max() / b.abs().max())
 
 
-@pytest.mark.parametrize("make", [rig, slow_rig])
-@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize(("make", "name"), EVERYWHERE)
 def test_engines_agree_with_torchdiffeq(make, name: str) -> None:
     network, space = make()
     e = experiment(name)
@@ -159,8 +162,7 @@ def test_the_random_faults_reach_rims_and_floors() -> None:
     assert levels.max() > 1.0 and levels.min() < 0.01
 
 
-@pytest.mark.parametrize("make", [rig, slow_rig])
-@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize(("make", "name"), EVERYWHERE)
 def test_jacobians_agree_with_central_differences(make, name: str) -> None:
     network, space = make()
     compiled, traced = (engine(network, space, experiment(name)) for engine in (CompiledEngine, TracedEngine))
@@ -291,7 +293,7 @@ def test_float32_is_near_float64() -> None:
     assert relative(single.double(), engine.readings(theta)) < 1e-4
 
 
-@pytest.mark.parametrize("name", ["three_tank", "quadruple_tank"])
+@pytest.mark.parametrize("name", ["three_tank", pytest.param("quadruple_tank", marks=pytest.mark.slow)])
 def test_every_effect_survives_every_engine(name: str) -> None:
     """All effects in one plant, each at the first place where it fits; each lane has one of them off nominal."""
     plant = load_plant(name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import cache
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -19,8 +20,6 @@ from fdi_torch.monitor.noise_model import learn_noise, noise_of_gain, operating_
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.stepper import Stepper
-from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.build import BuildError
 from fdi_torch.simulate.equilibrium import equilibrium
 
@@ -28,35 +27,38 @@ PLANT = load_plant("three_tank")
 NETWORK = build_network(PLANT, [])
 INPUTS = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
 LEARN, BLOCK, STD, FLOW = 2000, 100, 1e-3, 1.5e-6
+AREA = np.array([tank.area for tank in PLANT.tanks])
 
 
 CORRELATION_TIMES = (1.0, 15.0, 80.0, 150.0)  # s
 
 
+def rates(levels: np.ndarray) -> np.ndarray:
+    """dh/dt (lanes, 3) of the three tanks by Torricelli's law, m/s."""
+    heads = np.stack([levels[:, 0] - levels[:, 2], levels[:, 2] - levels[:, 1], levels[:, 1]])
+    strength = [p.discharge_coefficient * p.area * math.sqrt(2.0 * PLANT.gravity) for p in PLANT.pipes]
+    first, second, outlet = np.sign(heads) * np.sqrt(np.abs(heads)) * np.array(strength)[:, None]
+    pumped = INPUTS.numpy()
+    return np.stack([pumped[0] - first, pumped[1] + second - outlet, first - second], axis=1) / AREA
+
+
 @cache
 def disturbed_levels() -> Tensor:
-    """Levels (5, samples, 3) of the three tanks about their equilibrium by the Euler rule, with random flows into each
-    of each correlation time, and at last without.
+    """Levels (5, samples, 3) of the three tanks about their equilibrium by the midpoint rule, with random flows into
+    each of each correlation time, and at last without.
     """
     generator, samples, lanes = torch.Generator().manual_seed(0), 3 * LEARN, len(CORRELATION_TIMES) + 1
-    draws = torch.randn(samples, lanes, 3, generator=generator, dtype=torch.float64)
-    times = torch.tensor([*CORRELATION_TIMES, 1.0], dtype=torch.float64).unsqueeze(1)
-    flow, keep = torch.full_like(times, FLOW), torch.exp(-1.0 / times)
+    draws = torch.randn(samples, lanes, 3, generator=generator, dtype=torch.float64).numpy()
+    times = np.array([[*CORRELATION_TIMES, 1.0]]).T
+    flow, keep = np.full_like(times, FLOW), np.exp(-1.0 / times)
     flow[-1] = 0.0
-    area = torch.tensor([tank.area for tank in PLANT.tanks], dtype=torch.float64)
-    stepper, values = Stepper(NETWORK), NETWORK.bind(ParameterSpace(), NETWORK.nominal.new_zeros(0))
-    inputs = INPUTS.expand(lanes, 2)
-    state, now, levels = (
-        stepper.start(equilibrium(NETWORK, INPUTS).expand(lanes, 3).clone(), inputs, values),
-        flow * draws[0],
-        [],
-    )
+    level, now = np.tile(equilibrium(NETWORK, INPUTS).numpy(), (lanes, 1)), flow * draws[0]
+    levels = np.empty((samples, lanes, 3))
     for k in range(samples):
-        levels.append(state.levels.clone())
-        state = stepper.advance(state, lambda share: inputs, float(k), 1.0, values)
-        state.levels.add_(now / area)
-        now = keep * now + torch.sqrt(1.0 - keep**2) * flow * draws[k]
-    return torch.stack(levels, dim=1)
+        levels[k] = level
+        level = level + rates(level + 0.5 * rates(level)) + now / AREA
+        now = keep * now + np.sqrt(1.0 - keep**2) * flow * draws[k]
+    return torch.from_numpy(levels).movedim(0, 1)
 
 
 def disturbed(correlation_time: float | None, samples: int) -> Samples:

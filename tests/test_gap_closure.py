@@ -25,12 +25,15 @@ LAMINAR = {"P13.laminar_flow.transition_head": 0.05}
 LIBRARY = ("laminar_flow", "pump_lag", "leak")
 
 
+def recordings() -> tuple[Recording, list[Recording]]:
+    """A laminar pipe, and two hold-outs of the same rig with other inputs, one of them noisier."""
+    holdouts = [recorded(LAMINAR, 5, samples=500), recorded(LAMINAR, 7, samples=700, std=2e-3)]
+    return recorded(LAMINAR, 3), [replace(h, source=f"day{k}.csv") for k, h in enumerate(holdouts, 1)]
+
+
 @pytest.fixture(scope="module")
 def answer() -> Answer:
-    """A laminar pipe, and two hold-outs of the same rig with other inputs, one of them noisier."""
-    recording = recorded(LAMINAR, 3)
-    holdouts = [recorded(LAMINAR, 5, samples=500), recorded(LAMINAR, 7, samples=700, std=2e-3)]
-    holdouts = [replace(h, source=f"day{k}.csv") for k, h in enumerate(holdouts, 1)]
+    recording, holdouts = recordings()
     return diagnose(nominal_plant(), recording, holdouts, Settings(LIBRARY))
 
 
@@ -252,22 +255,22 @@ def test_a_free_form_that_fails_on_a_hold_out_is_reported() -> None:
     """A lag without its name: a function of what the pump sees now does not carry over."""
     lag = {"Q1.pump_lag.time_constant": 15.0}
     answer = diagnose(
-        nominal_plant(), recorded(lag, 41), recorded(lag, 42, samples=500), Settings(leave_out=("pump_lag",))
+        nominal_plant(), recorded(lag, 41), recorded(lag, 42, samples=500), Settings(("pump_gain", "leak"))
     )
     assert answer.verdict == "unknown" and answer.closure["augmented"] > answer.closure["recalibrated"]
     assert any("unknown discrepancy at Q1 predicts memory worse than" in said for said in answer.remarks)
 
 
-def test_errors_of_sensors_with_several_units_are_pooled_in_standard_deviations_of_noise() -> None:
+def test_errors_of_sensors_with_several_units_are_pooled_in_standard_deviations_of_noise(answer: Answer) -> None:
     plant, volts = nominal_plant(), 20.0  # a metre of level
     mixed = replace(plant, sensors=(*plant.sensors[:2], replace(plant.sensors[2], unit="V", gain=volts)))
 
     def in_volts(r: Recording) -> Recording:
         return replace(r, outputs=r.outputs * torch.tensor([1.0, 1.0, volts]), output_units=("m", "m", "V"))
 
-    files = recorded(LAMINAR, 3), recorded(LAMINAR, 5, samples=500)
-    alike = diagnose(plant, *files, Settings(LIBRARY)).closure
-    closure = diagnose(mixed, *(in_volts(r) for r in files), Settings(LIBRARY)).closure
+    recording, holdouts = recordings()
+    alike = answer.closure
+    closure = diagnose(mixed, in_volts(recording), [in_volts(h) for h in holdouts], Settings(LIBRARY)).closure
     assert alike["unit"] == "cm" and closure["unit"] == "noise levels"
     assert list(closure["units"].values()) == ["cm", "cm", "V"]
     assert closure["noise_floor"] == pytest.approx(1.0, rel=1e-9)

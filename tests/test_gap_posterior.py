@@ -93,6 +93,7 @@ def test_a_second_effect_that_only_corrects_the_law_of_the_first_is_not_a_cause(
     assert [(c.effect, c.location) for c in answer.causes] == [("pump_lag", "Q1")]
 
 
+@pytest.mark.slow
 def test_an_effect_beside_an_unknown_is_found_though_the_unknown_hides_it() -> None:
     """A sensor whose gain changes at half of its range, beside a draw from another tank."""
     draw = {"T1.unmetered_flow.flow": 1.5e-5, "T1.unmetered_flow.begin": 300.0, "T1.unmetered_flow.duration": 300.0}

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import pytest
 import torch
-from rigs import whitening_of
+from rigs import blank_recording, whitening_of
 from torch import Tensor
 
 from fdi_torch.cli import main
@@ -31,15 +31,16 @@ from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor, usual_faults
 from fdi_torch.monitor.monitor_state import MonitorState
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
-from fdi_torch.monitor.observer import Observation, bind_parameters
+from fdi_torch.monitor.observer import Observation
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow
 from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
-from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.equilibrium import equilibrium
+from fdi_torch.simulate.experiment import lay_out
 
 PLANT = load_plant("three_tank")
 PLACES = [("leak", "T1"), ("leak", "T3"), ("plugging", "P13"), ("pump_gain", "Q2"), ("sensor_bias", "h3")]
@@ -53,22 +54,32 @@ STD = 1e-3
 Truth = Callable[[float], Tensor]
 
 
+def constant_parts(truth: Truth, samples: int) -> Iterator[tuple[Tensor, int, int]]:
+    """Parameters, first sample and the one after the last, of parts with constant parameters; the first sample has
+    those of the step after it.
+    """
+    first, theta = 0, truth(0.5)
+    for k in range(2, samples):
+        if not torch.equal(following := truth(k - 0.5), theta):
+            yield theta, first, k
+            first, theta = k, following
+    yield theta, first, samples
+
+
 def recorded(
     truth: Truth, samples: int, network=NETWORK, space: ParameterSpace = SPACE, std: Tensor | float = STD, seed: int = 0
 ) -> Samples:  # type: ignore[no-untyped-def]
     """One run whose parameters follow `truth` (s -> values of the space)."""
-    stepper, generator = Stepper(network), torch.Generator().manual_seed(seed)
-    state = stepper.start(REST, INPUTS, bind_parameters(network, None, None))
-    readings: list[Tensor] = []
-    theta, values = None, bind_parameters(network, None, None)
-    for k in range(samples):
-        if theta is None or not torch.equal(theta, truth(k - 0.5)):
-            theta = truth(k - 0.5)
-            values = bind_parameters(network, space, theta)
-        if k:
-            state = stepper.advance(state, lambda share: INPUTS, k - 1.0, 1.0, values)
-        readings.append(stepper.read(state, float(k), 1.0, values)[0])
-    clean = torch.stack(readings)
+    starts = [f"{tank.name}.start_level" for tank in PLANT.tanks]
+    whole = ParameterSpace(network.constants[name] for name in [*space.names, *starts])
+    levels, clean = REST, torch.empty(samples, 3, dtype=torch.float64)
+    for theta, first, last in constant_parts(truth, samples):
+        time = torch.arange(max(first - 1, 0), last, dtype=torch.float64)
+        experiment = lay_out(blank_recording(PLANT, INPUTS.expand(len(time), 2), time), PLANT.channels(), 1.0)
+        engine, values = CompiledEngine(network, whole, experiment), torch.cat([theta, levels])
+        clean[first:last] = engine.readings(values)[first - last :]
+        levels = engine.levels(values)[-1]
+    generator = torch.Generator().manual_seed(seed)
     noisy = clean + std * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
     return Samples(torch.arange(samples, dtype=torch.float64), INPUTS.expand(samples, 2), noisy)
 

@@ -11,21 +11,16 @@ from functools import lru_cache
 from pathlib import Path
 
 import pytest
-import torch
 import yaml
 
 from fdi_torch.cli import INTERRUPTED, main
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.effects import build_network, placements_for
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.jobs.row_buffer import rows_until
 from fdi_torch.logbook import RunLog, follow, read_run
 from fdi_torch.monitor.live_batches import DelayWatch, LiveBatches
-from fdi_torch.monitor.observer import bind_parameters
-from fdi_torch.monitor.stepper import Stepper
-from fdi_torch.parameters import ParameterSpace
-from fdi_torch.simulate.equilibrium import equilibrium
+from tests.test_monitor import recorded, step_to
 
 FAULT, ONSET, SAMPLES = "T3.leak.size", 200.0, 300
 HEADER = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n"
@@ -34,17 +29,7 @@ HEADER = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n"
 @lru_cache
 def readings(size: float = 0.05, onset: float = ONSET) -> list[list[float]]:
     """Levels of the three tanks in m, once a second, with 1 mm of noise and a leak from `onset` on."""
-    network = build_network(load_plant("three_tank"), placements_for([FAULT]))
-    space = ParameterSpace([network.constants[FAULT]])
-    inputs = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
-    stepper, sound = Stepper(network), bind_parameters(network, None, None)
-    leaking = bind_parameters(network, space, torch.tensor([size], dtype=torch.float64))
-    state, levels = stepper.start(equilibrium(network, inputs), inputs, sound), []
-    for k in range(SAMPLES):
-        levels.append(state.levels)
-        state = stepper.advance(state, lambda share: inputs, float(k), 1.0, sound if k < onset else leaking)
-    noise = torch.randn(SAMPLES, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    return (torch.stack(levels) + 1e-3 * noise).tolist()
+    return recorded(step_to(FAULT, size, onset), SAMPLES, seed=2).readings.tolist()
 
 
 def row(t: float, levels: Sequence[float]) -> str:

@@ -40,7 +40,7 @@ from fdi_torch.simulate.traced_engine import TracedEngine
 from tests.test_monitor import NAMES, SPACE, followed, recorded, step_to
 
 FAULTS = {"T1.leak.size": 0.2, "P13.plugging.size": 0.3}
-scaled_rigs = pytest.mark.parametrize(("metres", "seconds"), [(3.7, 0.23), (0.23, 3.7), (0.05, 60.0)])
+scaled_rigs = pytest.mark.parametrize(("metres", "seconds"), [(3.7, 0.23), (0.05, 60.0)])
 
 
 def experiment(metres: float, seconds: float) -> tuple[PlantDescription, Recording]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import io
 import json
-import os
 import struct
 import subprocess
 import sys
@@ -183,29 +182,6 @@ def test_a_full_disk_is_said_with_the_path() -> None:
     sentence = r"/dev/full: the disk is full; free some space"
     with pytest.raises(OSError, match=sentence), replacing(Path("/dev/full")) as path:
         path.write_text("x")
-
-
-def run(words: str, **env: str) -> subprocess.CompletedProcess[str]:
-    whole = f"{sys.executable} -m fdi_torch {words}"
-    return subprocess.run(
-        ["bash", "-c", f"set -o pipefail; {whole}"],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-        env=os.environ | env,
-    )
-
-
-def test_who_reads_a_result_may_stop_reading(tmp_path: Path) -> None:
-    (tmp_path / "rig.csv").write_text(HEADER + ROWS)
-    done = run(f"check {tmp_path / 'rig.csv'} --plant three_tank | true")
-    assert (done.returncode, done.stderr) == (cli.DONE, "")
-
-
-def test_nobody_has_to_read(tmp_path: Path) -> None:
-    (tmp_path / "rig.csv").write_text(HEADER + ROWS)
-    assert run(f"check {tmp_path / 'rig.csv'} --plant three_tank >&- 2>&-").returncode == cli.DONE
 
 
 def test_without_a_compiler_the_compiled_engine_is_refused_in_a_sentence(
