@@ -21,7 +21,7 @@ from fdi_torch.jobs.gap import run_gap
 from fdi_torch.jobs.gap_replay import removed_options, settings_of
 from fdi_torch.logbook import own_signals, read_run, series
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
-from fdi_torch.recordings.csv_files import write_csv
+from fdi_torch.recordings.csv_writing import write_csv
 from fdi_torch.report.material import gather
 from fdi_torch.report.verdict import headline
 from tests.test_gap import nominal_plant, recorded
