@@ -20,6 +20,7 @@ from fdi_torch.estimate.posterior_draws import Draws
 from fdi_torch.estimate.profile import Profile
 from fdi_torch.jobs.estimate_uncertainty import profiled_names, profiles_of, with_draws
 from fdi_torch.jobs.log_paths import RESUMES, free_path, unfinished_search
+from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
 from fdi_torch.jobs.run_setup import (
     fitting_of,
     hybrid_settings,
@@ -31,7 +32,6 @@ from fdi_torch.jobs.run_setup import (
 )
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
-from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg, save
 from fdi_torch.tables import Shown, Table, needed
@@ -128,7 +128,9 @@ def estimate_logged(
         if config.draws:
             result = with_draws(fitting, result, config.draws, run.config.seed, tell=tell)
     log_result(log, result, fitting.space, profiles)
-    log_predictions(log, result, fitting.recordings)
+    for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
+        group = group_of(k, len(fitting.recordings))
+        log_prediction(log, recording, predicted, group, result.estimate.noise_std)
     return result, profiles
 
 
@@ -191,22 +193,15 @@ def state_is_due(generation: int) -> bool:
 def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[str, float]) -> None:
     """Log every recording and the simulated truth, and flush them to disk."""
     for k, part in enumerate(loaded):
-        r = part.recording
-        log.recording(
-            r.time,
-            r.inputs,
-            r.outputs,
-            r.input_names,
-            r.output_names,
-            r.input_units,
-            r.output_units,
-            mask=r.mask,
-            hold=r.hold,
-            group="" if len(loaded) == 1 else str(k + 1),
-        )
+        log_recording(log, part.recording, group_of(k, len(loaded)))
     if truth:
         log.write("/plant/truth", truth, 0.0)
     log.flush()
+
+
+def group_of(k: int, count: int) -> str:
+    """Log group of recording k of several."""
+    return "" if count == 1 else str(k + 1)
 
 
 def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profiles: Sequence[Profile] = ()) -> None:
@@ -238,15 +233,6 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profile
     log.result(final.to_dict() | {"kind": diagnosis.kind, "explained": diagnosis.explained} | more)
     if final.status != "converged":
         log.set_status("not_converged", final.status)
-
-
-def log_predictions(log: RunLog, result: HybridResult, recordings: Sequence[Recording]) -> None:
-    """Log the readings that the model predicts at the estimate, and the residuals, for each recording."""
-    for k, (r, predicted) in enumerate(zip(recordings, result.predicted, strict=True)):
-        names, units = r.output_names, r.output_units
-        group = "" if len(recordings) == 1 else str(k + 1)
-        noise = result.estimate.noise_std
-        log.predictions(r.time, r.outputs, predicted, names, units, mask=r.mask, noise_std=noise, group=group)
 
 
 def draw(run: Run, fitting: Fitting, result: HybridResult, log: Path) -> tuple[Path, ...]:
