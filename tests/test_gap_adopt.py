@@ -13,7 +13,7 @@ from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.jobs.train import train
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.csv_files import write_csv
+from fdi_torch.recordings.csv_writing import write_csv
 from tests.test_gap import nominal_plant, recorded
 
 LAMINAR = {"P13.laminar_flow.transition_head": 0.1}

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from fdi_torch.cli import DONE, MISUSE, NOT_EXPLAINED, main
-from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.run_file import Run, load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.logbook import content_hash, read_run
@@ -56,13 +55,6 @@ def test_without_refinement_the_estimate_is_the_searchs_best_and_says_so(tmp_pat
     done = train(quick_run(tmp_path, "estimate.refine.method=none"))
     assert torch.equal(done.result.estimate.value, done.result.search.best[0])
     assert done.result.estimate.status == "not refined"
-
-
-@pytest.mark.parametrize("method", ["lbfgs", "adam"])
-def test_a_method_that_is_gone_is_refused_in_one_sentence(method: str) -> None:
-    with pytest.raises(ConfigError, match=f"expected lm or none, got {method}, a method that no longer exists") as said:
-        load_run(None, [f"estimate.refine.method={method}"])
-    assert len(said.value.problems) == 1
 
 
 def test_the_log_tells_how_it_was_found(done: TrainResult) -> None:

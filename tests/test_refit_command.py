@@ -12,7 +12,7 @@ from fdi_torch import cli
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recordings.csv_files import write_csv
+from fdi_torch.recordings.csv_writing import write_csv
 from tests.test_gap import nominal_plant, recorded
 
 GAIN = {"Q2.pump_gain.factor": 0.9}

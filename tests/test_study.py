@@ -153,10 +153,8 @@ def test_ten_thousand_trials_stay_below_ten_megabytes(tmp_path: Path, plan: Plan
     assert (tmp_path / "many.mcap").stat().st_size < 10e6 * count / 10_000
 
 
-def test_figures_are_drawn_for_a_noise_study(tmp_path: Path) -> None:
+def test_a_noise_study_has_a_summary_for_each_level(tmp_path: Path) -> None:
     result = run_study(quick(tmp_path, "study.snr_db=[40, 20]", "study.trials=3"))
-    assert [p.name for p in result.pictures] == ["table3_noise_correlation.png", "table3_noise_estimates.png"]
-    assert all(p.stat().st_size > 10_000 for p in result.pictures)
     assert [s.setting for s in result.summaries] == ["SNR 40 dB", "SNR 20 dB"]
     assert result.summaries[0].rho.value > result.summaries[1].rho.value
     assert len(list(read_run(result.log).messages(["/study/summary"]))) == 2

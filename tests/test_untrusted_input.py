@@ -146,7 +146,7 @@ def test_chunks_that_unpack_to_too_much_are_damage(tmp_path: Path) -> None:
     sink = Sink(tmp_path / "a.mcap", "x")
     for k in range(24):
         sink.message(Channel("/x"), 0, 0, k, b'{"a": "' + b"0" * 2**21 + b'"}')
-        sink.cut()
+        sink.flush()
     sink.finish()
     assert (tmp_path / "a.mcap").stat().st_size < 2**18
     with pytest.raises(LogError, match="more than the"):

@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 from rigs import random_steps, three_tank
 
-from fdi_torch.recordings.csv_files import read_csv, write_csv
+from fdi_torch.recordings.csv_files import read_csv
+from fdi_torch.recordings.csv_writing import write_csv
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from fdi_torch.jobs.gap import run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.csv_files import write_csv
+from fdi_torch.recordings.csv_writing import write_csv
 
 KEPT = 1 << 30  # bytes of free memory to keep, and size up to which an array is kept
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)

@@ -9,7 +9,7 @@ from typing import Any
 
 import orjson
 
-from fdi_torch.cli.options import access_text, live
+from fdi_torch.cli.options import access_text, host_and_port, live
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
@@ -87,11 +87,8 @@ def outlets(arguments: argparse.Namespace, name: str, screen: Screen) -> Iterato
 def _metrics(wish: str, screen: Screen) -> Iterator[Listener]:
     from fdi_torch.live.metrics import serve_metrics
 
-    host, _, port = wish.rpartition(":")
-    if not (port.isascii() and port.isdigit() and int(port) < 2**16):
-        raise ValueError(f"--metrics: expected [HOST:]PORT such as 127.0.0.1:9464, got {wish}")
-    host = host or "127.0.0.1"
-    with serve_metrics(host, int(port)) as metrics:
+    host, port = host_and_port("--metrics", wish, "127.0.0.1:9464")
+    with serve_metrics(host, port) as metrics:
         screen.note(f"metrics: http://{host}:{metrics.port}/metrics ({access_text(host)})")
         yield metrics
 

@@ -20,11 +20,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
     """Repeat the run unchanged; every event must be the same."""
-    from fdi_torch.jobs.gap_replay import removed_options
     from fdi_torch.jobs.replay import comparable, repeat_run
 
-    for sentence in removed_options(read_run(arguments.log)):
-        screen.note(sentence)
     with tempfile.TemporaryDirectory() as folder, screen.progress("replay") as advance:
         target = Path(arguments.out or Path(folder) / "again.mcap")
         done = replay(
@@ -42,11 +39,8 @@ def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
     """Repeat the run with another setting, and compare the new log with the old one."""
-    from fdi_torch.jobs.gap_replay import removed_options
     from fdi_torch.jobs.replay import repeat_run
 
-    for sentence in removed_options(read_run(arguments.log)):
-        screen.note(sentence)
     source = Path(arguments.log)
     target = Path(arguments.out or source.with_name(f"{source.name.removesuffix('.mcap')}.what_if.mcap"))
     with screen.progress("replay") as advance:

@@ -10,7 +10,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.config.run_file import load_run
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.run_setup import simulate_recording
-from fdi_torch.recordings.csv_files import write_csv
+from fdi_torch.recordings.csv_writing import write_csv
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

@@ -36,8 +36,7 @@ def show(result: StudyResult, screen: Screen) -> None:
         screen.say(isolation_in_words(result.isolation))
     per_trial = f", {1e3 * result.seconds / result.computed:.0f} ms each" if result.computed else ""
     screen.say(f"{result.computed} trials in {result.seconds:.0f} s{per_trial}")
-    for path in (result.log, *result.pictures):
-        screen.say(str(path))
+    screen.say(f"log: {result.log} (fdi report {result.log} makes the page)")
 
 
 HEADER = ("estimator", "parameter", "bias", "RMSE", "/ bound", "95 %", "/ linearised", "95 %", "coverage", "95 %")
@@ -86,5 +85,4 @@ def as_json(result: StudyResult) -> dict[str, object]:
         "computed": result.computed,
         "seconds": result.seconds,
         "log": str(result.log),
-        "pictures": [str(path) for path in result.pictures],
     }

@@ -62,17 +62,8 @@ class ObjectiveConfig(Strict):
     refine: Objective = Field("likelihood", description="what the refinement maximises")
 
 
-def _existing_method(value: Any) -> Any:
-    if value in ("lbfgs", "adam"):
-        raise ValueError(
-            f"expected lm or none, got {value}, a method that no longer exists; use lm (estimate.refine.method=lm), "
-            "which gives the same result"
-        )
-    return value
-
-
 class RefineConfig(Strict):
-    method: Annotated[Literal["lm", "none"], BeforeValidator(_existing_method)] = Field(
+    method: Literal["lm", "none"] = Field(
         "lm", description="Levenberg-Marquardt, or none: the best member of the search is the result"
     )
     iterations: int = Field(50, ge=1, description="at most")

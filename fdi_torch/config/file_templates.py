@@ -8,7 +8,7 @@ from string import Template
 from fdi_torch.names import unknown
 from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recordings.csv_files import header_of
+from fdi_torch.recordings.csv_writing import header_of
 
 KINDS = ("plant", "run", "monitor", "study")
 

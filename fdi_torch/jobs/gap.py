@@ -16,6 +16,7 @@ from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.diagnose import ProgressCallback, solve_problem
 from fdi_torch.gap.problem import PLAIN, Settings, problem_of
 from fdi_torch.jobs.log_paths import STARTS_OVER
+from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
 from fdi_torch.logbook import RunLog
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -60,7 +61,9 @@ def run_gap(
             answer = solve_problem(case, say)
         log_answer(log, answer.to_dict(), answer.arrays)
         for group, each in zip(groups(len(holdouts), len(recordings)), every, strict=True):
-            log_predictions(log, each, answer.arrays, group)
+            predicted = answer.arrays.get(f"{group}_augmented" if group else "augmented")
+            if predicted is not None and predicted.shape == each.outputs.shape:
+                log_prediction(log, each, predicted, group)
     return answer
 
 
@@ -68,20 +71,6 @@ def groups(holdouts: int, recordings: int = 1) -> tuple[str, ...]:
     """Log groups of the recordings: "" for the first diagnosed one, then those of further ones and of the hold-outs."""
     further = (f"recording_{k + 1}" for k in range(1, recordings))
     return ("", *further, *("holdout" if k == 0 else f"holdout_{k + 1}" for k in range(holdouts)))
-
-
-def log_recording(log: RunLog, recording: Recording, group: str) -> None:
-    """Log a recording on /plant/input and /plant/output, or on /plant/GROUP/..."""
-    r = recording
-    names = (r.input_names, r.output_names, r.input_units, r.output_units)
-    log.recording(r.time, r.inputs, r.outputs, *names, mask=r.mask, hold=r.hold, group=group)
-
-
-def log_predictions(log: RunLog, recording: Recording, arrays: Mapping[str, Tensor], group: str) -> None:
-    """Log the readings that the plant with the named causes predicts, where the answer has them."""
-    predicted, r = arrays.get(f"{group}_augmented" if group else "augmented"), recording
-    if predicted is not None and predicted.shape == r.outputs.shape:
-        log.predictions(r.time, r.outputs, predicted, r.output_names, r.output_units, mask=r.mask, group=group)
 
 
 def log_answer(log: RunLog, answer: Mapping[str, Any], arrays: Mapping[str, Tensor]) -> None:

@@ -1,12 +1,27 @@
-"""Recordings restored from a log, to repeat a run."""
+"""Recordings in a log: written with the predicted readings, and restored to repeat a run."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 
 from fdi_torch.logbook import Run as LoggedRun
-from fdi_torch.logbook import own_signals
+from fdi_torch.logbook import RunLog, own_signals
 from fdi_torch.recording import Recording
+
+
+def log_recording(log: RunLog, recording: Recording, group: str) -> None:
+    """Log a recording on /plant/input and /plant/output, or on /plant/GROUP/..."""
+    r = recording
+    names = (r.input_names, r.output_names, r.input_units, r.output_units)
+    log.recording(r.time, r.inputs, r.outputs, *names, mask=r.mask, hold=r.hold, group=group)
+
+
+def log_prediction(log: RunLog, recording: Recording, predicted: Any, group: str, noise_std: Any = None) -> None:
+    """Log the readings that a model predicts, and the residuals."""
+    r, units = recording, recording.output_units
+    log.predictions(r.time, r.outputs, predicted, r.output_names, units, mask=r.mask, noise_std=noise_std, group=group)
 
 
 def logged_recording(log: LoggedRun, group: str, number: int) -> Recording:

@@ -1,4 +1,4 @@
-"""The study job: trials computed locally or on a cluster, logged, resumable, summarised and drawn."""
+"""The study job: trials computed locally or on a cluster, logged, resumable and summarised."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from fdi_torch.config.study_file import Study
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.logbook.reader import Run as LoggedRun
-from fdi_torch.report.study_figures import correlation_figure, error_figure
-from fdi_torch.report.style import save
 from fdi_torch.study.cluster import run_on_cluster
 from fdi_torch.study.mode_isolation import Isolation, count_modes
 from fdi_torch.study.monte_carlo import Trial, run_blocks
@@ -39,7 +37,6 @@ class StudyResult(Shown):
     computed: int
     seconds: float
     log: Path
-    pictures: tuple[Path, ...]
 
     @property
     def headline(self) -> str:
@@ -85,8 +82,7 @@ def run_study(
             tell(*progress(len(trials), copied, study.plan.trials, time.monotonic() - started))
         seconds = time.monotonic() - started
         summaries, isolation = log_summary(study, trials, log)
-        pictures = draw(study, trials, path)
-    return StudyResult(summaries, isolation, trials, len(trials) - copied, seconds, path, pictures)
+    return StudyResult(summaries, isolation, trials, len(trials) - copied, seconds, path)
 
 
 def origin_of(study: Study) -> dict[str, Any]:
@@ -167,19 +163,3 @@ def log_summary(study: Study, trials: Mapping[int, Trial], log: RunLog) -> tuple
         log.result({"isolation": {name: value for name, value in vars(isolation).items() if name != "confusion"}})
         log.result_arrays(confusion=isolation.confusion)
     return summaries, isolation
-
-
-def draw(study: Study, trials: Mapping[int, Trial], log: Path) -> tuple[Path, ...]:
-    """Draw Figure 3 and Table 3 of the 2020 paper as distributions, if the study varies the noise for one fault."""
-    if study.config.faults != "simulated" or None in study.config.snr_db:
-        return ()
-    groups = list(trials_by_setting(study.plan, trials))
-    levels = [float(setting.snr_db or 0.0) for setting in study.plan.settings]
-    figures = {"correlation": correlation_figure(levels, [[t.numbers["rho"] for t in group] for group in groups])}
-    estimator = next((name for name in ("free", "boxed") if name in study.config.estimators), None)
-    if estimator:
-        errors = [[t.numbers[estimator] for t in group] for group in groups]
-        truth = study.plan.settings[0].faults[0]
-        bounds = [group[0].numbers["bound"] for group in groups]
-        figures["estimates"] = error_figure(study.plan.fitting.space, levels, errors, truth, bounds)
-    return tuple(save(figure, log.with_name(f"{log.stem}_{name}.png")) for name, figure in figures.items())

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.run_file import Run
@@ -22,6 +20,7 @@ from fdi_torch.estimate.posterior_draws import Draws
 from fdi_torch.estimate.profile import Profile
 from fdi_torch.jobs.estimate_uncertainty import profiled_names, profiles_of, with_draws
 from fdi_torch.jobs.log_paths import RESUMES, free_path, unfinished_search
+from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
 from fdi_torch.jobs.run_setup import (
     fitting_of,
     hybrid_settings,
@@ -31,9 +30,8 @@ from fdi_torch.jobs.run_setup import (
     tensors_on,
     usable_device,
 )
-from fdi_torch.logbook import DeferredTopic, Listener, RunLog, as_array
+from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
-from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg, save
 from fdi_torch.tables import Shown, Table, needed
@@ -130,7 +128,9 @@ def estimate_logged(
         if config.draws:
             result = with_draws(fitting, result, config.draws, run.config.seed, tell=tell)
     log_result(log, result, fitting.space, profiles)
-    log_predictions(log, result, fitting.recordings)
+    for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
+        group = group_of(k, len(fitting.recordings))
+        log_prediction(log, recording, predicted, group, result.estimate.noise_std)
     return result, profiles
 
 
@@ -149,13 +149,8 @@ class SearchLogger:
 
     def __init__(self, log: RunLog, space: ParameterSpace, settings: HybridSettings, tell: Tell) -> None:
         self.log, self.settings, self.tell = log, settings, tell
-        self.names = space.names
-        self._fields = ("problem", "generation", "best_cost", "mean_cost", "evaluations", *space.names)
+        self.names, self.units = space.names, {p.name: p.unit for p in space}
         self.iterations = 0
-        units = {p.name: p.unit for p in space}
-        self._generation = DeferredTopic(GENERATION, self._generations, units)
-        self._iteration = DeferredTopic(ITERATION, self._iterations, units)
-        self._keep, self._next_state = log.keep, 0
 
     def generation(self, search: Search) -> None:
         state = search.state
@@ -164,79 +159,49 @@ class SearchLogger:
         self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {float(state.cost[0, 0]):.3g}")
 
     def write(self, search: Search) -> None:
-        """Log a generation."""
+        """Log a generation and its best member, and the complete state if it is due."""
         state = search.state
-        generation = state.generation
-        kept = generation, state.evaluations, state.cost, state.population  # not the whole state, to free its memory
-        if generation < self._next_state and not self.log.due:
-            self._keep((self._generation, kept))
-            return
-        self.log.later(self._generation, kept)
-        if state_is_due(generation):
-            self.log.population(generation, search.to_dict())
-        self._next_state = next_logged_generation(generation)
-
-    def _generations(self, kept: Sequence[tuple[int, int, Tensor, Tensor]]) -> Iterator[tuple[float, dict[str, Any]]]:
-        """Log fields of the generations, computed only when their messages are written."""
-        costs = as_array(torch.cat([cost for *_, cost, _ in kept], 1))[0]
-        start = 0
-        for generation, evaluations, cost, population in kept:
-            end = start + cost.shape[1]
-            mean = float(np.add.reduce(costs[start:end])) / (end - start)
-            best = as_array(population)[0, 0].tolist()
-            row = 0, generation, float(costs[start]), mean, evaluations, *best
-            yield generation, dict(zip(self._fields, row, strict=True))
-            start = end
+        costs = as_array(state.cost)[0]
+        row: dict[str, Any] = {"problem": 0, "generation": state.generation}
+        row |= {"best_cost": float(costs[0]), "mean_cost": float(np.mean(costs))}
+        row |= {"evaluations": state.evaluations, **dict(zip(self.names, state.population[0, 0].tolist(), strict=True))}
+        self.log.write(GENERATION, row, state.generation, units=self.units)
+        if state_is_due(state.generation):
+            self.log.population(state.generation, search.to_dict())
 
     def iteration(self, progress: Progress) -> None:
         self.iterations += 1
         for k in range(len(progress.lanes)):
-            self.log.later(self._iteration, (self.iterations, progress, k))
-        self.tell(0.9, f"refinement: iteration {progress.iteration}, cost {float(progress.cost.min()):.6g}")
-
-    def _iterations(self, steps: Sequence[tuple[int, Progress, int]]) -> Iterator[tuple[float, dict[str, Any]]]:
-        for number, progress, k in steps:
-            row = {"problem": int(progress.lanes[k]), "iteration": progress.iteration, "cost": float(progress.cost[k])}
+            row: dict[str, Any] = {
+                "problem": int(progress.lanes[k]),
+                "iteration": progress.iteration,
+                "cost": float(progress.cost[k]),
+            }
             row |= {"damping": float(progress.damping[k]), "accepted": bool(progress.accepted[k])}
-            yield number, row | dict(zip(self.names, progress.theta[k].tolist(), strict=True))
+            row |= dict(zip(self.names, progress.theta[k].tolist(), strict=True))
+            self.log.write(ITERATION, row, self.iterations, units=self.units)
+        self.tell(0.9, f"refinement: iteration {progress.iteration}, cost {float(progress.cost.min()):.6g}")
 
 
 def state_is_due(generation: int) -> bool:
     """Whether the complete search state is logged: a resumed run repeats at most 32 generations, or an
     eighth of all.
     """
-    return generation % _spacing(generation) == 0
-
-
-def next_logged_generation(generation: int) -> int:
-    """The first generation after this one whose state is logged."""
-    spacing = _spacing(generation + 1)
-    return -(-(generation + 1) // spacing) * spacing
-
-
-def _spacing(generation: int) -> int:
-    return 1 << max(5, generation.bit_length() - 4)
+    return generation % (1 << max(5, generation.bit_length() - 4)) == 0
 
 
 def log_recordings(log: RunLog, loaded: Sequence[LoadedRecording], truth: dict[str, float]) -> None:
     """Log every recording and the simulated truth, and flush them to disk."""
     for k, part in enumerate(loaded):
-        r = part.recording
-        log.recording(
-            r.time,
-            r.inputs,
-            r.outputs,
-            r.input_names,
-            r.output_names,
-            r.input_units,
-            r.output_units,
-            mask=r.mask,
-            hold=r.hold,
-            group="" if len(loaded) == 1 else str(k + 1),
-        )
+        log_recording(log, part.recording, group_of(k, len(loaded)))
     if truth:
         log.write("/plant/truth", truth, 0.0)
     log.flush()
+
+
+def group_of(k: int, count: int) -> str:
+    """Log group of recording k of several."""
+    return "" if count == 1 else str(k + 1)
 
 
 def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profiles: Sequence[Profile] = ()) -> None:
@@ -268,15 +233,6 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profile
     log.result(final.to_dict() | {"kind": diagnosis.kind, "explained": diagnosis.explained} | more)
     if final.status != "converged":
         log.set_status("not_converged", final.status)
-
-
-def log_predictions(log: RunLog, result: HybridResult, recordings: Sequence[Recording]) -> None:
-    """Log the readings that the model predicts at the estimate, and the residuals, for each recording."""
-    for k, (r, predicted) in enumerate(zip(recordings, result.predicted, strict=True)):
-        names, units = r.output_names, r.output_units
-        group = "" if len(recordings) == 1 else str(k + 1)
-        noise = result.estimate.noise_std
-        log.predictions(r.time, r.outputs, predicted, names, units, mask=r.mask, noise_std=noise, group=group)
 
 
 def draw(run: Run, fitting: Fitting, result: HybridResult, log: Path) -> tuple[Path, ...]:

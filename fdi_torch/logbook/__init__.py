@@ -17,12 +17,10 @@ from fdi_torch.logbook.recover import Recovery, recover
 from fdi_torch.logbook.replay import Replay, replay
 from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, number_at, own_signals, series
 from fdi_torch.logbook.unfinished_log import last_state, set_aside, unfinished
-from fdi_torch.logbook.write_buffer import DeferredTopic
 from fdi_torch.logbook.writer import Listener, RunLog
 
 __all__ = [
     "Comparison",
-    "DeferredTopic",
     "Inspection",
     "Listener",
     "Live",

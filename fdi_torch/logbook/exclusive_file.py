@@ -5,11 +5,8 @@ from __future__ import annotations
 import fcntl
 import os
 from pathlib import Path
-from typing import BinaryIO
 
 from fdi_torch.logbook.errors import LogError, log_error
-
-_PIECE = 1 << 20
 
 
 class ExclusiveFile:
@@ -41,30 +38,13 @@ class ExclusiveFile:
             self.dead = log_error(self.path, error)
             raise self.dead from error
 
-    def copy(self, source: BinaryIO, start: int, end: int) -> None:
-        """Copy the bytes `start` to `end` of another file."""
-        source.seek(start)
-        while start < end:
-            data = source.read(min(_PIECE, end - start))
-            self.write(data)
-            start += len(data)
-
     def expect_alive(self) -> None:
         if self.dead is not None:
             raise LogError(f"{self.dead}; nothing more is logged")
 
-    def go_back(self, place: int) -> None:
-        """Discard everything from `place` on, and continue writing there."""
-        try:
-            os.lseek(self._file, place, os.SEEK_SET)
-        except OSError as error:
-            raise log_error(self.path, error) from error
-        self.size = place
-
     def sync(self) -> None:
-        """Truncate the file to its size and flush it to disk."""
+        """Flush the file to disk."""
         try:
-            os.ftruncate(self._file, self.size)
             os.fsync(self._file)
         except OSError as error:
             raise log_error(self.path, error) from error

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterator
-from itertools import islice
 from pathlib import Path
 
 from mcap.opcode import Opcode
 
 from fdi_torch.logbook import scan
 from fdi_torch.logbook.errors import LogError
-from fdi_torch.logbook.reader import Directory, Message, map_file, open_part, read_run
+from fdi_torch.logbook.reader import Directory, Message, map_file, open_part
 
 
 def follow(
@@ -31,7 +30,7 @@ def follow(
     while True:
         finished = tail.finished()
         count = 0
-        for message in tail.new_messages(finished):
+        for message in tail.new_messages():
             count += 1
             if topics is None or message.topic in topics:
                 yield message
@@ -46,14 +45,12 @@ def follow(
 
 
 class _Tail:
-    """The position up to which a growing file has been read."""
+    """The position up to which a growing file has been read, under its unfinished and then its final name."""
 
     def __init__(self, path: Path, on_damage: Callable[[scan.Damage], None]) -> None:
         self.final = path.with_suffix("") if path.suffix == ".partial" else path
         self.partial = self.final.with_name(self.final.name + ".partial")
         self.place: int | None = None
-        self.seen = 0
-        self.begun = False  # positions in the unfinished file are not valid in the finished one, which is rewritten
         self.on_damage = on_damage
         self.directory = Directory()
 
@@ -63,15 +60,8 @@ class _Tail:
             return False
         return scan.ends_whole(map_file(self.final))
 
-    def new_messages(self, finished: bool) -> Iterator[Message]:
-        if finished and self.partial != self.final:
-            run = read_run(self.final, salvage=True)
-            yield from islice(run.messages(), self.seen, None)
-            for damage in run.damages:
-                self.on_damage(damage)
-            return
-        self.begun = self.begun or self.partial.exists()
-        source = self.partial if self.begun else self.final
+    def new_messages(self) -> Iterator[Message]:
+        source = self.partial if self.partial.exists() else self.final
         try:
             data = map_file(source) if source.stat().st_size else b""
         except (FileNotFoundError, LogError):
@@ -94,10 +84,6 @@ class _Tail:
 
     def _opened(self, data: scan.Buffer, part: scan.Frame) -> Iterator[Message]:
         try:
-            messages = open_part(data, part, self.directory)
+            yield from open_part(data, part, self.directory)
         except scan.ChunkError as error:
             self.on_damage(scan.Damage(part.start, part.end, str(error)))
-            return
-        for message in messages:
-            self.seen += 1
-            yield message

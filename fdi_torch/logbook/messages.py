@@ -14,41 +14,23 @@ from fdi_torch.interruption import SteadyLock
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.channel_register import Register
 from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, as_it_is, plain
-from fdi_torch.logbook.sample_block import Block, Timed, block_of
-from fdi_torch.logbook.sink import EPOCH_NS, log_time_of
-from fdi_torch.logbook.write_buffer import DeferredTopic, WriteBuffer
+from fdi_torch.logbook.sink import EPOCH_NS, Timed, log_time_of
 
 Named = Mapping[str, Any]
 _RESERVED = ("t", NON_FINITE, WALL, "masked")
 _NORMAL_95 = 1.96  # half width of the central 95 % of a normal distribution, standard deviations
 _BLOCK = 4096
-_FEW = 32
-"""Up to this many samples are written faster one by one."""
 
 
 class Messages:
-    """Encodes messages and passes them to `put`, with their log time in ns.
-
-    Messages that arrive one at a time can be deferred (`later`), and are then encoded many at a time. `keep((topic,
-    item))` does the same with the least overhead; it may be used while `due` is false, after a first `later`. due:
-    whether buffered messages must be written now.
-    """
+    """Encodes messages and passes them to `put`, with their log time in ns."""
 
     def __init__(self) -> None:
         self._lock = SteadyLock()
-        self._buffer = WriteBuffer()
-        self.keep = self._buffer.keep
-        self.due = False
         self._latest = 0.0
         self.register = Register()
 
     def put(self, messages: Iterable[Timed]) -> None:
-        raise NotImplementedError
-
-    def flush(self) -> None:
-        raise NotImplementedError
-
-    def put_block(self, block: Block) -> None:
         raise NotImplementedError
 
     def write(
@@ -63,53 +45,20 @@ class Messages:
 
         A field with the value None is omitted. Raises ValueError for a non-finite time and for reserved names.
         """
-        with self._lock:
-            self.settle()
-            self.put([self._timed(topic, fields, t, units)])
-
-    def _timed(
-        self,
-        topic: str,
-        fields: Named,
-        t: float | None,
-        units: Mapping[str, str] | None,
-    ) -> Timed:
         if "t" in fields:
             raise ValueError(f"{topic}: expected the time as argument, got it among the fields; remove it there")
         t = self._latest if t is None else float(t)
         if not math.isfinite(t):
             raise ValueError(f"{topic}: expected a finite time, got {t}; give the plant's time in s")
-        message: Named = {"t": t, **fields}
-        data = as_it_is(message)
-        if data is None:
-            message = plain(message)
-            data = orjson.dumps(message)
-        self._latest = max(self._latest, t)
-        channel = self.register.channel(topic, fields, message, units)
-        log_time = log_time_of(t)
-        return channel, log_time, log_time, self.register.next_number(topic), data
-
-    def later(self, deferred: DeferredTopic, item: Any, size: int = 0) -> None:
-        """Write one message with delay, but before the next one that is written at once. size: memory of the item,
-        bytes.
-
-        The first message of a topic is written at once, so that errors surface.
-        """
-        if deferred.topic not in self.register:
-            ((t, fields),) = deferred.encode((item,))
-            self.write(deferred.topic, fields, t, units=deferred.units)
-            return
-        self._buffer.add(deferred, item, size)
-        if self.due:
-            self.flush()
-        elif self._buffer.is_enough:
-            self.settle()
-
-    def settle(self) -> None:
-        """Write the deferred messages in their order."""
         with self._lock:
-            if self._buffer:
-                self.put(self._timed(of.topic, fields, t, of.units) for of, t, fields in self._buffer.taken())
+            message: Named = {"t": t, **fields}
+            data = as_it_is(message)
+            if data is None:
+                message = plain(message)
+                data = orjson.dumps(message)
+            self._latest = max(self._latest, t)
+            channel, log_time = self.register.channel(topic, fields, message, units), log_time_of(t)
+            self.put([(channel, log_time, log_time, self.register.next_number(topic), data)])
 
     def samples(
         self,
@@ -191,7 +140,6 @@ class Messages:
             _check_signal(topic, values, names, len(time))
         if not np.isfinite(time).all():
             raise ValueError(f"{signals[0][0]}: expected finite times, got NaN or infinity; drop those samples")
-        self.settle()
         topics = [topic for topic, *_ in signals]
         for first in range(0, len(time), _BLOCK):
             last = first + _BLOCK
@@ -207,12 +155,8 @@ class Messages:
                 self.register.channel(topic, numbers, numbers, dict(zip(names, units, strict=True)), about)
             named = [names for _, _, names, *_ in signals]
             channels, sequences = self.register.next_numbers(topics, len(clock))
-            whole = all(np.isfinite(block).all() for block in blocks) and not any(part.any() for part in hidden)
-            if whole and len(clock) > _FEW:
-                self.put_block(block_of(channels, sequences, named, blocks, clock, log_times))
-            else:
-                encoded = [_rows(*parts, clock.tolist()) for parts in zip(named, blocks, hidden, strict=True)]
-                self.put(_in_turn(channels, sequences, log_times.tolist(), encoded))
+            encoded = [_rows(*parts, clock.tolist()) for parts in zip(named, blocks, hidden, strict=True)]
+            self.put(_in_turn(channels, sequences, log_times.tolist(), encoded))
         self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
 
     def follow_on(self, channel: Channel, sequence: int, t: float) -> None:
@@ -236,9 +180,11 @@ def _in_turn(
 
 
 def _rows(names: Sequence[str], block: np.ndarray, hidden: np.ndarray, clock: list[float]) -> list[bytes]:
-    """Payloads of samples (B, N) with non-finite numbers, or with readings masked by hidden (B, N)."""
+    """Payloads of samples (B, N), with readings masked by hidden (B, N)."""
     keys = ("t", *names)
     rows = zip(clock, *block.T.tolist(), strict=True)
+    if np.isfinite(block).all() and not hidden.any():
+        return [orjson.dumps(dict(zip(keys, row, strict=True))) for row in rows]
     return [orjson.dumps(_row(keys, row, hidden[i : i + 1])) for i, row in enumerate(rows)]
 
 

@@ -11,7 +11,7 @@ import io
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -30,6 +30,25 @@ _MESSAGE = struct.Struct("<HIQQ")
 # Records at which reading may resume after damage, because inner lengths validate them: chunk, chunk index, attachment,
 # statistics, metadata, data end. The three high bytes of any plausible length are zero.
 _ANCHORS = re.compile(rb"[\x06\x08\x09\x0b\x0c\x0f](?=.{5}\x00\x00\x00)", re.DOTALL)
+
+_U32 = struct.Struct("<I")
+_U64 = struct.Struct("<Q")
+_TEXT, _MAP, _BYTES, _LONG_BYTES, _REST = "text", "texts", "bytes", "long bytes", "the rest"
+_LAYOUTS: dict[int, tuple[int | str, ...]] = {  # fields of a record; a number is that of bytes of fixed length
+    Opcode.HEADER: (_TEXT, _TEXT),
+    Opcode.FOOTER: (20,),
+    Opcode.SCHEMA: (2, _TEXT, _TEXT, _BYTES),
+    Opcode.CHANNEL: (4, _TEXT, _TEXT, _MAP),
+    Opcode.MESSAGE: (22, _REST),
+    Opcode.CHUNK: (28, _TEXT, _LONG_BYTES),
+    Opcode.MESSAGE_INDEX: (2, _BYTES),
+    Opcode.CHUNK_INDEX: (32, _BYTES, 8, _TEXT, 16),
+    Opcode.ATTACHMENT: (16, _TEXT, _TEXT, _LONG_BYTES, 4),
+    Opcode.STATISTICS: (42, _BYTES),
+    Opcode.METADATA: (_TEXT, _MAP),
+    Opcode.SUMMARY_OFFSET: (17,),
+    Opcode.DATA_END: (4,),
+}
 
 Buffer = Any  # bytes or mmap
 
@@ -95,7 +114,7 @@ def chunk_body(data: Buffer, frame: Frame, cap: int = MAX_CHUNK_BYTES, require_c
     wrong CRC.
     """
     size, crc = _CHUNK.unpack_from(data, frame.start + 9)[2:]
-    name_end = frame.start + 41 + _u32(data, frame.start + 37)
+    name_end = frame.start + 41 + _U32.unpack_from(data, frame.start + 37)[0]
     compression = bytes(data[frame.start + 41 : name_end])
     if size > cap:
         raise ChunkError(f"chunk of {size} bytes, more than the {cap} allowed")
@@ -171,98 +190,37 @@ def _framed(data: Buffer, place: int) -> int | None:
 def _sound(data: Buffer, place: int) -> int | None:
     """End of a record whose inner lengths (for attachments also the CRC) agree, else None."""
     end = _framed(data, place)
-    if end is None:
-        return None
-    check = _CHECKS.get(data[place])
+    if end is None or data[place] not in _LAYOUTS:
+        return end
     try:
-        return end if check is None or check(data, place + 9, end) else None
-    except (struct.error, IndexError, UnicodeDecodeError):
+        fits = _ends(_LAYOUTS[data[place]], data, place + 9, end) == end
+    except (struct.error, UnicodeDecodeError):
         return None
+    return end if fits and (data[place] != Opcode.ATTACHMENT or _attachment_agrees(data, place, end)) else None
 
 
-def _u32(data: Buffer, place: int) -> int:
-    return int(struct.unpack_from("<I", data, place)[0])
+def _ends(layout: Sequence[int | str], data: Buffer, place: int, end: int) -> int:
+    """Where fields of this layout that begin at `place` end; beyond `end` if they do not fit."""
+    for field in layout:
+        if isinstance(field, int):
+            place += field
+            continue
+        if field == _REST:
+            return max(place, end)
+        size = _U64 if field == _LONG_BYTES else _U32
+        begin = place + size.size
+        place = begin + size.unpack_from(data, place)[0]
+        if place > end:
+            return place
+        if field == _TEXT:
+            bytes(data[begin:place]).decode()
+        while field == _MAP and begin != place:
+            begin = _ends((_TEXT, _TEXT), data, begin, place)
+            if begin > place:
+                return end + 1
+    return place
 
 
-def _u64(data: Buffer, place: int) -> int:
-    return int(struct.unpack_from("<Q", data, place)[0])
-
-
-def _text_end(data: Buffer, place: int, end: int) -> int:
-    """End of a length-prefixed text."""
-    stop = place + 4 + _u32(data, place)
-    if stop > end:
-        raise IndexError
-    bytes(data[place + 4 : stop]).decode()
-    return stop
-
-
-def _map_ends_at(data: Buffer, place: int, end: int) -> bool:
-    """Whether a map of texts (name and value in turn) fills place..end."""
-    if place + 4 + _u32(data, place) != end:
-        return False
-    place += 4
-    while place < end:
-        place = _text_end(data, _text_end(data, place, end), end)
-    return place == end
-
-
-def _chunk_ok(data: Buffer, place: int, end: int) -> bool:
-    name_end = place + 32 + _u32(data, place + 28)
-    return name_end - place - 32 <= 16 and name_end + 8 + _u64(data, name_end) == end
-
-
-def _attachment_ok(data: Buffer, place: int, end: int) -> bool:
-    after = _text_end(data, _text_end(data, place + 16, end), end)
-    if after + 8 + _u64(data, after) + 4 != end:
-        return False
-    crc = _u32(data, end - 4)
-    return crc == 0 or zlib.crc32(data[place : end - 4]) == crc
-
-
-def _metadata_ok(data: Buffer, place: int, end: int) -> bool:
-    return _map_ends_at(data, _text_end(data, place, end), end)
-
-
-def _header_ok(data: Buffer, place: int, end: int) -> bool:
-    return _text_end(data, _text_end(data, place, end), end) == end
-
-
-def _schema_ok(data: Buffer, place: int, end: int) -> bool:
-    after = _text_end(data, _text_end(data, place + 2, end), end)
-    return after + 4 + _u32(data, after) == end
-
-
-def _channel_ok(data: Buffer, place: int, end: int) -> bool:
-    return _map_ends_at(data, _text_end(data, _text_end(data, place + 4, end), end), end)
-
-
-def _message_index_ok(data: Buffer, place: int, end: int) -> bool:
-    size = _u32(data, place + 2)
-    return size % 16 == 0 and place + 6 + size == end
-
-
-def _chunk_index_ok(data: Buffer, place: int, end: int) -> bool:
-    after = place + 36 + _u32(data, place + 32) + 8
-    return _text_end(data, after, end) + 16 == end
-
-
-def _statistics_ok(data: Buffer, place: int, end: int) -> bool:
-    return place + 46 + _u32(data, place + 42) == end
-
-
-_CHECKS = {
-    Opcode.HEADER: _header_ok,
-    Opcode.FOOTER: lambda data, place, end: end - place == 20,
-    Opcode.SCHEMA: _schema_ok,
-    Opcode.CHANNEL: _channel_ok,
-    Opcode.MESSAGE: lambda data, place, end: end - place >= 22,
-    Opcode.CHUNK: _chunk_ok,
-    Opcode.MESSAGE_INDEX: _message_index_ok,
-    Opcode.CHUNK_INDEX: _chunk_index_ok,
-    Opcode.ATTACHMENT: _attachment_ok,
-    Opcode.STATISTICS: _statistics_ok,
-    Opcode.METADATA: _metadata_ok,
-    Opcode.SUMMARY_OFFSET: lambda data, place, end: end - place == 17,
-    Opcode.DATA_END: lambda data, place, end: end - place == 4,
-}
+def _attachment_agrees(data: Buffer, place: int, end: int) -> bool:
+    crc = _U32.unpack_from(data, end - 4)[0]
+    return crc == 0 or zlib.crc32(data[place + 9 : end - 4]) == crc

@@ -6,7 +6,7 @@ that viewers draw it over its number; other events default to the latest logged 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import orjson
@@ -14,20 +14,8 @@ import orjson
 from fdi_torch.logbook.messages import Messages, Named
 from fdi_torch.logbook.payload import as_array, pack
 from fdi_torch.logbook.sink import log_time_of
-from fdi_torch.logbook.write_buffer import DeferredTopic
 
 _INFO = 2  # of the levels debug (1) to fatal (5) of foxglove.Log
-
-
-def _packed(items: Sequence[tuple[float, Named, Named]]) -> Iterator[tuple[float, Named]]:
-    for t, fields, arrays in items:
-        message = dict(fields)
-        for name, array in arrays.items():
-            message |= pack(name, array)
-        yield t, message
-
-
-_POPULATION = DeferredTopic("/estimator/de/population", _packed)
 
 
 class Topics(Messages):
@@ -39,13 +27,11 @@ class Topics(Messages):
         self.write("/observer/alarm", fields, t)
 
     def population(self, generation: int, arrays: Mapping[str, Any], *, problem: int = 0) -> None:
-        """The state of the search for its continuation: any numeric arrays, such as population and cost.
-
-        They are written with delay, and must not be changed in place.
-        """
-        fields = {"problem": problem, "generation": generation}
-        size = sum(getattr(array, "nbytes", 0) for array in arrays.values())
-        self.later(_POPULATION, (generation, fields, dict(arrays)), size)
+        """The state of the search for its continuation: any numeric arrays, such as population and cost."""
+        fields: dict[str, Any] = {"problem": problem, "generation": generation}
+        for name, array in arrays.items():
+            fields |= pack(name, array)
+        self.write("/estimator/de/population", fields, generation)
 
     def estimate(
         self,

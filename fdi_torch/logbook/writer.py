@@ -1,9 +1,8 @@
 """RunLog: the log of one run or study; a crash loses at most its last second.
 
 The run is written to `NAME.mcap.partial`, which becomes `NAME.mcap` at its end. Waiting messages go to disk after 0.75
-s at the latest, by a small thread, also while the run computes without logging. Chunks written in pieces are replaced
-by full ones at the end, so that equal configuration, data and seed give byte-identical files apart from wall-clock
-fields: `started` and `run_id` of `fdi_torch.run`, `ended` and `wall_seconds` of `fdi_torch.status`.
+s at the latest, by a small thread, also while the run computes without logging. Equal configuration, data and seed give
+equal messages; how these are divided into chunks depends on the clock.
 """
 
 from __future__ import annotations
@@ -28,16 +27,12 @@ from fdi_torch.logbook.flat_metadata import flatten
 from fdi_torch.logbook.payload import as_array
 from fdi_torch.logbook.provenance import environment, git_state, version_of
 from fdi_torch.logbook.reader import Message
-from fdi_torch.logbook.sample_block import Block, Timed
-from fdi_torch.logbook.sink import Sink
+from fdi_torch.logbook.sink import Sink, Timed
 from fdi_torch.logbook.topic_definitions import FORMAT_VERSION
 from fdi_torch.logbook.topics import Topics
 
 Listener = Callable[[Channel, int, bytes], None]
 """Called with each logged message: its channel, its log time in ns and its payload."""
-
-_GRACE_SECONDS = 0.05
-"""Time in which the run may write waiting messages itself before the flushing thread does."""
 
 
 class RunLog(Topics):
@@ -122,8 +117,11 @@ class RunLog(Topics):
 
     def _end(self) -> None:
         """Complete the log under its final name."""
-        self.settle()
-        self._publish(self._write_end(self._open_sink()))
+        self._write_end(self._open_sink())
+        try:
+            os.replace(self.partial_path, self.path)
+        except OSError as error:
+            raise log_error(self.path, error) from error
 
     def _say_what_is_kept(self, error: BaseException) -> None:
         kept = self.path if self.path.exists() else self.partial_path
@@ -145,7 +143,6 @@ class RunLog(Topics):
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
         """Attach a file to the log."""
-        self.settle()
         with self._lock:
             self._open_sink().attachment(name, media_type, data)
             self._note_progress()
@@ -153,9 +150,7 @@ class RunLog(Topics):
     def flush(self) -> None:
         """Write everything logged so far to disk."""
         with self._lock:
-            self.due = False
-            self.settle()
-            self._open_sink().cut()
+            self._open_sink().flush()
             self._note_progress()
 
     def put(self, messages: Iterable[Timed]) -> None:
@@ -163,15 +158,6 @@ class RunLog(Topics):
         with self._lock:
             sink = self._open_sink()
             sink.messages(messages if self._listener is None else self._heard(messages, self._listener))
-            self._note_progress()
-
-    def put_block(self, block: Block) -> None:
-        """Write a block of samples, with the same bytes."""
-        if self._listener is not None:
-            self.put(block)
-            return
-        with self._lock:
-            self._open_sink().block(block)
             self._note_progress()
 
     def carry_over(self, messages: Iterable[Message]) -> int:
@@ -204,25 +190,15 @@ class RunLog(Topics):
         self._size = sink.written
 
     def _flush_by_clock(self) -> None:
-        """Flush waiting messages periodically. A run about to log writes them itself, since two writers slow each other
-        down.
-        """
+        """Flush messages that have waited."""
         while not self._stop.wait(self._flush_seconds / 2):
-            self.due = self._has_waited()
-            if self.due and not self._stop.wait(_GRACE_SECONDS):
-                with self._lock:
+            with self._lock:
+                since = self._waiting_since
+                if since is not None and time.monotonic() - since >= self._flush_seconds / 2:
                     try:
-                        if self.due:
-                            self.flush()
+                        self.flush()
                     except LogError:
                         return  # the sink is dead; the next write says so
-
-    def _has_waited(self) -> bool:
-        with self._lock:
-            since = self._waiting_since
-            if since is None and self._buffer:
-                self._waiting_since = time.monotonic()
-            return since is not None and time.monotonic() - since >= self._flush_seconds / 2
 
     def _write_start(self, sink: Sink) -> None:
         sink.metadata("fdi_torch.run", self._run)
@@ -231,8 +207,8 @@ class RunLog(Topics):
         if self._config_text:
             sink.attachment("config.yaml", "application/yaml", self._config_text.encode())
 
-    def _write_end(self, sink: Sink) -> Path:
-        """Write results and status; returns the complete file."""
+    def _write_end(self, sink: Sink) -> None:
+        """Write results and status, and complete the file."""
         if self._arrays:
             sink.attachment("results.npz", "application/x-npz", _npz(self._arrays))
         if self._results:
@@ -245,18 +221,7 @@ class RunLog(Topics):
         except LogError:
             sink.abandon()
             raise
-        return sink.finish()
-
-    def _publish(self, whole: Path) -> None:
-        """Give the finished file its name."""
-        try:
-            os.replace(whole, self.path)
-            if whole != self.partial_path:
-                self.partial_path.unlink()
-        except OSError as error:
-            if whole.exists():
-                os.replace(whole, self.partial_path)
-            raise log_error(self.path, error) from error
+        sink.finish()
 
 
 def _make_room(path: Path) -> None:

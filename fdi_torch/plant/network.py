@@ -13,14 +13,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from fdi_torch.parameters import Parameter, ParameterSpace, by_prefix
+from fdi_torch.parameters import ParameterSpace, by_prefix
 from fdi_torch.plant.constants import constant_parameters
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor
-from fdi_torch.plant.effect import Memory, Placement, Stage, Values, fits, place_kinds_of
+from fdi_torch.plant.effect import Memory, Placement, Stage, Values
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
 from fdi_torch.plant.local_conditions import Local
 from fdi_torch.plant.operating_point import Constants, OperatingPoint, PlaceValues
 from fdi_torch.plant.orifice import limit_emptying, weir_flow
+from fdi_torch.plant.placed_effects import expect_fit, placed_parameters
 from fdi_torch.plant.signal_chain import SignalChain
 from fdi_torch.plant.signals import Clock
 
@@ -45,7 +46,7 @@ class TankNetwork(nn.Module):
         self._channel_index = {name: i for i, name in enumerate(description.channels())}
         self._place(tuple(placements))
         for placement in self.placements:
-            _expect_fit(description, placement)
+            expect_fit(description, placement)
         effect_parameters = [p for placement in self.placements for p in placed_parameters(placement, description)]
         self.constants = ParameterSpace([*constant_parameters(description), *effect_parameters])
         self.register_buffer("nominal", self.constants.nominal())
@@ -294,35 +295,3 @@ class TankNetwork(nn.Module):
 
 def _clipped(sensor: Sensor, value: Tensor) -> Tensor:
     return value if sensor.low is None and sensor.high is None else torch.clamp(value, sensor.low, sensor.high)
-
-
-def placed_parameters(placement: Placement, plant: PlantDescription) -> list[Parameter]:
-    """The effect's parameters under their full names ('T1.leak.size'), nominal at the placement's known values."""
-    known = dict(placement.values or {})
-    parameters = []
-    for p in placement.effect.parameters(placement.location, plant):
-        nominal = known.pop(p.name, p.nominal)
-        low, high = min(p.low, nominal), max(p.high, nominal)
-        name = placement.full_name(p.name)
-        std = plant.tolerances.get(name, p.std)
-        parameters.append(replace(p, name=name, nominal=nominal, low=low, high=high, std=std))
-    if known:
-        expected = ", ".join(p.name for p in placement.effect.parameters(placement.location, plant))
-        raise ValueError(f"{placement.prefix}: expected parameters of {expected}, got {', '.join(known)}")
-    return parameters
-
-
-def _expect_fit(plant: PlantDescription, placement: Placement) -> None:
-    if not fits(placement.effect, plant, placement.location):
-        kinds = " or ".join(place_kinds_of(placement.effect))
-        raise ValueError(f"{placement.prefix}: expected a place of kind {kinds}, got {placement.location}")
-    component = plant.component(placement.location) if placement.effect.states else None
-    if component is not None and not (
-        placement.effect.stage is Stage.FLOW
-        and isinstance(component, FlowComponent)
-        and component.order <= FlowOrder.BY_LEVELS
-    ):
-        raise ValueError(
-            f"{placement.prefix}: expected states only in a FLOW effect of a component whose flow depends on levels "
-            f"and commands alone, got {placement.effect.stage.name} at {placement.location}"
-        )

@@ -19,8 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from fdi_torch.disk import replacing
-from fdi_torch.parameters import display_unit, header_unit, unit_factor
+from fdi_torch.parameters import header_unit
 from fdi_torch.recording import Hold, Recording
 from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
@@ -276,35 +275,3 @@ def channels_in_si(table: np.ndarray, columns: Columns, bounds: Sequence[Bound])
 def _numbers(table: np.ndarray, columns: Columns, bound: Bound) -> np.ndarray:
     source = bound.constant if bound.position is None else table[:, columns.positions.index(bound.position)]
     return np.asarray(source * np.float64(bound.factor))
-
-
-def write_csv(recording: Recording, path: Path) -> Path:
-    """Write the recording as CSV whose headers need no mapping: t_s, Q1_cm3_s, h1_cm ..., in the units for display.
-    Masked readings become empty cells.
-    """
-    inputs = dict(zip(recording.input_names, recording.input_units, strict=True))
-    outputs = dict(zip(recording.output_names, recording.output_units, strict=True))
-    factors = [unit_factor(si, _file_unit(name, si)) for name, si in (*inputs.items(), *outputs.items())]
-    readings = torch.where(recording.mask, recording.outputs, torch.nan)
-    table = torch.cat([recording.inputs, readings], dim=1).numpy() * np.asarray(factors)
-    with replacing(path) as new, new.open("w", encoding="utf-8", newline="") as handle:
-        handle.write(header_of(inputs, outputs) + "\n")
-        for t, row in zip(recording.time.tolist(), table, strict=True):
-            cells = ("" if np.isnan(value) else f"{value:.12g}" for value in row.tolist())
-            handle.write(f"{t:.12g}," + ",".join(cells) + "\n")
-    return path
-
-
-def header_of(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> str:
-    """A header that needs no mapping, from names and SI units of channels: t_s,Q1_cm3_s,h1_cm."""
-    named = [(name, _file_unit(name, si_unit)) for name, si_unit in (*inputs.items(), *outputs.items())]
-    return ",".join(["t_s", *(f"{n}_{u}" if header_unit(f"{n}_{u}") == (n, u) else f"{n} [{u}]" for n, u in named)])
-
-
-def _file_unit(name: str, si_unit: str) -> str:
-    """The unit of a channel in a file: the unit for display, spelled as is usual in headers."""
-    unit = display_unit(si_unit, name)[0] or "1"
-    return _IN_HEADERS.get(unit, unit)
-
-
-_IN_HEADERS = {"cm^3/s": "cm3_s", "1/s": "Hz", "1": "pct", "%": "pct"}

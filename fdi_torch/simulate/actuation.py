@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -34,7 +34,7 @@ class Actuation:
     def commands(self, values: PlaceValues, lanes: int) -> list[Tensor]:
         """Output of each actuator over the K steps, one tensor (L, K) each."""
         signals, count = self._channels(values, lanes), self.network.command_memory()
-        stage = _Stage(self, values)
+        stage = self._stage(values)
         memory = solve_memory(stage.step, stage.first, signals, [], count, signals[0].shape) if signals else []
         return self.network.commands(signals, tuple(memory), self.clock, values)[0]
 
@@ -46,7 +46,7 @@ class Actuation:
         theta: each named parameter (L, 1). Returns the outputs, the slopes (L, M, K) of each output by the M parameters
         that affect any of them (None for an output without slopes), and the indices of these M parameters.
         """
-        channels, stage = self._channels(values, lanes), _Stage(self, values)
+        channels, stage = self._channels(values, lanes), self._stage(values)
         if not channels:
             return [], [], []
         shape = channels[0].shape
@@ -61,6 +61,9 @@ class Actuation:
         signals = [_columns([row[p] for p in columns]) for row in channel_slopes]
         return linearised.outputs, linearised.along(signals, columns), columns
 
+    def _stage(self, values: PlaceValues) -> NetworkStage:
+        return NetworkStage(self.network.commands, self.network.steady_command_memory, self.clock, self.names, values)
+
     def _channels(self, values: PlaceValues, lanes: int) -> list[Tensor]:
         """Mean of each actuator's channel over each step (L, K), with its dead time."""
         e = self.experiment
@@ -73,21 +76,24 @@ class Actuation:
 
 
 @dataclass(frozen=True)
-class _Stage:
-    actuation: Actuation
+class NetworkStage:
+    """The actuators or the sensors of a network as a stage whose parameters `names` are free.
+
+    outputs: outputs and new memory, steady: the memory at rest; both of signals, a clock and values.
+    """
+
+    outputs: Callable[[Signals, Memory, Clock, PlaceValues], tuple[Signals, Memory]]
+    steady: Callable[[Signals, Clock, PlaceValues], Memory]
+    clock: Clock
+    names: Sequence[str]
     values: PlaceValues
 
     def step(self, signals: Signals, memory: Memory, theta: Signals) -> tuple[Signals, Memory]:
-        return self.actuation.network.commands(
-            signals, memory, self.actuation.clock, with_parameters(self.values, self.actuation.names, theta)
-        )
+        return self.outputs(signals, memory, self.clock, with_parameters(self.values, self.names, theta))
 
     def first(self, signals: Signals, theta: Signals) -> Memory:
-        clock = self.actuation.clock
-        first_step = Clock(clock.start[:1], clock.step[:1], clock.resolution)
-        return self.actuation.network.steady_command_memory(
-            signals, first_step, with_parameters(self.values, self.actuation.names, theta)
-        )
+        first = Clock(self.clock.start[:1], self.clock.step[:1], self.clock.resolution)
+        return self.steady(signals, first, with_parameters(self.values, self.names, theta))
 
 
 def with_parameters(values: PlaceValues, names: Sequence[str], theta: Signals) -> PlaceValues:

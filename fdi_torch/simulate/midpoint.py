@@ -29,25 +29,10 @@ def newton_step(
     if compiled is not None:
         return compiled
     one = torch.eye(path.shape[1], dtype=path.dtype, device=path.device).unsqueeze(-1)
-    inverse = _inverse(one - 0.5 * span * by_level)
+    inverse = torch.linalg.inv((one - 0.5 * span * by_level).movedim(-1, 1)).movedim(1, -1)
     transition, gain = 2.0 * inverse - one, inverse * span
     misfit = (span * rates - (path[..., 1:] - path[..., :-1])).unsqueeze(2)
     forcing = torch.cat([product(inverse, misfit), product(gain, by_theta)], dim=2)
     first = torch.cat([(start - path[..., 0]).unsqueeze(-1), start_slopes], dim=-1)
     solution = scan_in_time(transition, forcing, first)
     return path + solution[:, :, 0], solution[:, :, 1:], transition, gain, solution[:, :, 0].abs().amax(dim=(-1, -2))
-
-
-def _inverse(a: Tensor) -> Tensor:
-    """Inverses of the matrices (L, n, n, K) of all steps, by elimination without pivoting (1 - dt/2 df/dh is diagonally
-    dominant).
-    """
-    n = a.shape[1]
-    one = torch.eye(n, dtype=a.dtype, device=a.device).unsqueeze(-1).expand(a.shape)
-    rows = list(torch.cat([a, one], dim=2).unbind(1))
-    for i in range(n):
-        rows[i] = rows[i] / rows[i][:, i, None]
-        for k in range(n):
-            if k != i:
-                rows[k] = rows[k] - rows[k][:, i, None] * rows[i]
-    return torch.stack([row[:, n:] for row in rows], dim=1)

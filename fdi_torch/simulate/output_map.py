@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
-from fdi_torch.simulate.actuation import with_parameters
+from fdi_torch.simulate.actuation import NetworkStage, with_parameters
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.linearised_stage import LinearisedStage, Signals, linearise_stage, solve_memory
 from fdi_torch.simulate.pointwise import Row, partials
@@ -90,7 +89,7 @@ class OutputMap:
         measured = [self.samples.of(path[:, tank]) for tank in self.network.sensor_tanks()]
         for i, delay in self.network.reading_delays(values).items():
             measured[i] = self._late(delay, len(path), []).of(measured[i])
-        shape, stage = (len(path), len(self.times)), _Stage(self, values)
+        shape, stage = (len(path), len(self.times)), self._stage(values)
         memory = solve_memory(stage.step, stage.first, measured, [], self.network.reading_memory(), shape)
         readings = stage.step(measured, tuple(memory), [])[0]
         return torch.stack([r.expand(shape) for r in readings], dim=1)
@@ -105,11 +104,14 @@ class OutputMap:
             late[i] = self._late(delay, len(path), partials(delayed, theta, (len(path), 1))[1][0])
             late_slopes[i] = late[i].by_delay(measured[i])
             measured[i] = late[i].of(measured[i])
-        stage = _Stage(self, values)
+        stage = self._stage(values)
         stage_outputs = linearise_stage(stage.step, stage.first, measured, theta, self.network.reading_memory(), shape)
         return LinearisedOutputs(
             torch.stack(stage_outputs.outputs, dim=1), stage_outputs, late, late_slopes, tanks, self.samples
         )
+
+    def _stage(self, values: PlaceValues) -> NetworkStage:
+        return NetworkStage(self.network.read, self.network.steady_reading_memory, self.clock, self.names, values)
 
     def _late(self, delay: Tensor, lanes: int, by_theta: Row) -> DelayedSignal:
         """The delay (L, 1) s of one sensor; its level is constant before the first sample."""
@@ -119,24 +121,6 @@ class OutputMap:
         interval = times[right] - times[right - 1]
         share = torch.where(delayed_times > times[0], (delayed_times - times[right - 1]) / interval, 0.0)
         return DelayedSignal(right - 1, share, interval, by_theta)
-
-
-@dataclass(frozen=True)
-class _Stage:
-    outputs: OutputMap
-    values: PlaceValues
-
-    def step(self, signals: Signals, memory: Memory, theta: Signals) -> tuple[Signals, Memory]:
-        return self.outputs.network.read(
-            signals, memory, self.outputs.clock, with_parameters(self.values, self.outputs.names, theta)
-        )
-
-    def first(self, signals: Signals, theta: Signals) -> Memory:
-        clock = self.outputs.clock
-        first_sample = Clock(clock.start[:1], clock.step[:1], clock.resolution)
-        return self.outputs.network.steady_reading_memory(
-            signals, first_sample, with_parameters(self.values, self.outputs.names, theta)
-        )
 
 
 class SampleGrid:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.logbook import DeferredTopic, RunLog
+from fdi_torch.logbook import RunLog
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.schemas import json_schema
 from fdi_torch.logbook.sink import Sink
@@ -25,13 +25,10 @@ FIXED: dict[str, Any] = {
 }
 
 
-GENERATIONS = DeferredTopic("/estimator/de/generation", lambda items: items)
-
-
 def log_generation(log: RunLog, generation: int, cost: float, numbers: dict[str, Any], problem: int = 0) -> None:
-    """A generation of the search, written with delay, as by `train`."""
+    """A generation of the search."""
     fields = {"problem": problem, "generation": generation, "best_cost": cost, **numbers}
-    log.later(GENERATIONS, (generation, fields))
+    log.write("/estimator/de/generation", fields, generation)
 
 
 def write_everything(log: RunLog, samples: int = 50) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from example_logs import FIXED, log_generation
 
-from fdi_torch.jobs.train import next_logged_generation, state_is_due
+from fdi_torch.jobs.train import state_is_due
 from fdi_torch.logbook import LogError, Message, RunLog, content_hash, last_state, read_run, set_aside, unfinished
 
 
@@ -100,5 +100,3 @@ def test_trials_done_are_carried_over(tmp_path: Path) -> None:
 def test_states_come_as_often_as_they_are_due() -> None:
     due = [generation for generation in range(5000) if state_is_due(generation)]
     assert due[:3] == [0, 32, 64] and due[-1] > 5000 * 7 / 8
-    for generation in range(due[-1]):
-        assert next_logged_generation(generation) == min(d for d in due if d > generation)

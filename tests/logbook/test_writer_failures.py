@@ -216,17 +216,6 @@ def check_kill(folder: Path, seconds: float) -> None:
     assert all(times[number] > killed - 1.0 for number in lost)
 
 
-def test_without_room_to_join_the_chunks_the_log_still_gets_its_name(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        with RunLog(tmp_path / f"{name}.mcap", "train", **FIXED) as log:
-            log.say("first")
-            log.flush()
-            log.say("second")
-            (tmp_path / "b.mcap.partial.joined").write_bytes(b"in the way")
-    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "b.mcap"]
-
-
 def test_a_log_whose_name_was_taken_meanwhile_is_kept_under_its_partial_name(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="it is a folder"), RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
         log.say("hello")

@@ -148,6 +148,14 @@ def add_live(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def host_and_port(option: str, address: str, example: str) -> tuple[str, int]:
+    """The parts of [HOST:]PORT; without a host, that of the example. Raises ValueError for anything else."""
+    host, _, port = address.rpartition(":")
+    if not (port.isascii() and port.isdigit() and int(port) < 2**16):
+        raise ValueError(f"{option}: expected [HOST:]PORT such as {example}, got {address}")
+    return host or example.partition(":")[0], int(port)
+
+
 def access_text(host: str) -> str:
     """Who can read the stream; the server has no password."""
     if host.strip("[]") in ("127.0.0.1", "::1", "localhost"):
@@ -163,9 +171,7 @@ def live(arguments: argparse.Namespace, name: str, screen: Screen) -> Iterator[L
         return
     from fdi_torch.logbook import serve
 
-    host, _, port = arguments.live.rpartition(":")
-    if not (port.isdigit() and int(port) < 2**16):
-        raise ValueError(f"--live: expected [HOST:]PORT such as {LIVE}, got {arguments.live}")
-    with serve(name, host or LIVE.partition(":")[0], int(port)) as server:
-        screen.note(f"live: {server.address} ({access_text(host or LIVE.partition(':')[0])})")
+    host, port = host_and_port("--live", arguments.live, LIVE)
+    with serve(name, host, port) as server:
+        screen.note(f"live: {server.address} ({access_text(host)})")
         yield server
