@@ -17,13 +17,19 @@ from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.fault_recovery import recovered_columns, recovery_is_observable, reset_to_nominal
-from fdi_torch.monitor.fault_tracking import STRONG_EVIDENCE, size_change, updated_tracks, with_new_sizes
+from fdi_torch.monitor.fault_tracking import (
+    STRONG_EVIDENCE,
+    effect_of_change,
+    size_change,
+    updated_tracks,
+    with_new_sizes,
+)
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState, PendingAlarm
 from fdi_torch.monitor.observer_bank import ObserverBank
-from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, fault_effect_rms, normalized_residuals
+from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, normalized_residuals
 
 GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes a fault that grows
 SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
@@ -234,7 +240,7 @@ class AlarmHandler:
             state,
             change,
             [fault.size for fault in self.faults],
-            lambda c: fault_effect_rms(self.observer, state, c, change.best.onset),
+            lambda c: effect_of_change(self.observer, state, change, c, float(state.healthy[c])),
         )
         state, events = self._end_recovered(state, change, reported)
         present = [c for c in best.hypothesis.sizes if c not in back]
@@ -307,7 +313,7 @@ class AlarmHandler:
     def _sensor_shares(self, state: MonitorState) -> tuple[tuple[str, float], ...]:
         """The share of each sensor in the detector's statistic."""
         since = max(self._search_start(state, state.now), state.now - self.settings.lookback)
-        white = normalized_residuals(self.observer, state, max(int((state.samples.time > since).sum()), 1))
+        white = normalized_residuals(state, max(int((state.samples.time > since).sum()), 1))
         names = [sensor.name for sensor in self.observer.network.description.sensors]
         return tuple(zip(names, self.detector.shares(white).tolist(), strict=True))
 

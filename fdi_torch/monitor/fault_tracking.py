@@ -26,7 +26,7 @@ def size_change(
 
     None without a known fault, if one of them recovered, if the change is large, or if a new fault is clearly likelier.
     """
-    off = (state.believed != state.healthy).nonzero().flatten().tolist()
+    off = state.off_nominal.nonzero().flatten().tolist()
     known = [f for f in faults if f.size in off]
     if not known:
         return None
@@ -52,12 +52,28 @@ def _relative_effect(
     observer: ObserverBank, window: ObserverWindow, state: MonitorState, change: HypothesisFit
 ) -> float:
     """Effect of a change of size on the white innovations over that of the known faults, root mean square."""
-    theta = torch.cat([change.value[None], state.parameters_without_each(observer)])
+    groups = [list(columns) for columns in observer.effects if bool(state.off_nominal[list(columns)].any())]
+    theta = torch.cat([change.value[None], state.believed.repeat(len(groups), 1)])
+    for lane, columns in enumerate(groups, start=1):
+        theta[lane, columns] = state.healthy[columns]
     sudden = torch.zeros(len(theta), dtype=torch.bool)
     lanes = ChangeHypotheses(theta, torch.full((len(theta),), change.onset, dtype=theta.dtype), sudden)
     base = observer.white_innovations(window, state.believed, no_change(state.believed))
     moved, *removed = (observer.white_innovations(window, state.believed, lanes) - base).square().sum((1, 2)).tolist()
     return (moved / sum(removed)) ** 0.5 if sum(removed) > 0.0 else float("inf")
+
+
+def effect_of_change(
+    observer: ObserverBank, state: MonitorState, change: DetectedChange, column: int, value: float
+) -> float:
+    """Root mean square of what another value of a parameter after a change adds to the white innovations since then."""
+    window, onset, late = state.window(change.best.onset), change.best.onset, change.best.hypothesis.incipient
+    theta = change.best.value.repeat(2, 1)
+    theta[1, column] = value
+    lanes = ChangeHypotheses(theta, torch.full((2,), onset, dtype=theta.dtype), torch.tensor([late, late]))
+    one, other = observer.white_innovations(window, change.before, lanes)
+    since = window.times > onset
+    return float((one - other)[since].square().mean().sqrt()) if bool(since.any()) else 0.0
 
 
 def updated_tracks(

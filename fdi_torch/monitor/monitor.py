@@ -159,6 +159,6 @@ class Monitor:
     def _observed(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, Tensor]:
         """The state after the samples, and the detector's statistic (S,) at each of them."""
         moved = advance_observer(self.observer, state, samples)
-        residuals = normalized_residuals(self.observer, moved, len(samples))
+        residuals = normalized_residuals(moved, len(samples))
         statistic, memory = self.detector.update(residuals, state.detector_memory)
         return replace(moved, detector_memory=memory), statistic

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from fdi_torch.monitor.alarm_state import Alarm
 from fdi_torch.monitor.hypothesis import HypothesisFit
-from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverBank, ObserverWindow
+from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples
 
 
@@ -81,13 +81,10 @@ class MonitorState:
     Recent samples, S of them:
       samples; state (S, tanks + M): observer state after each, levels in m, then memory of actuators and sensors;
       residual, innovations, white (S, sensors): residuals, innovations of the flow filter, and white residuals; memory
-      (S, F): state of the flow filter; fault_effects (S, E, sensors): change of the innovations if each of the E
-      effects were taken out of the observer's plant. number: samples since the observer's
-      start. reachable: when it started, s. earliest_start: no later window begins before it, s.
+      (S, F): state of the flow filter. number: samples since the observer's start. reachable: when it started, s.
+      earliest_start: no later window begins before it, s.
     Parameters:
       believed (P,): values that the observer uses; healthy (P,): the same with every fault at nominal.
-      states_without (E, tanks + M), memory_without (E, F): states of parallel observers, each without one effect, and
-      of their flow filters.
       unexplained_rms (sensors,): root mean square of the white residuals that the known faults leave unexplained.
     Bookkeeping:
       clock: time of the last sample. detector_memory: None after a restart of the detector. alarms: all so far.
@@ -101,12 +98,9 @@ class MonitorState:
     innovations: Tensor
     white: Tensor
     memory: Tensor
-    fault_effects: Tensor
     number: int
     believed: Tensor
     healthy: Tensor
-    states_without: Tensor
-    memory_without: Tensor
     reachable: float
     unexplained_rms: Tensor
     clock: ClockState
@@ -134,18 +128,10 @@ class MonitorState:
         """Time of the last sample, s."""
         return float(self.samples.time[-1])
 
-    def active_effects(self, observer: ObserverBank) -> list[int]:
-        """Indices of the observer's effects that have a value other than fault-free."""
-        off = (self.believed != self.healthy).tolist()
-        return [e for e, columns in enumerate(observer.effects) if any(off[c] for c in columns)]
-
-    def parameters_without_each(self, observer: ObserverBank) -> Tensor:
-        """The observer's parameters with one active effect removed at a time, (active effects, P)."""
-        active = self.active_effects(observer)
-        theta = self.believed.repeat(len(active), 1)
-        for lane, e in enumerate(active):
-            theta[lane, list(observer.effects[e])] = self.healthy[list(observer.effects[e])]
-        return theta
+    @property
+    def off_nominal(self) -> Tensor:
+        """Which parameters have a value other than fault-free, (P,) bool."""
+        return self.believed != self.healthy
 
     def window(self, start: float) -> ObserverWindow:
         """The window from the last sample before `start` s; it holds at least two further samples."""
