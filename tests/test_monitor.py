@@ -297,7 +297,7 @@ def test_misuse_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one fault to watch for"):
         Monitor(NETWORK, ParameterSpace(), noise(), monitor().detector)
     with pytest.raises(ValueError, match="lookback > 0"):
-        MonitorSettings(lookback=0.0)
+        replace(monitor().settings, lookback=0.0)
     late = build_network(PLANT, [place("pump_delay", "Q1")])
     with pytest.raises(ValueError, match="without pure delays, got Q1"):
         ObserverBank(late, SPACE, noise().gain, noise().whitening)
@@ -398,7 +398,7 @@ def test_figures_6_and_7() -> None:
     learnt, _ = learn_noise(network, free, space, space.nominal())
     detector = make_detector("cusum", 20000.0, 1.0, 3, torch.Generator().manual_seed(0))
     run_monitor = Monitor(
-        network, space, learnt, detector, MonitorSettings(lookback=200.0, together=4, incipient=False)
+        network, space, learnt, detector, MonitorSettings(200.0, 60.0, 1000.0, together=4, incipient=False)
     )
     _, events = followed(run_monitor, samples, 50)
     alarms = [event.time for event in events if event.kind == "alarm"]

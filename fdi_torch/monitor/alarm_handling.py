@@ -209,7 +209,7 @@ class AlarmHandler:
         announce: bool = True,
     ) -> tuple[MonitorState, list[Event]]:
         """Adopt the latest change with new explanations."""
-        alarm_time = change.alarm_time if change.alarm_time > fits[0].onset - 1.0 else state.alarm(change.number).last
+        alarm_time = change.alarm_time if change.alarm_time > fits[0].onset else state.alarm(change.number).last
         next_fit = self._next_revision(fits[0], state.now)
         revised = replace(change, explanations=tuple(fits), alarm_time=alarm_time, next_fit=next_fit)
         return self._adopt(state, revised, kind, announce)
@@ -335,5 +335,5 @@ class AlarmHandler:
         return state.now - change.best.onset <= longest and change.best.onset >= state.reachable
 
     def _next_revision(self, fit: HypothesisFit, now: float) -> float:
-        since = max(now - fit.onset, self.settings.confirm, 1.0)
+        since = max(now - fit.onset, self.settings.confirm)
         return fit.onset + self.settings.revise * since

@@ -54,7 +54,8 @@ class EventWriter:
         alarm, best = state.alarm(change.number), fits[0]
         explanations = tuple(self.explanation(f, change, state.now) for f in fits)
         text = f"{headline(explanations)}, {_onset_text(best)}"
-        if best.onset - state.reachable <= 2.0 * max(best.onset_std, 0.5):
+        interval = float(torch.diff(state.samples.time).median())
+        if best.onset - state.reachable <= max(2.0 * best.onset_std, interval):
             text += ", where the observer starts: it may have been there before"
         rates = [rate_text(self.space[s.name], s.rate) for s in explanations[0].sizes if s.rate is not None]
         text += f"; grows by {', '.join(rates)}" if rates else ""
