@@ -23,8 +23,8 @@ from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.fault_free_checks import residual_warnings
-from fdi_torch.monitor.hypothesis import Fault, faults_of
-from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.hypothesis import Fault, Hypothesis, faults_of
+from fdi_torch.monitor.isolation import Prior, fit, isolate
 from fdi_torch.monitor.level_forecast import DRAWS, limit_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
@@ -222,6 +222,19 @@ def test_two_simultaneous_faults_are_isolated_together() -> None:
     assert best.hypothesis.columns == (0, 4)
     for column, size in ((0, 0.05), (4, 0.01)):
         assert abs(float(best.value[column]) - size) < 4 * float(best.std[column])
+
+
+def test_a_known_onset_is_kept_and_sharpens_the_size() -> None:
+    run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
+    window = from_rest(recorded(step_to("T1.leak.size", 0.05, 100.0), 160))
+    nominal, prior = SPACE.nominal(), Prior(SPACE.names, 1)
+    start = torch.cat([nominal, nominal.new_tensor([100.0])])[None]
+    [known], [free] = (
+        fit(run_monitor, window, nominal, [Hypothesis((0,))], start, 0.0, prior, k) for k in (True, False)
+    )
+    assert known.onset == 100.0 and known.onset_std == 0.0 and free.onset != 100.0
+    assert abs(float(known.value[0]) - 0.05) < 4 * float(known.std[0])
+    assert float(known.std[0]) < float(free.std[0])
 
 
 def test_standard_errors_are_those_of_repeated_runs() -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
-from fdi_torch.monitor.fault_tracking import effect_of_change
+from fdi_torch.monitor.fault_tracking import STRONG_EVIDENCE, effect_of_value
 from fdi_torch.monitor.hypothesis import HypothesisFit
-from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState
-from fdi_torch.monitor.observer_bank import ObserverBank
+from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault, MonitorState
+from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank
 from fdi_torch.parameters import ParameterSpace
 
 # Assumed error of a fault's model, as a share of the fault's effect: a real leak is not an ideal orifice.
@@ -29,8 +30,17 @@ def recovery_is_observable(
     They would not if it adds less to the white innovations than three standard deviations of its model's error, the
     share FAULT_MODEL_ERROR of its earlier effect, for example in a dry tank or behind a closed valve.
     """
-    effect = effect_of_change(observer, state, change, track.column, float(change.before[track.column]))
+    window, size = state.window(change.best.onset), float(change.before[track.column])
+    effect, _ = effect_of_value(observer, window, change.before, change.hypothesis, track.column, size)
     return effect >= 3.0 * FAULT_MODEL_ERROR * track.effect_rms
+
+
+def end_is_shown(observer: ObserverBank, state: MonitorState, fault: HiddenFault, start: float) -> bool:
+    """Whether the readings since `start` s would show a hidden fault, and contradict it."""
+    window = state.window(start)
+    present = ChangeHypotheses(state.believed[None], window.samples.time[:1], torch.tensor([False]))
+    effect, misfit = effect_of_value(observer, window, state.believed, present, fault.track.column, fault.size)
+    return effect >= 3.0 * FAULT_MODEL_ERROR * fault.track.effect_rms and misfit > STRONG_EVIDENCE
 
 
 def reset_to_nominal(space: ParameterSpace, change: DetectedChange, recovered: Sequence[int]) -> Tensor:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit
 from fdi_torch.monitor.isolation import isolate
@@ -63,17 +64,21 @@ def _relative_effect(
     return (moved / sum(removed)) ** 0.5 if sum(removed) > 0.0 else float("inf")
 
 
-def effect_of_change(
-    observer: ObserverBank, state: MonitorState, change: DetectedChange, column: int, value: float
-) -> float:
-    """Root mean square of what another value of a parameter after a change adds to the white innovations since then."""
-    window, onset, late = state.window(change.best.onset), change.best.onset, change.best.hypothesis.incipient
-    theta = change.best.value.repeat(2, 1)
+def effect_of_value(
+    observer: ObserverBank, window: ObserverWindow, before: Tensor, change: ChangeHypotheses, column: int, value: float
+) -> tuple[float, float]:
+    """What another value of a parameter after a change adds to the white innovations since then: its root mean square,
+    and the misfit (half a sum of squares) with it less that without it.
+
+    before (P,): parameters before the change, which has one lane.
+    """
+    theta = change.theta.repeat(2, 1)
     theta[1, column] = value
-    lanes = ChangeHypotheses(theta, torch.full((2,), onset, dtype=theta.dtype), torch.tensor([late, late]))
-    one, other = observer.white_innovations(window, change.before, lanes)
-    since = window.times > onset
-    return float((one - other)[since].square().mean().sqrt()) if bool(since.any()) else 0.0
+    lanes = ChangeHypotheses(theta, change.onset.repeat(2), change.incipient.repeat(2))
+    since = window.times > float(change.onset)
+    white, other = observer.white_innovations(window, before, lanes)[:, since]
+    rms = float((other - white).square().mean().sqrt()) if bool(since.any()) else 0.0
+    return rms, 0.5 * float(other.square().sum() - white.square().sum())
 
 
 def updated_tracks(

@@ -118,6 +118,7 @@ class Monitor:
             fresh,
             alarms=state.alarms,
             tracks=state.tracks,
+            hidden=state.hidden,
             unexplained_rms=state.unexplained_rms,
             pending=state.pending,
             learning_until=state.learning_until,

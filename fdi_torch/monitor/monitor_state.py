@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from fdi_torch.monitor.alarm_state import Alarm
 from fdi_torch.monitor.hypothesis import HypothesisFit
-from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverWindow
+from fdi_torch.monitor.observer_bank import LONG_AGO, ChangeHypotheses, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples
 
 
@@ -40,14 +41,26 @@ class FaultTrack:
 
 
 @dataclass(frozen=True)
+class HiddenFault:
+    """A fault that seems to have ended, but that the readings since would not show, for example in a dry tank.
+
+    track: before it ended. size: before it ended. ended: s. seen: until when the readings were examined, s.
+    """
+
+    track: FaultTrack
+    size: float
+    ended: float
+    seen: float
+
+
+@dataclass(frozen=True)
 class DetectedChange:
     """The latest detected change of parameters.
 
     number: of its alarm. before (P,): the parameters before the change, valid since `since` s. explanations: all with
     more than 0.1 % of the posterior probability, likeliest first; the observer uses the first. alarm_time: s. next_fit:
-    when all explanations are fitted again, s. ended: tracks of the faults that recovered at this change. hidden: their
-    columns of which the readings since would not show that they still stand. reported: parameter names of each
-    explanation in the last event.
+    when all explanations are fitted again, s. ended: tracks of the faults that recovered at this change. reported:
+    parameter names of each explanation in the last event.
     """
 
     number: int
@@ -57,13 +70,19 @@ class DetectedChange:
     alarm_time: float
     next_fit: float
     ended: tuple[FaultTrack, ...] = ()
-    hidden: tuple[int, ...] = ()
     reported: tuple[tuple[str, ...], ...] = ()
 
     @property
     def best(self) -> HypothesisFit:
         """The likeliest explanation that changes a parameter."""
         return self.explanations[0]
+
+    @property
+    def hypothesis(self) -> ChangeHypotheses:
+        """The likeliest explanation as the single lane of a bank of observers."""
+        best = self.best
+        onset, incipient = best.value.new_tensor([best.onset]), torch.tensor([best.hypothesis.incipient])
+        return ChangeHypotheses(best.value[None], onset, incipient)
 
 
 @dataclass(frozen=True)
@@ -88,8 +107,8 @@ class MonitorState:
       unexplained_rms (sensors,): root mean square of the white residuals that the known faults leave unexplained.
     Bookkeeping:
       clock: time of the last sample. detector_memory: None after a restart of the detector. alarms: all so far.
-      pending: the alarm that is not isolated yet. change: the latest. tracks: the known faults. learning_until: no
-      alarm is raised before it, s.
+      pending: the alarm that is not isolated yet. change: the latest. tracks: the known faults. hidden: faults whose
+      end the readings have not shown yet. learning_until: no alarm is raised before it, s.
     """
 
     samples: Samples
@@ -110,6 +129,7 @@ class MonitorState:
     pending: PendingAlarm | None = None
     change: DetectedChange | None = None
     tracks: tuple[FaultTrack, ...] = ()
+    hidden: tuple[HiddenFault, ...] = ()
     learning_until: float = LONG_AGO
 
     @property
