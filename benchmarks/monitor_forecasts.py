@@ -19,10 +19,10 @@ from fdi_torch.blind.deviation import Array
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.monitor.event_text import FORECAST_WINDOWS
 from fdi_torch.monitor.level_forecast import EMPTY
-from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_settings import LONGEST
 
 LEARN, ONSET = 1000.0, 1300.0
-HORIZON = FORECAST_WINDOWS * MonitorSettings().longest
+HORIZON = FORECAST_WINDOWS * LONGEST
 LATEST = 2000.0
 """Latest event that counts, s: its whole horizon is simulated."""
 LASTS = LATEST + HORIZON

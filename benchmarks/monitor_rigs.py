@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fdi_torch.blind.control import LevelControl
+from fdi_torch.blind.control import Controller, LevelControl
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.random_flows import Disturbance
 from fdi_torch.blind.simulator import Drive, Group, HiddenRigs, simulate
@@ -31,6 +31,9 @@ SIZES = {
     "Q1.pump_gain.factor": -0.12, "Q2.pump_gain.factor": -0.12,
     "h1.sensor_bias.bias": 0.03, "h2.sensor_bias.bias": 0.03, "h3.sensor_bias.bias": 0.03,
     "h1.sensor_bias.bias down": -0.03, "h2.sensor_bias.bias down": -0.03, "h3.sensor_bias.bias down": -0.03,
+    "Q1.pump_offset.offset": -6e-6, "Q2.pump_offset.offset": -6e-6,
+    "h1.sensor_gain.factor": 0.07, "h2.sensor_gain.factor": 0.07, "h3.sensor_gain.factor": 0.07,
+    "h1.sensor_gain.factor down": -0.07, "h2.sensor_gain.factor down": -0.07, "h3.sensor_gain.factor down": -0.07,
 }  # fmt: skip
 
 
@@ -66,13 +69,17 @@ def recordings(cases: Sequence[Case], step: float = STEP) -> list[tuple[Recordin
     plant, draws = load_plant("three_tank"), [np.random.default_rng(case.seed) for case in cases]
     rigs = HiddenRigs([plant] * len(cases), [()] * len(cases))
     _with_faults(rigs, plant, cases)
-    errors, drives = [], []
+    sensors, drives = [], []
     for case, rng in zip(cases, draws, strict=True):
         samples = int(case.lasts) + 1
-        errors.append(NOISE * rng.normal(size=(samples, 3)) + _sensor_error(case, samples))
-        drives.append(_drive(case, rng, samples, errors[-1]))
+        error = NOISE * rng.normal(size=(samples, 3)) + _sensor_fault(case, "sensor_bias", samples)
+        sensors.append((1.0 + _sensor_fault(case, "sensor_gain", samples), error))
+        drives.append(_drive(case, rng, samples, *sensors[-1]))
     runs = simulate(rigs, drives, step)
-    return [(_recording(run.asked, run.levels + e), run.levels) for run, e in zip(runs, errors, strict=True)]
+    return [
+        (_recording(run.asked, factor * (run.levels + error)), run.levels)
+        for run, (factor, error) in zip(runs, sensors, strict=True)
+    ]
 
 
 def _recording(asked: Array, readings: Array) -> Recording:
@@ -83,8 +90,28 @@ def _recording(asked: Array, readings: Array) -> Recording:
     )
 
 
-def _drive(case: Case, rng: np.random.Generator, samples: int, error: Array) -> Drive:
-    """Commands between 40 and 60 cm^3/s in steps of 200 to 500 s, set points of T1 between 52 and 60 cm."""
+@dataclass(frozen=True)
+class _ScaledControl(LevelControl):
+    """Level control with a reading that is multiplied by `factor` (T,)."""
+
+    factor: Array
+
+    def start(self) -> Controller:
+        return _ScaledController(self)
+
+
+class _ScaledController(Controller):
+    control: _ScaledControl
+
+    def flow(self, second: int, reading: float) -> float:
+        return super().flow(second, float(self.control.factor[second]) * reading)
+
+
+def _drive(case: Case, rng: np.random.Generator, samples: int, factor: Array, error: Array) -> Drive:
+    """Commands between 40 and 60 cm^3/s in steps of 200 to 500 s, set points of T1 between 52 and 60 cm.
+
+    factor, error (T, 3): a sensor reads factor (level + error).
+    """
     asked, points = np.empty((samples, 2)), np.empty(samples)
     for column in (asked[:, 0], asked[:, 1], points):
         first = 0
@@ -99,16 +126,17 @@ def _drive(case: Case, rng: np.random.Generator, samples: int, error: Array) -> 
     # The variance of the flow integrated over a minute is that of flows held for 15 s.
     scale = {"white": 15.0**0.5, "held": 1.0, "slow": 0.55}[case.kind]
     random = Disturbance(case.kind, KINDS[case.kind], FLOW * scale * rng.uniform(0.5, 1.5, size=3), 1.0)
-    control = LevelControl("proportional_integral", 0, 0, points, 0.0, 9e-5, 0.01, 1e-3, 1e-8) if case.closed else None
+    limits = "proportional_integral", 0, 0, points, 0.0, 9e-5, 0.01, 1e-3, 1e-8
+    control = _ScaledControl(*limits, factor[:, 0]) if case.closed else None
     return Drive(asked, start, random.values(rng, samples), control, error[:, 0])
 
 
-def _sensor_error(case: Case, samples: int) -> Array:
-    """Error of each sensor (T, 3) m."""
-    error, time = np.zeros((samples, 3)), np.arange(samples)
-    if "sensor_bias" in case.fault:
-        error[:, int(case.fault[1]) - 1] = case.size * _grown(time, case.onset, case.ramp)
-    return error
+def _sensor_fault(case: Case, kind: str, samples: int) -> Array:
+    """Size of a fault of this kind at each sensor (T, 3)."""
+    size, time = np.zeros((samples, 3)), np.arange(samples)
+    if kind in case.fault:
+        size[:, int(case.fault[1]) - 1] = case.size * _grown(time, case.onset, case.ramp)
+    return size
 
 
 def _grown(time: Array | float, onset: Array | float, ramp: Array | float) -> Array:
@@ -125,6 +153,7 @@ def _with_faults(rigs: HiddenRigs, plant: PlantDescription, cases: Sequence[Case
         "leak": ([t.name for t in plant.tanks], rigs.tank_groups),
         "plugging": ([p.name for p in plant.pipes], rigs.pipe_groups),
         "pump_gain": ([p.name for p in plant.pumps], rigs.pump_groups),
+        "pump_offset": ([p.name for p in plant.pumps], rigs.pump_groups),
     }
     for kind, (names, groups) in places.items():
         chosen = [(i, c) for i, c in enumerate(cases) if f".{kind}." in c.fault]
@@ -149,4 +178,8 @@ def _pump_gain(q, now, p, state):  # type: ignore[no-untyped-def]
     return q * (1.0 + p["size"] * _grown(now.time, p["onset"], p["ramp"])), None
 
 
-_LAWS = {"leak": _leak, "plugging": _plugging, "pump_gain": _pump_gain}
+def _pump_offset(q, now, p, state):  # type: ignore[no-untyped-def]
+    return np.maximum(q + p["size"] * _grown(now.time, p["onset"], p["ramp"]), 0.0), None
+
+
+_LAWS = {"leak": _leak, "plugging": _plugging, "pump_gain": _pump_gain, "pump_offset": _pump_offset}

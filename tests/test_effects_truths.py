@@ -118,7 +118,7 @@ def test_bias_is_there_from_its_onset_and_rises_along_its_ramp() -> None:
     assert ramp == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0, 2.0, 2.0])
 
 
-@pytest.mark.parametrize(("onset", "ramp"), [(3.2, 0.0), (3.2, 0.5), (1.0, 25.0), (-4.0, 9.0)])
+@pytest.mark.parametrize(("onset", "ramp"), [(3.2, 0.0), (3.2, 0.5), (1.0, 25.0), (-4.0, 9.0), (-1e30, 4.0)])
 def test_a_rise_is_averaged_exactly(onset: float, ramp: float) -> None:
     clock = Clock(number(2.0), number(5.0), number(5.0))
     fine = 2.0 + 5.0 * (torch.arange(200000, dtype=torch.float64) + 0.5) / 200000

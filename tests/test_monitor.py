@@ -23,8 +23,8 @@ from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.fault_free_checks import residual_warnings
-from fdi_torch.monitor.hypothesis import Fault, faults_of
-from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.hypothesis import Fault, Hypothesis, faults_of
+from fdi_torch.monitor.isolation import Prior, fit, isolate
 from fdi_torch.monitor.level_forecast import DRAWS, limit_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
@@ -224,6 +224,19 @@ def test_two_simultaneous_faults_are_isolated_together() -> None:
         assert abs(float(best.value[column]) - size) < 4 * float(best.std[column])
 
 
+def test_a_known_onset_is_kept_and_sharpens_the_size() -> None:
+    run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
+    window = from_rest(recorded(step_to("T1.leak.size", 0.05, 100.0), 160))
+    nominal, prior = SPACE.nominal(), Prior(SPACE.names, 1)
+    start = torch.cat([nominal, nominal.new_tensor([100.0])])[None]
+    [known], [free] = (
+        fit(run_monitor, window, nominal, [Hypothesis((0,))], start, 0.0, prior, k) for k in (True, False)
+    )
+    assert known.onset == 100.0 and known.onset_std == 0.0 and free.onset != 100.0
+    assert abs(float(known.value[0]) - 0.05) < 4 * float(known.std[0])
+    assert float(known.std[0]) < float(free.std[0])
+
+
 def test_standard_errors_are_those_of_repeated_runs() -> None:
     run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
     pulls = []
@@ -297,7 +310,7 @@ def test_misuse_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one fault to watch for"):
         Monitor(NETWORK, ParameterSpace(), noise(), monitor().detector)
     with pytest.raises(ValueError, match="lookback > 0"):
-        MonitorSettings(lookback=0.0)
+        replace(monitor().settings, lookback=0.0)
     late = build_network(PLANT, [place("pump_delay", "Q1")])
     with pytest.raises(ValueError, match="without pure delays, got Q1"):
         ObserverBank(late, SPACE, noise().gain, noise().whitening)
@@ -398,7 +411,7 @@ def test_figures_6_and_7() -> None:
     learnt, _ = learn_noise(network, free, space, space.nominal())
     detector = make_detector("cusum", 20000.0, 1.0, 3, torch.Generator().manual_seed(0))
     run_monitor = Monitor(
-        network, space, learnt, detector, MonitorSettings(lookback=200.0, together=4, incipient=False)
+        network, space, learnt, detector, MonitorSettings(200.0, 60.0, 1000.0, together=4, incipient=False)
     )
     _, events = followed(run_monitor, samples, 50)
     alarms = [event.time for event in events if event.kind == "alarm"]

@@ -103,32 +103,57 @@ def test_a_statistic_updated_in_parts_equals_that_of_the_whole(chart: str) -> No
     assert torch.allclose(whole[300:], detector.statistic(white)[300:], rtol=1e-9)
 
 
-@pytest.mark.parametrize("mouth", [0.014, 0.02])
-def test_a_drain_is_not_told_as_closed_while_its_tank_is_dry(mouth: float, tmp_path: Path) -> None:
-    """A drain opens at 400 s. Its mouth lies above the floor: water stays, and Torricelli's law does not hold."""
-    (tmp_path / "tank.yaml").write_text(
-        "tanks: {T: {area: 100 cm^2, height: 60 cm}}\n"
-        "pumps: {Q: {target: T, max_flow: 200 cm^3/s}}\n"
-        "pipes: {OUT: {source: T, area: 0.02 cm^2, discharge_coefficient: 0.8}}\n"
-        "sensors: {h: {tank: T}}\n"
+def drained(mouth: float, seconds: int, folder: Path) -> list[Event]:
+    """Events of two tanks: the drain of T opens at 400 s and closes at 600 s, U leaks from 500 s on.
+
+    A pump fills T again from 640 s on. The drain's mouth (m) lies above the floor: water stays, and Torricelli's law
+    does not hold.
+    """
+    (folder / "tank.yaml").write_text(
+        "tanks: {T: {area: 100 cm^2, height: 60 cm}, U: {area: 100 cm^2, height: 60 cm}}\n"
+        "pumps: {Q: {target: T, max_flow: 200 cm^3/s}, V: {target: U, max_flow: 200 cm^3/s}}\n"
+        "pipes:\n"
+        "  OUT: {source: T, area: 0.02 cm^2, discharge_coefficient: 0.8}\n"
+        "  END: {source: U, area: 0.02 cm^2, discharge_coefficient: 0.8}\n"
+        "sensors: {h: {tank: T}, k: {tank: U}}\n"
     )
-    plant, outlet, level = load_plant(tmp_path / "tank.yaml"), 0.8 * 2e-6 * (2.0 * 9.81) ** 0.5, 0.3
-    time, levels, generator = torch.arange(600, dtype=torch.float64), [], torch.Generator().manual_seed(4)
-    pumped = torch.where(time < 400.0, outlet * level**0.5, 0.0)
-    disturbed, noise = 1e-4 * torch.randn(600, generator=generator), 5e-4 * torch.randn(600, generator=generator)
-    for k in range(len(time)):
-        levels.append(level)
+    plant, outlet, rest = load_plant(folder / "tank.yaml"), 0.8 * 2e-6 * (2.0 * 9.81) ** 0.5, 0.3
+    time, generator = torch.arange(seconds, dtype=torch.float64), torch.Generator().manual_seed(4)
+    disturbed, noise = (s * torch.randn(800, 2, generator=generator, dtype=torch.float64) for s in (1e-4, 5e-4))
+    kept = torch.full_like(time, outlet * rest**0.5)
+    pumped = torch.stack([torch.where(time < 400.0, kept, torch.where(time < 640.0, 0.0, 2e-5)), kept], dim=1)
+    levels = [torch.tensor([rest, rest], dtype=torch.float64)]
+    for k in range(seconds - 1):
+        level = levels[-1]
         for _ in range(20):
-            drained = 60.0 * outlet * max(level - mouth, 0.0) ** 0.5 if k >= 400 else 0.0
-            level = max(level + 0.05 * (float(pumped[k]) - outlet * level**0.5 - drained) / 0.01, 0.0)
-        level = max(level + float(disturbed[k]), 0.0)
-    noisy = torch.tensor(levels) + noise
-    recording = Recording(time, pumped[:, None], noisy.double()[:, None], ("Q",), ("h",), ("m^3/s",), ("m",))
+            drain = 60.0 * outlet * max(float(level[0]) - mouth, 0.0) ** 0.5 if 400 <= k < 600 else 0.0
+            leak = 0.5 * outlet * float(level[1]) ** 0.5 if k >= 500 else 0.0
+            lost = outlet * level.sqrt() + torch.tensor([drain, leak])
+            level = (level + 0.05 * (pumped[k] - lost) / 0.01).clamp(min=0.0)
+        levels.append((level + disturbed[k]).clamp(min=0.0))
+    readings, units = torch.stack(levels) + noise[:seconds], ("m^3/s",) * 2
+    recording = Recording(time, pumped, readings, ("Q", "V"), ("h", "k"), units, ("m", "m"))
     settings = MonitorSettings(lookback=60.0, confirm=20.0, longest=400.0, incipient=False, together=1)
     free, wide = fault_free_part(recording, 0.0, 390.0), {"T.leak.size": (0.0, 100.0)}
-    ready = prepare_monitor(plant, free, ["T.leak.size"], ranges=wide, settings=settings)
+    ready = prepare_monitor(plant, free, ["T.leak.size", "U.leak.size"], ranges=wide, settings=settings)
     samples = samples_of_recording(recording, plant)
     start = ready.monitor.start(samples, ready.believed, learning_until=390.0)
-    _, events = ready.monitor.advance(start, samples.segment(1, len(samples)))
+    state, events = ready.monitor.advance(start, samples.segment(1, len(samples)))
+    return [*events, *ready.monitor.close(state)]
+
+
+@pytest.mark.parametrize("mouth", [0.014, 0.02])
+def test_a_drain_is_not_told_as_closed_while_its_tank_is_dry(mouth: float, tmp_path: Path) -> None:
+    events = drained(mouth, 600, tmp_path)
     assert [event.alarm for event in events if event.kind == "cannot tell"] == [1]
     assert not [event for event in events if event.kind == "recovered"]
+
+
+@pytest.mark.parametrize("mouth", [0.014, 0.02])
+def test_a_closed_drain_is_told_once_its_tank_fills_even_if_a_fault_came_between(mouth: float, tmp_path: Path) -> None:
+    events = drained(mouth, 800, tmp_path)
+    first, last = next(e for e in events if e.kind == "cannot tell"), next(e for e in events if e.kind == "recovered")
+    assert first.time < 500.0 and 640.0 < last.time < 700.0
+    assert (last.alarm, last.faults) == (1, ("T.leak.size",))
+    assert any(e.faults == ("U.leak.size",) and 500.0 < e.time < 600.0 for e in events)
+    assert [e.state for e in events if e.kind == "summary" and e.alarm == 1] == [State.RECOVERED]

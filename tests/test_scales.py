@@ -22,7 +22,7 @@ from fdi_torch.effects import all_placements, build_network, placements_for
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
 from fdi_torch.jobs.run_setup import fitting_of, recordings_of, requested_space
-from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_settings import MonitorSettings, usual_settings
 from fdi_torch.monitor.monitor_setup import prepare_monitor
 from fdi_torch.monitor.monte_carlo.level_control import moving_commands
 from fdi_torch.monitor.samples import Samples
@@ -155,6 +155,8 @@ def test_times_of_a_monitor_that_nobody_chose_follow_the_plant() -> None:
     assert (usual.window.lookback, usual.window.confirm, usual.false_alarms_every) == (300, 90, 20000)
     assert config.window.confirm == 90
     assert (config.window.lookback, config.false_alarms_every) == pytest.approx((18000, 1.2e6), rel=1e-9)
+    settings = usual_settings(rescaled(three_tank(), 1.0, 60.0))
+    assert (settings.lookback, settings.confirm, settings.longest) == pytest.approx((18000, 3600, 60000), rel=1e-9)
 
 
 @scaled_rigs

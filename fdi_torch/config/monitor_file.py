@@ -16,7 +16,7 @@ from fdi_torch.config.problems import naming_source
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.strict import ScaledSeconds, Seconds, Strict
-from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_settings import CONFIRM, LONGEST, LOOKBACK, MonitorSettings
 from fdi_torch.monitor.monitor_setup import GainSpecification
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -25,9 +25,9 @@ from fdi_torch.recording import Recording
 class WindowConfig(Strict):
     """Default times are those of three_tank, and are multiplied by the time scale of the plant (`plant.scales`)."""
 
-    lookback: ScaledSeconds = Field(300.0, description="length before an alarm in which its onset is searched, s")
-    confirm: ScaledSeconds = Field(60.0, description="time after an alarm until the fault is isolated, s")
-    longest: ScaledSeconds = Field(1000.0, description="greatest length of a window, s")
+    lookback: ScaledSeconds = Field(LOOKBACK, description="length before an alarm in which its onset is searched, s")
+    confirm: ScaledSeconds = Field(CONFIRM, description="time after an alarm until the fault is isolated, s")
+    longest: ScaledSeconds = Field(LONGEST, description="greatest length of a window, s")
     stride: Seconds | None = Field(
         None, description="distance of windows that are fitted separately, s; by default longest"
     )

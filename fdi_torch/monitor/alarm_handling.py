@@ -16,14 +16,25 @@ from fdi_torch.monitor.alarm_state import Alarm, State
 from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event, Kind
-from fdi_torch.monitor.fault_recovery import recovered_columns, recovery_is_observable, reset_to_nominal
-from fdi_torch.monitor.fault_tracking import STRONG_EVIDENCE, size_change, updated_tracks, with_new_sizes
+from fdi_torch.monitor.fault_recovery import (
+    end_is_shown,
+    recovered_columns,
+    recovery_is_observable,
+    reset_to_nominal,
+)
+from fdi_torch.monitor.fault_tracking import (
+    STRONG_EVIDENCE,
+    effect_of_value,
+    size_change,
+    updated_tracks,
+    with_new_sizes,
+)
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState, PendingAlarm
+from fdi_torch.monitor.monitor_state import DetectedChange, HiddenFault, MonitorState, PendingAlarm
 from fdi_torch.monitor.observer_bank import ObserverBank
-from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, fault_effect_rms, normalized_residuals
+from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, normalized_residuals
 
 GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes a fault that grows
 SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
@@ -47,11 +58,12 @@ class AlarmHandler:
     # Schedule
 
     def next_fit(self, state: MonitorState) -> float:
-        """When explanations are fitted next, s: for the pending alarm, else for the latest change."""
+        """When something is examined next, s: the pending alarm, else the latest change or a hidden fault."""
         if state.pending is not None:
             raised = state.alarm(state.pending.number).last
             return raised + self.settings.confirm * self.settings.revise**state.pending.attempts
-        return state.change.next_fit if state.change is not None else float("inf")
+        changes = [] if state.change is None else [state.change.next_fit]
+        return min([*changes, *map(self._next_look, state.hidden)], default=float("inf"))
 
     def earliest_start(self, state: MonitorState) -> float:
         """The earliest time at which a later window may begin, s."""
@@ -85,11 +97,12 @@ class AlarmHandler:
         return raised, [self.writer.raised(raised, alarm)]
 
     def on_schedule(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
-        """Isolate the pending alarm, or fit all explanations of the latest change again."""
+        """Isolate the pending alarm, fit all explanations of the latest change again, or examine hidden faults."""
         change = state.change
         if state.pending is None:
-            assert change is not None
-            return self._reconsider(state, change)
+            if change is not None and state.now >= change.next_fit:
+                return self._reconsider(state, change)
+            return self._examine_hidden(state)
         if change is not None and self._within_window(state, change):
             # The previous change may have been explained wrongly: one change that explains both alarms is preferred.
             start, earlier = self._window_start(state, change), change.explanations
@@ -166,9 +179,7 @@ class AlarmHandler:
         )
         if not best.fits and not_better:
             later = self._next_revision(change.best, state.now)
-            doubtful = [t for t in change.ended if t.column in change.hidden]
-            change = replace(change, next_fit=later, hidden=self._hidden(state, change, doubtful))
-            return self._end_recovered(replace(state, change=change), change, self._reported(change.explanations))
+            return replace(state, change=replace(change, next_fit=later)), []
         return self._revise(state, change, "revised", fits)
 
     def _unexplained(self, state: MonitorState, fits: Sequence[HypothesisFit]) -> tuple[MonitorState, list[Event]]:
@@ -203,7 +214,7 @@ class AlarmHandler:
         announce: bool = True,
     ) -> tuple[MonitorState, list[Event]]:
         """Adopt the latest change with new explanations."""
-        alarm_time = change.alarm_time if change.alarm_time > fits[0].onset - 1.0 else state.alarm(change.number).last
+        alarm_time = change.alarm_time if change.alarm_time > fits[0].onset else state.alarm(change.number).last
         next_fit = self._next_revision(fits[0], state.now)
         revised = replace(change, explanations=tuple(fits), alarm_time=alarm_time, next_fit=next_fit)
         return self._adopt(state, revised, kind, announce)
@@ -225,17 +236,18 @@ class AlarmHandler:
         change = replace(change, explanations=kept)
         back = recovered_columns(self.space, change)
         ended = tuple(t for t in (change.ended or state.tracks) if t.column in back)
-        hidden = self._hidden(state, change, ended)
         names = tuple(tuple(self.space.names[c] for c in f.hypothesis.columns) for f in reported)
         announce = announce or names != change.reported
-        change = replace(change, ended=ended, hidden=hidden, reported=names)
+        change = replace(change, ended=ended, reported=names)
         state = adopt_change(self.observer, state, change, reset_to_nominal(self.space, change, back))
+        window, healthy = state.window(change.best.onset), state.healthy.tolist()
         state = updated_tracks(
             state,
             change,
             [fault.size for fault in self.faults],
-            lambda c: fault_effect_rms(self.observer, state, c, change.best.onset),
+            lambda c: effect_of_value(self.observer, window, change.before, change.hypothesis, c, healthy[c])[0],
         )
+        state = self._with_hidden(state, change)
         state, events = self._end_recovered(state, change, reported)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:
@@ -251,18 +263,38 @@ class AlarmHandler:
         kind = kind if kind == "revised" and alarm.state is answer else str(answer)  # type: ignore[assignment]
         return state, [*events, self.writer.answered(state, change, reported, kind, announce or kind != "revised")]
 
-    def _hidden(self, state: MonitorState, change: DetectedChange, ended: Sequence[FaultTrack]) -> tuple[int, ...]:
-        """Columns of the recovered faults of which the readings would not show that they still stand."""
-        return tuple(t.column for t in ended if not recovery_is_observable(self.observer, state, change, t))
+    def _with_hidden(self, state: MonitorState, change: DetectedChange) -> MonitorState:
+        """The state with the faults that recovered at a change but that the readings since would not show."""
+        onset, now = change.best.onset, state.now
+        hidden = [t for t in change.ended if not recovery_is_observable(self.observer, state, change, t)]
+        new = [HiddenFault(t, float(change.before[t.column]), onset, now) for t in hidden]
+        judged = {*change.best.hypothesis.columns, *state.off_nominal.nonzero().flatten().tolist()}
+        return replace(state, hidden=(*(h for h in state.hidden if h.track.column not in judged), *new))
+
+    def _examine_hidden(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
+        """Report the hidden faults of which the readings since the last look show that they have ended."""
+        valid, due = self._parameters_valid_since(state), [h for h in state.hidden if self._next_look(h) <= state.now]
+        gone = [h for h in due if end_is_shown(self.observer, state, h, max(h.seen, valid))]
+        hidden = (replace(h, seen=state.now) if h in due else h for h in state.hidden if h not in gone)
+        state, events = replace(state, hidden=tuple(hidden)), []
+        if state.change is not None:
+            ended = tuple(t for t in state.change.ended if t not in [h.track for h in gone])
+            state = replace(state, change=replace(state.change, ended=ended))
+        standing = {t.number for t in (*state.tracks, *(h.track for h in state.hidden))}
+        for number in sorted({h.track.number for h in gone}):
+            if number not in standing and state.alarm(number).state is State.CANNOT_TELL:
+                state = state.with_alarm(state.alarm(number).with_state(State.RECOVERED))
+            events.append(self.writer.end_shown(state, number, [h for h in gone if h.track.number == number]))
+        return state, events
 
     def _end_recovered(
         self, state: MonitorState, change: DetectedChange, reported: Sequence[HypothesisFit]
     ) -> tuple[MonitorState, list[Event]]:
         """End the alarms of recovered faults; "cannot tell" if the readings would not show one of them any more."""
-        events = []
+        events, unseen = [], [h.track.column for h in state.hidden]
         for number in sorted({t.number for t in change.ended}):
             columns, alarm = [t.column for t in change.ended if t.number == number], state.alarm(number)
-            hidden = [c for c in columns if c in change.hidden]
+            hidden = [c for c in columns if c in unseen]
             answer = State.CANNOT_TELL if hidden else State.RECOVERED
             if alarm.state is not answer:
                 state = state.with_alarm(alarm.with_state(answer))
@@ -307,7 +339,7 @@ class AlarmHandler:
     def _sensor_shares(self, state: MonitorState) -> tuple[tuple[str, float], ...]:
         """The share of each sensor in the detector's statistic."""
         since = max(self._search_start(state, state.now), state.now - self.settings.lookback)
-        white = normalized_residuals(self.observer, state, max(int((state.samples.time > since).sum()), 1))
+        white = normalized_residuals(state, max(int((state.samples.time > since).sum()), 1))
         names = [sensor.name for sensor in self.observer.network.description.sensors]
         return tuple(zip(names, self.detector.shares(white).tolist(), strict=True))
 
@@ -329,5 +361,7 @@ class AlarmHandler:
         return state.now - change.best.onset <= longest and change.best.onset >= state.reachable
 
     def _next_revision(self, fit: HypothesisFit, now: float) -> float:
-        since = max(now - fit.onset, self.settings.confirm, 1.0)
-        return fit.onset + self.settings.revise * since
+        return fit.onset + self.settings.revise * max(now - fit.onset, self.settings.confirm)
+
+    def _next_look(self, fault: HiddenFault) -> float:
+        return fault.seen + self.settings.confirm

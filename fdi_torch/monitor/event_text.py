@@ -21,7 +21,7 @@ from fdi_torch.monitor.events import (
 from fdi_torch.monitor.hypothesis import HypothesisFit
 from fdi_torch.monitor.level_forecast import forecast_limits
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState
+from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault, MonitorState
 from fdi_torch.monitor.observer_bank import ObserverBank
 
 FORECAST_WINDOWS = 4.0  # horizon of the level forecast, in longest windows
@@ -52,9 +52,10 @@ class EventWriter:
     ) -> Event:
         """The explanation of an alarm. fits: the reported explanations, likeliest first."""
         alarm, best = state.alarm(change.number), fits[0]
-        explanations = tuple(self.explanation(f, change, state.now) for f in fits)
+        explanations = tuple(self.explanation(f, state, change) for f in fits)
         text = f"{headline(explanations)}, {_onset_text(best)}"
-        if best.onset - state.reachable <= 2.0 * max(best.onset_std, 0.5):
+        interval = float(torch.diff(state.samples.time).median())
+        if best.onset - state.reachable <= max(2.0 * best.onset_std, interval):
             text += ", where the observer starts: it may have been there before"
         rates = [rate_text(self.space[s.name], s.rate) for s in explanations[0].sizes if s.rate is not None]
         text += f"; grows by {', '.join(rates)}" if rates else ""
@@ -71,7 +72,7 @@ class EventWriter:
 
     def unexplained(self, state: MonitorState, number: int, fits: Sequence[HypothesisFit]) -> Event:
         """An alarm for which "no change" is among the likely explanations."""
-        explanations = tuple(self.explanation(f, None, state.now) for f in fits)
+        explanations = tuple(self.explanation(f, state) for f in fits)
         text = f"no fault of the list explains the alarm better than chance does: {headline(explanations)}"
         return self._event(state, "cannot tell", text, state.alarm(number), explanations=explanations)
 
@@ -88,7 +89,7 @@ class EventWriter:
         observable: bool,
     ) -> Event:
         """Recovery of the faults of one alarm. observable: whether the readings would show them if still present."""
-        explanations = tuple(self.explanation(f, change, state.now) for f in fits)
+        explanations = tuple(self.explanation(f, state, change) for f in fits)
         text = f"{', '.join(names)}: back to nominal, {_onset_text(fits[0])}"
         if " or " in headline(explanations):
             text += f"; {headline(explanations)}"
@@ -99,6 +100,16 @@ class EventWriter:
         kind: Kind = "recovered" if observable else "cannot tell"
         delay = change.alarm_time - fits[0].onset
         return self._event(state, kind, text, state.alarm(number), explanations=explanations, delay=delay)
+
+    def end_shown(self, state: MonitorState, number: int, faults: Sequence[HiddenFault]) -> Event:
+        """The end of hidden faults of one alarm, once the readings have shown it."""
+        names = [self.space.names[f.track.column] for f in faults]
+        ended = max(f.ended for f in faults)
+        text = f"{', '.join(names)}: back to nominal, as the readings since {max(f.seen for f in faults):.1f} s show"
+        nominal = [self.space[name] for name in names]
+        sizes = tuple(Size(p.name, p.nominal, 0.0, p.unit, amount_text(p, p.nominal, 0.0)) for p in nominal)
+        explanations = (Explanation(1.0, sizes, ended, gone=True),)
+        return self._event(state, "recovered", text, state.alarm(number), explanations=explanations)
 
     def followed(
         self, state: MonitorState, tracks: Sequence[FaultTrack], announced: Sequence[FaultTrack]
@@ -129,12 +140,12 @@ class EventWriter:
         explanations = tuple(self._track_explanation(t) for t in tracks)
         return self._event(state, "summary", text, alarm, explanations=explanations)
 
-    def explanation(self, fit: HypothesisFit, change: DetectedChange | None, now: float) -> Explanation:
+    def explanation(self, fit: HypothesisFit, state: MonitorState, change: DetectedChange | None = None) -> Explanation:
         """A fit in the form that events report."""
-        h, sizes = fit.hypothesis, []
+        h, now, sizes = fit.hypothesis, state.now, []
         for c in h.columns:
             p, size, std = self.space.parameters[c], float(fit.value[c]), float(fit.std[c])
-            if change is not None and c in change.hidden:
+            if change is not None and c in [f.track.column for f in state.hidden]:
                 sizes.append(Size(p.name, size, float("inf"), p.unit, f"{p.name} unknown"))
                 continue
             at_bound = c in fit.at_bound

@@ -7,11 +7,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from fdi_torch.monitor.fault_tracking import STRONG_EVIDENCE, effect_of_value
 from fdi_torch.monitor.hypothesis import HypothesisFit
-from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, MonitorState
+from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault, MonitorState
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank
-from fdi_torch.monitor.state_update import FAULT_MODEL_ERROR
 from fdi_torch.parameters import ParameterSpace
+
+# Assumed error of a fault's model, as a share of the fault's effect: a real leak is not an ideal orifice.
+FAULT_MODEL_ERROR = 0.1
 
 
 def recovered_columns(space: ParameterSpace, change: DetectedChange) -> list[int]:
@@ -27,16 +30,17 @@ def recovery_is_observable(
     They would not if it adds less to the white innovations than three standard deviations of its model's error, the
     share FAULT_MODEL_ERROR of its earlier effect, for example in a dry tank or behind a closed valve.
     """
-    window = state.window(change.best.onset)
-    persisting = change.best.value.clone()
-    persisting[track.column] = change.before[track.column]
-    theta = torch.stack([change.best.value, persisting])
-    onsets = torch.full((2,), change.best.onset, dtype=theta.dtype)
-    lanes = ChangeHypotheses(theta, onsets, torch.tensor([False, False]))
-    without, with_fault = observer.white_innovations(window, change.before, lanes)
-    since = window.times > change.best.onset
-    rms = float((without - with_fault)[since].square().mean().sqrt()) if bool(since.any()) else 0.0
-    return rms >= 3.0 * FAULT_MODEL_ERROR * track.effect_rms
+    window, size = state.window(change.best.onset), float(change.before[track.column])
+    effect, _ = effect_of_value(observer, window, change.before, change.hypothesis, track.column, size)
+    return effect >= 3.0 * FAULT_MODEL_ERROR * track.effect_rms
+
+
+def end_is_shown(observer: ObserverBank, state: MonitorState, fault: HiddenFault, start: float) -> bool:
+    """Whether the readings since `start` s would show a hidden fault, and contradict it."""
+    window = state.window(start)
+    present = ChangeHypotheses(state.believed[None], window.samples.time[:1], torch.tensor([False]))
+    effect, misfit = effect_of_value(observer, window, state.believed, present, fault.track.column, fault.size)
+    return effect >= 3.0 * FAULT_MODEL_ERROR * fault.track.effect_rms and misfit > STRONG_EVIDENCE
 
 
 def reset_to_nominal(space: ParameterSpace, change: DetectedChange, recovered: Sequence[int]) -> Tensor:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit
 from fdi_torch.monitor.isolation import isolate
@@ -26,7 +27,7 @@ def size_change(
 
     None without a known fault, if one of them recovered, if the change is large, or if a new fault is clearly likelier.
     """
-    off = (state.believed != state.healthy).nonzero().flatten().tolist()
+    off = state.off_nominal.nonzero().flatten().tolist()
     known = [f for f in faults if f.size in off]
     if not known:
         return None
@@ -52,12 +53,32 @@ def _relative_effect(
     observer: ObserverBank, window: ObserverWindow, state: MonitorState, change: HypothesisFit
 ) -> float:
     """Effect of a change of size on the white innovations over that of the known faults, root mean square."""
-    theta = torch.cat([change.value[None], state.parameters_without_each(observer)])
+    groups = [list(columns) for columns in observer.effects if bool(state.off_nominal[list(columns)].any())]
+    theta = torch.cat([change.value[None], state.believed.repeat(len(groups), 1)])
+    for lane, columns in enumerate(groups, start=1):
+        theta[lane, columns] = state.healthy[columns]
     sudden = torch.zeros(len(theta), dtype=torch.bool)
     lanes = ChangeHypotheses(theta, torch.full((len(theta),), change.onset, dtype=theta.dtype), sudden)
     base = observer.white_innovations(window, state.believed, no_change(state.believed))
     moved, *removed = (observer.white_innovations(window, state.believed, lanes) - base).square().sum((1, 2)).tolist()
     return (moved / sum(removed)) ** 0.5 if sum(removed) > 0.0 else float("inf")
+
+
+def effect_of_value(
+    observer: ObserverBank, window: ObserverWindow, before: Tensor, change: ChangeHypotheses, column: int, value: float
+) -> tuple[float, float]:
+    """What another value of a parameter after a change adds to the white innovations since then: its root mean square,
+    and the misfit (half a sum of squares) with it less that without it.
+
+    before (P,): parameters before the change, which has one lane.
+    """
+    theta = change.theta.repeat(2, 1)
+    theta[1, column] = value
+    lanes = ChangeHypotheses(theta, change.onset.repeat(2), change.incipient.repeat(2))
+    since = window.times > float(change.onset)
+    white, other = observer.white_innovations(window, before, lanes)[:, since]
+    rms = float((other - white).square().mean().sqrt()) if bool(since.any()) else 0.0
+    return rms, 0.5 * float(other.square().sum() - white.square().sum())
 
 
 def updated_tracks(

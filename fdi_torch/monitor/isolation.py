@@ -136,14 +136,15 @@ def fit(
     starts: Tensor,
     base: float,
     prior: Prior,
+    known_onset: bool = False,
 ) -> list[HypothesisFit]:
     """Sizes and onset of each hypothesis by Levenberg-Marquardt on the white innovations, all in parallel.
 
     believed (P,): parameters before the change; starts (H, P+1): initial values and onset (s); base: misfit without a
-    change.
+    change. known_onset: the onsets of `starts` are exact.
     """
     free = torch.zeros(len(hypotheses), len(believed) + 1, dtype=torch.bool)
-    free[:, -1] = True
+    free[:, -1] = not known_onset
     for i, hypothesis in enumerate(hypotheses):
         free[i, hypothesis.free] = True
     incipient = torch.tensor([h.incipient for h in hypotheses])
@@ -154,6 +155,7 @@ def fit(
         return _expansion(observer, window, believed, point, free[lanes], incipient[lanes], middle)
 
     fixed = torch.cat([believed, first[None]]).repeat(len(starts), 1)
+    fixed[:, -1] = starts[:, -1]
     for i, hypothesis in enumerate(hypotheses):
         fixed[i, list(hypothesis.recovered)] = starts[i, list(hypothesis.recovered)]
     low = torch.where(free, torch.cat([observer.space.low(believed), first[None]]), fixed)

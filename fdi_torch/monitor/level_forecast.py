@@ -109,7 +109,7 @@ def _drawn_parameters(
     for f in drawn:
         error = torch.randn(len(f.value), generator=generator, dtype=torch.float64)
         value = (f.value + torch.nan_to_num(f.std, posinf=0.0) * error).clamp(low, high)
-        rate = (value - change.before) / max(now - f.onset, 1.0) if f.hypothesis.incipient else torch.zeros_like(value)
+        rate = (value - change.before) / (now - f.onset) if f.hypothesis.incipient else torch.zeros_like(value)
         values.append(value)
         after.append((value + rate * horizon).clamp(low, high))
     growing = torch.ones(DRAWS, dtype=torch.bool)

@@ -18,7 +18,7 @@ from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import faults_of
-from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_settings import MonitorSettings, usual_settings
 from fdi_torch.monitor.monitor_state import MonitorState
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverBank
@@ -63,7 +63,7 @@ class Monitor:
         if not len(space):
             raise ValueError("expected at least one fault to watch for, got none; name some")
         self.network, self.space, self.noise, self.detector = network, space, noise, detector
-        self.settings = settings or MonitorSettings()
+        self.settings = settings or usual_settings(network.description)
         self.watched = len(space) if watched is None else watched
         self.faults = faults_of(space.names[: self.watched])
         self.observer = ObserverBank(network, space, noise.gain, noise.whitening, longest_step)
@@ -118,6 +118,7 @@ class Monitor:
             fresh,
             alarms=state.alarms,
             tracks=state.tracks,
+            hidden=state.hidden,
             unexplained_rms=state.unexplained_rms,
             pending=state.pending,
             learning_until=state.learning_until,
@@ -159,6 +160,6 @@ class Monitor:
     def _observed(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, Tensor]:
         """The state after the samples, and the detector's statistic (S,) at each of them."""
         moved = advance_observer(self.observer, state, samples)
-        residuals = normalized_residuals(self.observer, moved, len(samples))
+        residuals = normalized_residuals(moved, len(samples))
         statistic, memory = self.detector.update(residuals, state.detector_memory)
         return replace(moved, detector_memory=memory), statistic

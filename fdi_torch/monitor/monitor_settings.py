@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.scales import time_scale
+
+LOOKBACK, CONFIRM, LONGEST = 300.0, 60.0, 1000.0  # in units of the plant's time scale
+
 
 @dataclass(frozen=True)
 class MonitorSettings:
@@ -13,10 +18,10 @@ class MonitorSettings:
     reported explanations together.
     """
 
-    lookback: float = 300.0
-    confirm: float = 60.0
+    lookback: float
+    confirm: float
+    longest: float
     revise: float = 2.0
-    longest: float = 1000.0
     incipient: bool = True
     together: int = 2
     level: float = 0.95
@@ -27,3 +32,9 @@ class MonitorSettings:
                 "expected lookback > 0, confirm >= 0, revise > 1 and longest >= lookback, "
                 f"got {self.lookback:g} s, {self.confirm:g} s, {self.revise:g}, {self.longest:g} s; change them"
             )
+
+
+def usual_settings(plant: PlantDescription) -> MonitorSettings:
+    """Default settings for a plant."""
+    scale = time_scale(plant)
+    return MonitorSettings(LOOKBACK * scale, CONFIRM * scale, LONGEST * scale)

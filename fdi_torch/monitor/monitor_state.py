@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from fdi_torch.monitor.alarm_state import Alarm
 from fdi_torch.monitor.hypothesis import HypothesisFit
-from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverBank, ObserverWindow
+from fdi_torch.monitor.observer_bank import LONG_AGO, ChangeHypotheses, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples
 
 
@@ -40,14 +41,26 @@ class FaultTrack:
 
 
 @dataclass(frozen=True)
+class HiddenFault:
+    """A fault that seems to have ended, but that the readings since would not show, for example in a dry tank.
+
+    track: before it ended. size: before it ended. ended: s. seen: until when the readings were examined, s.
+    """
+
+    track: FaultTrack
+    size: float
+    ended: float
+    seen: float
+
+
+@dataclass(frozen=True)
 class DetectedChange:
     """The latest detected change of parameters.
 
     number: of its alarm. before (P,): the parameters before the change, valid since `since` s. explanations: all with
     more than 0.1 % of the posterior probability, likeliest first; the observer uses the first. alarm_time: s. next_fit:
-    when all explanations are fitted again, s. ended: tracks of the faults that recovered at this change. hidden: their
-    columns of which the readings since would not show that they still stand. reported: parameter names of each
-    explanation in the last event.
+    when all explanations are fitted again, s. ended: tracks of the faults that recovered at this change. reported:
+    parameter names of each explanation in the last event.
     """
 
     number: int
@@ -57,13 +70,19 @@ class DetectedChange:
     alarm_time: float
     next_fit: float
     ended: tuple[FaultTrack, ...] = ()
-    hidden: tuple[int, ...] = ()
     reported: tuple[tuple[str, ...], ...] = ()
 
     @property
     def best(self) -> HypothesisFit:
         """The likeliest explanation that changes a parameter."""
         return self.explanations[0]
+
+    @property
+    def hypothesis(self) -> ChangeHypotheses:
+        """The likeliest explanation as the single lane of a bank of observers."""
+        best = self.best
+        onset, incipient = best.value.new_tensor([best.onset]), torch.tensor([best.hypothesis.incipient])
+        return ChangeHypotheses(best.value[None], onset, incipient)
 
 
 @dataclass(frozen=True)
@@ -81,18 +100,15 @@ class MonitorState:
     Recent samples, S of them:
       samples; state (S, tanks + M): observer state after each, levels in m, then memory of actuators and sensors;
       residual, innovations, white (S, sensors): residuals, innovations of the flow filter, and white residuals; memory
-      (S, F): state of the flow filter; fault_effects (S, E, sensors): change of the innovations if each of the E
-      effects were taken out of the observer's plant. number: samples since the observer's
-      start. reachable: when it started, s. earliest_start: no later window begins before it, s.
+      (S, F): state of the flow filter. number: samples since the observer's start. reachable: when it started, s.
+      earliest_start: no later window begins before it, s.
     Parameters:
       believed (P,): values that the observer uses; healthy (P,): the same with every fault at nominal.
-      states_without (E, tanks + M), memory_without (E, F): states of parallel observers, each without one effect, and
-      of their flow filters.
       unexplained_rms (sensors,): root mean square of the white residuals that the known faults leave unexplained.
     Bookkeeping:
       clock: time of the last sample. detector_memory: None after a restart of the detector. alarms: all so far.
-      pending: the alarm that is not isolated yet. change: the latest. tracks: the known faults. learning_until: no
-      alarm is raised before it, s.
+      pending: the alarm that is not isolated yet. change: the latest. tracks: the known faults. hidden: faults whose
+      end the readings have not shown yet. learning_until: no alarm is raised before it, s.
     """
 
     samples: Samples
@@ -101,12 +117,9 @@ class MonitorState:
     innovations: Tensor
     white: Tensor
     memory: Tensor
-    fault_effects: Tensor
     number: int
     believed: Tensor
     healthy: Tensor
-    states_without: Tensor
-    memory_without: Tensor
     reachable: float
     unexplained_rms: Tensor
     clock: ClockState
@@ -116,6 +129,7 @@ class MonitorState:
     pending: PendingAlarm | None = None
     change: DetectedChange | None = None
     tracks: tuple[FaultTrack, ...] = ()
+    hidden: tuple[HiddenFault, ...] = ()
     learning_until: float = LONG_AGO
 
     @property
@@ -134,18 +148,10 @@ class MonitorState:
         """Time of the last sample, s."""
         return float(self.samples.time[-1])
 
-    def active_effects(self, observer: ObserverBank) -> list[int]:
-        """Indices of the observer's effects that have a value other than fault-free."""
-        off = (self.believed != self.healthy).tolist()
-        return [e for e, columns in enumerate(observer.effects) if any(off[c] for c in columns)]
-
-    def parameters_without_each(self, observer: ObserverBank) -> Tensor:
-        """The observer's parameters with one active effect removed at a time, (active effects, P)."""
-        active = self.active_effects(observer)
-        theta = self.believed.repeat(len(active), 1)
-        for lane, e in enumerate(active):
-            theta[lane, list(observer.effects[e])] = self.healthy[list(observer.effects[e])]
-        return theta
+    @property
+    def off_nominal(self) -> Tensor:
+        """Which parameters have a value other than fault-free, (P,) bool."""
+        return self.believed != self.healthy
 
     def window(self, start: float) -> ObserverWindow:
         """The window from the last sample before `start` s; it holds at least two further samples."""

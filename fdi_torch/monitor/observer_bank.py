@@ -56,7 +56,7 @@ class ObserverWindow:
 
     samples: the first one only sets the start; `state` (order + M,) is the observer's state after its correction,
     `number` the count of samples that the observer had processed by then, and `memory` the state of the flow filter
-    (None: zero). The later samples are compared. state and memory may have a lane for each hypothesis.
+    (None: zero). The later samples are compared.
     """
 
     samples: Samples

@@ -64,17 +64,12 @@ class Whitening:
         return self.flows(residual, number, memory)
 
     def of_innovations(self, innovations: Tensor) -> Tensor:
-        """White e of innovations (*batch, S, C)."""
-        return self.filter(innovations - self.mean)
-
-    def filter(self, innovations: Tensor) -> Tensor:
-        """Whiten without subtracting the mean, as for the effect of a fault. Innovations before the
-        first sample are 0.
-        """
-        own = innovations
+        """White e of innovations (*batch, S, C). Those before the first sample equal the mean."""
+        deviation = innovations - self.mean
+        own = deviation
         for lag, matrix in enumerate(self.coefficients, start=1):
-            before = torch.zeros_like(innovations)
-            before[..., lag:, :] = innovations[..., :-lag, :]
+            before = torch.zeros_like(deviation)
+            before[..., lag:, :] = deviation[..., :-lag, :]
             own = own - _apply(matrix, before)
         return _apply(self.whitener, own)
 

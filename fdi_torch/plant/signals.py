@@ -40,7 +40,8 @@ class Clock:
 
     def risen(self, onset: Tensor, ramp: Tensor) -> Tensor:
         """Exact mean over the step of a linear rise from 0 to 1 that begins at `onset` (s) and takes `ramp` (s)."""
-        return (_rise_integral(self.end - onset, ramp) - _rise_integral(self.start - onset, ramp)) / self.step
+        end, start = torch.clamp(self.end - onset, min=0.0), torch.clamp(self.start - onset, min=0.0)
+        return self.share_after(onset) - (_lag_integral(end, ramp) - _lag_integral(start, ramp)) / self.step
 
     def risen_by_end(self, onset: Tensor, ramp: Tensor) -> Tensor:
         """The rise from 0 to 1 as a sample at the step's end shows it, smoothed over one sampling interval.
@@ -60,11 +61,10 @@ class Clock:
         return torch.sin(2.0 * math.pi * self.middle / period + phase) * torch.sin(half) / half
 
 
-def _rise_integral(since: Tensor, ramp: Tensor) -> Tensor:
-    """Integral of a linear rise from 0 to 1 within `ramp` (s), from its onset to `since` seconds after it, s."""
-    after = torch.clamp(since, min=0.0)
-    rising = torch.minimum(after, ramp)
-    return after - rising + 0.5 * rising * (rising / torch.clamp(ramp, min=1e-9))
+def _lag_integral(since: Tensor, ramp: Tensor) -> Tensor:
+    """Integral of what a linear rise within `ramp` (s) lacks of 1, from its onset to `since` seconds after it, s."""
+    rising = torch.minimum(since, ramp)
+    return rising - 0.5 * rising * (rising / torch.clamp(ramp, min=1e-9))
 
 
 class CumulativeSignal:
