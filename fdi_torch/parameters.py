@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from fdi_torch.names import shortened
+from fdi_torch.names import shortened, unknown
 from fdi_torch.units import MOST_CHARACTERS, UnitError, factor, in_unit, number_and_unit, same_kind
 
 SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
@@ -163,7 +163,7 @@ class ParameterSpace:
 
     def index(self, name: str) -> int:
         if name not in self._index:
-            raise ValueError(f"expected one of {', '.join(self.names)}, got {name}")
+            raise ValueError(unknown("a parameter", name, self.names))
         return self._index[name]
 
     def with_changes(self, name: str, **changes: Any) -> ParameterSpace:

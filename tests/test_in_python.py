@@ -188,6 +188,30 @@ def test_a_monitor_runs_along_a_recording_in_memory(tmp_path: Path) -> None:
     assert table["onset"][isolated] == pytest.approx(400.0, abs=3.0) and table["units"][isolated] == ("1",)
 
 
+def test_a_plant_prints_as_its_file() -> None:
+    assert build_plant(yaml.safe_load(str(in_code())), "text") == in_code()
+
+
+def test_arguments_of_another_kind_are_named() -> None:
+    blank: Any = simulated()
+    for function in (fdi_torch.train, fdi_torch.monitor, fdi_torch.study):
+        with pytest.raises(TypeError, match=r"expected the name of a file, or its keys .* got a Plant"):
+            function(RIG)  # type: ignore[operator]
+    with pytest.raises(TypeError, match="plant: expected a Plant or the name of a plant file, got a Recording"):
+        fdi_torch.predict(blank, RIG)  # type: ignore[arg-type]
+    with pytest.raises(
+        fdi_torch.ConfigError, match=r"inputs.Q: expected a value such as .* or \{steps: .*got \[3, 4\]"
+    ):
+        fdi_torch.simulate(RIG, inputs={"Q": [3, 4]})
+
+
+def test_an_effect_without_a_field_means_its_size() -> None:
+    fitting = fdi_torch.set_up(RIG, [simulated()], ["A.leak", "Q.gain"], "equilibrium")
+    assert fitting.space.names == ("A.leak.size", "Q.gain")
+    with pytest.raises(ValueError, match=r"got 'A.heigt'; the nearest is 'A.height'"):
+        fdi_torch.set_up(RIG, [simulated()], ["A.heigt"])
+
+
 def test_a_recording_at_hand_is_asked_for_the_plant_s_channels() -> None:
     blank = simulated()
     with pytest.raises(fdi_torch.ConfigError, match=r"expected an output .*got 'h'"):

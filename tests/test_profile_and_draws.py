@@ -136,7 +136,7 @@ def test_profile_of_an_unbounded_undetermined_parameter_is_refused() -> None:
     space = ParameterSpace([Parameter("a", "1", 1.0), Parameter("b", "1", 1.0)])
     with pytest.raises(ValueError, match="a: expected a finite standard error or a range"):
         LeastSquares(lambda t: t.sum(-1, keepdim=True), space).profile("a")
-    with pytest.raises(ValueError, match="expected one of a, b, got c"):
+    with pytest.raises(ValueError, match=r"expected a parameter \(a, b\), got 'c'"):
         LeastSquares(lambda t: t, space).profile("c")
     with pytest.raises(ValueError, match="expected a confidence between 0 and 1, got 95"):
         LeastSquares(lambda t: t, space).profile("a", 95)

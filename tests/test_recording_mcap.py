@@ -143,7 +143,7 @@ def test_keys_that_a_log_cannot_have_are_refused(
     entry = {"file": "own.mcap", "columns": {name: {key: value}}}
     config = RecordingConfig.model_validate(entry)
     plant = load_plant("three_tank")
-    with pytest.raises(ConfigError, match=rf"{name}\.{key}: expected no such key|expected neither zone nor sort"):
+    with pytest.raises(ConfigError, match=rf"{name}\.{key}: expected no such key|expected neither zone, sort"):
         if followed:
             list(growing_rows(config, plant, tmp_path, idle=0.1))
         else:

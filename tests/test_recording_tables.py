@@ -20,6 +20,7 @@ from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.recording import Recording
 from fdi_torch.recordings import parquet as parquet_reader
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.recordings.source import ChannelSource
@@ -204,6 +205,43 @@ def test_a_laboratory_s_file_without_a_header_with_two_commands_to_add(tmp_path:
     clock_alone = config | {"columns": {"t": columns["t"]}}
     with pytest.raises(ConfigError, match=r"expected a column for Q1 .*got 1, 2, 3"):
         read_recording(RecordingConfig.model_validate(clock_alone), plant)
+
+
+def test_a_file_without_a_column_of_time_is_read_by_the_time_between_its_rows(tmp_path: Path) -> None:
+    path = tmp_path / "run.txt"
+    path.write_text("".join(f"2{k % 3},25\t10,5\t4{k % 7},0\t30,0\t35,0\n" for k in range(20)))
+    columns: dict[str, Any] = {
+        "t": {"period": "50 ms", "shift": "2 s"},
+        **{f"Q{k}": {"column": k, "unit": "cm^3/s"} for k in (1, 2)},
+        **{f"h{k}": {"column": 2 + k, "unit": "cm"} for k in (1, 2, 3)},
+    }
+    config, plant = {"file": str(path), "header": False}, load_plant("three_tank")
+
+    def read(**clock: Any) -> Recording:
+        every = config | {"columns": columns | ({"t": clock} if clock else {})}
+        return read_recording(RecordingConfig.model_validate(every), plant)
+
+    found = read()
+    assert found.time.tolist() == pytest.approx([2.0 + 0.05 * k for k in range(20)])
+    assert found.inputs[1].tolist() == pytest.approx([21.25e-6, 10.5e-6])
+    assert found.outputs[1].tolist() == pytest.approx([0.41, 0.30, 0.35])
+    with pytest.raises(ValueError, match=r"greater than 0"):
+        read(period="0 s")
+    with pytest.raises(ConfigError, match=r"t: expected a period or a column, got period and column, unit"):
+        read(period="1 s", column=1, unit="s")
+    with pytest.raises(ConfigError, match=r"expected a column for t .* or give the time between its rows: .*period"):
+        read(column="seconds")
+
+
+def test_a_period_needs_a_table_with_one_row_per_instant(tmp_path: Path) -> None:
+    plant = load_plant("three_tank")
+    (tmp_path / "tags.csv").write_text("Tag,Value\nLT1,3\nLT1,4\n")
+    tagged = {"file": str(tmp_path / "tags.csv"), "tags": {"tag": "Tag", "value": "Value"}}
+    for config in (tagged, {"file": str(tmp_path / "run.mcap")}):
+        (tmp_path / "run.mcap").write_bytes(b"")
+        config = RecordingConfig.model_validate(config | {"columns": {"t": {"period": "1 s"}}})
+        with pytest.raises(ConfigError, match="one row per instant"):
+            read_recording(config, plant)
 
 
 def test_commands_are_added_each_by_its_own_unit_and_unknown_where_one_is(tmp_path: Path) -> None:

@@ -25,13 +25,15 @@ def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, Ch
         if name != "t" and name not in units:
             raise ValueError(f"{place}: {unknown('a channel of the plant or t', name, [*units, 't'])}")
         _expect_keys_that_fit(place, name, column, plant)
+        if column.period is not None:
+            _expect_rows_in_time(place, column, config)
         mapping[name] = _clock_source(column) if name == "t" else _channel_source(place, column, units[name])
     return mapping
 
 
 def _expect_keys_that_fit(place: str, name: str, column: ColumnConfig, plant: PlantDescription) -> None:
     """Raises ValueError for a key that does not apply to that channel."""
-    only_clock, only_input = ("stamps", "zone", "shift", "sort"), ("held",)
+    only_clock, only_input = ("stamps", "zone", "shift", "sort", "period"), ("held",)
     only_channel = ("constant", "recorded", "held", "words", "quality", "good", "plus")
     not_allowed = only_channel if name == "t" else only_clock
     if name != "t" and name not in plant.channels():
@@ -42,9 +44,23 @@ def _expect_keys_that_fit(place: str, name: str, column: ColumnConfig, plant: Pl
             raise ValueError(f"{place}.{key}: expected this key of {kind} only; leave it out")
 
 
+def _expect_rows_in_time(place: str, column: ColumnConfig, config: FileConfig) -> None:
+    """Raises ValueError if a file with a period has a column of time as well, or no row per instant."""
+    if beside := sorted(column.model_fields_set - {"period", "shift"}):
+        raise ValueError(f"{place}: expected a period or a column, got period and {', '.join(beside)}; drop one")
+    if config.tags or is_log(Path(config.file)):
+        raise ValueError(f"{place}.period: expected this key of a table with one row per instant only; leave it out")
+
+
 def _clock_source(column: ColumnConfig) -> ClockSource:
     return ClockSource(
-        column.column, column.unit, stamps=column.stamps, zone=column.zone, shift=column.shift, sort=column.sort
+        column.column,
+        column.unit,
+        stamps=column.stamps,
+        zone=column.zone,
+        shift=column.shift,
+        sort=column.sort,
+        period=column.period,
     )
 
 

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field
 from fdi_torch.config.plant_in_code import effect_at
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
-from fdi_torch.effects import EFFECTS, all_placements, build_network, placements_for
+from fdi_torch.effects import all_placements, build_network, placements_for, with_size
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.names import shortened, unknown
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, display_unit
@@ -103,10 +103,11 @@ class EstimationConfig(Strict):
 
 def full_name(name: str, plant: PlantDescription) -> str:
     """'T1.leak' -> 'T1.leak.size': an effect's name means its size. Raises ValueError for an impossible place."""
-    at = ParameterName.of_effect(name)
-    if at.field or at.effect not in {e.name for e in EFFECTS}:
-        return name
-    return str(at.sibling(effect_at(at.effect, at.place, plant).parameters(at.place, plant)[0].name))
+    full = with_size(name, plant)
+    if full != name:
+        at = ParameterName.parse(full)
+        effect_at(at.effect, at.place, plant)
+    return full
 
 
 def matching_names(pattern: str, plant: PlantDescription) -> list[str]:

@@ -38,8 +38,8 @@ def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, i
     if config.sheet or not config.header:
         raise ConfigError([f"{config.file}: expected a CSV file with a header to follow; leave sheet and header"])
     clock = config.columns.get("t", ColumnConfig())
-    if clock.zone or clock.sort:
-        raise ConfigError([f"{config.file}: expected neither zone nor sort for a file that is followed; leave them"])
+    if clock.zone or clock.sort or clock.period:
+        raise ConfigError([f"{config.file}: expected neither zone, sort nor period to follow a file; leave them"])
     path = _find(config.file, base)
     rows = _mcap_rows if ".mcap" in path.suffixes else _csv_rows
     if isinstance(config.start, datetime) or isinstance(config.stop, datetime):

@@ -121,6 +121,12 @@ class Plant(PlantDescription):
         columns = torch.broadcast_tensors(*(torch.as_tensor(v, dtype=torch.float64) for v in named.values()))
         return PlantOde(network, inputs, space, torch.stack(columns, -1) if columns else None, resolution=resolution)
 
+    def __str__(self) -> str:
+        """The plant as a plant file."""
+        from fdi_torch.config.plant_writer import dump_plant
+
+        return dump_plant(self)
+
     def _repr_html_(self) -> str:
         """The drawing of the rig for notebooks."""
         from fdi_torch.report.schematic import schematic

@@ -90,6 +90,9 @@ class ColumnConfig(Strict):
     )
     shift: Seconds = Field(0.0, description="of t: added to this clock, s")
     sort: bool = Field(False, description="of t: rows may be in any order")
+    period: Seconds | None = Field(
+        None, gt=0, description="of t: time between rows, 50 ms, of a file without a column of time"
+    )
 
 
 class TagsConfig(Strict):

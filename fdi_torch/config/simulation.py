@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Annotated, Any, Literal
 
@@ -13,7 +14,7 @@ from fdi_torch.capacity import expect_room
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import StartLevels
 from fdi_torch.config.strict import Amount, Decibel, Seconds, Strict, quantity
-from fdi_torch.names import unknown
+from fdi_torch.names import shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.simulated_recording import noise_level
@@ -27,7 +28,12 @@ class InputConfig(Strict):
 
 
 def _input(value: Any) -> Any:
-    return {"value": value} if isinstance(value, int | float | str) else value
+    if isinstance(value, int | float | str):
+        return {"value": value}
+    if not isinstance(value, Mapping | InputConfig):
+        example = "{steps: [[0 s, 50 cm^3/s], [200 s, 60 cm^3/s]]}"
+        raise ValueError(f"expected a value such as 50 cm^3/s, or {example}, got {shortened(str(value))}")
+    return value
 
 
 def flat_names(value: Any, prefix: str = "") -> Any:

@@ -148,6 +148,14 @@ def without_startup_effects(plant: PlantDescription, channels: Collection[str]) 
     return replace(with_tolerances(plant, lambda name: name.prefix not in ended), effects=effects)
 
 
+def with_size(name: str, plant: PlantDescription) -> str:
+    """'T1.leak' -> 'T1.leak.size': an effect's name means its size. Other names are returned unchanged."""
+    at = ParameterName.of_effect(name)
+    if at.field or at.effect not in {e.name for e in EFFECTS}:
+        return name
+    return str(at.sibling(effect(at.effect).parameters(at.place, plant)[0].name))
+
+
 def placements_for(names: Iterable[str]) -> tuple[Placement, ...]:
     """The distinct effects behind parameter names such as 'T1.leak.size'; names of component constants are ignored."""
     pairs = dict.fromkeys((n.effect, n.place) for n in map(ParameterName.parse, names) if n.effect)

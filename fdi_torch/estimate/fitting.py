@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import build_network, placements_for
+from fdi_torch.effects import build_network, placements_for, with_size
 from fdi_torch.estimate.objectives import Objective, Problem, Term
 from fdi_torch.parameters import Parameter, ParameterSpace, name_in_recording, quantity_text
 from fdi_torch.plant.description import PlantDescription, Tank
@@ -21,7 +21,8 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.engine_choice import adaptive_engine, make_engine
 from fdi_torch.simulate.equilibrium import equilibrium
-from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.experiment import Experiment, lay_out
+from fdi_torch.simulate.resampling import step_means
 from fdi_torch.simulate.step_control import StepControl
 from fdi_torch.simulate.step_length import commensurate_step
 
@@ -72,25 +73,29 @@ class Fitting:
         return replace(self, recordings=tuple(shortened))
 
     def engines(self, step: float, adaptive: bool = False) -> list[Engine]:
-        """A simulation engine for each recording.
+        """A simulation engine for each recording, with its samples.
 
         It takes steps of at most `step` s, or adaptive ones of about the same accuracy. Raises ValueError if step <= 0.
         """
+        numbers = range(len(self.recordings))
+        return [self._engine(k, self._experiment(k, step, adaptive), step, adaptive) for k in numbers]
+
+    def _experiment(self, k: int, step: float, adaptive: bool) -> Experiment:
+        """Recording k on the grid of its simulation."""
         if not step > 0.0:
             raise ValueError(f"expected a positive integration step, got {step:g} s")
-        engines = []
-        for network, space, recording in zip(self.networks, self.own_spaces, self.recordings, strict=True):
-            uses_own_steps = not adaptive and self._takes_own_steps(recording, network, step)
-            input_step = commensurate_step(INPUT_STEP * time_scale(self.plant), recording.interval)
-            longest = input_step if adaptive or uses_own_steps else step
-            step_control = _step_control(step, recording, self.plant) if uses_own_steps else None
-            experiment = lay_out(recording, self.plant.channels(), longest, step_control)
-            if adaptive:
-                engines.append(adaptive_engine(network, space, experiment, step))
-            else:
-                device = recording.time.device.type
-                engines.append(make_engine(network, space, experiment, self.engine, device=device))
-        return engines
+        recording = self.recordings[k]
+        uses_own_steps = not adaptive and self._takes_own_steps(recording, self.networks[k], step)
+        input_step = commensurate_step(INPUT_STEP * time_scale(self.plant), recording.interval)
+        longest = input_step if adaptive or uses_own_steps else step
+        step_control = _step_control(step, recording, self.plant) if uses_own_steps else None
+        return lay_out(recording, self.plant.channels(), longest, step_control)
+
+    def _engine(self, k: int, experiment: Experiment, step: float, adaptive: bool) -> Engine:
+        network, space = self.networks[k], self.own_spaces[k]
+        if adaptive:
+            return adaptive_engine(network, space, experiment, step)
+        return make_engine(network, space, experiment, self.engine, device=experiment.nodes.device.type)
 
     def takes_own_steps(self, step: float) -> bool:
         """Whether the step length is controlled separately for each lane in at least one recording.
@@ -110,15 +115,23 @@ class Fitting:
         )
         return inputs_constant and not self.is_slow and steps > OWN_STEP_COST * len(recording)
 
-    def problem(self, step: float, objective: Objective = "likelihood", adaptive: bool = False) -> Problem:
+    def problem(
+        self, step: float, objective: Objective = "likelihood", adaptive: bool = False, averaged: bool = True
+    ) -> Problem:
         """The estimation problem with integration steps of at most `step` s.
 
-        Raises ValueError if the objective is 'correlation' and a channel's readings are constant.
+        averaged: readings of one fixed step are replaced by their mean, see `simulate.resampling`. Raises ValueError if
+        the objective is 'correlation' and a channel's readings are constant.
         """
-        for recording in self.recordings if objective == "correlation" else ():
-            _expect_variation(recording, self.plant)
-        parts = zip(self.engines(step, adaptive), self.recordings, self.columns, strict=True)
-        terms = [Term(engine, readings_of(recording, self.plant), columns) for engine, recording, columns in parts]
+        terms = []
+        for k, recording in enumerate(self.recordings):
+            if objective == "correlation":
+                _expect_variation(recording, self.plant)
+            experiment, data = self._experiment(k, step, adaptive), readings_of(recording, self.plant)
+            if averaged and not adaptive:
+                experiment, means, counts = step_means(experiment, data.values, data.weight > 0)
+                data = Readings(means, counts)
+            terms.append(Term(self._engine(k, experiment, step, adaptive), data, self.columns[k]))
         return Problem(self.space, terms, objective)
 
 
@@ -138,7 +151,7 @@ def set_up(
     start: StartLevels | Sequence[StartLevels] = "free",
     engine: EngineKind = "auto",
 ) -> Fitting:
-    """Set up the fit of `parameters` ('T1.leak.size', or a Parameter with its own range) to recordings.
+    """Set up the fit of `parameters` ('T1.leak', 'T1.leak.size', or a Parameter with its own range) to recordings.
 
     start: initial levels, one choice for all tanks or a mapping by tank, for all recordings or a sequence with one
     entry per recording. A choice is 'equilibrium' (the level of the plant file, else the equilibrium under the first
@@ -147,7 +160,7 @@ def set_up(
     """
     if not isinstance(plant, PlantDescription):
         raise TypeError(f"plant: expected a Plant, got {plant!r}; read a plant file by fdi_torch.load_plant")
-    requested = list(parameters)
+    requested = [with_size(p, plant) if isinstance(p, str) else p for p in parameters]
     names = [p if isinstance(p, str) else p.name for p in requested]
     placements = placements_for(names)
     reference = build_network(plant, placements)

@@ -159,18 +159,21 @@ def conclude(
     """Compute estimate, diagnosis and goodness of fit at the refined optimum.
 
     Standard errors use each channel's noise level times sqrt((1 + a) / (1 - a)), with a the lag-1 correlation of the
-    residuals (see `lasting`), because correlated residuals carry less information than independent ones.
+    residuals of each step (see `lasting`), because correlated residuals carry less information than independent ones.
     """
     theta = refinement.theta
     lanes = torch.zeros(1, dtype=torch.int64)
     problem = fitting.problem(steps[1], "likelihood", settings.adaptive)
-    noise = problem.noise(theta, lanes)
+    raw = fitting.problem(steps[1], "likelihood", settings.adaptive, averaged=False)
     predicted, noise_ratios, inflated_noise = [], [], []
-    for term, noise_level in zip(problem.terms, noise, strict=True):
+    noise = raw.noise(theta, lanes)
+    for term, noise_level in zip(raw.terms, noise, strict=True):
         predicted.append(term.engine.readings(term.theta(theta))[0])
         sensor_noise = sample_noise(term.data.known, term.data.weight)
         noise_ratios.append(float((noise_level[0] / sensor_noise.clamp(min=1e-12)).max()))
-        inflated_noise.append(noise_level[0] * torch.sqrt(lasting(term.data.known - predicted[-1], term.data.weight)))
+    for term, noise_level in zip(problem.terms, problem.noise(theta, lanes), strict=True):
+        residuals = term.data.known - term.engine.readings(term.theta(theta))[0]
+        inflated_noise.append(noise_level[0] * torch.sqrt(lasting(residuals, (term.data.weight > 0).to(residuals))))
     likelihood = problem.at_noise(inflated_noise)
     curvature = likelihood.linearise(theta, lanes).curvature[0]
     estimate = make_estimate(
@@ -181,7 +184,7 @@ def conclude(
         noise_std=noise[0][0],
         reached={"search": search_result.reasons()[0], "refinement": refinement.statuses()[0], "steps_s": list(steps)},
     )
-    first = problem.terms[0]
+    first = raw.terms[0]
     levels = first.engine.levels(first.theta(theta))[0].mean(dim=0)
     channels = [fitting.recordings[0].input_names.index(c) for c in fitting.plant.channels()]
     means = fitting.recordings[0].inputs[:, channels].mean(dim=0)
@@ -202,7 +205,7 @@ def conclude(
         search=search_result,
         refinement=refinement,
         likelihood=likelihood,
-        correlation=problem.correlations(theta.unsqueeze(1), lanes)[0, 0],
+        correlation=raw.correlations(theta.unsqueeze(1), lanes)[0, 0],
         predicted=tuple(predicted),
         steps=steps,
         engine=problem.terms[0].engine.why or problem.terms[0].engine.name,

@@ -112,7 +112,7 @@ class Problem:
         return Linearisation(cost, gradient, curvature)
 
     def noise(self, theta: Tensor, lanes: Tensor) -> list[Tensor]:
-        """Standard deviation of the residuals, (L, C) for each recording.
+        """Standard deviation of one reading's residual, (L, C) for each recording.
 
         The P degrees of freedom that the parameters use are divided equally among all channels of all recordings.
         """
@@ -121,7 +121,7 @@ class Problem:
             data = of_lanes(term.data, lanes)
             squares = term.engine.moments(term.theta(theta.unsqueeze(1)), data)[:, 0, :, 1]
             lost_degrees = theta.shape[-1] / squares.shape[-1] / len(self.terms)
-            levels.append(torch.sqrt(squares / (data.weight.sum(-2) - lost_degrees).clamp(min=1.0)))
+            levels.append(torch.sqrt(squares / (data.degrees - lost_degrees).clamp(min=1.0)))
         return levels
 
     def _precision(self, theta: Tensor) -> Tensor:
@@ -154,11 +154,11 @@ def known_noise(term: Term, lanes: Tensor) -> Tensor | None:
 def deviance(squares: Tensor, data: Readings, noise_std: Tensor | None) -> Tensor:
     """Negative log-likelihood of each channel, (L, N, C), from its sum of squared residuals; constants are dropped.
 
-    Known noise: SSR / (2 sigma^2). Unknown noise, profiled out: n/2 log(SSR / n), n being the sum of the weights.
+    Known noise: SSR / (2 sigma^2). Unknown noise, profiled out: n/2 log(SSR / n), n being the number of values.
     """
     if noise_std is not None:
         return 0.5 * squares / _per_lane(noise_std, squares) ** 2
-    count = _per_lane(data.weight.sum(-2), squares)
+    count = _per_lane(data.degrees, squares)
     return 0.5 * count * torch.log(squares / count.clamp(min=1.0) + _per_lane(_rounding_variance(data), squares))
 
 
@@ -166,7 +166,7 @@ def likelihood_expansion(gram: Tensor, data: Readings, noise_std: Tensor | None)
     """Gauss-Newton model of the negative log-likelihood, from the sums of products `Engine.gram` (L, C, P+3, P+3)."""
     squares = gram[..., -3, -3]
     cost = deviance(squares.unsqueeze(1), data, noise_std).squeeze(1).sum(-1)
-    profiled = squares / data.weight.sum(-2).clamp(min=1.0) + _rounding_variance(data)
+    profiled = squares / data.degrees.clamp(min=1.0) + _rounding_variance(data)
     variance = profiled if noise_std is None else (noise_std**2).expand_as(squares)
     scaled = gram / variance[..., None, None]
     return Linearisation(cost, -scaled[..., :-3, -3].sum(1), scaled[..., :-3, :-3].sum(1))

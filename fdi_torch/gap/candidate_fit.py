@@ -20,7 +20,6 @@ from fdi_torch.estimate.kalman import KalmanWhitening
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
 from fdi_torch.gap.dataset import DataSet, RecordingPart
-from fdi_torch.gap.resampling import interpolate
 from fdi_torch.gap.start_choice import Start, likeliest_starts, vector_of
 from fdi_torch.gap.trajectory_problem import CAP, FAR, DescentResult, TrajectoryProblem, descend
 from fdi_torch.parameters import ParameterSpace, common_name, name_in_recording
@@ -29,6 +28,7 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation
+from fdi_torch.simulate.resampling import interpolate
 
 
 class Fitter:

@@ -10,13 +10,17 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.resampling import interpolate, step_means
 from fdi_torch.parameters import name_in_recording
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import Experiment, lay_out
+from fdi_torch.simulate.resampling import interpolate, step_means
+
+FEWEST = 0.5
+"""Least valid readings of a mean, as a share of the usual number in a step; it limits the variance to twice the usual
+one."""
 
 
 @dataclass(frozen=True)
@@ -144,5 +148,7 @@ def _part(plant: PlantDescription, recording: Recording, step: float, averaged: 
     experiment = lay_out(recording, plant.channels(), step)
     readings, mask = recording.outputs[:, order], recording.mask[:, order]
     if averaged:
-        experiment, readings, mask = step_means(experiment, readings, mask)
+        experiment, readings, counts = step_means(experiment, readings, mask)
+        usual = torch.where(counts > 0, counts, torch.nan).nanmedian(dim=0).values
+        mask = counts >= FEWEST * usual
     return RecordingPart(recording, experiment, readings, mask)

@@ -23,10 +23,10 @@ from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.resampling import interpolate
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.resampling import interpolate
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,16 @@ def silent(share: float, text: str) -> None:
     """Ignore progress messages."""
 
 
+def _keys(run: Any) -> Mapping[str, Any]:
+    """The keys of a run, monitor or study file. Raises TypeError for anything but a mapping."""
+    if not isinstance(run, Mapping):
+        raise TypeError(
+            f"expected the name of a file, or its keys as in {{'plant': plant, ...}}, got a {type(run).__name__}; "
+            "help() of the function has an example"
+        )
+    return run
+
+
 def simulate(
     plant: AnyPlant = "three_tank",
     *,
@@ -85,7 +95,7 @@ def train(
     if run is None or isinstance(run, str | Path):
         run = load_run(run)
     elif not isinstance(run, Run):
-        run = build_run(run, Path.cwd(), HERE)
+        run = build_run(_keys(run), Path.cwd(), HERE)
     return train_job.train(run, tell, resume, listener)
 
 
@@ -179,7 +189,7 @@ def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = si
     if isinstance(run, str | Path):
         run = load_monitor(run)
     elif not isinstance(run, MonitorRun):
-        run = build_monitor(run, Path.cwd(), HERE)
+        run = build_monitor(_keys(run), Path.cwd(), HERE)
     events: list[Event] = []
     summary = run_monitor(run, MonitorCallbacks(tell, events.append, lambda prepared: None))
     return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
@@ -256,14 +266,16 @@ def study(
     if isinstance(study, str | Path):
         study = load_study(study)
     elif not isinstance(study, Study):
-        study = build_study(study, Path.cwd(), HERE)
+        study = build_study(_keys(study), Path.cwd(), HERE)
     return study_job.run_study(study, resume, cluster, tell)
 
 
 def plant_of(plant: AnyPlant) -> PlantDescription:
     """The plant itself, or the plant of a file or of a shipped name; its units are those for display."""
-    if not isinstance(plant, PlantDescription):
+    if isinstance(plant, str | Path):
         return chosen_plant(plant)
+    if not isinstance(plant, PlantDescription):
+        raise TypeError(f"plant: expected a Plant or the name of a plant file, got a {type(plant).__name__}")
     display_in(plant.units)
     return plant
 

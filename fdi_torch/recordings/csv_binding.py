@@ -43,8 +43,13 @@ class Bound:
 
 
 def bind_clock(path: Path, header: Sequence[str], source: ChannelSource | None) -> Bound:
-    """The column of time: the mapped one, or one of `TIME_NAMES` with a unit, or one of them that holds time stamps."""
+    """The column of time: the mapped one, or one of `TIME_NAMES` with a unit, or one of them that holds time stamps.
+
+    Without a column, time is the number of rows above times the period, which is the factor.
+    """
     source = source or ClockSource()
+    if isinstance(source, ClockSource) and source.period is not None:
+        return Bound("t", "t", None, source.period, "s")
     if source.column is None:
         units = {h: header_unit(h) for h in header}
         timed = [h for h, unit in units.items() if unit and unit[0].lower() in TIME_NAMES]
@@ -121,10 +126,11 @@ def _find_column(path: Path, header: Sequence[str], name: str, column: str | Non
         [h for h in header if h.lower().startswith(requested.lower())] or nearest if len(requested) > 1 else nearest
     )
     hint = f"; the nearest is {shortened(names.get(nearest[0], nearest[0]))}" if nearest else ""
+    without = ", or give the time between its rows: columns: {t: {period: 50 ms}}" if name == "t" else ""
     raise ValueError(
         f"{path}: expected a column for {name} ('{requested}' or '{requested}_UNIT'), got "
         f"{', '.join(map(shortened, header))}{hint}; "
-        f"map it under columns: {{{name}: {{column: ..., unit: ...}}}}"
+        f"map it under columns: {{{name}: {{column: ..., unit: ...}}}}{without}"
     )
 
 

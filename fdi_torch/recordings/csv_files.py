@@ -135,7 +135,8 @@ def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
         columns = columns_of(path, heading, [clock, *bounds], clock_source, sparse)
         table, notes = _read_table(lines, columns)
     place, first = f"{path}: row {{}}, column {clock.header}", heading.lines + 1
-    seconds = _clock(table[:, 0], clock, clock_source, place, first)
+    cells = np.arange(len(table)) if clock.position is None else table[:, 0]
+    seconds = _clock(cells, clock, clock_source, place, first)
     in_file = [b for b in bounds if b.position is not None]
     values = channels_in_si(table, columns, in_file)
     order = in_order(seconds, values, _sorted(clock_source), place, first, _summer_time_hint(clock, clock_source))

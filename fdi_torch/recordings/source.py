@@ -33,13 +33,15 @@ class ClockSource(ChannelSource):
     """The source of time.
 
     stamps: format of time stamps (as for strptime; default: ISO 8601). zone: IANA name of the zone of local time.
-    shift: added to this clock, s. sort: whether rows may be in any order.
+    shift: added to this clock, s. sort: whether rows may be in any order. period: time between rows, s, of a file
+    without a column of time.
     """
 
     stamps: str | None = None
     zone: str | None = None
     shift: float = 0.0
     sort: bool = False
+    period: float | None = None
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,10 @@ from torch import Tensor
 class Readings:
     """Measured readings, to be compared with an engine's predictions.
 
-    values and weight: (S, C) for all lanes, or (problems, S, C), one set per problem; weight 0 masks a reading. ar:
-    None, or the AR(1) coefficient of each channel's noise, (C,) or (problems, C). With it, residuals and Jacobians are
-    whitened, x_k - ar x_(k-1); the first sample, and a sample after a masked one, is scaled by sqrt(1 - ar^2) instead.
+    values and weight: (S, C) for all lanes, or (problems, S, C), one set per problem. A value of weight n is the
+    mean of n readings; weight 0 masks it. ar: None, or the AR(1) coefficient of each channel's noise, (C,) or
+    (problems, C). With it, residuals and Jacobians are whitened, x_k - ar x_(k-1); the first sample, and a sample after
+    a masked one, is scaled by sqrt(1 - ar^2) instead.
     """
 
     values: Tensor
@@ -37,6 +38,11 @@ class Readings:
     def count(self) -> Tensor:
         """The number of unmasked readings, (C,) or (problems, C)."""
         return self.weight.sum(dim=-2)
+
+    @cached_property
+    def degrees(self) -> Tensor:
+        """The number of unmasked values, (C,) or (problems, C)."""
+        return (self.weight > 0).sum(dim=-2).to(self.weight.dtype)
 
     @cached_property
     def known(self) -> Tensor:

@@ -15,6 +15,18 @@ from mcap.reader import make_reader
 from fdi_torch.cli import DONE, MISUSE, main
 from fdi_torch.logbook import RunLog, foxglove_layout, read_run, series
 
+# Keys that the panels read: fields of PlotConfig, TableConfig, LogConfig, RawMessagesConfig in foxglove.layouts of
+# foxglove-sdk 0.30.3, and of the types of these panels in Lichtblick (packages/suite-base/src/panels), camel case.
+PANELS = {
+    "Plot": {
+        *("title", "paths", "showLegend", "legendDisplay", "showXAxisLabels", "showYAxisLabels", "isSynced"),
+        *("xAxisVal", "xAxisPath"),
+    },
+    "Table": {"topicPath"},
+    "RawMessages": {"topicPath"},
+    "RosOut": {"searchTerms", "minLogLevel", "topicToRender"},
+    "Tab": {"activeTabIdx", "tabs"},
+}
 DATA = Path(__file__).parents[1] / "data"
 GOLDEN = sorted(DATA.glob("log_format_1*.mcap"))
 
@@ -49,6 +61,12 @@ def expect_sound(layout: dict[str, Any], log: Path) -> list[str]:
         assert re.fullmatch(r"(/[\w-]+)+(\.\w+)?", path), path
         topic, _, name = path.partition(".")
         assert topic in known and (not name or known[topic][name] in ("number", "integer")), path
+    assert {"configById", "layout", "globalVariables", "userNodes", "playbackConfig"} == set(layout)
+    for panel, config in layout["configById"].items():
+        assert set(config) <= PANELS[panel.partition("!")[0]], panel
+        for line in config.get("paths", ()):
+            assert set(line) == {"value", "enabled", "timestampMethod", "label"}
+        assert config.get("xAxisVal", "timestamp") == ("custom" if "xAxisPath" in config else "timestamp")
     tabs = layout["configById"]["Tab!fdi"]["tabs"]
     placed = re.findall(r'"(\w+!\w+)"', json.dumps([layout["layout"], *(tab["layout"] for tab in tabs)]))
     assert sorted(placed) == sorted(layout["configById"])

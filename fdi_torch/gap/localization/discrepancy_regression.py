@@ -25,11 +25,11 @@ from fdi_torch.gap.localization.component_regressors import (
 )
 from fdi_torch.gap.localization.regressors import HARMONICS, harmonics, time_functions
 from fdi_torch.gap.marginal_likelihood import predicted_levels
-from fdi_torch.gap.resampling import interpolate
 from fdi_torch.plant.description import OUTSIDE, Sensor
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.resampling import interpolate
 from fdi_torch.simulate.scan import product, scan_in_time
 
 SAMPLES_A_STEP = 9  # fewest samples per step function of time

@@ -14,7 +14,7 @@ import math
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.resampling import interpolate
+from fdi_torch.simulate.resampling import interpolate
 from fdi_torch.simulate.scan import scan_in_time
 
 LAGS = (3.0, 10.0, 30.0, 100.0, 300.0)  # time constants, s

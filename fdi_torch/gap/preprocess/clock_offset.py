@@ -13,8 +13,8 @@ from torch import Tensor
 from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit
 from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Suspicion, WeightedFault
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, clock_offset
-from fdi_torch.gap.resampling import interpolate
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.resampling import interpolate
 
 MAX_DELAY = 0.25
 """Largest clock offset, as a share of the recording."""

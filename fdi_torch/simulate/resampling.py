@@ -14,10 +14,6 @@ from torch import Tensor
 
 from fdi_torch.simulate.experiment import Experiment
 
-FEWEST = 0.5
-"""Least valid readings of a mean, as a share of the usual number in a step; it limits the variance to twice the usual
-one."""
-
 
 def interpolate(at: Tensor, times: Tensor, values: Tensor) -> Tensor:
     """Linear interpolation of values (S,) at increasing times (S,) to times `at` (K,); constant beyond the ends."""
@@ -29,28 +25,27 @@ def interpolate(at: Tensor, times: Tensor, values: Tensor) -> Tensor:
 
 
 def step_means(experiment: Experiment, readings: Tensor, mask: Tensor) -> tuple[Experiment, Tensor, Tensor]:
-    """The experiment with one sample per step, and the mean readings with their mask, (S', C) each.
+    """The experiment with one sample per step, the mean readings, and the number of readings of each, (S', C) both.
 
     readings, mask (S, C): at the samples of the experiment, which are unchanged if no step has more than one.
     """
     ends = experiment.sample_step + (experiment.sample_share > 0.0)
     used, row = torch.unique_consecutive(ends, return_inverse=True)
     if len(used) == len(ends):
-        return experiment, readings, mask
+        return experiment, readings, mask.to(readings.dtype)
     times = _means(row, experiment.sample_times.unsqueeze(1))[:, 0]
-    counts = torch.zeros(len(used), mask.shape[1], dtype=readings.dtype).index_add_(0, row, mask.to(readings.dtype))
-    means, valid = torch.zeros_like(counts), torch.zeros_like(counts, dtype=torch.bool)
-    for c, count in enumerate(counts.T):
+    counts = readings.new_zeros(len(used), mask.shape[1]).index_add_(0, row, mask.to(readings.dtype))
+    means = torch.zeros_like(counts)
+    for c in range(mask.shape[1]):
         kept, of_row = mask[:, c], row[mask[:, c]]
         if not len(of_row):
             continue
-        own, position = torch.unique_consecutive(of_row, return_inverse=True)
+        _, position = torch.unique_consecutive(of_row, return_inverse=True)
         at, values = (_means(position, x[kept, None])[:, 0] for x in (experiment.sample_times, readings[:, c]))
         means[:, c] = interpolate(times, at, values)  # a channel with missing readings has other mean times
-        valid[own, c] = count[own] >= FEWEST * count[own].median()
     index = (used - 1).clamp(min=0)
     share = (times - experiment.nodes[index]) / experiment.steps[index]
-    return replace(experiment, sample_times=times, sample_step=index, sample_share=share), means, valid
+    return replace(experiment, sample_times=times, sample_step=index, sample_share=share), means, counts
 
 
 def _means(row: Tensor, values: Tensor) -> Tensor:
