@@ -22,6 +22,7 @@ from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.refinement import (
     ADAPTIVE_STEPS,
     distant_members,
+    nearest_to_nominal,
     refine_adaptively,
     refine_to_convergence,
     status_of,
@@ -85,6 +86,9 @@ def estimate_parameters(
         refinement = refine_adaptively(fitting, settings, starts, low, high, coarse, on_iteration)
     else:
         refinement, fine = refine_to_convergence(fitting, settings, starts, low, high, fine, on_iteration)
+    if settings.method != "none":
+        problem = fitting.problem(fine, settings.objectives[1], settings.adaptive)
+        refinement = nearest_to_nominal(problem, refinement, low, high, settings.refine)
     return conclude(fitting, settings, result, refinement, (coarse, fine))
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from fdi_torch.estimate.evolution import EvolutionResult
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid_settings import HybridSettings
+from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.objectives import Problem
 from fdi_torch.estimate.refined import Refined
@@ -28,6 +29,9 @@ FINEST_STEP = 0.01
 ADAPTIVE_STEPS = (2.0, 0.05)
 # Newton decrements at which a refinement stops: in an intermediate stage, and in the last one.
 LOOSE_DECREASE, TIGHT_DECREASE = 1e-2, 1e-4
+# Moves along a valley of equally good points towards nominal: their largest number, and the share of a parameter's
+# range below which one ends them.
+MOST_MOVES, NEAREST_WITHIN = 10, 0.01
 
 
 def distant_members(search_result: EvolutionResult, low: Tensor, high: Tensor, count: int) -> Tensor:
@@ -105,6 +109,30 @@ def refine_adaptively(
     for step in ADAPTIVE_STEPS:
         problem = fitting.problem(step * scale, settings.objectives[1], adaptive=True)
         refinement = run(problem, refinement.theta, TIGHT_DECREASE if step == ADAPTIVE_STEPS[-1] else LOOSE_DECREASE)
+    return refinement
+
+
+def nearest_to_nominal(
+    problem: Problem, refinement: Refined, low: Tensor, high: Tensor, stop: RefineSettings
+) -> Refined:
+    """The optimum nearest to the nominal values among those that fit equally well.
+
+    Where only a combination of parameters is determined, the optima form a valley, often a curved one, on which search
+    and refinement end anywhere. The sensitivities change along it: next to a bound, a fault may hide the error of a
+    constant, and the combination then seems far better determined than it is. The undetermined part of the deviation
+    from nominal is therefore removed, and the point refined again, until that moves it no further.
+    """
+    for _ in range(MOST_MOVES):
+        uncertainty = certainty(refinement.curvature[0])
+        deviation = (refinement.theta[0] - problem.space.nominal()) / uncertainty.scale
+        change = uncertainty.scale * (uncertainty.null @ deviation)
+        moved = (refinement.theta - change).clamp(low, high)
+        if not bool(((moved - refinement.theta).abs() > NEAREST_WITHIN * (high - low)).any()):
+            break
+        again = levenberg_marquardt(problem.linearise, moved, low, high, stop)
+        if not float(again.cost[0]) < float(refinement.cost[0]) + LOOSE_DECREASE:
+            break
+        refinement = again
     return refinement
 
 
