@@ -16,6 +16,7 @@ from fdi_torch import Pipe, PlacedEffect, Plant, Pump, Recording, Sensor, Tank
 from fdi_torch.config import plant_in_code
 from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.yaml_files import shipped_plants
+from tests.rigs import blank_recording
 
 IN_YAML = """
 name: rig
@@ -271,3 +272,10 @@ def test_a_library_that_is_not_there_is_named_with_its_extra(monkeypatch: pytest
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match=r"expected the library pandas, got none; pip install 'fdi_torch\[pandas\]'"):
         simulated().to_pandas()
+
+
+def test_an_effect_at_a_place_of_another_kind_is_refused_in_a_sentence() -> None:
+    plant = fdi_torch.load_plant("three_tank")
+    blank = blank_recording(plant, torch.full((3, 2), 1e-5, dtype=torch.float64), torch.arange(3, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"Q1\.leak: expected a place of kind tank \(T1, T2, T3\), got pump Q1"):
+        fdi_torch.set_up(plant, [blank], ["Q1.leak"])

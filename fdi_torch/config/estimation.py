@@ -9,13 +9,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from fdi_torch.config.plant_in_code import effect_at
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
-from fdi_torch.effects import all_placements, build_network, placements_for, with_size
+from fdi_torch.effects import all_placements, build_network, full_name, placements_for
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.names import shortened, unknown
-from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, display_unit
+from fdi_torch.parameters import Parameter, ParameterSpace, display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 
@@ -99,15 +98,6 @@ class EstimationConfig(Strict):
     windows: Seconds | None = Field(
         None, gt=0, description="length of windows that are fitted separately, s, for faults that come and go"
     )
-
-
-def full_name(name: str, plant: PlantDescription) -> str:
-    """'T1.leak' -> 'T1.leak.size': an effect's name means its size. Raises ValueError for an impossible place."""
-    full = with_size(name, plant)
-    if full != name:
-        at = ParameterName.parse(full)
-        effect_at(at.effect, at.place, plant)
-    return full
 
 
 def matching_names(pattern: str, plant: PlantDescription) -> list[str]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from fdi_torch.config.strict import quantity
 from fdi_torch.config.written_units import written_units
-from fdi_torch.effects import build_network, effect, placements_for
+from fdi_torch.effects import build_network, effect_at, placements_for
 from fdi_torch.names import matching, unknown
 from fdi_torch.parameters import Parameter, ParameterSpace, is_effect_parameter
 from fdi_torch.plant.description import (
@@ -25,7 +25,6 @@ from fdi_torch.plant.description import (
     Sensor,
     Tank,
 )
-from fdi_torch.plant.effect import Effect, fits, place_kind, place_kinds_of
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.simulate.ode import Inputs, PlantOde
 
@@ -174,18 +173,6 @@ def effect_in_si(index: int, placed: PlacedEffect, plant: PlantDescription, read
 def effect_parameters(name: str, location: str, plant: PlantDescription) -> dict[str, Parameter]:
     """The parameters of an effect at a place, by short name. Raises ValueError for an impossible place."""
     return {p.name: p for p in effect_at(name, location, plant).parameters(location, plant)}
-
-
-def effect_at(name: str, location: str, plant: PlantDescription) -> Effect:
-    """The effect of that name. Raises ValueError if it cannot be placed there."""
-    requested = effect(name)
-    if not fits(requested, plant, location):
-        possible = ", ".join(place for place in plant.locations() if fits(requested, plant, place)) or "none there is"
-        raise ValueError(
-            f"{location}.{name}: expected a place of kind {' or '.join(place_kinds_of(requested))} ({possible}), "
-            f"got {place_kind(plant, location)} {location}"
-        )
-    return requested
 
 
 def tolerances_in_si(

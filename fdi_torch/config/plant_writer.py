@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from fdi_torch.config.flow_sections import written_fields
-from fdi_torch.config.plant_in_code import absolute_units, effect_at, effect_parameters
+from fdi_torch.config.plant_in_code import absolute_units, effect_parameters
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import write_yaml
+from fdi_torch.effects import effect_at
 from fdi_torch.parameters import ParameterName, display_unit, displayed_in, parse_quantity
 from fdi_torch.plant.description import (
     FLOW_KINDS,

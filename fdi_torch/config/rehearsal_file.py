@@ -11,12 +11,11 @@ import torch
 from pydantic import BeforeValidator, Field
 
 from fdi_torch.capacity import expect_room
-from fdi_torch.config.estimation import full_name
 from fdi_torch.config.monitor_file import WindowConfig
 from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.strict import Decibel, ScaledSeconds, Share, Strict, quantity
-from fdi_torch.effects import build_network, placements_for
+from fdi_torch.effects import build_network, full_name, placements_for
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.monitor.monitor_setup import with_shapes
 from fdi_torch.monitor.monte_carlo.detection_plan import DetectionPlan

@@ -53,7 +53,7 @@ from fdi_torch.effects.valve_lag import ValveLag
 from fdi_torch.effects.valve_leak import ValveLeak
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription, with_tolerances
-from fdi_torch.plant.effect import Effect, Placement, fits
+from fdi_torch.plant.effect import Effect, Placement, fits, place_kind, place_kinds_of
 from fdi_torch.plant.network import TankNetwork
 
 # Of two effects at one place, the earlier one acts first.
@@ -148,12 +148,27 @@ def without_startup_effects(plant: PlantDescription, channels: Collection[str]) 
     return replace(with_tolerances(plant, lambda name: name.prefix not in ended), effects=effects)
 
 
-def with_size(name: str, plant: PlantDescription) -> str:
-    """'T1.leak' -> 'T1.leak.size': an effect's name means its size. Other names are returned unchanged."""
+def effect_at(name: str, location: str, plant: PlantDescription) -> Effect:
+    """The effect of that name. Raises ValueError if it cannot be placed there."""
+    requested = effect(name)
+    if not fits(requested, plant, location):
+        possible = ", ".join(place for place in plant.locations() if fits(requested, plant, place)) or "none there is"
+        raise ValueError(
+            f"{location}.{name}: expected a place of kind {' or '.join(place_kinds_of(requested))} ({possible}), "
+            f"got {place_kind(plant, location)} {location}"
+        )
+    return requested
+
+
+def full_name(name: str, plant: PlantDescription) -> str:
+    """'T1.leak' -> 'T1.leak.size': an effect's name means its size. Other names are returned unchanged.
+
+    Raises ValueError for an effect at an impossible place.
+    """
     at = ParameterName.of_effect(name)
     if at.field or at.effect not in {e.name for e in EFFECTS}:
         return name
-    return str(at.sibling(effect(at.effect).parameters(at.place, plant)[0].name))
+    return str(at.sibling(effect_at(at.effect, at.place, plant).parameters(at.place, plant)[0].name))
 
 
 def placements_for(names: Iterable[str]) -> tuple[Placement, ...]:

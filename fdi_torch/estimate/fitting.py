@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import build_network, placements_for, with_size
+from fdi_torch.effects import build_network, full_name, placements_for
 from fdi_torch.estimate.objectives import Objective, Problem, Term
 from fdi_torch.parameters import Parameter, ParameterSpace, name_in_recording, quantity_text
 from fdi_torch.plant.description import PlantDescription, Tank
@@ -160,7 +160,7 @@ def set_up(
     """
     if not isinstance(plant, PlantDescription):
         raise TypeError(f"plant: expected a Plant, got {plant!r}; read a plant file by fdi_torch.load_plant")
-    requested = [with_size(p, plant) if isinstance(p, str) else p for p in parameters]
+    requested = [full_name(p, plant) if isinstance(p, str) else p for p in parameters]
     names = [p if isinstance(p, str) else p.name for p in requested]
     placements = placements_for(names)
     reference = build_network(plant, placements)

@@ -8,9 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from fdi_torch.config.estimation import full_name
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.run_file import Run
+from fdi_torch.effects import full_name
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult
 from fdi_torch.estimate.objectives import Problem
