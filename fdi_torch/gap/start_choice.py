@@ -6,7 +6,7 @@ the parameters x of the fit:
     chi^2(z) = min over dx of |W (y - y(x, z) - J dx)|^2 + |x + dx - nominal|^2 / tolerance^2
 
 which is the variable projection of Golub and Pereyra (1973) with constant J. A descent costs as many sensitivities as z
-has entries, instead of 14 at three tanks and 60 at twelve. The full problem is then solved from the best end point.
+has entries, instead of 6 more at three tanks and 26 more at eleven. The full problem is then solved from the best end.
 """
 
 from __future__ import annotations
