@@ -175,3 +175,12 @@ def test_outputs_without_common_inputs_share_a_backward_pass(monkeypatch: pytest
         for j in range(10):
             assert (rows[k][j] is None) == (shared[k][j] is None) == (abs(j - k) > 1)
             assert rows[k][j] is None or torch.equal(rows[k][j], shared[k][j])  # type: ignore[arg-type]
+
+
+def test_dependences_are_found_anew_where_a_function_has_other_ones() -> None:
+    inputs = [torch.full((1, 2), float(k + 2), dtype=torch.float64) for k in range(3)]
+    slopes = Partials()
+    slopes(lambda x: [x[0] ** 2, x[1] ** 2], inputs, (1, 2))
+    _, rows = slopes(lambda x: [x[0] * x[2], x[1] ** 2], inputs, (1, 2))
+    assert rows[0][0] is not None and rows[0][2] is not None and rows[1][2] is None
+    assert rows[0][0].tolist() == [[4.0, 4.0]] and rows[0][2].tolist() == [[2.0, 2.0]]

@@ -15,8 +15,8 @@ Pointwise = Callable[[list[Tensor]], Sequence[Tensor]]
 class Partials:
     """y_i = function(x)_i and dy_i/dx_j, each of `shape`; None where y_i does not depend on x_j.
 
-    The first call needs one backward pass per output, and finds which inputs each depends on. In later calls, of
-    functions with the same dependences, outputs without a common input share a pass (Curtis, Powell and Reid, 1974): a
+    The first call needs one backward pass per output, and finds which inputs each depends on. In later calls, as long
+    as the dependences are the same, outputs without a common input share a pass (Curtis, Powell and Reid, 1974): a
     network of any size needs about as many passes as a tank has neighbours.
     """
 
@@ -32,19 +32,26 @@ class Partials:
             outputs = [y.expand(shape) for y in function(leaves)]
             # The sum's gradient holds all elementwise slopes, since no element depends on another element's inputs.
             totals = [y.sum() for y in outputs]
-        if not self._groups:
+        rows = self._in_groups(totals, leaves)
+        if rows is None:
             rows = [_slopes([total], leaves) for total in totals]
             self._inputs = [{j for j, slope in enumerate(row) if slope is not None} for row in rows]
             self._groups = _without_common_inputs(self._inputs)
-        else:
-            shared = {
-                i: row for group in self._groups for row in [_slopes([totals[i] for i in group], leaves)] for i in group
-            }
-            rows = [
-                [slope if j in self._inputs[i] else None for j, slope in enumerate(shared[i])]
-                for i in range(len(outputs))
-            ]
         return [y.detach() for y in outputs], rows
+
+    def _in_groups(self, totals: Sequence[Tensor], leaves: Sequence[Tensor]) -> list[Row] | None:
+        """The rows by one pass for each group; None before the first call and where the dependences differ."""
+        if not self._groups or len(totals) != len(self._inputs):
+            return None
+        rows: list[Row] = [[] for _ in totals]
+        for group in self._groups:
+            shared = _slopes([totals[i] for i in group], leaves)
+            known = set().union(*(self._inputs[i] for i in group))
+            if {j for j, slope in enumerate(shared) if slope is not None} != known:
+                return None
+            for i in group:
+                rows[i] = [slope if j in self._inputs[i] else None for j, slope in enumerate(shared)]
+        return rows
 
 
 @lru_cache(maxsize=1024)
