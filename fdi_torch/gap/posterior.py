@@ -15,30 +15,40 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
+import torch
+
 from fdi_torch.estimate.evidence import ODDS, RARE, posterior
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.library import canonical, tanks_of
 from fdi_torch.gap.localization.localize import FitBeside, localize
 from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
 from fdi_torch.gap.screening import Option
+from fdi_torch.gap.start_choice import vector_of
 from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, SearchResult
 from fdi_torch.plant.description import PlantDescription
 
 
 @dataclass(frozen=True)
 class CauseHypothesis:
-    """An explanation with or without an unknown discrepancy.
+    """An explanation with or without a discrepancy at one place.
 
-    causes: effects of the explanation, without those that the unknown replaces. weight: log posterior, not normalised.
+    causes: effects of the explanation, without those that an unknown replaces. weight: log posterior, not normalised.
+    discrepancy: an unknown, or the error of the law of an effect at the same place. inexact: whether it is the latter.
     """
 
     explanation: RankedExplanation
     causes: tuple[CauseName, ...]
     weight: float
-    place: LocalizedDiscrepancy | None = None
+    discrepancy: LocalizedDiscrepancy | None = None
+    inexact: bool = False
+
+    @property
+    def place(self) -> LocalizedDiscrepancy | None:
+        """The discrepancy, if it is an unknown."""
+        return None if self.inexact else self.discrepancy
 
     @property
     def unknown_at(self) -> str | None:
@@ -88,30 +98,24 @@ def posterior_of(
     place is called unknown. named_only: without unknown discrepancies.
     """
 
-    def weight(explanation: RankedExplanation) -> float:
-        return explanation.log_evidence if named_only else explanation.log_weight
-
-    hypotheses = [CauseHypothesis(e, causes_in_order(e.fit), weight(e)) for e in result.explanations]
+    hypotheses = [_about_predicted_levels(e) for e in result.explanations]
+    best_named = hypotheses[0].weight
     if not named_only:
-        likeliest = _likeliest(hypotheses).explanation
-        for explanation in {e.key: e for e in (likeliest, result.best, result.null)}.values():
+        for explanation in {e.key: e for e in (_likeliest(hypotheses).explanation, result.null)}.values():
             hypotheses += _with_unknowns(pool, explanation, places, len(places), _likeliest(hypotheses))
-        hypotheses += _with_fewer_effects(pool, _likeliest(hypotheses), len(places))
         hypotheses = _after_fits_at_unknowns(pool, hypotheses, options, len(places))
-        hypotheses += _with_more_effects(pool, _likeliest(hypotheses), options, len(places))
-        hypotheses += _from_unknown_alone(pool, result.null, _likeliest(hypotheses), options, len(places))
+        hypotheses += _climbed(pool, _likeliest(hypotheses), options, len(places))
+        best = _likeliest(hypotheses)
+        if best.discrepancy and any(at != best.discrepancy.location for _, at in best.explanation.key):
+            alone = _with_unknowns(pool, result.null, [best.discrepancy.location], len(places))
+            hypotheses += [*alone, *_climbed(pool, _likeliest(alone), options, len(places))]
         least = _likeliest(hypotheses).weight + math.log(RARE)
-        hypotheses += [
-            _about_predicted_levels(h.explanation) for h in hypotheses if h.place is None and h.weight > least
-        ]
         hypotheses += [law for h in hypotheses if h.weight > least for law in _with_inexact_laws(pool, h, options)]
-    best: dict[tuple[frozenset[CauseName], str | None], CauseHypothesis] = {}
-    for h in hypotheses:
-        key = frozenset(canonical(c, plant) for c in h.causes), h.unknown_at
-        if key not in best or h.weight > best[key].weight:
-            best[key] = h
-    ranked = sorted(best.values(), key=lambda h: -h.weight)
-    unfitted = weight(result.best) + math.log(max(result.unexamined, 1e-300))
+    by_causes: dict[tuple[frozenset[CauseName], str | None], CauseHypothesis] = {}
+    for h in sorted(hypotheses, key=lambda h: -h.weight):
+        by_causes.setdefault((frozenset(canonical(c, plant) for c in h.causes), h.unknown_at), h)
+    ranked = list(by_causes.values())
+    unfitted = best_named + math.log(max(result.unexamined, 1e-300))
     *probabilities, unexamined = posterior([*(h.weight for h in ranked), unfitted])
     return Posterior(tuple(ranked), tuple(probabilities), unexamined, _marginals(ranked, probabilities, places))
 
@@ -188,8 +192,8 @@ def _with_unknown(
     plant, flow = pool.fitter.data.plant, place.noise.apart is not None
     here = [c for c in causes if c[1] == place.location or (flow and place.location in tanks_of(c[1], plant))]
     weight = explanation.log_weight + place.gain
-    if here and _is_small(pool, explanation, place.size, here):
-        return CauseHypothesis(explanation, causes, weight)
+    if here and place.size < ODDS.discrepancy * _influence(pool.fitter, explanation.fit, here):
+        return CauseHypothesis(explanation, causes, weight, place, inexact=True)
     weight += math.log(ODDS.unknown / places)
     return CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight, place)
 
@@ -203,15 +207,21 @@ def _fitness(known: RankedExplanation, alone: RankedExplanation) -> float:
     return likelihood(known) - likelihood(alone)
 
 
-def _is_small(pool: ExplanationPool, explanation: RankedExplanation, size: float, here: Collection[CauseName]) -> bool:
-    """Whether a discrepancy of this size is small compared with the influence of the effects `here`, at its place."""
-    elsewhere = explanation.key - set(here)
-    least = min(_cost(pool.fitter, e.fit) for e in pool.explanations.values() if e.key <= elsewhere)
-    return size < ODDS.discrepancy * math.sqrt(max(least - _cost(pool.fitter, explanation.fit), 0.0))
+def _influence(fitter: Fitter, fit: Fit, causes: Collection[CauseName]) -> float:
+    """Norm of the influence of some of a fit's effects on the readings, in units of the sensor noise.
 
-
-def _cost(fitter: Fitter, fit: Fit) -> float:
-    return float(fitter.white(fit.linearised)[0].square().sum())
+    To first order without the part that the other parameters, within their tolerances, would have in common with it.
+    """
+    others = [p for p in fit.candidate.placements if (p.effect.name, p.location) not in causes]
+    engine = fitter.engine(Candidate(tuple(others)), list(fit.values_of(others)))
+    theta = vector_of(engine.space, fit.values)
+    without = engine.converge(theta.unsqueeze(0), fit.linearised.levels[..., : len(fitter.data.plant.tanks)])
+    scale, pull, _ = fitter.priors(engine.space, theta)
+    change = fitter.noise.whiten(fit.linearised.readings[0] - without.readings[0], fitter.data.mask).flatten()
+    jacobian = (fitter.noise.whiten(without.jacobian[0], fitter.data.mask) * scale).flatten(0, 1)
+    rows = torch.cat([jacobian, torch.diag(pull)])
+    target = torch.cat([change, torch.zeros_like(pull)])
+    return float(torch.linalg.vector_norm(target - rows @ torch.linalg.lstsq(rows, target.unsqueeze(1)).solution[:, 0]))
 
 
 def _with_inexact_laws(pool: ExplanationPool, h: CauseHypothesis, options: Sequence[Option]) -> list[CauseHypothesis]:
@@ -225,64 +235,54 @@ def _with_inexact_laws(pool: ExplanationPool, h: CauseHypothesis, options: Seque
         others = {c for c in h.causes if c[1] == cause[1]} - {cause}
         if not others:
             continue
-        reduced = pool.without(h.explanation, cause)
-        size = math.sqrt(max(_cost(pool.fitter, reduced.fit) - _cost(pool.fitter, h.explanation.fit), 0.0))
-        if _is_small(pool, h.explanation, size, others | {cause}):
+        own, all_here = (_influence(pool.fitter, h.explanation.fit, which) for which in ({cause}, {cause} | others))
+        if own < ODDS.discrepancy * all_here:
+            reduced = pool.without(h.explanation, cause)
             odds = log_prior(reduced.key, pool.choices) - log_prior(h.explanation.key, pool.choices)
             weight = h.weight + odds - math.log(len({o.cause for o in options if o.cause[1] == cause[1]}))
-            law = CauseHypothesis(reduced, tuple(c for c in h.causes if c != cause), weight, h.place)
+            law = CauseHypothesis(reduced, tuple(c for c in h.causes if c != cause), weight, h.discrepancy, h.inexact)
             explained += [law, *_with_inexact_laws(pool, law, options)]
     return explained
 
 
-def _with_fewer_effects(pool: ExplanationPool, best: CauseHypothesis, places: int) -> list[CauseHypothesis]:
-    """Hypotheses with fewer effects: an effect may only have compensated the unknown, or a wrong law of another."""
-    accepted: list[CauseHypothesis] = []
-    while len(best.fit.key) > (0 if best.place else 1):
-        trials = []
-        for cause in best.fit.key:
-            reduced = pool.without(best.explanation, cause)
-            at = [best.place.location] if best.place else list(dict.fromkeys(place for _, place in reduced.key))
-            trials += _with_unknowns(pool, reduced, at, places, best)
-        accepted += trials
+def _climbed(
+    pool: ExplanationPool, best: CauseHypothesis, options: Sequence[Option], places: int
+) -> list[CauseHypothesis]:
+    """Hypotheses about one: with an effect fewer, or with a further one beside its discrepancy, while that improves it.
+
+    An effect may only have compensated a discrepancy, which may also have hidden an effect.
+    """
+    found: list[CauseHypothesis] = []
+    while True:
+        trials = [*_with_fewer_effects(pool, best, places), *_with_more_effects(pool, best, options, places)]
+        found += trials
         if not trials or _likeliest(trials).weight <= best.weight:
-            break
+            return found
         best = _likeliest(trials)
-    return accepted
+
+
+def _with_fewer_effects(pool: ExplanationPool, best: CauseHypothesis, places: int) -> list[CauseHypothesis]:
+    """The hypothesis without each of its effects, with its discrepancy, or one at the place of another effect."""
+    trials: list[CauseHypothesis] = []
+    for cause in best.explanation.key if best.discrepancy or len(best.explanation.key) > 1 else ():
+        reduced = pool.without(best.explanation, cause)
+        at = [best.discrepancy.location] if best.discrepancy else list(dict.fromkeys(at for _, at in reduced.key))
+        trials += _with_unknowns(pool, reduced, at, places, best)
+    return trials
 
 
 def _with_more_effects(
     pool: ExplanationPool, best: CauseHypothesis, options: Sequence[Option], places: int
 ) -> list[CauseHypothesis]:
-    """Hypotheses with further effects beside the unknown of the best one, which hid them."""
-    accepted: list[CauseHypothesis] = []
-    while best.place:
-        under = with_disturbances(best.explanation.fitter, best.fit, best.place.noise)
-        explained, noise, at = best.place.explained, best.place.noise, [best.place.location]
-        trials = [
-            h
-            for extension, fit in pool.extend_beside(best.explanation, explained, under, options)
-            for h in _with_unknowns(pool, extension, at, places, best, FitBeside(fit, explained, noise))
-        ]
-        accepted += trials
-        if not trials or _likeliest(trials).weight <= best.weight:
-            break
-        best = _likeliest(trials)
-    return accepted
-
-
-def _from_unknown_alone(
-    pool: ExplanationPool,
-    null: RankedExplanation,
-    best: CauseHypothesis,
-    options: Sequence[Option],
-    places: int,
-) -> list[CauseHypothesis]:
-    """Hypotheses with effects beside the unknown of the best one, without those that were found before the unknown."""
-    if best.place is None or not best.explanation.key:
+    """The hypothesis with each of the most promising further effects beside its discrepancy."""
+    if (at := best.discrepancy) is None:
         return []
-    alone = [h for h in _with_unknowns(pool, null, [best.place.location], places) if h.place]
-    return [further for h in alone for further in (h, *_with_more_effects(pool, h, options, places))]
+    under = with_disturbances(best.explanation.fitter, at.fit, at.noise)
+    return [
+        h
+        for extension, fit in pool.extend_beside(best.explanation, at.explained, under, options)
+        for h in _with_unknowns(pool, extension, [at.location], places, best, FitBeside(fit, at.explained, at.noise))
+    ]
 
 
 def _marginals(
