@@ -30,10 +30,11 @@ from fdi_torch.blind.sizes import SAME
 from fdi_torch.blind.statistics import clopper_pearson
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.diagnose import diagnose, recalibrate
+from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
 from fdi_torch.gap.library import STANDARD as LIBRARY
 from fdi_torch.gap.problem import Settings, problem_of
 from fdi_torch.gap.screening import Option, options_of
-from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, search
+from fdi_torch.gap.structure_search import search
 from fdi_torch.logbook.provenance import git_state
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import operating_range_of_all, with_simulated_levels

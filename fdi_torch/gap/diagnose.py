@@ -15,6 +15,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise, estimate_noise, quantization_step
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.diagnosis_result import DiagnosisResult
+from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.free_form import fitted_free_form
 from fdi_torch.gap.library import possible_places
 from fdi_torch.gap.marginal_likelihood import with_disturbances
@@ -23,7 +24,7 @@ from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_noise_limits
 from fdi_torch.gap.problem import PLAIN, DiagnosisProblem, Settings, problem_of
 from fdi_torch.gap.screening import options_of
-from fdi_torch.gap.structure_search import ExplanationPool, search
+from fdi_torch.gap.structure_search import search
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of_all, with_simulated_levels

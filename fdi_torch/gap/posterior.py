@@ -21,13 +21,14 @@ from fdi_torch.estimate.evidence import ODDS, RARE, posterior
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
 from fdi_torch.gap.library import canonical, tanks_of
 from fdi_torch.gap.localization.localize import FitBeside, localize
 from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.start_choice import vector_of
-from fdi_torch.gap.structure_search import ExplanationPool, RankedExplanation, SearchResult
+from fdi_torch.gap.structure_search import SearchResult
 from fdi_torch.plant.description import PlantDescription
 
 
@@ -104,11 +105,12 @@ def posterior_of(
         for explanation in {e.key: e for e in (_likeliest(hypotheses).explanation, result.null)}.values():
             hypotheses += _with_unknowns(pool, explanation, places, len(places), _likeliest(hypotheses))
         hypotheses = _after_fits_at_unknowns(pool, hypotheses, options, len(places))
-        hypotheses += _climbed(pool, _likeliest(hypotheses), options, len(places))
-        best = _likeliest(hypotheses)
+        further = _climbed(pool, _likeliest(hypotheses), options, len(places))
+        best = _likeliest([*hypotheses, *further])
         if best.discrepancy and any(at != best.discrepancy.location for _, at in best.explanation.key):
             alone = _with_unknowns(pool, result.null, [best.discrepancy.location], len(places))
-            hypotheses += [*alone, *_climbed(pool, _likeliest(alone), options, len(places))]
+            further += [*alone, *_climbed(pool, _likeliest(alone), options, len(places))]
+        hypotheses += _after_fits_at_unknowns(pool, further, options, len(places), _likeliest(hypotheses).weight)
         least = _likeliest(hypotheses).weight + math.log(RARE)
         hypotheses += [law for h in hypotheses if h.weight > least for law in _with_inexact_laws(pool, h, options)]
     by_causes: dict[tuple[frozenset[CauseName], str | None], CauseHypothesis] = {}
@@ -125,24 +127,27 @@ def _likeliest(hypotheses: Sequence[CauseHypothesis]) -> CauseHypothesis:
 
 
 def _after_fits_at_unknowns(
-    pool: ExplanationPool, hypotheses: Sequence[CauseHypothesis], options: Sequence[Option], places: int
+    pool: ExplanationPool,
+    hypotheses: Sequence[CauseHypothesis],
+    options: Sequence[Option],
+    places: int,
+    rival: float = -math.inf,
 ) -> list[CauseHypothesis]:
     """The hypotheses after the effects of the library were fitted at the place of each unknown that is relevant.
 
     An unknown is a law that no library has: its weight goes to effects at the same place that predict as well by
-    Akaike's criterion. The law of such an effect may also be inexact.
+    Akaike's criterion. The law of such an effect may also be inexact. rival: weight of the likeliest of all others.
     """
-    best, before = _likeliest(hypotheses), set(pool.explanations)
-    inexact: list[CauseHypothesis] = []
+    added: list[CauseHypothesis] = []
+    best = max((h.weight for h in hypotheses), default=rival)
     for h in hypotheses:
-        if h.place and h.weight > best.weight + math.log(RARE):
+        if h.place and h.weight > max(best, rival) + math.log(RARE):
             under = with_disturbances(h.explanation.fitter, h.fit, replace(h.place.noise, wander=None))
-            pool.extend_at(h.explanation, h.place.location, under, options)
+            at_place = [o for o in options if o.placement.location == h.place.location]
+            pool.extend_under(under, h.explanation, at_place)
             here = [e for e in list(pool.explanations.values()) if _added_at(h.place.location, e, h.explanation)]
-            inexact += [law for e in here for law in _with_unknowns(pool, e, [h.place.location], places, best)]
-    added = [e for key, e in pool.explanations.items() if key not in before]
-    named = [CauseHypothesis(e, causes_in_order(e.fit), e.log_weight) for e in added]
-    return [*named, *inexact, *(_as_known(h, pool.explanations.values()) for h in hypotheses)]
+            added += [law for e in here for law in _with_unknowns(pool, e, [h.place.location], places, h)]
+    return [*added, *(_as_known(h, pool.explanations.values()) for h in hypotheses)]
 
 
 def _added_at(place: str, known: RankedExplanation, alone: RankedExplanation) -> bool:
@@ -278,9 +283,11 @@ def _with_more_effects(
     if (at := best.discrepancy) is None:
         return []
     under = with_disturbances(best.explanation.fitter, at.fit, at.noise)
+    corrected = replace(under.data, readings=under.data.readings - at.explained)
+    extensions = pool.extend_under(Fitter(corrected, under.noise, under.whitening), best.explanation, options)
     return [
         h
-        for extension, fit in pool.extend_beside(best.explanation, at.explained, under, options)
+        for extension, fit in extensions
         for h in _with_unknowns(pool, extension, [at.location], places, best, FitBeside(fit, at.explained, at.noise))
     ]
 

@@ -1,0 +1,293 @@
+"""Explanations evaluated so far, and how they are extended: screened, fitted, and judged by their evidence.
+
+About an explanation, a first-order regression estimates what every effect of the library would gain (`screening.py`);
+the most promising are fitted, and the evidence of the best fits is computed with the noise of sensors and flows
+estimated anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from fdi_torch.estimate.evidence import RARE
+from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.gap.answer import CauseName
+from fdi_torch.gap.candidate import Candidate, Fit, Key
+from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.extensions import ExpectedGain, best_pairs, extended, log_prior_width
+from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
+from fdi_torch.gap.onsets import fine_onsets, likeliest_intervals
+from fdi_torch.gap.screening import Option, ScreeningResult, pairs_of, screen
+from fdi_torch.gap.trajectory_problem import BEHIND, SHARE
+
+# BEAM, FITTED, STARTS, EVALUATED and PAIRS are budgets of computing. An extension that FITTED and EVALUATED leave out
+# keeps its share of the posterior, `ExplanationPool.unexamined`.
+BEAM = 2  # explanations of one size that are extended
+FITTED = 8  # effects fitted about each explanation and noise, by first-order gain
+STARTS = 8  # initial values of one effect, by first-order gain
+EVALUATED = 3  # of these fits, the best whose evidence is computed
+CONVERGED = 0.1  # nats; a smaller gain ends the alternation between noise and fit
+PRIOR_GAIN = 3.0  # nats; gain at which an effect with odds of one in twenty becomes likely
+PAIRS = 3  # pairs of effects fitted together
+
+
+@dataclass(frozen=True)
+class RankedExplanation:
+    """A set of effects: its fit, the fitter with its own noise, that noise, and its log evidence with prior odds."""
+
+    fit: Fit
+    fitter: Fitter
+    noise: StateNoise
+    log_evidence: float
+
+    @property
+    def key(self) -> Key:
+        return self.fit.key
+
+    @property
+    def log_weight(self) -> float:
+        """Log posterior weight if nothing is unknown: random flows are then of one order of magnitude in all tanks."""
+        return self.log_evidence + self.noise.log_prior()
+
+
+class ExplanationPool:
+    """The explanations evaluated so far, by their effects.
+
+    fitter: with sensor noise alone. null: the recalibrated plant, fitted by it. choices: number of effects at places in
+    the library.
+    """
+
+    def __init__(self, fitter: Fitter, null: Fit, choices: int) -> None:
+        self.fitter, self.null, self.choices = fitter, null, choices
+        self.explanations: dict[Key, RankedExplanation] = {}
+        self._expected_gains: dict[Key, dict[Key, ExpectedGain]] = {}
+        self._failed: set[Key] = set()
+
+    def evaluate(self, fit: Fit, start: StateNoise | None = None) -> RankedExplanation:
+        """Estimate noise and fit alternately until the evidence converges; keep the better explanation.
+
+        Effects that were evaluated before are evaluated again only if this fit is better under the noise found then.
+        An explanation that falls too far behind those of its size that will be extended is given up, as a fit is.
+        """
+        before = self.explanations.get(fit.key)
+        if before and before.fitter.cost(fit) > before.fit.cost - CONVERGED:
+            return before
+        rivals = self.best_of(len(fit.key))[BEAM - 1 :]
+        rival = rivals[0].log_evidence if rivals else -math.inf
+        best: RankedExplanation | None = None
+        climb = False
+        while True:
+            own_fitter, likely = with_estimated_noise(self.fitter, fit, start, climb)
+            fit = replace(fit, cost=own_fitter.cost(fit))
+            lead = log_evidence(own_fitter, fit, self.choices) - rival
+            fit = own_fitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit, fit.cost + 2.0 * lead)
+            updated = RankedExplanation(fit, own_fitter, likely.noise, log_evidence(own_fitter, fit, self.choices))
+            gain = updated.log_evidence - best.log_evidence if best else math.inf
+            if best is None or gain > 0.0:
+                best = updated
+            behind = rival - best.log_evidence
+            hopeless = behind > 0.5 * BEHIND and gain < SHARE * behind
+            if hopeless or (climb and not gain > CONVERGED):
+                break
+            # The search for the correlation time, which takes longest, begins where the rest has converged.
+            fit, start, climb = best.fit, best.noise, not gain > CONVERGED
+        if before is None or best.log_evidence > before.log_evidence:
+            self.explanations[fit.key] = best
+        return best
+
+    def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
+        """The explanation without one of its effects, refitted from its present values.
+
+        A start near the optimum may avoid a local minimum in which an earlier fit of the same effects ended.
+        """
+        fit = explanation.fit
+        placements = tuple(p for p in fit.candidate.placements if (p.effect.name, p.location) != cause)
+        candidate = Candidate(placements, (fit.values_of(placements),))
+        self.evaluate(explanation.fitter.fit(candidate, fit), explanation.noise)
+        return self.explanations[explanation.key - {cause}]
+
+    def best_of(self, effects: int) -> list[RankedExplanation]:
+        """Explanations with this number of effects, the likeliest first."""
+        return sorted((e for e in self.explanations.values() if len(e.key) == effects), key=lambda e: -e.log_evidence)
+
+    def extend_by(self, parent: RankedExplanation, options: Sequence[Option]) -> None:
+        """Extend an explanation by one effect, screened under its own noise."""
+        further = [o for o in options if o.cause not in parent.key]
+        self.extend(parent, screen(parent.fitter, parent.fit, further))
+
+    def extend(
+        self, parent: RankedExplanation, own_noise: ScreeningResult, sensor_noise: ScreeningResult | None = None
+    ) -> None:
+        """Extend an explanation by the most promising effects, and by pairs of effects.
+
+        own_noise: screening under its own noise. sensor_noise: screening under sensor noise alone.
+        """
+        own_noise = _with_fine_onsets(parent.fitter, parent.fit, own_noise)
+        relevant = [c for c in self._extensions(parent, own_noise, own=True) if self._relevant(parent, c.key)]
+        fits = self._fitted(parent.fitter, parent.fit, relevant)[:EVALUATED]
+        if sensor_noise:
+            pairs = best_pairs(pairs_of(self.fitter, parent.fit, sensor_noise), PAIRS)
+            candidates = [*self._extensions(parent, sensor_noise, own=False), *pairs]
+            undisturbed = self._fitted(self.fitter, self.null, candidates, (self.fitter.cost(f) for f in fits))
+            costs = {parent.key: self.null.cost} | {f.key: f.cost for f in undisturbed}
+            fits += [f for f in undisturbed if self._improves(f, costs)][:EVALUATED]
+        for fit in sorted(fits, key=lambda f: len(f.key)):
+            self.evaluate(fit, parent.noise)
+
+    def extend_under(
+        self, fitter: Fitter, parent: RankedExplanation, options: Sequence[Option]
+    ) -> list[tuple[RankedExplanation, Fit]]:
+        """Extend an explanation by effects under another noise, and beside a discrepancy: the extensions, and their
+        fits beside it.
+
+        fitter: with the noise that the discrepancy left, and the readings without what it explains of them. The own
+        noise of the explanation absorbs what it does not explain, and hides effects of which none was fitted.
+        """
+        base = fitter.fit(parent.fit.candidate, parent.fit)
+        further = [o for o in options if o.cause not in parent.key]
+        screening = _with_fine_onsets(fitter, base, screen(fitter, base, further))
+        candidates = [
+            replace(c, starts=(*c.starts, self.explanations[c.key].fit.effect_values))
+            if c.key in self.explanations
+            else c
+            for c in self._extensions(parent, screening, own=False)
+        ]
+        fits = self._fitted(fitter, base, candidates, again=True)[:EVALUATED]
+        noise = replace(fitter.whitening.noise, wander=None) if fitter.whitening else parent.noise
+        return [(self.evaluate(fit, noise), fit) for fit in fits]
+
+    def _fitted(
+        self,
+        fitter: Fitter,
+        base: Fit,
+        candidates: Sequence[Candidate],
+        rivals: Iterable[float] = (),
+        again: bool = False,
+    ) -> list[Fit]:
+        """Fits of the candidates from `base`, the best first. A fit that is worse than `base` has failed.
+
+        rivals: costs of other fits under the same noise. again: also of those that were evaluated before, under other
+        noise.
+        """
+        cost, fits, least = fitter.cost(base), list[Fit](), min(rivals, default=math.inf)
+        for candidate in candidates:
+            if again or candidate.key not in self.explanations:
+                fit = fitter.fit(candidate, base, least)
+                least = min(least, fit.cost)
+                if fit.cost < cost:
+                    fits.append(fit)
+                else:
+                    self._failed.add(candidate.key)
+        return sorted(fits, key=lambda f: f.cost)
+
+    def _relevant(self, parent: RankedExplanation, key: Key) -> bool:
+        """Whether an extension of `parent` is expected to come within RARE of the best explanation.
+
+        It may gain more than its first-order gain by the largest factor among all extensions that were fitted so far.
+        """
+        best = max(e.log_evidence for e in self.explanations.values())
+        pairs = [pair for k in self._expected_gains for pair in self._gains(k)]
+        factor = max([1.0, *(actual / gain for actual, gain in pairs if gain > PRIOR_GAIN)])
+        expected = self._expected_gains[parent.key][key]
+        return factor * expected.gain + expected.prior + parent.log_evidence - best > math.log(RARE)
+
+    def _improves(self, fit: Fit, costs: Mapping[Key, float]) -> bool:
+        """Whether a fit gains more than its prior odds cost, against every explanation that it contains.
+
+        costs: chi-square of each fit under sensor noise alone; under any other noise the gain would be smaller.
+        """
+        prior = log_prior(fit.key, self.choices)
+        return all(
+            0.5 * (cost - fit.cost) + prior > log_prior(key, self.choices)
+            for key, cost in costs.items()
+            if key < fit.key
+        )
+
+    def _extensions(self, parent: RankedExplanation, screening: ScreeningResult, own: bool) -> list[Candidate]:
+        """The most promising extensions of an explanation by one effect whose first-order gain exceeds the cost of its
+        prior.
+
+        own: whether the screening was made under the explanation's own noise; its expected gains are then recorded.
+        """
+        by_cause: dict[tuple[str, str], list[int]] = {}
+        for i in torch.argsort(screening.gain, descending=True).tolist():
+            by_cause.setdefault(screening.options[i].cause, []).append(i)
+        candidates: list[Candidate] = []
+        for cause, group in by_cause.items():
+            key = parent.key | {cause}
+            odds = log_prior(key, self.choices) - log_prior(parent.key, self.choices)
+            gain = 0.5 * float(screening.gain[group[0]])
+            candidate = extended(parent.fit, screening, group[:STARTS])
+            if own:
+                expected = ExpectedGain(candidate, gain, odds - log_prior_width(screening, group[0]))
+                self._expected_gains.setdefault(parent.key, {})[key] = expected
+            if gain + odds > 0.0 and len(candidates) < FITTED:
+                candidates.append(candidate)
+        return candidates
+
+    def exchange_effects(self, options: Sequence[Option]) -> None:
+        """Remove each effect of the best explanation and try others in its place, while that improves it."""
+        while True:
+            best = max(self.explanations.values(), key=lambda e: e.log_evidence)
+            for cause in best.key:
+                known = self.explanations.get(best.key - {cause})
+                reduced = self.without(best, cause)
+                if reduced is not known and options:
+                    self.extend_by(reduced, options)
+            if max(self.explanations.values(), key=lambda e: e.log_evidence) is best:
+                return
+
+    def unexamined(self) -> float:
+        """Odds of all candidates that were not fitted, against the best explanation."""
+        return sum(math.exp(min(lead, 0.0)) for lead, _, _ in self._unfitted())
+
+    def fit_unexamined(self) -> None:
+        """Fit and evaluate the likeliest candidates that were not fitted."""
+        candidates = [e for e in self._unfitted() if e[2].candidate.key not in self._failed]
+        for _, parent, expected in sorted(candidates, key=lambda e: -e[0])[:FITTED]:
+            for fit in self._fitted(parent.fitter, parent.fit, [expected.candidate]):
+                self.evaluate(fit, parent.noise)
+
+    def _unfitted(self) -> Iterator[tuple[float, RankedExplanation, ExpectedGain]]:
+        """Candidates that were not fitted: expected lead in log evidence over the best explanation, parent, and
+        expected gain.
+        """
+        best = max(self.explanations.values(), key=lambda e: e.log_evidence)
+        for key, expected_gains in self._expected_gains.items():
+            # The effects of the best explanation, which are true if it is, gain more than others.
+            parent, true = self.explanations[key], {key | {cause} for cause in best.key}
+            ratio = _gain_ratio(self._gains(key, true))
+            behind = best.log_evidence - parent.log_evidence
+            for k, expected in expected_gains.items():
+                if k not in self.explanations:
+                    yield ratio * expected.gain + expected.prior - behind, parent, expected
+
+    def _gains(self, key: Key, without: Collection[Key] = ()) -> list[tuple[float, float]]:
+        """Actual and first-order gains of the fitted extensions of an explanation."""
+        evidence = self.explanations[key].log_evidence
+        return [
+            (self.explanations[k].log_evidence - evidence - expected.prior, expected.gain)
+            for k, expected in self._expected_gains[key].items()
+            if k in self.explanations and k not in without
+        ]
+
+
+def _with_fine_onsets(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> ScreeningResult:
+    """A screening with further onset times and intervals of the most promising effects."""
+    promising = screening.promising(FITTED)
+    further = fine_onsets(promising, fitter) + likeliest_intervals(promising, fitter, fit)
+    return screening + screen(fitter, fit, further) if further else screening
+
+
+def _gain_ratio(gains: Sequence[tuple[float, float]]) -> float:
+    """Actual over first-order gain by least squares, at least one.
+
+    Fits gain more than the first-order estimate because the estimated noise shrinks. One prior observation gained
+    PRIOR_GAIN nats as expected.
+    """
+    covariance = PRIOR_GAIN**2 + sum(actual * expected for actual, expected in gains)
+    return max(1.0, covariance / (PRIOR_GAIN**2 + sum(expected**2 for _, expected in gains)))
