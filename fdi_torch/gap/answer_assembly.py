@@ -182,7 +182,7 @@ def _p_value(result: DiagnosisResult) -> float:
 def _disturbances(result: DiagnosisResult) -> dict[str, dict[str, object]]:
     """The random flow into each tank under the likeliest hypothesis."""
     best = result.posterior.best
-    noise = best.place.noise if best.place else best.explanation.noise
+    noise = best.noise
     return {
         t.name: {"std": float(noise.intensity[i]), "unit": "m^3/s", "correlation_time": noise.correlation_time}
         for i, t in enumerate(result.fitter.data.plant.tanks)

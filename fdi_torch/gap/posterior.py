@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from fdi_torch.estimate.evidence import ODDS, RARE, posterior
+from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
@@ -54,6 +55,10 @@ class CauseHypothesis:
     @property
     def unknown_at(self) -> str | None:
         return self.place.location if self.place else None
+
+    @property
+    def noise(self) -> StateNoise:
+        return self.discrepancy.noise if self.discrepancy else self.explanation.noise
 
     @property
     def fit(self) -> Fit:
@@ -183,7 +188,8 @@ def _with_unknowns(
     """An explanation with an unknown discrepancy at each of some places, as far as relevant against the best."""
     odds = math.log(ODDS.unknown / places)
     needed = best.weight + math.log(RARE) - explanation.log_weight - odds if best else -math.inf
-    found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed, beside)
+    rival = best.noise if best else None
+    found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed, rival, beside)
     itself = CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + found.itself)
     return [itself, *(_with_unknown(pool, explanation, d, places) for d in found.discrepancies)]
 

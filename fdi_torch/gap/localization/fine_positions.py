@@ -17,13 +17,14 @@ from torch import Tensor
 
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression, Regressors
+from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
 from fdi_torch.gap.localization.single_regressor_gain import (
     adjoints_of,
     gains_of,
     inflow_weights,
     largest_influence,
     parameter_basis,
+    position_products,
     random_signs,
     strengths_of,
     whitened_residual,
@@ -97,8 +98,7 @@ class Positions:
             weights = inflow_weights(self.regression, self.place, adjoints)
         else:
             weights = [adjoints.readings[piece.rows, channel].T for piece in self.regression.pieces]
-        pairs = list(zip(self.regression.at(self.place)[0], weights, strict=True))
-        return [torch.stack([r.fine @ w.T for r, w in pairs]).sum(dim=0), *(_of_steps(r, w) for r, w in pairs)]
+        return position_products(self.regression, self.place, weights)
 
 
 def with_best_frequency(
@@ -133,11 +133,6 @@ def with_best_frequency(
         best = int(explained.square().sum(dim=(1, 2)).argmax())
         frequency = float(frequencies[best])
     return discrepancy.with_sinusoids(frequency, columns[:, :, best])
-
-
-def _of_steps(regressors: Regressors, weights: Tensor) -> Tensor:
-    """Products (K, .) of the steps in time at every step with weights (., K)."""
-    return (regressors.factor * weights).flip(-1).cumsum(dim=-1).flip(-1).T
 
 
 def _local_maxima(gains: Tensor) -> list[int]:

@@ -27,6 +27,7 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     log_evidence,
     log_likelihood,
     nearly_without_disturbances,
+    nearly_without_the_largest,
 )
 from fdi_torch.gap.localization.random_processes import drifting_sensors, random_flows
 from fdi_torch.gap.localization.regressors import dominant_frequency
@@ -66,13 +67,14 @@ def localize(
     noise: StateNoise,
     places: Sequence[str],
     needed: float = -math.inf,
+    rival: StateNoise | None = None,
     beside: FitBeside | None = None,
 ) -> Localization:
     """Evaluate a discrepancy at each of the places.
 
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
-    there are none in the result if none can reach it. beside: fit of the same effects beside a discrepancy, to start
-    from as well.
+    there are none in the result if none can reach it. rival: the noise that a likelier hypothesis left. beside: fit of
+    the same effects beside a discrepancy, to start from as well.
     """
     data, base = fitter.data, log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     frequency = dominant_frequency(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
@@ -81,10 +83,12 @@ def localize(
         return Localization((), 0.0)
     likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
     itself = max(log_evidence(fitter, fit, likely, regression.linearised) - base, 0.0)
-    if _evidence_bound(fitter, fit, noise, regression.steps) - base < needed:
+    scale = torch.minimum(noise.scale, rival.scale) if rival else noise.scale
+    if _evidence_bound(fitter, fit, replace(noise, scale=scale), regression.steps) - base < needed:
         return Localization((), itself)
     generator, largest = torch.Generator().manual_seed(0), largest_influence(fitter)
-    starts = (likely, nearly_without_disturbances(likely))
+    starts = [likely, nearly_without_disturbances(likely), nearly_without_the_largest(likely)]
+    starts += [replace(rival, wander=None, apart=None)] if rival else []
     first_order = _first_order_gains(regression, starts, fit, places, base)
 
     def evaluate(
@@ -165,7 +169,7 @@ def localize(
         if len(evaluated) >= CALIBRATION_PLACES and first_order[place] + excess < needed:
             break
         start = regression.of(place)
-        first = [evaluate(regression, start, place, each) for each in starts]
+        first = [with_finer_positions(evaluate(regression, start, place, each)) for each in starts]
         others = [with_likely_noise(about(beside, place, frequency), True)] if beside else []
         found = climbed(max([*first, *others], key=_gain))
         itself = max(itself, *(e.without for e in (*first, found) if e.regression is regression))

@@ -46,15 +46,33 @@ def single_regressor_gains(
     basis = parameter_basis(under, fit)
     residual = whitened_residual(under, fit, regression.linearised)
     adjoints = adjoints_of(regression, under, torch.cat([residual, random_signs(residual, generator)], dim=1), basis)
-    gains = {}
+    gains, largest = {}, largest_influence(under)
     for place in places:
         if (channel := regression.sensor(place)) is None:
-            products = _flow_products(regression, place, adjoints)
+            weights = inflow_weights(regression, place, adjoints)
+            products = _flow_products(regression, place, adjoints, weights)
         else:
-            products = _sensor_products(regression.of(place), under, fit, basis, adjoints, channel)
-        (cost,) = column_costs(torch.tensor([float(len(products))]), largest_influence(under)).tolist()
-        gains[place] = float(gains_of(products[:, 0], strengths_of(products[:, 1:])).max()) - cost
+            discrepancy = regression.of(place)
+            by_reading = _sensor_weights(discrepancy, under, fit, basis, adjoints, channel)
+            weights = [by_reading[piece.rows].T for piece in regression.pieces]
+            products = discrepancy.columns[:, channel].T @ by_reading
+        groups = products, torch.cat(position_products(regression, place, weights))
+        gains[place] = max(_largest_gain(group, largest) for group in groups)
     return gains
+
+
+def _largest_gain(products: Tensor, largest: float) -> float:
+    """Largest gain among regressors, less its cost. products (M, 1 + SIGNS): with the residual and random signs."""
+    (cost,) = column_costs(torch.tensor([float(len(products))]), largest).tolist()
+    return float(gains_of(products[:, 0], strengths_of(products[:, 1:])).max()) - cost
+
+
+def position_products(regression: DiscrepancyRegression, place: str, weights: Sequence[Tensor]) -> list[Tensor]:
+    """Products of the regressors at all positions with weights (., K) per recording: kinks and jumps (F, .), and the
+    steps in time of each recording (K, .)."""
+    pairs = list(zip(regression.at(place)[0], weights, strict=True))
+    steps = [(r.factor * w).flip(-1).cumsum(dim=-1).flip(-1).T for r, w in pairs]
+    return [torch.stack([r.fine @ w.T for r, w in pairs]).sum(dim=0), *steps]
 
 
 def largest_influence(fitter: Fitter) -> float:
@@ -133,9 +151,10 @@ def inflow_weights(regression: DiscrepancyRegression, place: str, adjoints: Adjo
     return weights
 
 
-def _flow_products(regression: DiscrepancyRegression, place: str, adjoints: Adjoints) -> Tensor:
+def _flow_products(
+    regression: DiscrepancyRegression, place: str, adjoints: Adjoints, weights: Sequence[Tensor]
+) -> Tensor:
     shared, per_recording = list[Tensor](), list[Tensor]()
-    weights = inflow_weights(regression, place, adjoints)
     for regressors, net, rates in zip(regression.at(place)[0], weights, adjoints.rates, strict=True):
         products = regressors.functions @ net.T
         if regressors.areas is not None:
@@ -146,10 +165,9 @@ def _flow_products(regression: DiscrepancyRegression, place: str, adjoints: Adjo
     return torch.cat([torch.stack(shared).sum(dim=0), *per_recording])
 
 
-def _sensor_products(
+def _sensor_weights(
     discrepancy: Discrepancy, under: Fitter, fit: Fit, basis: Tensor, adjoints: Adjoints, channel: int
 ) -> Tensor:
-    """Products for a sensor, about the model's level of its tank."""
+    """Weights (S, 1 + SIGNS) of a sensor's readings, about the model's level of its tank."""
     residual = _whitened_adjoint(under, whitened_residual(under, fit, discrepancy.linearised), basis)
-    weights = torch.cat([residual[:, channel], adjoints.readings[:, channel, 1:]], dim=1)
-    return discrepancy.columns[:, channel].T @ weights
+    return torch.cat([residual[:, channel], adjoints.readings[:, channel, 1:]], dim=1)
