@@ -12,12 +12,12 @@ import torch
 from fdi_torch.estimate.evidence import ODDS, posterior
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose, verdict_of
 from fdi_torch.gap.localization.regressors import lagged
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior
-from fdi_torch.gap.posterior import CauseHypothesis
 from tests.rigs import three_tank
 from tests.test_gap import nominal_plant, recorded
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from fdi_torch.gap.answer import UNKNOWN, Amount, Answer, Cause, CauseName, ProbableExplanation, names
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
+from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, p_value
 from fdi_torch.gap.discrepancy_curves import curves_at
@@ -25,7 +26,6 @@ from fdi_torch.gap.model_comparison import (
     prediction_arrays,
     reference_models,
 )
-from fdi_torch.gap.posterior import CauseHypothesis
 from fdi_torch.gap.remarks import remarks_on
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
@@ -181,8 +181,7 @@ def _p_value(result: DiagnosisResult) -> float:
 
 def _disturbances(result: DiagnosisResult) -> dict[str, dict[str, object]]:
     """The random flow into each tank under the likeliest hypothesis."""
-    best = result.posterior.best
-    noise = best.noise
+    noise = result.posterior.best.noise
     return {
         t.name: {"std": float(noise.intensity[i]), "unit": "m^3/s", "correlation_time": noise.correlation_time}
         for i, t in enumerate(result.fitter.data.plant.tanks)

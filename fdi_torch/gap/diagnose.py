@@ -12,6 +12,7 @@ from fdi_torch.gap.answer import UNKNOWN, Answer, CauseName, Verdict
 from fdi_torch.gap.answer_assembly import build_answer
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.channel_noise import Noise, estimate_noise, quantization_step
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.diagnosis_result import DiagnosisResult
@@ -19,7 +20,7 @@ from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.free_form import fitted_free_form
 from fdi_torch.gap.library import possible_places
 from fdi_torch.gap.marginal_likelihood import with_disturbances
-from fdi_torch.gap.posterior import CauseHypothesis, Posterior, posterior_of
+from fdi_torch.gap.posterior import Posterior, posterior_of
 from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_noise_limits
 from fdi_torch.gap.problem import PLAIN, DiagnosisProblem, Settings, problem_of

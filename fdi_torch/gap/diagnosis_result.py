@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from fdi_torch.gap.answer import CauseName, Verdict
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter, unexplained_chi_square
-from fdi_torch.gap.posterior import CauseHypothesis, Posterior
+from fdi_torch.gap.cause_hypothesis import CauseHypothesis
+from fdi_torch.gap.posterior import Posterior
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
 from fdi_torch.gap.structure_search import SearchResult
 from fdi_torch.plant.effect import Placement

@@ -127,38 +127,33 @@ class ExplanationPool:
         own_noise: screening under its own noise. sensor_noise: screening under sensor noise alone.
         """
         own_noise = _with_fine_onsets(parent.fitter, parent.fit, own_noise)
-        relevant = [c for c in self._extensions(parent, own_noise, own=True) if self._relevant(parent, c.key)]
+        relevant = [c for c in self._extensions(parent.fit, own_noise, own=True) if self._relevant(parent, c.key)]
         fits = self._fitted(parent.fitter, parent.fit, relevant)[:EVALUATED]
         if sensor_noise:
             pairs = best_pairs(pairs_of(self.fitter, parent.fit, sensor_noise), PAIRS)
-            candidates = [*self._extensions(parent, sensor_noise, own=False), *pairs]
+            candidates = [*self._extensions(parent.fit, sensor_noise, own=False), *pairs]
             undisturbed = self._fitted(self.fitter, self.null, candidates, (self.fitter.cost(f) for f in fits))
             costs = {parent.key: self.null.cost} | {f.key: f.cost for f in undisturbed}
             fits += [f for f in undisturbed if self._improves(f, costs)][:EVALUATED]
         for fit in sorted(fits, key=lambda f: len(f.key)):
             self.evaluate(fit, parent.noise)
 
-    def extend_under(
-        self, fitter: Fitter, parent: RankedExplanation, options: Sequence[Option]
-    ) -> list[tuple[RankedExplanation, Fit]]:
-        """Extend an explanation by effects under another noise, and beside a discrepancy: the extensions, and their
-        fits beside it.
+    def fits_beside(self, fitter: Fitter, base: Fit, options: Sequence[Option]) -> list[Fit]:
+        """Fits of the most promising extensions of `base` under another noise, and beside a discrepancy.
 
         fitter: with the noise that the discrepancy left, and the readings without what it explains of them. The own
-        noise of the explanation absorbs what it does not explain, and hides effects of which none was fitted.
+        noise of an explanation absorbs what it does not explain, and hides effects of which none was fitted.
         """
-        base = fitter.fit(parent.fit.candidate, parent.fit)
-        further = [o for o in options if o.cause not in parent.key]
+        base = fitter.fit(replace(base.candidate, starts=(base.effect_values,)), base)
+        further = [o for o in options if o.cause not in base.key]
         screening = _with_fine_onsets(fitter, base, screen(fitter, base, further))
         candidates = [
             replace(c, starts=(*c.starts, self.explanations[c.key].fit.effect_values))
             if c.key in self.explanations
             else c
-            for c in self._extensions(parent, screening, own=False)
+            for c in self._extensions(base, screening, own=False)
         ]
-        fits = self._fitted(fitter, base, candidates, again=True)[:EVALUATED]
-        noise = replace(fitter.whitening.noise, wander=None) if fitter.whitening else parent.noise
-        return [(self.evaluate(fit, noise), fit) for fit in fits]
+        return self._fitted(fitter, base, candidates, again=True)[:EVALUATED]
 
     def _fitted(
         self,
@@ -207,7 +202,7 @@ class ExplanationPool:
             if key < fit.key
         )
 
-    def _extensions(self, parent: RankedExplanation, screening: ScreeningResult, own: bool) -> list[Candidate]:
+    def _extensions(self, base: Fit, screening: ScreeningResult, own: bool) -> list[Candidate]:
         """The most promising extensions of an explanation by one effect whose first-order gain exceeds the cost of its
         prior.
 
@@ -218,13 +213,13 @@ class ExplanationPool:
             by_cause.setdefault(screening.options[i].cause, []).append(i)
         candidates: list[Candidate] = []
         for cause, group in by_cause.items():
-            key = parent.key | {cause}
-            odds = log_prior(key, self.choices) - log_prior(parent.key, self.choices)
+            key = base.key | {cause}
+            odds = log_prior(key, self.choices) - log_prior(base.key, self.choices)
             gain = 0.5 * float(screening.gain[group[0]])
-            candidate = extended(parent.fit, screening, group[:STARTS])
+            candidate = extended(base, screening, group[:STARTS])
             if own:
                 expected = ExpectedGain(candidate, gain, odds - log_prior_width(screening, group[0]))
-                self._expected_gains.setdefault(parent.key, {})[key] = expected
+                self._expected_gains.setdefault(base.key, {})[key] = expected
             if gain + odds > 0.0 and len(candidates) < FITTED:
                 candidates.append(candidate)
         return candidates

@@ -21,12 +21,12 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.cause_hypothesis import causes_in_order
 from fdi_torch.gap.dataset import DataSet, at_recorded_times
 from fdi_torch.gap.diagnosis_result import DiagnosisResult
 from fdi_torch.gap.free_form import free_form
 from fdi_torch.gap.free_form_coefficients import coefficients_of, without_time_course
 from fdi_torch.gap.holdout import Closure, HeldOut, Model, closure, free_run, model_of
-from fdi_torch.gap.posterior import causes_in_order
 from fdi_torch.parameters import ParameterName, display_unit
 from fdi_torch.plant.description import PlantDescription
 

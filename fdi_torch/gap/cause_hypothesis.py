@@ -1,0 +1,92 @@
+"""A hypothesis about the causes of a gap: a set of effects, with or without an unknown discrepancy at one place.
+
+    log weight(S)    = log evidence of S + log prior of its random flows
+    log weight(S, p) = log weight(S) + gain of a free discrepancy at p + log odds of an unknown there
+
+each under its most likely disturbance noise (`marginal_likelihood.py`, `localization/localize.py`). No library
+has the exact law of a rig (Brynjarsdottir and O'Hagan, 2014). A discrepancy at a place where S has an effect,
+and small compared with its influence, is therefore attributed to the effect, and its weight goes to S. A large one
+means that the law there is a different one: then the effects at that place are part of the unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import torch
+
+from fdi_torch.estimate.evidence import ODDS
+from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.gap.answer import CauseName
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.explanation_pool import RankedExplanation
+from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy
+from fdi_torch.gap.start_choice import vector_of
+
+
+@dataclass(frozen=True)
+class CauseHypothesis:
+    """An explanation with or without a discrepancy at one place.
+
+    causes: effects of the explanation, without those that an unknown replaces. weight: log posterior, not normalised.
+    discrepancy: an unknown, or the error of the law of an effect at the same place. inexact: whether it is the latter.
+    """
+
+    explanation: RankedExplanation
+    causes: tuple[CauseName, ...]
+    weight: float
+    discrepancy: LocalizedDiscrepancy | None = None
+    inexact: bool = False
+
+    @property
+    def place(self) -> LocalizedDiscrepancy | None:
+        """The discrepancy, if it is an unknown."""
+        return None if self.inexact else self.discrepancy
+
+    @property
+    def unknown_at(self) -> str | None:
+        return self.place.location if self.place else None
+
+    @property
+    def noise(self) -> StateNoise:
+        return self.discrepancy.noise if self.discrepancy else self.explanation.noise
+
+    @property
+    def fit(self) -> Fit:
+        return self.place.fit if self.place else self.explanation.fit
+
+
+def likeliest(hypotheses: Collection[CauseHypothesis]) -> CauseHypothesis:
+    return max(hypotheses, key=lambda h: h.weight)
+
+
+def causes_in_order(fit: Fit) -> tuple[CauseName, ...]:
+    """The causes of a fit in the order of its placements."""
+    return tuple((p.effect.name, p.location) for p in fit.candidate.placements)
+
+
+def is_inexact_law(fitter: Fitter, fit: Fit, size: float, effects: Collection[CauseName]) -> bool:
+    """Whether a deviation of the readings is small compared with the influence of some of a fit's effects.
+
+    size: its norm, in units of the sensor noise.
+    """
+    return size < ODDS.discrepancy * influence(fitter, fit, effects)
+
+
+def influence(fitter: Fitter, fit: Fit, effects: Collection[CauseName]) -> float:
+    """Norm of the influence of some of a fit's effects on the readings, in units of the sensor noise.
+
+    To first order without the part that the other parameters, within their tolerances, would have in common with it.
+    """
+    others = [p for p in fit.candidate.placements if (p.effect.name, p.location) not in effects]
+    engine = fitter.engine(Candidate(tuple(others)), list(fit.values_of(others)))
+    theta = vector_of(engine.space, fit.values)
+    without = engine.converge(theta.unsqueeze(0), fit.linearised.levels[..., : len(fitter.data.plant.tanks)])
+    scale, pull, _ = fitter.priors(engine.space, theta)
+    change = fitter.noise.whiten(fit.linearised.readings[0] - without.readings[0], fitter.data.mask).flatten()
+    jacobian = (fitter.noise.whiten(without.jacobian[0], fitter.data.mask) * scale).flatten(0, 1)
+    rows = torch.cat([jacobian, torch.diag(pull)])
+    target = torch.cat([change, torch.zeros_like(pull)])
+    return float(torch.linalg.vector_norm(target - rows @ torch.linalg.lstsq(rows, target.unsqueeze(1)).solution[:, 0]))

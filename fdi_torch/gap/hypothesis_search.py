@@ -1,0 +1,216 @@
+"""Search over hypotheses with a discrepancy: which unknown, beside which effects.
+
+It starts from the explanations that the structure search found. Beside the likeliest, and beside none, a discrepancy is
+evaluated at each place. About the likeliest hypothesis, effects are then removed and added while that improves it: an
+effect may only have compensated the discrepancy, which may also have hidden an effect.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from fdi_torch.estimate.evidence import ODDS, RARE
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.cause_hypothesis import (
+    CauseHypothesis,
+    causes_in_order,
+    influence,
+    is_inexact_law,
+    likeliest,
+)
+from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
+from fdi_torch.gap.library import tanks_of
+from fdi_torch.gap.localization.localize import FitBeside, localize
+from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy
+from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_disturbances
+from fdi_torch.gap.screening import Option
+from fdi_torch.gap.structure_search import SearchResult
+
+
+class HypothesisSearch:
+    """The hypotheses about a pool of explanations, which grows.
+
+    options: effects that may be added. places: where something unknown may be.
+    """
+
+    def __init__(self, pool: ExplanationPool, options: Sequence[Option], places: Sequence[str]) -> None:
+        self.pool, self.options, self.places = pool, options, places
+        self._log_odds = math.log(ODDS.unknown / len(places))
+        self._evaluated: dict[tuple[int, str], CauseHypothesis] = {}  # by the explanation's id, and the place
+
+    def search(self, result: SearchResult, named: Sequence[CauseHypothesis]) -> list[CauseHypothesis]:
+        """All hypotheses that were examined. named: those without a discrepancy."""
+        hypotheses = list(named)
+        for explanation in {e.key: e for e in (likeliest(named).explanation, result.null)}.values():
+            hypotheses += self._with_discrepancies(explanation, self.places, likeliest(hypotheses))
+        hypotheses = self._after_fits_at_unknowns(hypotheses)
+        found = self._climbed(likeliest(hypotheses))
+        best = likeliest([*hypotheses, *found])
+        if best.discrepancy and any(at != best.discrepancy.location for _, at in best.explanation.key):
+            alone = self._with_discrepancies(result.null, [best.discrepancy.location])
+            found += [*alone, *self._climbed(likeliest(alone))]
+        hypotheses += self._after_fits_at_unknowns(found, likeliest(hypotheses).weight)
+        least = likeliest(hypotheses).weight + math.log(RARE)
+        return hypotheses + [law for h in hypotheses if h.weight > least for law in self._with_inexact_laws(h)]
+
+    def alone(self, explanation: RankedExplanation) -> CauseHypothesis:
+        """An explanation without a discrepancy, linearised about the levels that it predicts, where discrepancies are:
+        their gains shall not contain that of another point."""
+        gain = localize(explanation.fitter, explanation.fit, explanation.noise, (), math.inf).itself
+        return CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + gain)
+
+    def _with_discrepancies(
+        self,
+        explanation: RankedExplanation,
+        at: Sequence[str],
+        best: CauseHypothesis | None = None,
+        beside: FitBeside | None = None,
+    ) -> list[CauseHypothesis]:
+        """An explanation alone, and with a discrepancy at each of some places, as far as relevant against the best.
+
+        It is not evaluated again unless it starts from a fit beside a discrepancy.
+        """
+        if beside is None and all((id(explanation), place) in self._evaluated for place in at):
+            return [self._evaluated[id(explanation), place] for place in at]
+        needed = best.weight + math.log(RARE) - explanation.log_weight - self._log_odds if best else -math.inf
+        rival = best.noise if best else None
+        found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed, rival, beside)
+        causes = causes_in_order(explanation.fit)
+        alone = CauseHypothesis(explanation, causes, explanation.log_weight + found.itself)
+        hypotheses = [self._with_discrepancy(explanation, d) for d in found.discrepancies]
+        self._evaluated |= {
+            (id(explanation), d.location): h for d, h in zip(found.discrepancies, hypotheses, strict=True)
+        }
+        return [alone, *hypotheses]
+
+    def _with_discrepancy(self, explanation: RankedExplanation, at: LocalizedDiscrepancy) -> CauseHypothesis:
+        """An explanation with a discrepancy at one place, which is attributed to an effect there if it is small."""
+        causes = causes_in_order(explanation.fit)
+        # A random flow into a tank may stand for the error of any flow there.
+        plant, flow = self.pool.fitter.data.plant, at.noise.apart is not None
+        here = [c for c in causes if c[1] == at.location or (flow and at.location in tanks_of(c[1], plant))]
+        weight = explanation.log_weight + at.gain
+        if here and is_inexact_law(self.pool.fitter, explanation.fit, at.size, here):
+            return CauseHypothesis(explanation, causes, weight, at, inexact=True)
+        return CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight + self._log_odds, at)
+
+    def _climbed(self, best: CauseHypothesis) -> list[CauseHypothesis]:
+        """Hypotheses with an effect fewer or more than the best, while that improves it."""
+        found: list[CauseHypothesis] = []
+        while True:
+            trials = [*self._with_fewer_effects(best), *self._with_more_effects(best)]
+            found += trials
+            if not trials or likeliest(trials).weight <= best.weight:
+                return found
+            best = likeliest(trials)
+
+    def _with_fewer_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
+        """Without each of the effects, with the same discrepancy, or one at the place of another effect."""
+        if (at := best.discrepancy) is not None:
+            beside = _without_discrepancy(best, at)
+            reduced = [
+                tuple(p for p in best.fit.candidate.placements if (p.effect.name, p.location) != cause)
+                for cause in best.explanation.key
+            ]
+            fits = [beside.fit(Candidate(p, (at.fit.values_of(p),)), at.fit) for p in reduced]
+            return self._with_the_same(at, fits, best)
+        if len(best.explanation.key) < 2:
+            return []
+        explanations = [self.pool.without(best.explanation, cause) for cause in best.explanation.key]
+        return [h for e in explanations for h in self._with_discrepancies(e, sorted({at for _, at in e.key}), best)]
+
+    def _with_more_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
+        """With each of the most promising further effects beside the discrepancy."""
+        if (at := best.discrepancy) is None:
+            return []
+        fits = self.pool.fits_beside(_without_discrepancy(best, at), at.fit, self.options)
+        return self._with_the_same(at, fits, best)
+            at, self.pool.fits_beside(_without_discrepancy(best, at), at.fit, self.options), best
+        )
+
+    def _with_the_same(
+        self, at: LocalizedDiscrepancy, fits: Iterable[Fit], best: CauseHypothesis
+    ) -> list[CauseHypothesis]:
+        """Other effects with the same discrepancy. fits: beside it. best: likeliest hypothesis so far."""
+        noise, hypotheses = replace(at.noise, wander=None, apart=None), list[CauseHypothesis]()
+        for fit in fits:
+            fitter = with_disturbances(self.pool.fitter, fit, noise)
+            fit = replace(fit, cost=fitter.cost(fit))
+            explanation = RankedExplanation(fit, fitter, noise, log_evidence(fitter, fit, self.pool.choices))
+            beside = FitBeside(fit, at.explained, at.noise)
+            hypotheses += self._with_discrepancies(explanation, [at.location], best, beside)
+        return hypotheses
+
+    def _after_fits_at_unknowns(
+        self, hypotheses: Sequence[CauseHypothesis], rival: float = -math.inf
+    ) -> list[CauseHypothesis]:
+        """The hypotheses after the effects of the library were fitted at the place of each unknown that is relevant.
+
+        An unknown is a law that no library has: its weight goes to effects at the same place that predict as well by
+        Akaike's criterion. The law of such an effect may also be inexact. rival: weight of the likeliest of all others.
+        """
+        added: list[CauseHypothesis] = []
+        least = max([rival, *(h.weight for h in hypotheses)]) + math.log(RARE)
+        for h in hypotheses:
+            if h.place and h.weight > least:
+                under = with_disturbances(h.explanation.fitter, h.fit, replace(h.place.noise, wander=None))
+                at_place = [o for o in self.options if o.placement.location == h.place.location]
+                for fit in self.pool.fits_beside(under, h.explanation.fit, at_place):
+                    self.pool.evaluate(fit, replace(h.place.noise, wander=None))
+                here = [e for e in self.pool.explanations.values() if _added_at(h.place.location, e, h.explanation)]
+                added += [law for e in here for law in self._with_discrepancies(e, [h.place.location], h)]
+        return [*added, *(_as_known(h, self.pool.explanations.values()) for h in hypotheses)]
+
+    def _with_inexact_laws(self, h: CauseHypothesis) -> list[CauseHypothesis]:
+        """Without effects that are small compared with others at their place.
+
+        Such an effect describes the error of the other's law. It costs its selection among all effects there instead of
+        the prior odds of one more cause.
+        """
+        explained: list[CauseHypothesis] = []
+        fitter, fit = self.pool.fitter, h.explanation.fit
+        for cause in h.causes:
+            here = [c for c in h.causes if c[1] == cause[1]]
+            if len(here) > 1 and is_inexact_law(fitter, fit, influence(fitter, fit, [cause]), here):
+                reduced = self.pool.without(h.explanation, cause)
+                odds = log_prior(reduced.key, self.pool.choices) - log_prior(h.explanation.key, self.pool.choices)
+                selected = len({o.cause for o in self.options if o.cause[1] == cause[1]})
+                others, weight = tuple(c for c in h.causes if c != cause), h.weight + odds - math.log(selected)
+                law = CauseHypothesis(reduced, others, weight, h.discrepancy, h.inexact)
+                explained += [law, *self._with_inexact_laws(law)]
+        return explained
+
+
+def _without_discrepancy(h: CauseHypothesis, at: LocalizedDiscrepancy) -> Fitter:
+    """Fitter of the readings without what the discrepancy of a hypothesis explains, under the noise that this left."""
+    under = with_disturbances(h.explanation.fitter, at.fit, at.noise)
+    corrected = replace(under.data, readings=under.data.readings - at.explained)
+    return Fitter(corrected, under.noise, under.whitening)
+
+
+def _added_at(place: str, known: RankedExplanation, alone: RankedExplanation) -> bool:
+    """Whether an explanation has all effects of another one, and further ones at one place only."""
+    return known.key > alone.key and {at for _, at in known.key - alone.key} == {place}
+
+
+def _as_known(h: CauseHypothesis, explanations: Iterable[RankedExplanation]) -> CauseHypothesis:
+    """The hypothesis, or that of effects at the place of its unknown which predict as well."""
+    if h.place is None:
+        return h
+    for known in explanations:
+        at_place = _added_at(h.place.location, known, h.explanation)
+        if at_place and _fitness(known, h.explanation) >= h.place.fitness:
+            return CauseHypothesis(known, causes_in_order(known.fit), h.weight)
+    return h
+
+
+def _fitness(known: RankedExplanation, alone: RankedExplanation) -> float:
+    """Log likelihood of an explanation less one nat for each parameter (Akaike, 1974), over that of a smaller one."""
+
+    def likelihood(e: RankedExplanation) -> float:
+        return -0.5 * e.fit.cost - 0.5 * e.fitter.log_det + e.noise.log_prior() - len(e.fit.space)
+
+    return likelihood(known) - likelihood(alone)
