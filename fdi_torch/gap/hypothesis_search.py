@@ -128,8 +128,6 @@ class HypothesisSearch:
             return []
         fits = self.pool.fits_beside(_without_discrepancy(best, at), at.fit, self.options)
         return self._with_the_same(at, fits, best)
-            at, self.pool.fits_beside(_without_discrepancy(best, at), at.fit, self.options), best
-        )
 
     def _with_the_same(
         self, at: LocalizedDiscrepancy, fits: Iterable[Fit], best: CauseHypothesis
