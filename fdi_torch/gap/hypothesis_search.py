@@ -24,8 +24,8 @@ from fdi_torch.gap.cause_hypothesis import (
 from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
 from fdi_torch.gap.library import tanks_of
 from fdi_torch.gap.localization.localize import FitBeside, localize
-from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy
-from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_disturbances
+from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, log_likelihood
+from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import SearchResult
 
@@ -137,7 +137,8 @@ class HypothesisSearch:
         for fit in fits:
             fitter = with_disturbances(self.pool.fitter, fit, noise)
             fit = replace(fit, cost=fitter.cost(fit))
-            explanation = RankedExplanation(fit, fitter, noise, log_evidence(fitter, fit, self.pool.choices))
+            evidence = log_likelihood(fitter, fit, fit.linearised) + log_prior(fit.key, self.pool.choices)
+            explanation = RankedExplanation(fit, fitter, noise, evidence)
             beside = FitBeside(fit, at.explained, at.noise)
             hypotheses += self._with_discrepancies(explanation, [at.location], best, beside)
         return hypotheses

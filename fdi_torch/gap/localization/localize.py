@@ -84,7 +84,7 @@ def localize(
     likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
     itself = max(log_evidence(fitter, fit, likely, regression.linearised) - base, 0.0)
     scale = torch.minimum(noise.scale, rival.scale) if rival else noise.scale
-    if _evidence_bound(fitter, fit, replace(noise, scale=scale), regression.steps) - base < needed:
+    if beside is None and _evidence_bound(fitter, fit, replace(noise, scale=scale), regression.steps) - base < needed:
         return Localization((), itself)
     generator, largest = torch.Generator().manual_seed(0), largest_influence(fitter)
     starts = [likely, nearly_without_disturbances(likely), nearly_without_the_largest(likely)]
