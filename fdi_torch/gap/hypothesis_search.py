@@ -25,7 +25,7 @@ from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
 from fdi_torch.gap.library import tanks_of
 from fdi_torch.gap.localization.localize import FitBeside, localize
 from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, log_likelihood
-from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
+from fdi_torch.gap.marginal_likelihood import log_prior, occam, with_disturbances
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import SearchResult
 
@@ -161,7 +161,23 @@ class HypothesisSearch:
                     self.pool.evaluate(fit, replace(h.place.noise, wander=None))
                 here = [e for e in self.pool.explanations.values() if _added_at(h.place.location, e, h.explanation)]
                 added += [law for e in here for law in self._with_discrepancies(e, [h.place.location], h)]
-        return [*added, *(_as_known(h, self.pool.explanations.values()) for h in hypotheses)]
+        return [*added, *map(self._as_known, hypotheses)]
+
+    def _as_known(self, h: CauseHypothesis) -> CauseHypothesis:
+        """The hypothesis, or that of effects at the place of its unknown which predict as well."""
+        if h.place is None:
+            return h
+        needed = self._fitness(h.explanation) + h.place.fitness
+        for known in self.pool.explanations.values():
+            if _added_at(h.place.location, known, h.explanation) and self._fitness(known) >= needed:
+                return CauseHypothesis(known, causes_in_order(known.fit), h.weight)
+        return h
+
+    def _fitness(self, explanation: RankedExplanation) -> float:
+        """Log likelihood of an explanation less one nat for each parameter (Akaike, 1974)."""
+        fitter, fit = explanation.fitter, explanation.fit
+        volume = occam(fitter, fit.space, fit.theta, fitter.white(fit.linearised)[1][0])
+        return explanation.log_weight - log_prior(fit.key, self.pool.choices) - volume - len(fit.space)
 
     def _with_inexact_laws(self, h: CauseHypothesis) -> list[CauseHypothesis]:
         """Without effects that are small compared with others at their place.
@@ -193,23 +209,3 @@ def _without_discrepancy(h: CauseHypothesis, at: LocalizedDiscrepancy) -> Fitter
 def _added_at(place: str, known: RankedExplanation, alone: RankedExplanation) -> bool:
     """Whether an explanation has all effects of another one, and further ones at one place only."""
     return known.key > alone.key and {at for _, at in known.key - alone.key} == {place}
-
-
-def _as_known(h: CauseHypothesis, explanations: Iterable[RankedExplanation]) -> CauseHypothesis:
-    """The hypothesis, or that of effects at the place of its unknown which predict as well."""
-    if h.place is None:
-        return h
-    for known in explanations:
-        at_place = _added_at(h.place.location, known, h.explanation)
-        if at_place and _fitness(known, h.explanation) >= h.place.fitness:
-            return CauseHypothesis(known, causes_in_order(known.fit), h.weight)
-    return h
-
-
-def _fitness(known: RankedExplanation, alone: RankedExplanation) -> float:
-    """Log likelihood of an explanation less one nat for each parameter (Akaike, 1974), over that of a smaller one."""
-
-    def likelihood(e: RankedExplanation) -> float:
-        return -0.5 * e.fit.cost - 0.5 * e.fitter.log_det + e.noise.log_prior() - len(e.fit.space)
-
-    return likelihood(known) - likelihood(alone)
