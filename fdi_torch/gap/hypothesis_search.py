@@ -23,7 +23,7 @@ from fdi_torch.gap.cause_hypothesis import (
 )
 from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
 from fdi_torch.gap.library import tanks_of
-from fdi_torch.gap.localization.localize import FitBeside, localize
+from fdi_torch.gap.localization.localize import localize, localize_beside
 from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, log_likelihood
 from fdi_torch.gap.marginal_likelihood import log_prior, occam, with_disturbances
 from fdi_torch.gap.screening import Option
@@ -63,28 +63,17 @@ class HypothesisSearch:
         return CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + gain)
 
     def _with_discrepancies(
-        self,
-        explanation: RankedExplanation,
-        at: Sequence[str],
-        best: CauseHypothesis | None = None,
-        beside: FitBeside | None = None,
+        self, explanation: RankedExplanation, at: Sequence[str], best: CauseHypothesis | None = None
     ) -> list[CauseHypothesis]:
-        """An explanation alone, and with a discrepancy at each of some places, as far as relevant against the best.
-
-        It is not evaluated again unless it starts from a fit beside a discrepancy.
-        """
-        if beside is None and all((id(explanation), place) in self._evaluated for place in at):
+        """An explanation alone, and with a discrepancy at each of some places, as far as relevant against the best."""
+        if all((id(explanation), place) in self._evaluated for place in at):
             return [self._evaluated[id(explanation), place] for place in at]
-        needed = best.weight + math.log(RARE) - explanation.log_weight - self._log_odds if best else -math.inf
-        rival = best.noise if best else None
-        found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed, rival, beside)
-        causes = causes_in_order(explanation.fit)
-        alone = CauseHypothesis(explanation, causes, explanation.log_weight + found.itself)
+        needed, rival = (self._needed(explanation, best), best.noise) if best else (-math.inf, None)
+        found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed, rival)
         hypotheses = [self._with_discrepancy(explanation, d) for d in found.discrepancies]
-        self._evaluated |= {
-            (id(explanation), d.location): h for d, h in zip(found.discrepancies, hypotheses, strict=True)
-        }
-        return [alone, *hypotheses]
+        self._evaluated |= {(id(explanation), h.discrepancy.location): h for h in hypotheses if h.discrepancy}
+        causes = causes_in_order(explanation.fit)
+        return [CauseHypothesis(explanation, causes, explanation.log_weight + found.itself), *hypotheses]
 
     def _with_discrepancy(self, explanation: RankedExplanation, at: LocalizedDiscrepancy) -> CauseHypothesis:
         """An explanation with a discrepancy at one place, which is attributed to an effect there if it is small."""
@@ -133,15 +122,18 @@ class HypothesisSearch:
         self, at: LocalizedDiscrepancy, fits: Iterable[Fit], best: CauseHypothesis
     ) -> list[CauseHypothesis]:
         """Other effects with the same discrepancy. fits: beside it. best: likeliest hypothesis so far."""
-        noise, hypotheses = replace(at.noise, wander=None, apart=None), list[CauseHypothesis]()
+        noise, hypotheses = best.explanation.noise, list[CauseHypothesis]()
         for fit in fits:
             fitter = with_disturbances(self.pool.fitter, fit, noise)
-            fit = replace(fit, cost=fitter.cost(fit))
             evidence = log_likelihood(fitter, fit, fit.linearised) + log_prior(fit.key, self.pool.choices)
-            explanation = RankedExplanation(fit, fitter, noise, evidence)
-            beside = FitBeside(fit, at.explained, at.noise)
-            hypotheses += self._with_discrepancies(explanation, [at.location], best, beside)
+            explanation = RankedExplanation(replace(fit, cost=fitter.cost(fit)), fitter, noise, evidence)
+            if found := localize_beside(fitter, fit, noise, at, self._needed(explanation, best)):
+                hypotheses.append(self._with_discrepancy(explanation, found))
         return hypotheses
+
+    def _needed(self, explanation: RankedExplanation, best: CauseHypothesis) -> float:
+        """Gain of a discrepancy beside an explanation from which on it is relevant against the best hypothesis."""
+        return best.weight + math.log(RARE) - explanation.log_weight - self._log_odds
 
     def _after_fits_at_unknowns(
         self, hypotheses: Sequence[CauseHypothesis], rival: float = -math.inf

@@ -23,7 +23,7 @@ from fdi_torch.gap.localization.component_regressors import (
     fine_reading_regressors,
     reading_regressors,
 )
-from fdi_torch.gap.localization.regressors import HARMONICS, harmonics, time_functions
+from fdi_torch.gap.localization.regressors import harmonics, time_functions
 from fdi_torch.gap.marginal_likelihood import predicted_levels
 from fdi_torch.plant.description import OUTSIDE, Sensor
 from fdi_torch.plant.scales import time_scale
@@ -48,11 +48,6 @@ class Discrepancy:
     choices: Tensor
     frequency: float | None
     sinusoids: Tensor
-
-    @property
-    def periods(self) -> tuple[float, ...]:
-        """Of the sinusoids, s."""
-        return () if self.frequency is None else tuple(1.0 / (k * self.frequency) for k in range(1, HARMONICS + 1))
 
     def with_column(self, column: Tensor, choices: int) -> Discrepancy:
         """The same with one more column (S, C)."""

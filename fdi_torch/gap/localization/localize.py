@@ -52,15 +52,6 @@ class Localization:
     itself: float
 
 
-@dataclass(frozen=True)
-class FitBeside:
-    """A fit of the readings without what a discrepancy explains of them, (S, C), under the noise that this left."""
-
-    fit: Fit
-    explained: Tensor
-    noise: StateNoise
-
-
 def localize(
     fitter: Fitter,
     fit: Fit,
@@ -68,133 +59,44 @@ def localize(
     places: Sequence[str],
     needed: float = -math.inf,
     rival: StateNoise | None = None,
-    beside: FitBeside | None = None,
 ) -> Localization:
     """Evaluate a discrepancy at each of the places.
 
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
-    there are none in the result if none can reach it. rival: the noise that a likelier hypothesis left. beside: fit of
-    the same effects beside a discrepancy, to start from as well.
+    there are none in the result if none can reach it. rival: the noise that a likelier hypothesis left.
     """
-    data, base = fitter.data, log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     frequency = dominant_frequency(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
     regression = DiscrepancyRegression(fitter, fit, frequency, STEPS)
+    base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     if not math.isfinite(base + log_evidence(fitter, fit, noise, regression.linearised)):
         return Localization((), 0.0)
     likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
     itself = max(log_evidence(fitter, fit, likely, regression.linearised) - base, 0.0)
     scale = torch.minimum(noise.scale, rival.scale) if rival else noise.scale
-    if beside is None and _evidence_bound(fitter, fit, replace(noise, scale=scale), regression.steps) - base < needed:
+    if _evidence_bound(fitter, fit, replace(noise, scale=scale), regression.steps) - base < needed:
         return Localization((), itself)
-    generator, largest = torch.Generator().manual_seed(0), largest_influence(fitter)
+    ascent = _Ascent(fitter, fit, noise, base)
     starts = [likely, nearly_without_disturbances(likely), nearly_without_the_largest(likely)]
     starts += [replace(rival, wander=None, apart=None)] if rival else []
     first_order = _first_order_gains(regression, starts, fit, places, base)
-
-    def evaluate(
-        regression: DiscrepancyRegression, discrepancy: Discrepancy, place: str, noise: StateNoise
-    ) -> _EvaluatedDiscrepancy:
-        fit = regression.fit
-        under = with_disturbances(fitter, fit, noise, discrepancy.linearised)
-        whitened = WhitenedDiscrepancy(under, fit, discrepancy)
-        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, largest))
-        without = log_likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - base
-        return _EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, whitened, regressed, without)
-
-    def changed(known: _EvaluatedDiscrepancy, discrepancy: Discrepancy, columns: Tensor) -> _EvaluatedDiscrepancy:
-        """The same with a discrepancy that differs in some columns, (M,) bool."""
-        whitened = known.whitened.with_columns(discrepancy.columns, columns)
-        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, largest))
-        return replace(known, discrepancy=discrepancy, whitened=whitened, regressed=regressed)
-
-    def with_likely_noise(known: _EvaluatedDiscrepancy, climb: bool) -> _EvaluatedDiscrepancy:
-        at, used = known.discrepancy, known.regressed.used
-        further = LinearParameters(at.columns[..., used], torch.sqrt(known.regressed.precision[used]))
-        likely = estimate_disturbances(fitter, known.regression.fit, at.linearised, further, known.noise, climb).noise
-        return evaluate(known.regression, at, known.location, likely)
-
-    def with_finer_positions(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
-        """With further regressors under the same noise, until none is worth its selection.
-
-        The estimated noise falls only after most of them were added, so that each alone seems to gain little.
-        """
-        at, used = known.discrepancy, known.regressed.used
-        positions = Positions(known.regression, known.location, known.under, at, used, generator)
-        while finer := positions.best(known.discrepancy, known.regressed.used):
-            last = torch.arange(len(finer.choices)) == len(finer.choices) - 1
-            further = changed(known, finer, last)
-            if further.gain - known.gain < CONVERGED:
-                break
-            known = further
-        return known
-
-    def with_finer_frequency(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
-        used, regression, at = known.regressed.used, known.regression, known.discrepancy
-        finer = with_best_frequency(regression, known.location, known.under, regression.fit, at, used)
-        return changed(known, finer, finer.sinusoids) if finer else known
-
-    def refitted(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
-        """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
-        fit, corrected = known.regression.fit, replace(data, readings=data.readings - known.explained)
-        refitter = Fitter(corrected, fitter.noise, known.under.whitening)
-        new = refitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
-        return about(FitBeside(new, known.explained, known.noise), known.location, known.discrepancy.frequency)
-
-    def about(beside: FitBeside, place: str, frequency: float | None) -> _EvaluatedDiscrepancy:
-        """The discrepancy about another fit, with the levels that are predicted from the readings of right sensors."""
-        explained = beside.explained if regression.sensor(place) is not None else 0.0
-        right = Fitter(replace(data, readings=data.readings - explained), fitter.noise)
-        along = with_disturbances(right, beside.fit, noise) if fitter.whitening else right
-        again = DiscrepancyRegression(along, beside.fit, frequency, STEPS)
-        return evaluate(again, again.of(place), place, beside.noise)
-
-    def climbed(best: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
-        """Noise, regressors and parameters of the fit in turn, until nothing gains or `needed` is out of reach."""
-        for turn in range(MOST_TURNS):
-            before, best = best, max(best, with_likely_noise(best, turn == 0), key=_gain)
-            best = with_finer_positions(best)
-            best = max(best, with_finer_frequency(best), key=_gain)
-            if best.gain < SHARE * (needed - best.gain):
-                break
-            # An effect at the place keeps its parameters: the discrepancy is then the error of its law.
-            if all(p.location != best.location for p in fit.candidate.placements):
-                best = max(best, refitted(best), key=_gain)
-            if best.gain - before.gain < max(CONVERGED, SHARE * (needed - best.gain)):
-                break
-        return best
-
     evaluated: dict[str, _EvaluatedDiscrepancy] = {}
     excess = -math.inf  # largest difference seen so far between a gain and its first-order estimate
-    for place in sorted(places, key=lambda p: -first_order[p]):
-        if len(evaluated) >= CALIBRATION_PLACES and first_order[place] + excess < needed:
+    for place, (expected, start) in sorted(first_order.items(), key=lambda item: -item[1][0]):
+        if len(evaluated) >= CALIBRATION_PLACES and expected + excess < needed:
             break
-        start = regression.of(place)
-        first = [with_finer_positions(evaluate(regression, start, place, each)) for each in starts]
-        others = [with_likely_noise(about(beside, place, frequency), True)] if beside else []
-        found = climbed(max([*first, *others], key=_gain))
-        itself = max(itself, *(e.without for e in (*first, found) if e.regression is regression))
-        excess = max(excess, found.gain - first_order[place])
+        first = ascent.with_finer_positions(ascent.evaluate(regression, regression.of(place), place, start))
+        found = ascent.climbed(first, needed)
+        itself = max(itself, *(e.without for e in (first, found) if e.regression is regression))
+        excess = max(excess, found.gain - expected)
         if not is_rounding_error(fitter, place, float(found.explained.square().mean(dim=0).max().sqrt())):
             needed, evaluated[place] = max(needed, found.gain + math.log(RARE)), found
     likeliest = max(evaluated.values(), key=_gain, default=None)
     for place, known in evaluated.items():
         # A larger noise than that which the likeliest discrepancy left hides what another place explains as well.
         if likeliest and known is not likeliest:
-            again = with_finer_positions(evaluate(known.regression, known.discrepancy, place, likeliest.noise))
-            evaluated[place] = max(known, climbed(again), key=_gain)
-    localized = [
-        LocalizedDiscrepancy(
-            place,
-            found.gain,
-            found.fitness,
-            found.explained,
-            _effect_size(fitter, found),
-            found.discrepancy.periods,
-            found.regression.fit,
-            found.noise,
-        )
-        for place, found in evaluated.items()
-    ]
+            again = ascent.evaluate(known.regression, known.discrepancy, place, likeliest.noise)
+            evaluated[place] = max(known, ascent.climbed(ascent.with_finer_positions(again), needed), key=_gain)
+    localized = [e.localized(fitter) for e in evaluated.values()]
     random = [*drifting_sensors(regression, likely, places, base, needed)]
     random += random_flows(regression, likely, places, base)
     for process in random:
@@ -204,23 +106,136 @@ def localize(
     return Localization(tuple(sorted(localized, key=_gain, reverse=True)), itself)
 
 
+def localize_beside(
+    fitter: Fitter, fit: Fit, noise: StateNoise, at: LocalizedDiscrepancy, needed: float = -math.inf
+) -> LocalizedDiscrepancy | None:
+    """The discrepancy `at` of an explanation beside another one; None if there is none.
+
+    fitter, noise: with the disturbance noise without the discrepancy. fit: of the readings without what the discrepancy
+    explains of them. needed: gain in log evidence below which it is irrelevant.
+    """
+    base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
+    if at.noise.wander or at.noise.apart is not None:
+        regression = DiscrepancyRegression(fitter, fit, None, STEPS)
+        likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
+        processes = [*drifting_sensors(regression, likely, [at.location], base, needed)]
+        processes += random_flows(regression, likely, [at.location], base)
+        return max(processes, key=_gain, default=None)
+    ascent = _Ascent(fitter, fit, noise, base)
+    found = ascent.about(fit, at.explained, at.noise, at.location, at.frequency)
+    return ascent.climbed(ascent.with_finer_positions(found), needed).localized(fitter)
+
+
+class _Ascent:
+    """Maximises the evidence of a discrepancy beside a fit: over its noise, its regressors, and the fit's parameters.
+
+    fitter, noise: with the disturbance noise without the discrepancy. base: log evidence of the fit alone.
+    """
+
+    def __init__(self, fitter: Fitter, fit: Fit, noise: StateNoise, base: float) -> None:
+        self.fitter, self.fit, self.noise, self.base = fitter, fit, noise, base
+        self.largest, self.generator = largest_influence(fitter), torch.Generator().manual_seed(0)
+
+    def evaluate(
+        self, regression: DiscrepancyRegression, discrepancy: Discrepancy, place: str, noise: StateNoise
+    ) -> _EvaluatedDiscrepancy:
+        fit = regression.fit
+        under = with_disturbances(self.fitter, fit, noise, discrepancy.linearised)
+        whitened = WhitenedDiscrepancy(under, fit, discrepancy)
+        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest))
+        without = log_likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - self.base
+        return _EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, whitened, regressed, without)
+
+    def about(
+        self, fit: Fit, explained: Tensor, noise: StateNoise, place: str, frequency: float | None
+    ) -> _EvaluatedDiscrepancy:
+        """The discrepancy about a fit beside it, with the levels that are predicted from the readings of right sensors.
+
+        explained: part of the readings (S, C) that the discrepancy explains.
+        """
+        data, right = self.fitter.data, Fitter(self.fitter.data, self.fitter.noise)
+        if any(s.name == place for s in data.plant.sensors):
+            right = Fitter(replace(data, readings=data.readings - explained), self.fitter.noise)
+        along = with_disturbances(right, fit, self.noise) if self.fitter.whitening else right
+        regression = DiscrepancyRegression(along, fit, frequency, STEPS)
+        return self.evaluate(regression, regression.of(place), place, noise)
+
+    def climbed(self, best: _EvaluatedDiscrepancy, needed: float) -> _EvaluatedDiscrepancy:
+        """Noise, regressors and parameters of the fit in turn, until nothing gains or `needed` is out of reach."""
+        for turn in range(MOST_TURNS):
+            before, best = best, max(best, self._with_likely_noise(best, turn == 0), key=_gain)
+            best = self.with_finer_positions(best)
+            best = max(best, self._with_finer_frequency(best), key=_gain)
+            if best.gain < SHARE * (needed - best.gain):
+                break
+            # An effect at the place keeps its parameters: the discrepancy is then the error of its law.
+            if all(p.location != best.location for p in self.fit.candidate.placements):
+                best = max(best, self._refitted(best), key=_gain)
+            if best.gain - before.gain < max(CONVERGED, SHARE * (needed - best.gain)):
+                break
+        return best
+
+    def with_finer_positions(self, known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
+        """With further regressors under the same noise, until none is worth its selection.
+
+        The estimated noise falls only after most of them were added, so that each alone seems to gain little.
+        """
+        at, used = known.discrepancy, known.regressed.used
+        positions = Positions(known.regression, known.location, known.under, at, used, self.generator)
+        while finer := positions.best(known.discrepancy, known.regressed.used):
+            last = torch.arange(len(finer.choices)) == len(finer.choices) - 1
+            further = self._changed(known, finer, last)
+            if further.gain - known.gain < CONVERGED:
+                break
+            known = further
+        return known
+
+    def _with_finer_frequency(self, known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
+        used, regression, at = known.regressed.used, known.regression, known.discrepancy
+        finer = with_best_frequency(regression, known.location, known.under, regression.fit, at, used)
+        return self._changed(known, finer, finer.sinusoids) if finer else known
+
+    def _changed(
+        self, known: _EvaluatedDiscrepancy, discrepancy: Discrepancy, columns: Tensor
+    ) -> _EvaluatedDiscrepancy:
+        """The same with a discrepancy that differs in some columns, (M,) bool."""
+        whitened = known.whitened.with_columns(discrepancy.columns, columns)
+        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest))
+        return replace(known, discrepancy=discrepancy, whitened=whitened, regressed=regressed)
+
+    def _with_likely_noise(self, known: _EvaluatedDiscrepancy, climb: bool) -> _EvaluatedDiscrepancy:
+        at, used = known.discrepancy, known.regressed.used
+        further = LinearParameters(at.columns[..., used], torch.sqrt(known.regressed.precision[used]))
+        fit = known.regression.fit
+        likely = estimate_disturbances(self.fitter, fit, at.linearised, further, known.noise, climb).noise
+        return self.evaluate(known.regression, at, known.location, likely)
+
+    def _refitted(self, known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
+        """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
+        data, fit = self.fitter.data, known.regression.fit
+        corrected = replace(data, readings=data.readings - known.explained)
+        refitter = Fitter(corrected, self.fitter.noise, known.under.whitening)
+        new = refitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
+        return self.about(new, known.explained, known.noise, known.location, known.discrepancy.frequency)
+
+
 def _first_order_gains(
     regression: DiscrepancyRegression,
     starts: Sequence[StateNoise],
     fit: Fit,
     places: Sequence[str],
     base: float,
-) -> dict[str, float]:
-    """Gain in log evidence of the best single regressor of each place, under the better of the noises."""
-    gains = dict.fromkeys(places, -math.inf)
+) -> dict[str, tuple[float, StateNoise]]:
+    """Gain in log evidence of the best single regressor of each place, under the best of the noises, and that noise."""
+    best: dict[str, tuple[float, StateNoise]] = {}
     for noise in starts:
         under = with_disturbances(regression.fitter, fit, noise, regression.linearised)
         offset = log_likelihood(under, fit, regression.linearised) + noise.log_prior() - base
-        for place, gain in single_regressor_gains(
-            regression, under, fit, places, torch.Generator().manual_seed(0)
-        ).items():
-            gains[place] = max(gains[place], offset + gain)
-    return gains
+        generator = torch.Generator().manual_seed(0)
+        for place, gain in single_regressor_gains(regression, under, fit, places, generator).items():
+            if place not in best or offset + gain > best[place][0]:
+                best[place] = offset + gain, noise
+    return best
 
 
 def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise, choices: int) -> float:
@@ -239,11 +254,6 @@ def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise, choices: int) -
         - cost
         + occam(fitter, fit.space, fit.theta, fitter.white(fit.linearised)[1][0])
     )
-
-
-def _effect_size(fitter: Fitter, evaluated: _EvaluatedDiscrepancy) -> float:
-    """Norm of the discrepancy's influence on the readings, in units of the sensor noise."""
-    return float(torch.linalg.vector_norm(fitter.noise.whiten(evaluated.explained, fitter.data.mask)))
 
 
 @dataclass(frozen=True)
@@ -274,6 +284,14 @@ class _EvaluatedDiscrepancy:
     def explained(self) -> Tensor:
         """The part of the readings (S, C) that the discrepancy explains."""
         return self.discrepancy.columns @ self.regressed.mean
+
+    def localized(self, fitter: Fitter) -> LocalizedDiscrepancy:
+        """The result. fitter: that of the explanation, under its sensor noise alone."""
+        explained, at = self.explained, self.discrepancy
+        size = float(torch.linalg.vector_norm(fitter.noise.whiten(explained, fitter.data.mask)))
+        return LocalizedDiscrepancy(
+            self.location, self.gain, self.fitness, explained, size, at.frequency, self.regression.fit, self.noise
+        )
 
 
 def _gain(discrepancy: _EvaluatedDiscrepancy | LocalizedDiscrepancy) -> float:

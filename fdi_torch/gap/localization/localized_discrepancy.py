@@ -11,6 +11,7 @@ from torch import Tensor
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.localization.regressors import HARMONICS
 from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
 from fdi_torch.simulate.collocation import Linearised
 
@@ -21,8 +22,9 @@ class LocalizedDiscrepancy:
 
     gain: in log evidence against the fit alone, without prior odds. fitness: log likelihood less one nat for each
     parameter of the discrepancy (Akaike, 1974), over that of the fit alone. explained: its influence on the readings
-    (S, C); none of a random process. size: norm of its influence, in units of the sensor noise. periods: of its
-    harmonics, s. fit, noise: the fit refitted, and the most likely disturbance noise, with the discrepancy.
+    (S, C); none of a random process. size: norm of its influence, in units of the sensor noise. frequency:
+    of its sinusoids, Hz, if any. fit, noise: the fit refitted, and the most likely disturbance noise, with the
+    discrepancy.
     """
 
     location: str
@@ -30,9 +32,14 @@ class LocalizedDiscrepancy:
     fitness: float
     explained: Tensor
     size: float
-    periods: tuple[float, ...]
+    frequency: float | None
     fit: Fit
     noise: StateNoise
+
+    @property
+    def periods(self) -> tuple[float, ...]:
+        """Of the sinusoids, s."""
+        return () if self.frequency is None else tuple(1.0 / (k * self.frequency) for k in range(1, HARMONICS + 1))
 
 
 def log_likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
