@@ -141,10 +141,10 @@ class ExplanationPool:
     def fits_beside(self, fitter: Fitter, base: Fit, options: Sequence[Option]) -> list[Fit]:
         """Fits of the most promising extensions of `base` under another noise, and beside a discrepancy.
 
-        fitter: with the noise that the discrepancy left, and the readings without what it explains of them. The own
-        noise of an explanation absorbs what it does not explain, and hides effects of which none was fitted.
+        base: fit by this fitter. fitter: with the noise that the discrepancy left, and the readings without what it
+        explains of them. The own noise of an explanation absorbs what it does not explain, and hides effects of which
+        none was fitted.
         """
-        base = fitter.fit(replace(base.candidate, starts=(base.effect_values,)), base)
         further = [o for o in options if o.cause not in base.key]
         screening = _with_fine_onsets(fitter, base, screen(fitter, base, further))
         candidates = [

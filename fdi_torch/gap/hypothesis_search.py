@@ -115,8 +115,9 @@ class HypothesisSearch:
         """With each of the most promising further effects beside the discrepancy."""
         if (at := best.discrepancy) is None:
             return []
-        fits = self.pool.fits_beside(_without_discrepancy(best, at), at.fit, self.options)
-        return self._with_the_same(at, fits, best)
+        beside = _without_discrepancy(best, at)
+        base = beside.fit(replace(at.fit.candidate, starts=(at.fit.effect_values,)), at.fit)
+        return self._with_the_same(at, self.pool.fits_beside(beside, base, self.options), best)
 
     def _with_the_same(
         self, at: LocalizedDiscrepancy, fits: Iterable[Fit], best: CauseHypothesis
@@ -140,7 +141,7 @@ class HypothesisSearch:
     ) -> list[CauseHypothesis]:
         """The hypotheses after the effects of the library were fitted at the place of each unknown that is relevant.
 
-        An unknown is a law that no library has: its weight goes to effects at the same place that predict as well by
+        An unknown is a law that no library has: its weight goes to an effect at the same place that predicts as well by
         Akaike's criterion. The law of such an effect may also be inexact. rival: weight of the likeliest of all others.
         """
         added: list[CauseHypothesis] = []
@@ -149,19 +150,21 @@ class HypothesisSearch:
             if h.place and h.weight > least:
                 under = with_disturbances(h.explanation.fitter, h.fit, replace(h.place.noise, wander=None))
                 at_place = [o for o in self.options if o.placement.location == h.place.location]
-                for fit in self.pool.fits_beside(under, h.explanation.fit, at_place):
+                others = tuple(p for p in h.fit.candidate.placements if (p.effect.name, p.location) in h.causes)
+                base = under.fit(Candidate(others, (h.fit.values_of(others),)), h.fit)
+                for fit in self.pool.fits_beside(under, base, at_place):
                     self.pool.evaluate(fit, replace(h.place.noise, wander=None))
-                here = [e for e in self.pool.explanations.values() if _added_at(h.place.location, e, h.explanation)]
+                here = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
                 added += [law for e in here for law in self._with_discrepancies(e, [h.place.location], h)]
         return [*added, *map(self._as_known, hypotheses)]
 
     def _as_known(self, h: CauseHypothesis) -> CauseHypothesis:
-        """The hypothesis, or that of effects at the place of its unknown which predict as well."""
+        """The hypothesis, or that of an effect at the place of its unknown which predicts as well."""
         if h.place is None:
             return h
         needed = self._fitness(h.explanation) + h.place.fitness
         for known in self.pool.explanations.values():
-            if _added_at(h.place.location, known, h.explanation) and self._fitness(known) >= needed:
+            if _names_unknown(known, h) and self._fitness(known) >= needed:
                 return CauseHypothesis(known, causes_in_order(known.fit), h.weight)
         return h
 
@@ -198,6 +201,7 @@ def _without_discrepancy(h: CauseHypothesis, at: LocalizedDiscrepancy) -> Fitter
     return Fitter(corrected, under.noise, under.whitening)
 
 
-def _added_at(place: str, known: RankedExplanation, alone: RankedExplanation) -> bool:
-    """Whether an explanation has all effects of another one, and further ones at one place only."""
-    return known.key > alone.key and {at for _, at in known.key - alone.key} == {place}
+def _names_unknown(known: RankedExplanation, h: CauseHypothesis) -> bool:
+    """Whether an explanation has one effect instead of the unknown of a hypothesis, and else the same causes."""
+    further = known.key - set(h.causes)
+    return known.key.issuperset(h.causes) and [at for _, at in further] == [h.unknown_at]
