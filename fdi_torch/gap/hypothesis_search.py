@@ -102,13 +102,13 @@ class HypothesisSearch:
             beside = _without_discrepancy(best, at)
             reduced = [
                 tuple(p for p in best.fit.candidate.placements if (p.effect.name, p.location) != cause)
-                for cause in best.explanation.key
+                for cause in sorted(best.explanation.key)
             ]
             fits = [beside.fit(Candidate(p, (at.fit.values_of(p),)), at.fit) for p in reduced]
             return self._with_the_same(at, fits, best)
         if len(best.explanation.key) < 2:
             return []
-        explanations = [self.pool.without(best.explanation, cause) for cause in best.explanation.key]
+        explanations = [self.pool.without(best.explanation, cause) for cause in sorted(best.explanation.key)]
         return [h for e in explanations for h in self._with_discrepancies(e, sorted({at for _, at in e.key}), best)]
 
     def _with_more_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
