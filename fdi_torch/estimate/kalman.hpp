@@ -151,27 +151,47 @@ inline bool inverse_factor(const double* s, double* inverse, double* log_det) {
     return true;
 }
 
-// Innovations of unit variance for W columns of y, starting at column `first`; columns beyond the last are padding.
+constexpr int64_t BLOCK = 32;
+
+// W columns of x (C, columns, S) from `first` on, at the samples from `start` on, side by side: block (length, C, W); and
+// back. Columns beyond the last are padding.
+template <int W>
+inline void gather(const double* x, int64_t samples, int64_t columns, int64_t first, int64_t start, int64_t length,
+                   double* block) {
+    for (int c = 0; c < C; ++c)
+        for (int64_t k = 0; k < std::min<int64_t>(W, columns - first); ++k)
+            for (int64_t t = 0; t < length; ++t)
+                block[(t * C + c) * W + k] = x[(c * columns + first + k) * samples + start + t];
+}
+
+template <int W>
+inline void scatter(const double* block, int64_t samples, int64_t columns, int64_t first, int64_t start, int64_t length,
+                    double* x) {
+    for (int c = 0; c < C; ++c)
+        for (int64_t k = 0; k < std::min<int64_t>(W, columns - first); ++k)
+            for (int64_t t = 0; t < length; ++t)
+                x[(c * columns + first + k) * samples + start + t] = block[(t * C + c) * W + k];
+}
+
+// Innovations of unit variance for W columns of y, starting at column `first`.
 template <int W>
 void whiten(const Model& m, int64_t samples, int64_t columns, int64_t first, const double* gain, const double* white,
             const double* y, double* out) {
-    double z[d * W], moved[d * W], nu[C * W], scaled[C * W];
-    const int64_t width = std::min<int64_t>(W, columns - first);
+    double z[d * W], moved[d * W], nu[C * W];
+    std::vector<double> block(BLOCK * C * W);
     for (int64_t t = 0; t < samples; ++t) {
+        double* own = &block[t % BLOCK * C * W];
+        if (own == block.data()) gather<W>(y, samples, columns, first, t, std::min(BLOCK, samples - t), own);
         if (m.fresh[t]) std::fill(z, z + d * W, 0.0);
         look<W>(m, t, z, nu);
         for (int c = 0; c < C; ++c) {
-            const double* row = y + (t * C + c) * columns + first;
             const bool on = m.seen[t * C + c];
-            if (width == W)
-                for (int k = 0; k < W; ++k) nu[c * W + k] = on ? row[k] - nu[c * W + k] : 0.0;
-            else
-                for (int64_t k = 0; k < W; ++k) nu[c * W + k] = on && k < width ? row[k] - nu[c * W + k] : 0.0;
+            for (int k = 0; k < W; ++k) nu[c * W + k] = on ? own[c * W + k] - nu[c * W + k] : 0.0;
         }
-        std::fill(scaled, scaled + C * W, 0.0);
-        add_product<C, C, W>(white + t * C * C, nu, scaled);
-        for (int c = 0; c < C; ++c)
-            std::copy(scaled + c * W, scaled + c * W + width, out + (t * C + c) * columns + first);
+        std::fill(own, own + C * W, 0.0);
+        add_product<C, C, W>(white + t * C * C, nu, own);
+        if (const int64_t done = t % BLOCK + 1; done == BLOCK || t + 1 == samples)
+            scatter<W>(block.data(), samples, columns, first, t + 1 - done, done, out);
         if (t + 1 == samples || m.fresh[t + 1]) continue;
         add_product<d, C, W>(gain + t * d * C, nu, z);
         forward<W>(m, t, z, moved);
@@ -183,23 +203,23 @@ void whiten(const Model& m, int64_t samples, int64_t columns, int64_t first, con
 template <int W>
 void whiten_back(const Model& m, int64_t samples, int64_t columns, int64_t first, const double* gain,
                  const double* white, const double* v, double* out) {
-    double z[d * W], moved[d * W], nu[C * W], own[C * W];
-    const int64_t width = std::min<int64_t>(W, columns - first);
+    double z[d * W], moved[d * W], nu[C * W];
+    std::vector<double> block(BLOCK * C * W);
     for (int64_t t = samples - 1; t >= 0; --t) {
+        double* own = &block[t % BLOCK * C * W];
+        const int64_t start = t - t % BLOCK, length = std::min(BLOCK, samples - start);
+        if (t + 1 == start + length) gather<W>(v, samples, columns, first, start, length, block.data());
         if (t + 1 == samples || m.fresh[t + 1])
             std::fill(moved, moved + d * W, 0.0);
         else
             backward<W>(m, t, z, moved);
-        for (int c = 0; c < C; ++c)
-            for (int64_t k = 0; k < W; ++k)
-                own[c * W + k] = k < width ? v[(t * C + c) * columns + first + k] : 0.0;
         std::fill(nu, nu + C * W, 0.0);
         add_product_of_transposed<C, C, W>(white + t * C * C, own, nu);
         add_product_of_transposed<d, C, W>(gain + t * d * C, moved, nu);
-        for (int c = 0; c < C; ++c) {
+        for (int c = 0; c < C; ++c)
             if (!m.seen[t * C + c]) std::fill(nu + c * W, nu + (c + 1) * W, 0.0);
-            std::copy(nu + c * W, nu + c * W + width, out + (t * C + c) * columns + first);
-        }
+        std::copy(nu, nu + C * W, own);
+        if (t == start) scatter<W>(block.data(), samples, columns, first, start, length, out);
         look_back<W>(m, t, nu, z);
         for (int i = 0; i < d * W; ++i) z[i] = moved[i] - z[i];
     }
@@ -275,14 +295,14 @@ double kalman_gains(int64_t samples, const Model* model, double* gain, double* w
     return log_det;
 }
 
-// y (S, C, M) -> innovations of unit variance (S, C, M), column by column.
+// y (C, M, S) -> innovations of unit variance (C, M, S), column by column.
 void kalman_innovations(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
                         const double* y, double* out) {
     in_tiles({{32, whiten<32>}, {16, whiten<16>}, {8, whiten<8>}, {1, whiten<1>}}, *model, samples, columns, gain,
              white, y, out);
 }
 
-// Adjoint of kalman_innovations: v (S, C, M) -> out (S, C, M).
+// Adjoint of kalman_innovations: v (C, M, S) -> out (C, M, S).
 void kalman_transposed(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
                        const double* v, double* out) {
     in_tiles({{32, whiten_back<32>}, {16, whiten_back<16>}, {8, whiten_back<8>}, {1, whiten_back<1>}}, *model, samples,

@@ -211,7 +211,7 @@ def _is_small(pool: ExplanationPool, explanation: RankedExplanation, size: float
 
 
 def _cost(fitter: Fitter, fit: Fit) -> float:
-    return float(fitter.white(fit.linearised)[0].square().sum())
+    return float(fitter.residual(fit.linearised.readings).square().sum())
 
 
 def _with_inexact_laws(pool: ExplanationPool, h: CauseHypothesis, options: Sequence[Option]) -> list[CauseHypothesis]:
