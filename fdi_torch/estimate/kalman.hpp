@@ -23,32 +23,56 @@ struct Model {
     const uint8_t *seen, *fresh; // (S, C), (S)
 };
 
+// to += sum over j < B of m_j x_j for R rows and V columns, which stay in registers. `to` and x have rows of W, and the
+// element of m for row r and term j lies at m[r * down + j * along].
+template <int B, int W, int R, int V>
+inline void add_tile(const double* __restrict m, int down, int along, const double* __restrict x,
+                     double* __restrict to) {
+    typedef double Columns __attribute__((vector_size(V * sizeof(double)), aligned(sizeof(double)), may_alias));
+    Columns total[R];
+#pragma GCC unroll 8
+    for (int r = 0; r < R; ++r) total[r] = *reinterpret_cast<const Columns*>(to + r * W);
+    for (int j = 0; j < B; ++j) {
+        const Columns term = *reinterpret_cast<const Columns*>(x + j * W);
+#pragma GCC unroll 8
+        for (int r = 0; r < R; ++r) total[r] += m[r * down + j * along] * term;
+    }
+#pragma GCC unroll 8
+    for (int r = 0; r < R; ++r) *reinterpret_cast<Columns*>(to + r * W) = total[r];
+}
+
+// The same for A rows.
+template <int A, int B, int W, int V>
+inline void add_columns(const double* m, int down, int along, const double* x, double* to) {
+    constexpr int R = 8;
+    for (int i = 0; i < A / R; ++i) add_tile<B, W, R, V>(m + i * R * down, down, along, x, to + i * R * W);
+    add_tile<B, W, A % R, V>(m + A / R * R * down, down, along, x, to + A / R * R * W);
+}
+
+// The same for A rows and all W columns.
+template <int A, int B, int W>
+inline void add_all(const double* __restrict m, int down, int along, const double* __restrict x, double* __restrict to) {
+    constexpr int eights = W / 8 * 8, fours = W / 4 * 4;
+    for (int k = 0; k < eights; k += 8) add_columns<A, B, W, 8>(m, down, along, x + k, to + k);
+    if (fours > eights) add_columns<A, B, W, 4>(m, down, along, x + eights, to + eights);
+    for (int i = 0; i < A; ++i)
+        for (int j = 0; j < B; ++j)
+            for (int k = fours; k < W; ++k) to[i * W + k] += m[i * down + j * along] * x[j * W + k];
+}
+
 // to (A, W) += m (A, B) x (B, W)
 template <int A, int B, int W>
-inline void add_product(const double* __restrict m, const double* __restrict x, double* __restrict to) {
-    for (int i = 0; i < A; ++i) {
-        double row[W];
-        for (int k = 0; k < W; ++k) row[k] = to[i * W + k];
-        for (int j = 0; j < B; ++j) {
-            const double v = m[i * B + j];
-            for (int k = 0; k < W; ++k) row[k] += v * x[j * W + k];
-        }
-        for (int k = 0; k < W; ++k) to[i * W + k] = row[k];
-    }
+inline void add_product(const double* m, const double* x, double* to) {
+    add_all<A, B, W>(m, B, 1, x, to);
 }
 
 // to (B, W) += m (A, B)' x (A, W)
 template <int A, int B, int W>
-inline void add_product_of_transposed(const double* __restrict m, const double* __restrict x, double* __restrict to) {
-    for (int j = 0; j < B; ++j) {
-        double row[W];
-        for (int k = 0; k < W; ++k) row[k] = to[j * W + k];
-        for (int i = 0; i < A; ++i) {
-            const double v = m[i * B + j];
-            for (int k = 0; k < W; ++k) row[k] += v * x[i * W + k];
-        }
-        for (int k = 0; k < W; ++k) to[j * W + k] = row[k];
-    }
+inline void add_product_of_transposed(const double* m, const double* x, double* to) {
+    if (W == 1)
+        add_all<1, A, B>(x, A, 1, m, to);
+    else
+        add_all<B, A, W>(m, 1, B, x, to);
 }
 
 template <int A, int B>
@@ -81,7 +105,9 @@ inline void backward(const Model& m, int64_t t, const double* __restrict z, doub
 template <int W>
 inline void look(const Model& m, int64_t t, const double* __restrict z, double* __restrict to) {
     std::fill(to, to + C * W, 0.0);
-    add_product<C, n, W>(m.h + t * C * n, z, to);
+    for (int i = 0; i < C * n; ++i)  // a channel shows few levels
+        if (const double h = m.h[t * C * n + i]; h != 0.0)
+            for (int k = 0; k < W; ++k) to[i / n * W + k] += h * z[i % n * W + k];
     for (int i = 0; i < LAYERS * C; ++i)
         for (int k = 0; k < W; ++k) to[i % C * W + k] += z[(2 * n + i) * W + k];
     for (int c = 0; c < C; ++c)
@@ -92,7 +118,9 @@ inline void look(const Model& m, int64_t t, const double* __restrict z, double* 
 template <int W>
 inline void look_back(const Model& m, int64_t t, const double* __restrict x, double* __restrict to) {
     std::fill(to, to + 2 * n * W, 0.0);
-    add_product_of_transposed<C, n, W>(m.h + t * C * n, x, to);
+    for (int i = 0; i < C * n; ++i)
+        if (const double h = m.h[t * C * n + i]; h != 0.0)
+            for (int k = 0; k < W; ++k) to[i % n * W + k] += h * x[i / n * W + k];
     for (int i = 0; i < LAYERS * C; ++i) std::copy(x + i % C * W, x + (i % C + 1) * W, to + (2 * n + i) * W);
 }
 
@@ -123,27 +151,47 @@ inline bool inverse_factor(const double* s, double* inverse, double* log_det) {
     return true;
 }
 
-// Innovations of unit variance for W columns of y, starting at column `first`; columns beyond the last are padding.
+constexpr int64_t BLOCK = 32;
+
+// W columns of x (C, columns, S) from `first` on, at the samples from `start` on, side by side: block (length, C, W); and
+// back. Columns beyond the last are padding.
+template <int W>
+inline void gather(const double* x, int64_t samples, int64_t columns, int64_t first, int64_t start, int64_t length,
+                   double* block) {
+    for (int c = 0; c < C; ++c)
+        for (int64_t k = 0; k < std::min<int64_t>(W, columns - first); ++k)
+            for (int64_t t = 0; t < length; ++t)
+                block[(t * C + c) * W + k] = x[(c * columns + first + k) * samples + start + t];
+}
+
+template <int W>
+inline void scatter(const double* block, int64_t samples, int64_t columns, int64_t first, int64_t start, int64_t length,
+                    double* x) {
+    for (int c = 0; c < C; ++c)
+        for (int64_t k = 0; k < std::min<int64_t>(W, columns - first); ++k)
+            for (int64_t t = 0; t < length; ++t)
+                x[(c * columns + first + k) * samples + start + t] = block[(t * C + c) * W + k];
+}
+
+// Innovations of unit variance for W columns of y, starting at column `first`.
 template <int W>
 void whiten(const Model& m, int64_t samples, int64_t columns, int64_t first, const double* gain, const double* white,
             const double* y, double* out) {
-    double z[d * W], moved[d * W], nu[C * W], scaled[C * W];
-    const int64_t width = std::min<int64_t>(W, columns - first);
+    double z[d * W], moved[d * W], nu[C * W];
+    std::vector<double> block(BLOCK * C * W);
     for (int64_t t = 0; t < samples; ++t) {
+        double* own = &block[t % BLOCK * C * W];
+        if (own == block.data()) gather<W>(y, samples, columns, first, t, std::min(BLOCK, samples - t), own);
         if (m.fresh[t]) std::fill(z, z + d * W, 0.0);
         look<W>(m, t, z, nu);
         for (int c = 0; c < C; ++c) {
-            const double* row = y + (t * C + c) * columns + first;
             const bool on = m.seen[t * C + c];
-            if (width == W)
-                for (int k = 0; k < W; ++k) nu[c * W + k] = on ? row[k] - nu[c * W + k] : 0.0;
-            else
-                for (int64_t k = 0; k < W; ++k) nu[c * W + k] = on && k < width ? row[k] - nu[c * W + k] : 0.0;
+            for (int k = 0; k < W; ++k) nu[c * W + k] = on ? own[c * W + k] - nu[c * W + k] : 0.0;
         }
-        std::fill(scaled, scaled + C * W, 0.0);
-        add_product<C, C, W>(white + t * C * C, nu, scaled);
-        for (int c = 0; c < C; ++c)
-            std::copy(scaled + c * W, scaled + c * W + width, out + (t * C + c) * columns + first);
+        std::fill(own, own + C * W, 0.0);
+        add_product<C, C, W>(white + t * C * C, nu, own);
+        if (const int64_t done = t % BLOCK + 1; done == BLOCK || t + 1 == samples)
+            scatter<W>(block.data(), samples, columns, first, t + 1 - done, done, out);
         if (t + 1 == samples || m.fresh[t + 1]) continue;
         add_product<d, C, W>(gain + t * d * C, nu, z);
         forward<W>(m, t, z, moved);
@@ -155,23 +203,23 @@ void whiten(const Model& m, int64_t samples, int64_t columns, int64_t first, con
 template <int W>
 void whiten_back(const Model& m, int64_t samples, int64_t columns, int64_t first, const double* gain,
                  const double* white, const double* v, double* out) {
-    double z[d * W], moved[d * W], nu[C * W], own[C * W];
-    const int64_t width = std::min<int64_t>(W, columns - first);
+    double z[d * W], moved[d * W], nu[C * W];
+    std::vector<double> block(BLOCK * C * W);
     for (int64_t t = samples - 1; t >= 0; --t) {
+        double* own = &block[t % BLOCK * C * W];
+        const int64_t start = t - t % BLOCK, length = std::min(BLOCK, samples - start);
+        if (t + 1 == start + length) gather<W>(v, samples, columns, first, start, length, block.data());
         if (t + 1 == samples || m.fresh[t + 1])
             std::fill(moved, moved + d * W, 0.0);
         else
             backward<W>(m, t, z, moved);
-        for (int c = 0; c < C; ++c)
-            for (int64_t k = 0; k < W; ++k)
-                own[c * W + k] = k < width ? v[(t * C + c) * columns + first + k] : 0.0;
         std::fill(nu, nu + C * W, 0.0);
         add_product_of_transposed<C, C, W>(white + t * C * C, own, nu);
         add_product_of_transposed<d, C, W>(gain + t * d * C, moved, nu);
-        for (int c = 0; c < C; ++c) {
+        for (int c = 0; c < C; ++c)
             if (!m.seen[t * C + c]) std::fill(nu + c * W, nu + (c + 1) * W, 0.0);
-            std::copy(nu + c * W, nu + c * W + width, out + (t * C + c) * columns + first);
-        }
+        std::copy(nu, nu + C * W, own);
+        if (t == start) scatter<W>(block.data(), samples, columns, first, start, length, out);
         look_back<W>(m, t, nu, z);
         for (int i = 0; i < d * W; ++i) z[i] = moved[i] - z[i];
     }
@@ -203,9 +251,9 @@ extern "C" {
 // is not positive definite.
 double kalman_gains(int64_t samples, const Model* model, double* gain, double* white) {
     const Model& m = *model;
-    std::vector<double> space(3 * d * d + 2 * d * C);
+    std::vector<double> space(3 * d * d + 2 * d * C + 2 * n * n);
     double *p = space.data(), *half = p + d * d, *next = half + d * d, *cross = next + d * d, *shown = cross + d * C;
-    double s[C * C], weight[C * C], log_det = 0.0;
+    double *turned = shown + d * C, s[C * C], weight[C * C], log_det = 0.0;
     for (int64_t t = 0; t < samples; ++t) {
         const uint8_t* on = m.seen + t * C;
         if (m.fresh[t]) {
@@ -230,23 +278,31 @@ double kalman_gains(int64_t samples, const Model* model, double* gain, double* w
         add_product<d, C, d>(k, shown, next);
         for (int i = 0; i < d * d; ++i) p[i] -= next[i];
         forward<d>(m, t, p, half);
-        transpose<d, d>(half, p);
-        forward<d>(m, t, p, next);  // F (F P)' = F P F', because P is symmetric
+        // F P F': only the columns of the levels need a product, and P is symmetric.
+        for (int j = 0; j < 2 * n; ++j)
+            for (int i = 0; i < n; ++i) turned[j * n + i] = half[i * d + j];
+        std::fill(next, next + n * n, 0.0);
+        add_product<n, n, n>(m.a + t * n * n, turned, next);
+        add_product<n, n, n>(m.b + t * n * n, turned + n * n, next);
         for (int i = 0; i < d; ++i)
-            for (int j = 0; j < d; ++j) p[i * d + j] = 0.5 * (next[i * d + j] + next[j * d + i]);
+            for (int j = std::max(i, n); j < d; ++j) p[i * d + j] = half[i * d + j] * m.keep[j - n];
+        for (int i = 0; i < n; ++i)
+            for (int j = i; j < n; ++j) p[i * d + j] = 0.5 * (next[i * n + j] + next[j * n + i]);
+        for (int i = 0; i < d; ++i)
+            for (int j = 0; j < i; ++j) p[i * d + j] = p[j * d + i];
         for (int i = 0; i < decaying; ++i) p[(n + i) * (d + 1)] += m.q[i];
     }
     return log_det;
 }
 
-// y (S, C, M) -> innovations of unit variance (S, C, M), column by column.
+// y (C, M, S) -> innovations of unit variance (C, M, S), column by column.
 void kalman_innovations(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
                         const double* y, double* out) {
     in_tiles({{32, whiten<32>}, {16, whiten<16>}, {8, whiten<8>}, {1, whiten<1>}}, *model, samples, columns, gain,
              white, y, out);
 }
 
-// Adjoint of kalman_innovations: v (S, C, M) -> out (S, C, M).
+// Adjoint of kalman_innovations: v (C, M, S) -> out (C, M, S).
 void kalman_transposed(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
                        const double* v, double* out) {
     in_tiles({{32, whiten_back<32>}, {16, whiten_back<16>}, {8, whiten_back<8>}, {1, whiten_back<1>}}, *model, samples,
@@ -266,7 +322,7 @@ void kalman_score(int64_t samples, const Model* model, const double* gain, const
     std::vector<double> space(3 * d * d + 4 * d * C);
     double *big = space.data(), *half = big + d * d, *turned = half + d * d, *inner = turned + d * d;
     double *inner_t = inner + d * C, *wide = inner_t + d * C, *cross = wide + d * C;
-    double r[d] = {}, back[d], u[C], spread[C * C];
+    double r[d] = {}, back[d], u[C], spread[C * C], by_level[n * n], by_flow[2 * n * n];
     for (double* sum : {by_q, n_q}) std::fill(sum, sum + decaying, 0.0);
     for (double* sum : {by_r, n_r}) std::fill(sum, sum + C, 0.0);
     for (double* sum : {by_p0, n_p0}) std::fill(sum, sum + d, 0.0);
@@ -282,9 +338,21 @@ void kalman_score(int64_t samples, const Model* model, const double* gain, const
             }
             backward<1>(m, t, r, back);
             std::copy(back, back + d, r);
+            // F' N F: only the rows and columns of the levels and flows need a product, and N is symmetric.
             backward<d>(m, t, big, half);
-            transpose<d, d>(half, turned);
-            backward<d>(m, t, turned, big);  // F' N F
+            for (int i = 0; i < d; ++i)
+                for (int j = std::max(i, n); j < d; ++j) big[i * d + j] = half[i * d + j] * m.keep[j - n];
+            for (int i = 0; i < 2 * n; ++i) std::copy(half + i * d, half + i * d + n, turned + i * n);
+            std::fill(by_level, by_level + n * n, 0.0);
+            add_product<n, n, n>(turned, m.a + t * n * n, by_level);
+            std::fill(by_flow, by_flow + 2 * n * n, 0.0);
+            add_product<2 * n, n, n>(turned, m.b + t * n * n, by_flow);
+            for (int i = 0; i < n; ++i)
+                for (int j = i; j < n; ++j) big[i * d + j] = by_level[i * n + j];
+            for (int i = 0; i < 2 * n; ++i)
+                for (int j = std::max(i, n); j < 2 * n; ++j) big[i * d + j] += by_flow[i * n + j - n];
+            for (int i = 0; i < d; ++i)
+                for (int j = 0; j < i; ++j) big[i * d + j] = big[j * d + i];
         }
         // u = S^-1 nu - K' F' r, and S^-1 + K' F' N F K.
         std::fill(inner, inner + d * C, 0.0);

@@ -178,17 +178,11 @@ class Filtered:
 
     def innovations(self, y: Tensor) -> Tensor:
         """Innovations (S, C, M) of unit variance of residuals y (S, C, M); 0 where masked."""
-        y = y.contiguous()
-        out = torch.empty_like(y)
-        self._run("kalman_innovations", y.shape[-1], self.gain, self.white, y, out)
-        return out
+        return self._run_on_columns("kalman_innovations", y)
 
     def transposed(self, v: Tensor) -> Tensor:
         """Adjoint of `innovations`: u (S, C, M) such that sum(u y) = sum(v innovations(y)) for every y."""
-        v = v.contiguous()
-        out = torch.empty_like(v)
-        self._run("kalman_transposed", v.shape[-1], self.gain, self.white, v, out)
-        return out
+        return self._run_on_columns("kalman_transposed", v)
 
     def score(self, nu: Tensor) -> Score:
         """Score of the log-likelihood, given innovations nu (S, C) of unit variance."""
@@ -218,6 +212,13 @@ class Filtered:
         states = residual.new_empty(self.own.samples, self.order)
         self._run("kalman_predictions", self.gain, residual.contiguous(), states)
         return states[:, : self.own.order]
+
+    def _run_on_columns(self, name: str, x: Tensor) -> Tensor:
+        """x (S, C, M) -> (S, C, M), with time last in memory."""
+        columns = x.permute(1, 2, 0).contiguous()
+        out = torch.empty_like(columns)
+        self._run(name, x.shape[-1], self.gain, self.white, columns, out)
+        return out.permute(2, 0, 1)
 
     def _run(self, name: str, *arguments: Tensor | int) -> Any:
         function = getattr(self._library, name)

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.damped_step import Quadratic, Step, bent_step, damped_step, newton_decrement
-from fdi_torch.estimate.linearisation import AnyTrial, Linearisation, Linearise, Neighbourhood
+from fdi_torch.estimate.linearisation import AnyTrial, Linearisation, Linearise, Neighbourhood, are_all_lanes
 from fdi_torch.estimate.refined import (
     ABANDONED,
     CONVERGED,
@@ -119,7 +119,7 @@ class _Lanes:
     after_refusals: Tensor  # bool: the last step was accepted after refusals
 
     def __getitem__(self, keep: Tensor) -> _Lanes:
-        if keep.dtype == torch.bool and bool(keep.all()):
+        if are_all_lanes(keep, len(self.lanes)):
             return self
         return _Lanes(*(value[keep] for value in vars(self).values()))
 
@@ -239,7 +239,7 @@ def _try_with_correction(
     A trial that would be refused is replaced by its second-order correction, if that is valid (see `bent_step`).
     """
     trial = neighbourhood.attempt(step.trial, lanes.model, step.trial - lanes.theta)
-    lower = _lower(lanes, step, trial.cost)
+    lower = _lower(lanes.model.cost, step, trial.cost)
     refused = (step.solvable & (step.predicted > 0) & ~lower).nonzero().flatten()
     if len(refused):
         point, known, refused_trial = step.trial[refused], lanes[refused], trial[refused]
@@ -251,16 +251,16 @@ def _try_with_correction(
             new = neighbourhood.attempt(corrected, known[valid].model, corrected - point[valid], refused_trial[valid])
             trial = trial.replaced(refused, new)
             step = replace(step, trial=step.trial.index_copy(0, refused, corrected))
-            lower = _lower(lanes, step, trial.cost)
+            lower = _lower(lanes.model.cost, step, trial.cost)
     hopeful = lower.nonzero().flatten()
     if not len(hopeful):
         return step, hopeful, lanes.model[hopeful]
     return step, hopeful, neighbourhood.model(step.trial[hopeful], trial[hopeful])
 
 
-def _lower(lanes: _Lanes, step: Step, cost: Tensor) -> Tensor:
-    """Which trials have a finite and lower cost, from a solvable step with a predicted decrease, (L,) bool."""
-    return step.solvable & torch.isfinite(cost) & (cost < lanes.model.cost) & (step.predicted > 0)
+def _lower(before: Tensor, step: Step, cost: Tensor) -> Tensor:
+    """Which trials have a finite cost below that before, from a solvable step with a predicted decrease, (L,) bool."""
+    return step.solvable & torch.isfinite(cost) & (cost < before) & (step.predicted > 0)
 
 
 def _advance(
@@ -270,7 +270,7 @@ def _advance(
 
     model: at the trials of the lanes `hopeful`; the trials of all others are refused.
     """
-    better = model.finite() & _lower(lanes[hopeful], step[hopeful], model.cost)
+    better = model.finite() & _lower(lanes.model.cost[hopeful], step[hopeful], model.cost)
     accepted = torch.zeros_like(step.solvable).index_copy(0, hopeful, better)
     decrease = torch.zeros_like(lanes.damping).index_copy(0, hopeful, lanes.model.cost[hopeful] - model.cost)
     decrease = torch.where(accepted, decrease, 0.0)

@@ -12,6 +12,13 @@ from torch import Tensor
 from fdi_torch.estimate.refined import State
 
 
+def are_all_lanes(which: Tensor, count: int) -> bool:
+    """Whether an index (int64) or mask (bool) selects all of `count` lanes in order, so that no copy is needed."""
+    if which.dtype == torch.bool:
+        return bool(which.all())
+    return torch.equal(which, torch.arange(count, device=which.device))
+
+
 @dataclass(frozen=True)
 class Linearisation:
     """Quadratic model of the cost at a point: cost (L,), gradient (L, P), Gauss-Newton curvature (L, P, P).
@@ -30,6 +37,8 @@ class Linearisation:
         return torch.isfinite(self.cost) & slopes
 
     def __getitem__(self, keep: Tensor) -> Linearisation:
+        if are_all_lanes(keep, len(self.cost)):
+            return self
         state = None if self.state is None else self.state.lanes(keep)
         return Linearisation(self.cost[keep], self.gradient[keep], self.curvature[keep], state)
 

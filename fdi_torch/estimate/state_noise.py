@@ -118,8 +118,9 @@ class _Problem:
 
     @cached_property
     def columns(self) -> Tensor:
-        """Residual and Jacobian side by side, (S, C, 1 + P)."""
-        return torch.cat([self.residual.unsqueeze(-1), self.jacobian], dim=-1)
+        """Residual and Jacobian side by side, (S, C, 1 + P), with time last in memory."""
+        columns = torch.cat([self.residual.unsqueeze(-1), self.jacobian], dim=-1)
+        return columns.permute(1, 2, 0).contiguous().permute(2, 0, 1)
 
     def climbed(
         self,
@@ -198,10 +199,10 @@ def _profiled(white: Tensor, pull: Tensor, off: Tensor) -> tuple[Tensor, Tensor]
     white (S, C, 1 + P): whitened residual and Jacobian. Returns the regression residuals of the readings, (S, C), and
     of the priors, (P,).
     """
-    rows = white.flatten(0, 1)
-    gram = rows.T @ rows
+    columns = white.permute(1, 2, 0)
+    gram = (columns @ columns.mT).sum(dim=0)
     curvature, right = gram[1:, 1:] + torch.diag(pull**2), gram[1:, 0] - pull * off
     scale = torch.diagonal(curvature).sqrt().clamp(min=1e-150)
     unit = curvature / scale / scale.unsqueeze(1) + RIDGE * torch.eye(len(pull), dtype=white.dtype)
     step = torch.linalg.solve(unit, (right / scale).unsqueeze(1)).squeeze(1) / scale
-    return white @ torch.cat([step.new_ones(1), -step]), -off - pull * step
+    return (torch.cat([step.new_ones(1), -step]) @ columns).T, -off - pull * step

@@ -182,10 +182,10 @@ class Fitter:
         """
         weight = 1.0 / space.std(theta)
         deviation = (theta - space.nominal(theta)) * weight
-        j, r = (jacobian * scale).permute(0, 3, 2, 1).flatten(2), residual.transpose(1, 2).flatten(1)  # time last
-        cost = (r * r).sum(-1) + (deviation * deviation).sum(-1)
-        gradient = (j @ r.unsqueeze(-1)).squeeze(-1) - deviation * weight * scale
-        curvature = j @ j.mT + torch.diag_embed((weight * scale) ** 2)
+        j, r = jacobian.permute(0, 2, 3, 1), residual.transpose(1, 2)  # time last
+        cost = (r * r).sum((-1, -2)) + (deviation * deviation).sum(-1)
+        gradient = scale * ((j @ r.unsqueeze(-1)).sum(1).squeeze(-1) - deviation * weight)
+        curvature = scale * scale.unsqueeze(-1) * (j @ j.mT).sum(1) + torch.diag_embed((weight * scale) ** 2)
         return cost, gradient, curvature
 
     def chi_square(self, space: ParameterSpace, theta: Tensor, residual: Tensor) -> Tensor:
@@ -237,7 +237,7 @@ class Fitter:
 
 def unexplained_chi_square(fitter: Fitter, fit: Fit) -> float:
     """Chi-square that a fit leaves at low frequencies, beyond noise."""
-    return max(low_frequency_excess(fitter.white(fit.linearised)[0][0]), 0.0)
+    return max(low_frequency_excess(fitter.residual(fit.linearised.readings)[0]), 0.0)
 
 
 def _in_library_order(placements: Sequence[Placement]) -> list[Placement]:

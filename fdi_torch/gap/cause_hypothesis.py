@@ -18,6 +18,7 @@ import torch
 
 from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
@@ -83,10 +84,8 @@ def influence(fitter: Fitter, fit: Fit, effects: Collection[CauseName]) -> float
     others = [p for p in fit.candidate.placements if (p.effect.name, p.location) not in effects]
     engine = fitter.engine(Candidate(tuple(others)), list(fit.values_of(others)))
     theta = vector_of(engine.space, fit.values)
-    without = engine.converge(theta.unsqueeze(0), fit.linearised.levels[..., : len(fitter.data.plant.tanks)])
+    nominal = engine.converge(theta.unsqueeze(0), fit.linearised.levels[..., : len(fitter.data.plant.tanks)])
     scale, pull, _ = fitter.priors(engine.space, theta)
-    change = fitter.noise.whiten(fit.linearised.readings[0] - without.readings[0], fitter.data.mask).flatten()
-    jacobian = (fitter.noise.whiten(without.jacobian[0], fitter.data.mask) * scale).flatten(0, 1)
-    rows = torch.cat([jacobian, torch.diag(pull)])
-    target = torch.cat([change, torch.zeros_like(pull)])
-    return float(torch.linalg.vector_norm(target - rows @ torch.linalg.lstsq(rows, target.unsqueeze(1)).solution[:, 0]))
+    change = fitter.noise.whiten(fit.linearised.readings[0] - nominal.readings[0], fitter.data.mask).flatten()
+    jacobian = (fitter.noise.whiten(nominal.jacobian[0], fitter.data.mask) * scale).flatten(0, 1)
+    return float(torch.linalg.vector_norm(without(decomposed(jacobian, pull)[0], change.unsqueeze(1))))

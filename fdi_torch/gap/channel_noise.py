@@ -84,26 +84,22 @@ class Noise:
         x_k - a x_{k-1}; the first sample, and one after a masked sample, is divided by its standard deviation instead.
         For a moving average of n, the sample that left it is added again: y_k = ... + a^n y_{k-n}.
         """
-        columns = x.shape[-2:] != mask.shape
+        columns, whole = x.shape[-2:] != mask.shape, bool(mask.all())
         broadcast = (lambda t: t.unsqueeze(-1)) if columns else (lambda t: t)
-        ar, keep, time = broadcast(self.ar), broadcast(mask), -3 if columns else -2
-        whole = bool(mask.all())
-        scaled = (x if whole else torch.where(keep, x, 0.0)) / broadcast(self.innovation)
-        if not bool((ar != 0.0).any()):
-            return scaled
-        count, first_scale = x.shape[time], 1.0 / torch.sqrt(broadcast(self.energy))
-        first, previous = scaled.narrow(time, 0, 1), scaled.narrow(time, 0, count - 1)
-        following = scaled.narrow(time, 1, count - 1)
-        difference = following - ar * previous
-        if not whole:
-            difference = torch.where(keep[1:], torch.where(keep[:-1], difference, first_scale * following), 0.0)
-        white = torch.cat([first_scale * first, difference], dim=time)
+        time, count = -3 if columns else -2, len(mask)
+        keep, follows = broadcast(mask), torch.cat([torch.zeros_like(mask[:1]), mask[:-1]])
+        own = mask / self.innovation * torch.where(follows, 1.0, 1.0 / torch.sqrt(self.energy))
+        known = x if whole else torch.where(keep, x, 0.0)
+        white = known * broadcast(own)
+        if not bool((self.ar != 0.0).any()):
+            return white
+        before = broadcast(-self.ar * own * follows)[1:]
+        white.narrow(time, 1, count - 1).addcmul_(known.narrow(time, 0, count - 1), before)
         for doubling in range(DOUBLINGS if self.mean_of else 0):
             lag = self.mean_of * 2**doubling
             if lag < count:
-                returned = ar**lag * white.narrow(time, 0, count - lag)
-                unchanged, later = white.narrow(time, 0, lag), white.narrow(time, lag, count - lag)
-                white = torch.cat([unchanged, later + returned], dim=time)
+                returned = broadcast(self.ar**lag) * white.narrow(time, 0, count - lag)
+                white.narrow(time, lag, count - lag).add_(returned)
         return white if whole or not self.mean_of else torch.where(keep, white, 0.0)
 
 

@@ -20,7 +20,7 @@ from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.actuation import Actuation
 from fdi_torch.simulate.collocation import CONVERGED
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.midpoint import newton_step
+from fdi_torch.simulate.midpoint import newton_correction
 from fdi_torch.simulate.output_map import OutputMap
 from fdi_torch.simulate.pointwise import Row, partials
 
@@ -131,14 +131,12 @@ class Forcing:
 
         steady = torch.stack([x.expand(shape) for x in network.steady_states(now)[placement.prefix]], dim=1)
         start, path = steady[..., 0], torch.cat([steady[..., :1], steady], dim=-1)
-        nothing = start.new_empty(*start.shape, 0)
         for _ in range(NEWTON_ROUNDS):
             middle = 0.5 * (path[..., 1:] + path[..., :-1])
             values, rows = partials(rates, middle.unbind(1), shape)
             by_state = [torch.stack([torch.zeros_like(middle[:, 0]) if s is None else s for s in r], 1) for r in rows]
-            none = middle.new_empty(*middle.shape[:2], 0, shape[1])
-            path, *_, defect = newton_step(
-                steps, path.contiguous(), torch.stack(values, 1), torch.stack(by_state, 1), none, start, nothing
+            path, defect = newton_correction(
+                steps, path.contiguous(), torch.stack(values, 1), torch.stack(by_state, 1), start
             )
             if float(defect.max()) < CONVERGED * length_scale(network.description):
                 break

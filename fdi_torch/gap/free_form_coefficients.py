@@ -51,7 +51,7 @@ def coefficients_of(
     options = options_of(free, fitter, reach)
     names = tuple(next(n for n, v in o.start.items() if v != 0.0) for o in options)
     columns = fitter.whiten(effect_columns(fitter, fit, options)) / UNIT
-    residual = fitter.white(fit.linearised)[0][0]
+    residual = fitter.residual(fit.linearised.readings)[0]
     if returned:
         changes = effect_columns(fitter, fit, [_as_fitted(fitter, fit, p) for p in returned])
         residual = residual + fitter.whiten(changes).sum(-1)
@@ -87,7 +87,7 @@ def _without_initial_levels(fitter: Fitter, fit: Fit, columns: Tensor, residual:
     constant.
     """
     initial_levels = [i for i, n in enumerate(fit.space.names) if ParameterName.parse(n).field == "start_level"]
-    j = fitter.white(fit.linearised)[1][0][..., initial_levels].flatten(0, 1)
+    j = fitter.whiten(fit.linearised.jacobian[..., initial_levels])[0].flatten(0, 1)
     q, _ = torch.linalg.qr(j / j.norm(dim=0).clamp(min=1e-300))
     c, r = columns.flatten(0, 1), residual.flatten()
     return c - q @ (q.T @ c), r - q @ (q.T @ r)

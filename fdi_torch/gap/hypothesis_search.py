@@ -171,7 +171,7 @@ class HypothesisSearch:
     def _fitness(self, explanation: RankedExplanation) -> float:
         """Log likelihood of an explanation less one nat for each parameter (Akaike, 1974)."""
         fitter, fit = explanation.fitter, explanation.fit
-        volume = occam(fitter, fit.space, fit.theta, fitter.white(fit.linearised)[1][0])
+        volume = occam(fitter, fit.space, fit.theta, fitter.whiten(fit.linearised.jacobian[0]))
         return explanation.log_weight - log_prior(fit.key, self.pool.choices) - volume - len(fit.space)
 
     def _with_inexact_laws(self, h: CauseHypothesis) -> list[CauseHypothesis]:

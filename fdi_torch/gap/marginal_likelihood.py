@@ -148,7 +148,7 @@ def log_evidence(fitter: Fitter, fit: Fit, choices: int) -> float:
 
     Minus infinity for a fit whose likelihood is not finite.
     """
-    jacobian = fitter.white(fit.linearised)[1][0]
+    jacobian = fitter.whiten(fit.linearised.jacobian)[0]
     likelihood = -0.5 * fit.cost - 0.5 * fitter.log_det
     if not (math.isfinite(likelihood) and bool(jacobian.isfinite().all())):
         return -math.inf

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.forcing import Forcing
@@ -26,7 +27,7 @@ from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
 from fdi_torch.simulate.scan import scan_in_time
 
 Start = Mapping[str, float]
-BATCH = 256  # options whose columns are in memory together
+BATCH = 64  # options whose columns are in memory together
 
 
 @dataclass(frozen=True)
@@ -152,27 +153,17 @@ class _ProjectedRegression:
     def of(fitter: Fitter, fit: Fit) -> _ProjectedRegression:
         residual, jacobian = (x[0] for x in fitter.white(fit.linearised))
         scale, weight, deviation = fitter.priors(fit.space, fit.theta)
-        # Effects have no rows in the priors of the constants.
-        rows = torch.diag(weight), 1e-6 * torch.eye(len(weight), dtype=weight.dtype)
-        q, _ = torch.linalg.qr(torch.cat([(jacobian * scale).flatten(0, 1), *rows]))
-        r = torch.cat([residual.flatten(), -deviation, torch.zeros_like(deviation)])
-        count = residual.numel()
-        remaining = (r - q @ (q.T @ r))[:count]
-        return _ProjectedRegression(
-            fitter, fit, remaining.reshape(residual.shape), q[:count].reshape(*residual.shape, -1)
-        )
+        basis, _ = decomposed((jacobian * scale).flatten(0, 1), weight)
+        remaining = without(basis, torch.cat([residual.flatten(), -deviation]).unsqueeze(1))
+        remaining, basis = (x[: residual.numel()].reshape(*residual.shape, -1) for x in (remaining, basis))
+        return _ProjectedRegression(fitter, fit, remaining[..., 0], basis)
 
     def screened(self, columns: Tensor) -> tuple[Tensor, Tensor]:
         """Score and strength of options, (M,) each; columns (S, C, M): their changes of the readings."""
-        columns = self.fitter.whiten(columns)
-        score, strength = columns.new_zeros(2, columns.shape[-1]).unbind()
-        shared = columns.new_zeros(columns.shape[-1], self.basis.shape[-1])
-        for c in range(columns.shape[1]):
-            channel_columns = columns[:, c].T
-            score += channel_columns @ self.remaining[:, c]
-            strength += torch.linalg.vecdot(channel_columns, channel_columns)
-            shared += channel_columns @ self.basis[:, c]
-        return score, strength - torch.linalg.vecdot(shared, shared)
+        white = self.fitter.whiten(columns).permute(1, 2, 0)
+        shared = (white @ self.basis.permute(1, 0, 2)).sum(dim=0)
+        score = (white @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
+        return score, torch.linalg.vecdot(white, white).sum(dim=0) - torch.linalg.vecdot(shared, shared)
 
     def pairs(self, screening: ScreeningResult) -> Pairs:
         """The regression on pairs of the most promising options."""
@@ -187,10 +178,10 @@ class _ProjectedRegression:
 
     def products(self, options: Sequence[Option]) -> tuple[Tensor, Tensor]:
         """Score (M,) and gram (M, M) of options."""
-        columns = self.fitter.whiten(effect_columns(self.fitter, self.fit, options)).permute(1, 0, 2)
-        shared = (columns.mT @ self.basis.permute(1, 0, 2)).sum(dim=0)
-        score = (columns.mT @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
-        return score, (columns.mT @ columns).sum(dim=0) - shared @ shared.T
+        white = self.fitter.whiten(effect_columns(self.fitter, self.fit, options)).permute(1, 2, 0)
+        shared = (white @ self.basis.permute(1, 0, 2)).sum(dim=0)
+        score = (white @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
+        return score, (white @ white.mT).sum(dim=0) - shared @ shared.T
 
 
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:

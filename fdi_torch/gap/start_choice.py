@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.linear_parameters import decomposed
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.trajectory_problem import NEARLY, Objective, TrajectoryProblem, corrected_trajectories, descend
 from fdi_torch.parameters import ParameterSpace
@@ -108,8 +109,7 @@ class _Projected:
         """which (P,): the linear parameters among those of `base`."""
         scale, weight, deviation = (x[which] for x in objective.priors(base.space, base.theta))
         jacobian = objective.whiten(base.linearised.jacobian[..., which])[0] * scale
-        ridge = torch.diag(weight.clamp(min=1e-6))  # keeps parameters without information in place
-        basis, factor = torch.linalg.qr(torch.cat([jacobian.flatten(0, 1), ridge]))
+        basis, factor = decomposed(jacobian.flatten(0, 1), weight)
         rows = len(basis) - len(which)
         pull = -(deviation @ basis[rows:])
         return _Projected(objective, basis[:rows], factor, pull, float(deviation.square().sum()))

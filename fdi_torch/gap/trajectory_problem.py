@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, levenberg_marquardt
-from fdi_torch.estimate.linearisation import Linearisation
+from fdi_torch.estimate.linearisation import Linearisation, are_all_lanes
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Linearised
 
@@ -84,6 +84,8 @@ class TrialTrajectory:
     allowed: Tensor
 
     def __getitem__(self, keep: Tensor) -> TrialTrajectory:
+        if are_all_lanes(keep, len(self.cost)):
+            return self
         return TrialTrajectory(self.cost[keep], self.levels[keep], self.readings[keep], self.allowed[keep])
 
     def replaced(self, which: Tensor, new: TrialTrajectory) -> TrialTrajectory:

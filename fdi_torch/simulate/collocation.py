@@ -26,7 +26,7 @@ from fdi_torch.plant.scales import length_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.actuation import Actuation, with_parameters
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.midpoint import newton_step
+from fdi_torch.simulate.midpoint import newton_correction, newton_step
 from fdi_torch.simulate.output_map import LinearisedOutputs, OutputMap
 from fdi_torch.simulate.pointwise import partials, partials_of
 from fdi_torch.simulate.scan import scan_in_time
@@ -125,20 +125,18 @@ class Collocation:
         """The levels and defect of `linearise` without derivatives, at a fraction of the cost."""
         path = self._path(theta, levels)
         values = self.network.bind(self.space, theta.unsqueeze(-2))
-        rates, by_level, by_theta = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), values, [], 0)
+        rates, by_level, _ = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), values, [], 0)
         start = self._start(theta, values, slopes=False)[0]
-        none = start.new_empty(*start.shape, 0)
-        corrected, _, _, _, defect = newton_step(self.experiment.steps, path, rates, by_level, by_theta, start, none)
+        corrected, defect = newton_correction(self.experiment.steps, path, rates, by_level, start)
         return corrected.movedim(2, 1), defect
 
     def converge(self, theta: Tensor, levels: Tensor, rounds: int = 12) -> Linearised:
         """Newton steps at fixed theta from levels (L, K+1, tanks), m, until they converge or `rounds` are used up."""
-        for _ in range(rounds):
-            linearised = self.linearise(theta, levels)
-            levels = linearised.levels
-            if float(linearised.defect.max()) < CONVERGED * self._length:
+        for _ in range(rounds - 1):
+            levels, defect = self.corrected(theta, levels)
+            if float(defect.max()) < CONVERGED * self._length:
                 break
-        return linearised
+        return self.linearise(theta, levels)
 
     def simulate_tank(self, theta: Tensor, levels: Tensor, tank: int, rounds: int = 8) -> Tensor:
         """Simulate one tank with the levels of all others given: levels (L, K+1, tanks) m, with that tank's

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.simulate.recurrence import midpoint_step
+from fdi_torch.simulate.recurrence import midpoint_correction, midpoint_step
 from fdi_torch.simulate.scan import product, scan_in_time
 
 
@@ -28,11 +28,28 @@ def newton_step(
     compiled = midpoint_step(span, path, rates, by_level, by_theta, start, start_slopes)
     if compiled is not None:
         return compiled
-    one = torch.eye(path.shape[1], dtype=path.dtype, device=path.device).unsqueeze(-1)
-    inverse = torch.linalg.inv((one - 0.5 * span * by_level).movedim(-1, 1)).movedim(1, -1)
-    transition, gain = 2.0 * inverse - one, inverse * span
-    misfit = (span * rates - (path[..., 1:] - path[..., :-1])).unsqueeze(2)
-    forcing = torch.cat([product(inverse, misfit), product(gain, by_theta)], dim=2)
+    transition, gain, forcing = _recurrence(span, path, rates, by_level)
+    forcing = torch.cat([forcing, product(gain, by_theta)], dim=2)
     first = torch.cat([(start - path[..., 0]).unsqueeze(-1), start_slopes], dim=-1)
     solution = scan_in_time(transition, forcing, first)
     return path + solution[:, :, 0], solution[:, :, 1:], transition, gain, solution[:, :, 0].abs().amax(dim=(-1, -2))
+
+
+def newton_correction(
+    span: Tensor, path: Tensor, rates: Tensor, by_level: Tensor, start: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The corrected levels (L, n, K+1) and the largest correction (L,) of `newton_step`, without sensitivities."""
+    compiled = midpoint_correction(span, path, rates, by_level, start)
+    if compiled is not None:
+        return compiled
+    transition, _, forcing = _recurrence(span, path, rates, by_level)
+    correction = scan_in_time(transition, forcing, (start - path[..., 0]).unsqueeze(-1))[:, :, 0]
+    return path + correction, correction.abs().amax(dim=(-1, -2))
+
+
+def _recurrence(span: Tensor, path: Tensor, rates: Tensor, by_level: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Transition and gain (L, n, n, K) of the correction, and its forcing (L, n, 1, K)."""
+    one = torch.eye(path.shape[1], dtype=path.dtype, device=path.device).unsqueeze(-1)
+    inverse = torch.linalg.inv((one - 0.5 * span * by_level).movedim(-1, 1)).movedim(1, -1)
+    misfit = (span * rates - (path[..., 1:] - path[..., :-1])).unsqueeze(2)
+    return 2.0 * inverse - one, inverse * span, product(inverse, misfit)

@@ -3,12 +3,13 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 namespace {
 constexpr int64_t BLOCK = 64;
 
-// rows (count, stride) from `first` on -> block[t][row]; and back.
+// rows (count, stride) from `first` on -> block[t][row]; and back, from the first `count` of `each` in a block's step.
 inline void gather(const double* rows, int64_t count, int64_t stride, int64_t first, int64_t length, double* block) {
     for (int64_t r = 0; r < count; ++r) {
         const double* row = rows + r * stride + first;
@@ -16,10 +17,11 @@ inline void gather(const double* rows, int64_t count, int64_t stride, int64_t fi
     }
 }
 
-inline void scatter(const double* block, int64_t count, int64_t stride, int64_t first, int64_t length, double* rows) {
+inline void scatter(const double* block, int64_t each, int64_t count, int64_t stride, int64_t first, int64_t length,
+                    double* rows) {
     for (int64_t r = 0; r < count; ++r) {
         double* row = rows + r * stride + first;
-        for (int64_t t = 0; t < length; ++t) row[t] = block[t * count + r];
+        for (int64_t t = 0; t < length; ++t) row[t] = block[t * each + r];
     }
 }
 
@@ -39,43 +41,60 @@ inline void add_product(const double* __restrict a, const double* __restrict fro
     }
 }
 
-// to = A from + b, columns side by side.
+// Columns of eight, of any alignment.
+typedef double Eights __attribute__((vector_size(8 * sizeof(double)), aligned(sizeof(double)), may_alias));
+constexpr int64_t EIGHT = 8;
+
+// to = A from + to, columns side by side in groups of eight.
 template <int N>
-inline void step(const double* __restrict a, const double* __restrict from, const double* __restrict b,
-                 int64_t columns, double* __restrict to) {
-    for (int i = 0; i < N; ++i)
-        for (int64_t c = 0; c < columns; ++c) {
-            double total = b[i * columns + c];
-            for (int j = 0; j < N; ++j) total += a[i * N + j] * from[j * columns + c];
-            to[i * columns + c] = total;
+inline void step(const double* __restrict a, const double* __restrict from, int64_t columns, double* __restrict to) {
+    for (int64_t c = 0; c < columns; c += EIGHT)
+        for (int i = 0; i < N; ++i) {
+            Eights total = *reinterpret_cast<const Eights*>(to + i * columns + c);
+            for (int j = 0; j < N; ++j) total += a[i * N + j] * *reinterpret_cast<const Eights*>(from + j * columns + c);
+            *reinterpret_cast<Eights*>(to + i * columns + c) = total;
         }
 }
 
 // A block of steps of several rows, time last: row r lies at r * BLOCK.
 typedef double Steps[BLOCK];
 
-// Inverses of N x N matrices by elimination without pivots, at all steps of a block side by side.
+inline bool any(const double* row, int64_t length) {
+    return std::any_of(row, row + length, [](double x) { return x != 0.0; });
+}
+
+// to += factor x, at all steps of a block.
+inline void add_scaled(const Steps& factor, const double* x, int64_t length, Steps& to) {
+    for (int64_t t = 0; t < length; ++t) to[t] += factor[t] * x[t];
+}
+
+// Inverses of N x N matrices by elimination without pivots, at all steps of a block side by side. on (N, N): which
+// elements of m are not zero at all steps; becomes which elements of the inverse are not.
 template <int N>
-inline void invert(Steps* m, Steps* inverse) {
-    for (int i = 0; i < N; ++i)
-        for (int j = 0; j < N; ++j)
-            for (int64_t t = 0; t < BLOCK; ++t) inverse[i * N + j][t] = i == j;
+inline void invert(Steps* m, Steps* inverse, bool* on) {
+    bool reached[N * N] = {};
+    std::fill(&inverse[0][0], &inverse[0][0] + N * N * BLOCK, 0.0);
+    for (int i = 0; i < N; ++i) std::fill(inverse[i * N + i], inverse[i * N + i] + BLOCK, 1.0), reached[i * N + i] = true;
     for (int i = 0; i < N; ++i) {
         Steps scale;
         for (int64_t t = 0; t < BLOCK; ++t) scale[t] = 1.0 / m[i * N + i][t];
         for (int j = 0; j < N; ++j)
-            for (int64_t t = 0; t < BLOCK; ++t) m[i * N + j][t] *= scale[t], inverse[i * N + j][t] *= scale[t];
+            for (auto [matrix, full] : {std::pair(m, on), std::pair(inverse, reached)})
+                if (full[i * N + j])
+                    for (int64_t t = 0; t < BLOCK; ++t) matrix[i * N + j][t] *= scale[t];
         for (int k = 0; k < N; ++k) {
-            if (k == i) continue;
+            if (k == i || !on[k * N + i]) continue;
             Steps factor;
-            for (int64_t t = 0; t < BLOCK; ++t) factor[t] = m[k * N + i][t];
+            for (int64_t t = 0; t < BLOCK; ++t) factor[t] = -m[k * N + i][t];
             for (int j = 0; j < N; ++j)
-                for (int64_t t = 0; t < BLOCK; ++t) {
-                    m[k * N + j][t] -= factor[t] * m[i * N + j][t];
-                    inverse[k * N + j][t] -= factor[t] * inverse[i * N + j][t];
-                }
+                for (auto [matrix, full] : {std::pair(m, on), std::pair(inverse, reached)})
+                    if (full[i * N + j]) {
+                        add_scaled(factor, matrix[i * N + j], BLOCK, matrix[k * N + j]);
+                        full[k * N + j] = true;
+                    }
         }
     }
+    std::copy(reached, reached + N * N, on);
 }
 
 // A linear recurrence of one lane, as in `scan`, for W columns from `from` on, of which the last may not be there.
@@ -147,85 +166,85 @@ void scan(int64_t lanes, int64_t steps, int64_t columns, const double* a, const 
 // Newton's correction of a path (lanes, N, steps + 1) under the implicit midpoint rule, and its slopes by parameters:
 // span (steps), rates (lanes, N, steps), by_level (lanes, N, N, steps), by_theta (lanes, N, columns, steps),
 // start (lanes, N), start_slopes (lanes, N, columns) -> levels like path, slopes (lanes, N, columns, steps + 1),
-// transition and gain (lanes, N, N, steps), defect (lanes).
+// transition and gain (lanes, N, N, steps), both or none, defect (lanes).
 template <int N>
 void midpoint(int64_t lanes, int64_t steps, int64_t columns, const double* span, const double* path,
               const double* rates, const double* by_level, const double* by_theta, const double* start,
               const double* start_slopes, double* levels, double* slopes, double* transition, double* gain,
               double* defect) {
-    const int64_t wide = N * columns;
-    std::vector<double> pushed(BLOCK * wide), moved((BLOCK + 1) * wide);
-    double on[BLOCK * N * N], forcing[BLOCK * N], shift[(BLOCK + 1) * N];
+    // The correction of the levels is the first of the columns, before the slopes; the last ones may be padding.
+    const int64_t width = (columns + EIGHT) / EIGHT * EIGHT, wide = N * width;
+    std::vector<double> moved((BLOCK + 1) * wide);
+    double move[BLOCK * N * N];
     Steps matrix[N * N], inverse[N * N], half, misfit[N];
     for (int i = 0; i < N * N; ++i)
         for (int64_t t = 0; t < BLOCK; ++t) matrix[i][t] = i % (N + 1) == 0;
     for (int64_t lane = 0; lane < lanes; ++lane) {
         const double* own_path = path + lane * N * (steps + 1);
         const double *own_rates = rates + lane * N * steps, *own_by_level = by_level + lane * N * N * steps;
-        const double* own_by_theta = by_theta + lane * wide * steps;
-        double *own_levels = levels + lane * N * (steps + 1), *own_slopes = slopes + lane * wide * (steps + 1);
-        double *own_on = transition + lane * N * N * steps, *own_gain = gain + lane * N * N * steps;
-        std::copy(start_slopes + lane * wide, start_slopes + (lane + 1) * wide, moved.begin());
-        scatter(moved.data(), wide, steps + 1, 0, 1, own_slopes);
+        const double* own_by_theta = by_theta + lane * N * columns * steps;
+        double *own_levels = levels + lane * N * (steps + 1), *own_slopes = slopes + lane * N * columns * (steps + 1);
         double largest = 0.0;
         bool broken = false;
+        // The corrections and slopes after step t of the block, from the first of its nodes that is not yet written.
+        const auto write = [&](int64_t node, int64_t t, int64_t length) {
+            for (int i = 0; i < N; ++i) {
+                for (int64_t s = 0; s < length; ++s) {
+                    const double own = moved[(t + s) * wide + i * width];
+                    largest = std::max(largest, std::fabs(own));
+                    broken |= std::isnan(own);
+                    own_levels[i * (steps + 1) + node + s] = own_path[i * (steps + 1) + node + s] + own;
+                }
+                double* to = own_slopes + i * columns * (steps + 1);
+                scatter(&moved[t * wide + i * width + 1], wide, columns, steps + 1, node, length, to);
+            }
+        };
         for (int i = 0; i < N; ++i) {
-            shift[i] = start[lane * N + i] - own_path[i * (steps + 1)];
-            own_levels[i * (steps + 1)] = own_path[i * (steps + 1)] + shift[i];
-            largest = std::max(largest, std::fabs(shift[i]));
-            broken |= std::isnan(shift[i]);
+            moved[i * width] = start[lane * N + i] - own_path[i * (steps + 1)];
+            for (int64_t c = 0; c < columns; ++c)
+                moved[i * width + 1 + c] = start_slopes[(lane * N + i) * columns + c];
         }
+        write(0, 0, 1);
         for (int64_t k = 0; k < steps; k += BLOCK) {
             const int64_t length = std::min(BLOCK, steps - k);
+            bool on[N * N];
             for (int64_t t = 0; t < length; ++t) half[t] = 0.5 * span[k + t];
             for (int i = 0; i < N * N; ++i) {
                 const double* by = own_by_level + i * steps + k;
+                on[i] = i % (N + 1) == 0 || any(by, length);
                 for (int64_t t = 0; t < length; ++t) matrix[i][t] = (i % (N + 1) == 0) - half[t] * by[t];
             }
-            invert<N>(matrix, inverse);
+            invert<N>(matrix, inverse, on);
             for (int i = 0; i < N; ++i) {
                 const double *at = own_path + i * (steps + 1) + k, *rate = own_rates + i * steps + k;
                 for (int64_t t = 0; t < length; ++t) misfit[i][t] = 2.0 * half[t] * rate[t] - (at[t + 1] - at[t]);
             }
             for (int i = 0; i < N * N; ++i) {
-                double *to = own_on + i * steps + k, *reach = own_gain + i * steps + k;
+                for (int64_t t = 0; t < length; ++t) move[t * N * N + i] = 2.0 * inverse[i][t] - (i % (N + 1) == 0);
+                if (!transition) continue;
+                double *to = transition + (lane * N * N + i) * steps + k, *reach = gain + (lane * N * N + i) * steps + k;
                 for (int64_t t = 0; t < length; ++t) {
                     to[t] = 2.0 * inverse[i][t] - (i % (N + 1) == 0);
                     reach[t] = 2.0 * half[t] * inverse[i][t];
                 }
-                for (int64_t t = 0; t < length; ++t) on[t * N * N + i] = to[t];
             }
-            for (int i = 0; i < N; ++i) {
-                for (int64_t t = 0; t < length; ++t) {
-                    double total = 0.0;
-                    for (int j = 0; j < N; ++j) total += inverse[i * N + j][t] * misfit[j][t];
-                    forcing[t * N + i] = total;
+            for (int64_t c = -1; c < columns; ++c) {
+                Steps total[N] = {};
+                for (int j = 0; j < N; ++j) {
+                    const double* by = c < 0 ? misfit[j] : own_by_theta + (j * columns + c) * steps + k;
+                    if (!any(by, length)) continue;
+                    Steps pushed;
+                    for (int64_t t = 0; t < length; ++t) pushed[t] = (c < 0 ? 1.0 : 2.0 * half[t]) * by[t];
+                    for (int i = 0; i < N; ++i)
+                        if (on[i * N + j]) add_scaled(inverse[i * N + j], pushed, length, total[i]);
                 }
-                for (int64_t c = 0; c < columns; ++c) {
-                    Steps total = {};
-                    for (int j = 0; j < N; ++j) {
-                        const double* reach = own_gain + (i * N + j) * steps + k;
-                        const double* by = own_by_theta + (j * columns + c) * steps + k;
-                        for (int64_t t = 0; t < length; ++t) total[t] += reach[t] * by[t];
-                    }
-                    for (int64_t t = 0; t < length; ++t) pushed[t * wide + i * columns + c] = total[t];
-                }
+                for (int i = 0; i < N; ++i)
+                    for (int64_t t = 0; t < length; ++t) moved[(t + 1) * wide + i * width + 1 + c] = total[i][t];
             }
-            for (int64_t t = 0; t < length; ++t) {
-                step<N>(&on[t * N * N], &shift[t * N], &forcing[t * N], 1, &shift[(t + 1) * N]);
-                step<N>(&on[t * N * N], moved.data() + t * wide, pushed.data() + t * wide, columns,
-                        moved.data() + (t + 1) * wide);
-            }
-            for (int i = 0; i < N; ++i)
-                for (int64_t t = 0; t < length; ++t) {
-                    const double own = shift[(t + 1) * N + i];
-                    largest = std::max(largest, std::fabs(own));
-                    broken |= std::isnan(own);
-                    own_levels[i * (steps + 1) + k + 1 + t] = own_path[i * (steps + 1) + k + 1 + t] + own;
-                }
-            scatter(moved.data() + wide, wide, steps + 1, k + 1, length, own_slopes);
-            std::copy(&shift[length * N], &shift[length * N] + N, shift);
-            std::copy(moved.data() + length * wide, moved.data() + (length + 1) * wide, moved.begin());
+            for (int64_t t = 0; t < length; ++t)
+                step<N>(&move[t * N * N], &moved[t * wide], width, &moved[(t + 1) * wide]);
+            write(k + 1, 1, length);
+            std::copy(&moved[length * wide], &moved[length * wide] + wide, moved.begin());
         }
         defect[lane] = broken ? std::nan("") : largest;
     }

@@ -43,12 +43,25 @@ def midpoint_step(
     return tuple(outputs) if _run("midpoint_step", by_theta.shape, inputs, outputs) else None
 
 
+def midpoint_correction(
+    span: Tensor, path: Tensor, rates: Tensor, by_level: Tensor, start: Tensor
+) -> tuple[Tensor, Tensor] | None:
+    """As `midpoint.newton_correction`, or None."""
+    inputs = [span, path, rates, by_level, None, start, None]
+    if not _plain(span, path, rates, by_level, start):
+        return None
+    lanes, n, steps = rates.shape
+    levels, defect = torch.empty_like(path), path.new_empty(lanes)
+    shape = torch.Size((lanes, n, 0, steps))
+    return (levels, defect) if _run("midpoint_step", shape, inputs, [levels, None, None, None, defect]) else None
+
+
 def _plain(*tensors: Tensor) -> bool:
     """Whether all tensors are float64 numbers on the CPU without gradients."""
     return not any(t.requires_grad or t.dtype is not torch.float64 or t.device.type != "cpu" for t in tensors)
 
 
-def _run(name: str, shape: torch.Size, inputs: Sequence[Tensor | None], outputs: Sequence[Tensor]) -> bool:
+def _run(name: str, shape: torch.Size, inputs: Sequence[Tensor | None], outputs: Sequence[Tensor | None]) -> bool:
     """Run one of the loops; False without a compiled library. shape: (L, n, columns, K). given: inputs; made:
     outputs.
     """

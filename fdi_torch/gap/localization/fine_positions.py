@@ -15,6 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.linear_parameters import without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
@@ -73,9 +74,7 @@ class Positions:
         if not tried or tried[0][0] < self._cost:
             return None
         columns = torch.stack([self._column(family, position) for _, family, position in tried], dim=-1)
-        white = self.under.whiten(columns).flatten(0, 1)
-        white = torch.cat([white, white.new_zeros(len(basis) - len(white), white.shape[1])])
-        white -= basis @ (basis.T @ white)
+        white = without(basis, self.under.whiten(columns).flatten(0, 1))
         exact = gains_of((white.T @ self._residual).squeeze(1), white.square().sum(dim=0))
         return discrepancy.with_column(columns[..., int(exact.argmax())], self._choices)
 
@@ -118,7 +117,7 @@ def with_best_frequency(
         return None
     basis = parameter_basis(under, fit, discrepancy.columns[..., used & ~sinusoids])
     residual = whitened_residual(under, fit, discrepancy.linearised)
-    residual = residual - basis @ (basis.T @ residual)
+    residual = without(basis, residual)
     frequency = discrepancy.frequency
     spacing = 1.0 / max(float(part.experiment.nodes[-1]) for part in under.data.parts)
     for _ in range(FREQUENCY_ROUNDS):
@@ -126,9 +125,8 @@ def with_best_frequency(
         steps = torch.arange(FREQUENCIES, dtype=residual.dtype) - FREQUENCIES // 2
         frequencies = frequency + spacing * steps
         columns = regression.sinusoids(place, frequencies)
-        white = under.whiten(columns.flatten(2)).flatten(0, 1)
-        white = torch.cat([white, white.new_zeros(len(residual) - len(white), white.shape[1])])
-        white = (white - basis @ (basis.T @ white)).unflatten(1, columns.shape[2:]).transpose(0, 1)  # (F, S C + P, W)
+        white = without(basis, under.whiten(columns.flatten(2)).flatten(0, 1))
+        white = white.unflatten(1, columns.shape[2:]).transpose(0, 1)  # (F, S C + P, W)
         explained = torch.linalg.qr(white)[0].mT @ residual
         best = int(explained.square().sum(dim=(1, 2)).argmax())
         frequency = float(frequencies[best])

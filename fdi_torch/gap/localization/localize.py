@@ -65,7 +65,7 @@ def localize(
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
     there are none in the result if none can reach it. rival: the noise that a likelier hypothesis left.
     """
-    frequency = dominant_frequency(fitter.white(fit.linearised)[0][0], fitter.data.row_spacing)
+    frequency = dominant_frequency(fitter.residual(fit.linearised.readings)[0], fitter.data.row_spacing)
     regression = DiscrepancyRegression(fitter, fit, frequency, STEPS)
     base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     if not math.isfinite(base + log_evidence(fitter, fit, noise, regression.linearised)):
@@ -245,14 +245,14 @@ def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise, choices: int) -
     costs (1 + log G) / 2 nats at its most likely precision, plus log(choices) for its selection.
     """
     undisturbed = with_disturbances(fitter, fit, replace(noise, intensity=torch.zeros_like(noise.intensity)))
-    count, (residual, _) = int(fitter.data.mask.sum()), undisturbed.white(fit.linearised)
+    count, residual = int(fitter.data.mask.sum()), undisturbed.residual(fit.linearised.readings)
     cost = 0.5 * (1.0 + math.log(max(float(residual.square().sum()) - count, 1.0))) + math.log(choices)
     # The parameters are determined no better than with the disturbances.
     return (
         -0.5 * count
         - 0.5 * undisturbed.log_det
         - cost
-        + occam(fitter, fit.space, fit.theta, fitter.white(fit.linearised)[1][0])
+        + occam(fitter, fit.space, fit.theta, fitter.whiten(fit.linearised.jacobian)[0])
     )
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.regressors import HARMONICS
@@ -49,11 +50,9 @@ def log_likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
     if not math.isfinite(fitter.log_det + float(residual.square().sum() + jacobian.square().sum())):
         return -math.inf
     scale, pull, off = fitter.priors(space, theta)
-    rows = torch.cat([(jacobian * scale).flatten(0, 1), torch.diag(pull + 1e-9)])
-    target = torch.cat([residual.flatten(), -off])
-    basis, _ = torch.linalg.qr(rows)
-    remaining = target - basis @ (basis.T @ target)
-    return -0.5 * float(remaining @ remaining) - 0.5 * fitter.log_det + occam(fitter, space, theta, jacobian)
+    basis, _ = decomposed((jacobian * scale).flatten(0, 1), pull)
+    remaining = without(basis, torch.cat([residual.flatten(), -off]).unsqueeze(1))
+    return -0.5 * float(remaining.square().sum()) - 0.5 * fitter.log_det + occam(fitter, space, theta, jacobian)
 
 
 def log_evidence(fitter: Fitter, fit: Fit, noise: StateNoise, linearised: Linearised) -> float:

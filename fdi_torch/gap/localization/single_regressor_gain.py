@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.component_regressors import discrepancy_model_at
@@ -107,18 +108,16 @@ def strengths_of(products: Tensor) -> Tensor:
 def whitened_residual(under: Fitter, fit: Fit, linearised: Linearised) -> Tensor:
     """Whitened residual and prior residual of the parameters, (S C + P, 1)."""
     off = under.priors(fit.space, fit.theta)[2]
-    return torch.cat([under.white(linearised)[0][0].flatten(), -off]).unsqueeze(1)
+    return torch.cat([under.residual(linearised.readings).flatten(), -off]).unsqueeze(1)
 
 
 def parameter_basis(under: Fitter, fit: Fit, columns: Tensor | None = None) -> Tensor:
     """Orthonormal basis (S C + P, .) of the influence of the parameters, and of further columns (S, C, M)."""
     scale, pull, _ = under.priors(fit.space, fit.theta)
-    jacobian = (under.white(fit.linearised)[1][0] * scale).flatten(0, 1)
-    rows = torch.cat([jacobian, torch.diag(pull + 1e-9)])
+    jacobian = under.whiten(fit.linearised.jacobian[0]) * scale
     if columns is not None:
-        further = under.whiten(columns).flatten(0, 1)
-        rows = torch.cat([rows, torch.cat([further, further.new_zeros(len(pull), further.shape[1])])], dim=1)
-    return torch.linalg.qr(rows)[0]
+        jacobian = torch.cat([jacobian, under.whiten(columns)], dim=-1)
+    return decomposed(jacobian.flatten(0, 1), pull)[0]
 
 
 def adjoints_of(regression: DiscrepancyRegression, under: Fitter, columns: Tensor, basis: Tensor) -> Adjoints:
@@ -133,7 +132,7 @@ def adjoints_of(regression: DiscrepancyRegression, under: Fitter, columns: Tenso
 
 
 def _whitened_adjoint(under: Fitter, columns: Tensor, basis: Tensor) -> Tensor:
-    remaining = columns - basis @ (basis.T @ columns)
+    remaining = without(basis, columns)
     shape = under.data.mask.shape
     assert under.whitening is not None
     return under.whitening.transposed(remaining[: shape.numel()].reshape(*shape, -1))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy
@@ -53,10 +54,9 @@ class WhitenedDiscrepancy:
         columns = self._columns if used is None else self._columns[..., used]
         group = max(len(columns) // MOST_ROWS, 1) if used is None else 1
         c, r, j = (_grouped(x, group).flatten(0, 1) for x in (columns, self._residual.unsqueeze(-1), self._jacobian))
-        basis, _ = torch.linalg.qr(torch.cat([j, torch.diag(self._pull + 1e-9)]))
-        remaining = torch.cat([torch.cat([c, r], dim=1), c.new_zeros(len(self._pull), c.shape[1] + 1)])
-        remaining[len(r) :, -1] = -self._off
-        remaining -= basis @ (basis.T @ remaining)
+        basis, _ = decomposed(j, self._pull)
+        of_priors = torch.nn.functional.pad(-self._off.unsqueeze(1), (c.shape[1], 0))
+        remaining = without(basis, torch.cat([torch.cat([c, r], dim=1), of_priors]))
         products = remaining.T @ remaining
         return NormalEquations(products[:-1, :-1], products[:-1, -1])
 

@@ -1,0 +1,25 @@
+"""Projection of linear parameters with normal priors out of whitened columns: N readings, P parameters."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+RIDGE = 1e-6  # least root of a prior precision; keeps parameters without information in place
+
+
+def decomposed(jacobian: Tensor, pull: Tensor) -> tuple[Tensor, Tensor]:
+    """Orthonormal basis Q (N + P, M) of the influence of the parameters on readings and priors, and factor R (M, M).
+
+    jacobian (N, M): whitened derivatives of the readings by the P parameters and by M - P further ones without a prior.
+    pull (P,): root of the precision of the parameters' priors.
+    """
+    priors = torch.diag(pull.clamp(min=RIDGE))
+    rows = torch.nn.functional.pad(priors, (0, jacobian.shape[1] - len(pull)))
+    return torch.linalg.qr(torch.cat([jacobian, rows]))
+
+
+def without(basis: Tensor, columns: Tensor) -> Tensor:
+    """Columns (N + P, K), or (N, K) with no influence on the priors, less what the basis explains of them."""
+    columns = torch.nn.functional.pad(columns, (0, 0, 0, len(basis) - len(columns)))
+    return columns - basis @ (basis.T @ columns)
