@@ -54,6 +54,7 @@ class AlarmHandler:
     ) -> None:
         self.observer, self.space, self.detector = observer, observer.space, detector
         self.faults, self.watched, self.settings, self.writer = faults, watched, settings, writer
+        self.reach = max(round(settings.lookback / detector.design.interval), 1)
 
     # Schedule
 
@@ -339,7 +340,7 @@ class AlarmHandler:
     def _sensor_shares(self, state: MonitorState) -> tuple[tuple[str, float], ...]:
         """The share of each sensor in the detector's statistic."""
         since = max(self._search_start(state, state.now), state.now - self.settings.lookback)
-        white = normalized_residuals(state, max(int((state.samples.time > since).sum()), 1))
+        white = normalized_residuals(state, max(int((state.samples.time > since).sum()), 1), self.reach)
         names = [sensor.name for sensor in self.observer.network.description.sensors]
         return tuple(zip(names, self.detector.shares(white).tolist(), strict=True))
 

@@ -119,7 +119,6 @@ class Monitor:
             alarms=state.alarms,
             tracks=state.tracks,
             hidden=state.hidden,
-            unexplained_rms=state.unexplained_rms,
             pending=state.pending,
             learning_until=state.learning_until,
         )
@@ -160,6 +159,6 @@ class Monitor:
     def _observed(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, Tensor]:
         """The state after the samples, and the detector's statistic (S,) at each of them."""
         moved = advance_observer(self.observer, state, samples)
-        residuals = normalized_residuals(moved, len(samples))
+        residuals = normalized_residuals(moved, len(samples), self.alarms.reach)
         statistic, memory = self.detector.update(residuals, state.detector_memory)
         return replace(moved, detector_memory=memory), statistic

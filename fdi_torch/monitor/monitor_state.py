@@ -104,7 +104,6 @@ class MonitorState:
       earliest_start: no later window begins before it, s.
     Parameters:
       believed (P,): values that the observer uses; healthy (P,): the same with every fault at nominal.
-      unexplained_rms (sensors,): root mean square of the white residuals that the known faults leave unexplained.
     Bookkeeping:
       clock: time of the last sample. detector_memory: None after a restart of the detector. alarms: all so far.
       pending: the alarm that is not isolated yet. change: the latest. tracks: the known faults. hidden: faults whose
@@ -121,7 +120,6 @@ class MonitorState:
     believed: Tensor
     healthy: Tensor
     reachable: float
-    unexplained_rms: Tensor
     clock: ClockState
     earliest_start: float = LONG_AGO
     detector_memory: Tensor | None = None
