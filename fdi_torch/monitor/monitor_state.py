@@ -147,6 +147,12 @@ class MonitorState:
         return float(self.samples.time[-1])
 
     @property
+    def valid_since(self) -> float:
+        """Since when the observer's present parameters have applied, s."""
+        last = self.change.best.onset if self.change is not None else self.reachable
+        return max(self.reachable, last, self.adjusted)
+
+    @property
     def off_nominal(self) -> Tensor:
         """Which parameters have a value other than fault-free, (P,) bool."""
         return self.believed != self.healthy
