@@ -1,25 +1,32 @@
 """False alarms of single calibrations on disturbed tanks without a fault: `python -m benchmarks.monitor_false_alarms`.
 
 Each calibration learns from its own recording and is tested on the rest of it. Its number of alarms is compared with
-the 95 % interval that it predicts for itself.
+the 95 % interval that it predicts for itself. With `--cases FOLDER`, each fault-free case of a folder of practice data
+(CASE/plant.yaml, CASE/recording.csv.gz, CASE/holdout.csv.gz, key.json) is learnt from its recording and tested on its
+hold-out.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.stats import poisson
 
 from benchmarks.monitor_rigs import KINDS, Case, recordings
+from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.monitor.fault_free_checks import QUESTION
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.samples import samples_of_recording
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
 LEARN = (300.0, 1000.0, 3000.0)
@@ -43,19 +50,34 @@ class Calibration:
         return self.low <= self.alarms <= self.high
 
 
-def tested(recording: Recording, learn: float, every: float) -> Calibration:
-    plant = load_plant("three_tank")
-    prepared = prepare_monitor(plant, fault_free_part(recording, 0.0, learn), time_between_false_alarms=every)
-    monitor, samples = prepared.monitor, samples_of_recording(recording, plant)
+def tested(plant: PlantDescription, learnt: Recording, test: Recording, skip: int, every: float) -> Calibration:
+    """Learn from one recording and count the alarms of another, whose first `skip` samples do not count."""
+    prepared = prepare_monitor(plant, learnt, time_between_false_alarms=every)
+    monitor, samples = prepared.monitor, samples_of_recording(test, plant)
     observer = Observer(
         monitor.network, prepared.noise.gain, monitor.space, prepared.believed, monitor.observer.stepper.longest
     )
-    white = prepared.noise.whitening(observer.run(samples).steady_residual)[int(learn) :]
+    white = prepared.noise.whitening(observer.run(samples).steady_residual)[skip:]
     detector, seconds = monitor.detector, len(white) * monitor.detector.design.interval
     alarms, expected = int(detector.alarms(white).sum()), detector.design.rates * seconds
     low, high = (detector.design.count_quantile(seconds, p) for p in (0.025, 0.975))
     share = float(np.mean(poisson.cdf(alarms, expected) - 0.5 * poisson.pmf(alarms, expected)))
     return Calibration(alarms, low, high, share, detector.threshold, any(QUESTION in w for w in prepared.warnings))
+
+
+def test_cases(folder: Path, every: float) -> None:
+    """Test each fault-free case on its hold-out."""
+    for case, answer in json.loads((folder / "key.json").read_text()).items():
+        if answer["causes"]:
+            continue
+        plant = load_plant(folder / case / "plant.yaml")
+        learnt, test = (
+            read_recording(RecordingConfig(file=str(folder / case / f"{name}.csv.gz")), plant, folder)
+            for name in ("recording", "holdout")
+        )
+        row, lasts = tested(plant, learnt, test, 0, every), float(test.time[-1] - test.time[0])
+        print(f"{case} {answer['kind']:6} {len(plant.tanks):2} tanks: {row.alarms} ", end="")
+        print(f"({row.low} to {row.high}) of {lasts / every:.1f}", flush=True)
 
 
 def main() -> None:
@@ -64,7 +86,12 @@ def main() -> None:
     parser.add_argument("--calibrations", type=int, default=4, help="of each kind, loop and learning time")
     parser.add_argument("--lasts", type=float, default=40000.0, help="test after learning, s")
     parser.add_argument("--every", type=float, default=20000.0)
+    parser.add_argument("--cases", type=Path, help="folder of practice data")
     a = parser.parse_args()
+    if a.cases is not None:
+        test_cases(a.cases, a.every)
+        return
+    plant = load_plant("three_tank")
     cells = [(k, closed, learn) for k in KINDS for closed in (True, False) for learn in LEARN]
     cases = [
         Case("", 0.0, k, learn, math.inf, learn + a.lasts, closed, 100000 * a.seed + 100 * i + j)
@@ -74,7 +101,8 @@ def main() -> None:
     runs, started, results = recordings(cases, step=0.25), time.process_time(), []
     for first in range(0, len(cases), a.calibrations):
         case = cases[first]
-        rows = [tested(recording, case.learn, a.every) for recording, _ in runs[first : first + a.calibrations]]
+        whole = [recording for recording, _ in runs[first : first + a.calibrations]]
+        rows = [tested(plant, fault_free_part(r, 0.0, case.learn), r, int(case.learn), a.every) for r in whole]
         results += rows
         loop, thresholds = "closed" if case.closed else "open", [round(row.threshold, 1) for row in rows]
         texts = ", ".join(f"{row.alarms} ({row.low} to {row.high})" for row in rows)

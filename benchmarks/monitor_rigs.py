@@ -104,7 +104,8 @@ class _ScaledController(Controller):
     control: _ScaledControl
 
     def flow(self, second: int, reading: float) -> float:
-        return super().flow(second, float(self.control.factor[second]) * reading)
+        factor = self.control.factor
+        return super().flow(second, float(factor[min(second, len(factor) - 1)]) * reading)  # others may last longer
 
 
 def _drive(case: Case, rng: np.random.Generator, samples: int, factor: Array, error: Array) -> Drive:

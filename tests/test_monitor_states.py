@@ -17,6 +17,7 @@ from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
 from fdi_torch.monitor.samples import Samples, samples_of_recording
+from fdi_torch.monitor.state_update import normalized_residuals
 from fdi_torch.recording import Recording
 from tests.test_monitor import SPACE, followed, monitor, recorded
 
@@ -101,6 +102,25 @@ def test_a_statistic_updated_in_parts_equals_that_of_the_whole(chart: str) -> No
         parts.append(part)
     assert torch.equal(torch.cat(parts), whole)
     assert torch.allclose(whole[300:], detector.statistic(white)[300:], rtol=1e-9)
+
+
+def test_a_misfit_that_has_passed_does_not_hide_a_change() -> None:
+    """Beside a known fault, a residual counts relative to the `reach` residuals before it, not to older ones."""
+    watch, reach = monitor(), 60
+    white = torch.randn(500, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    white[100:140] += 100.0
+    white[70:75, 2] = torch.nan
+    white[400:, 0] += 3.0
+    state = replace(watch.start(troubled()), white=white, believed=SPACE.vector({"T1.leak.size": 0.1}))
+    scaled = normalized_residuals(state, 499, reach)
+    for k in (30, 90, 120, 150, 260, 450):
+        before = white[max(k - reach, 0) : k].square().nanmean(dim=0).sqrt()
+        assert torch.allclose(scaled[k - 1], white[k] / before.clamp(min=1.0), rtol=1e-12)
+    assert torch.equal(normalized_residuals(state, 7, reach), scaled[-7:])
+    statistic = watch.detector.update(scaled[259:], None)[0]
+    first = int((statistic > watch.detector.threshold).to(torch.int8).argmax())
+    assert 260 + first in range(400, 410)
+    assert torch.equal(normalized_residuals(replace(state, believed=state.healthy), 499, reach)[100:], white[101:])
 
 
 def drained(mouth: float, seconds: int, folder: Path) -> list[Event]:

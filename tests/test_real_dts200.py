@@ -7,18 +7,21 @@ from pathlib import Path
 import pytest
 
 from fdi_torch.config.loaded_recordings import named_recordings, read_recording
+from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.free_runs.prediction import predict
 from fdi_torch.gap.free_runs.refit import refit
+from fdi_torch.jobs.logged_monitor import MonitorCallbacks
+from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.recording import Recording
 
 pytestmark = pytest.mark.data
 ROOT = Path(__file__).resolve().parents[1]
-REAL = ROOT / "configs" / "real"
+REAL, MONITOR = ROOT / "configs" / "real", ROOT / "configs" / "monitor"
 EXP5 = "dts200/exp5_pump_staircase_drain__2194.csv"
 FREE = ["hL.offset", "hM.offset"]
 
@@ -106,3 +109,16 @@ def test_the_valve_the_pump_and_the_offset_of_the_sensors_are_named_where_they_a
     assert 1.08 < gain.value < 1.13 and gain.std < 0.01  # pulses of 4 s deliver 1.10 to 1.12 of 60 to 100 cm^3/s
     (offset,) = (c for (effect, place), c in causes.items() if effect == "sensor_bias" and place in ("hL", "hM"))
     assert 0.004 < abs(offset.parameters["bias"].value) < 0.010  # m; 6 to 6.7 mm by eye, at one level
+
+
+@pytest.mark.slow
+def test_each_opening_and_closing_of_the_drains_raises_an_alarm_within_10_s(data: Path, tmp_path: Path) -> None:
+    """exp5: five times; the recorded positions, which are not shown, are the truth."""
+    run, alarms = load_monitor(MONITOR / "dts200_exp5_adopted.yaml", [f"output.folder={tmp_path}"]), []
+    heard = [lambda share, text: None, lambda e: alarms.append(e.time) if e.kind == "alarm" else None, lambda p: None]
+    run_monitor(run, MonitorCallbacks(*heard))
+    truth = read_recording(RecordingConfig(file=EXP5), load_plant("dts200"), ROOT)
+    opening = truth.inputs[:, truth.input_names.index("vLD")]
+    half = truth.time[1:][(opening[1:] > 0.5) != (opening[:-1] > 0.5)].tolist()
+    assert len(half) == 10
+    assert all(any(-5.0 <= alarm - moment <= 10.0 for alarm in alarms) for moment in half)

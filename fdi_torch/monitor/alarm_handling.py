@@ -10,17 +10,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from torch import Tensor
-
 from fdi_torch.monitor.alarm_state import Alarm, State
 from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event, Kind
+from fdi_torch.monitor.explanations import Explainer
 from fdi_torch.monitor.fault_recovery import (
-    end_is_shown,
+    end_recovered,
+    examine_hidden,
     recovered_columns,
-    recovery_is_observable,
     reset_to_nominal,
+    with_hidden,
 )
 from fdi_torch.monitor.fault_tracking import (
     STRONG_EVIDENCE,
@@ -29,31 +29,25 @@ from fdi_torch.monitor.fault_tracking import (
     updated_tracks,
     with_new_sizes,
 )
-from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
-from fdi_torch.monitor.isolation import isolate
-from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.hypothesis import HypothesisFit, merged
 from fdi_torch.monitor.monitor_state import DetectedChange, HiddenFault, MonitorState, PendingAlarm
-from fdi_torch.monitor.observer_bank import ObserverBank
 from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, normalized_residuals
 
-GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes a fault that grows
 SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
 
 
 class AlarmHandler:
     """Alarm logic of one monitor; each method takes a state and returns the next one with the events it causes."""
 
-    def __init__(
-        self,
-        observer: ObserverBank,
-        detector: Detector,
-        faults: Sequence[Fault],
-        watched: int,
-        settings: MonitorSettings,
-        writer: EventWriter,
-    ) -> None:
-        self.observer, self.space, self.detector = observer, observer.space, detector
-        self.faults, self.watched, self.settings, self.writer = faults, watched, settings, writer
+    def __init__(self, explainer: Explainer, detector: Detector, writer: EventWriter) -> None:
+        self.explainer, self.observer, self.faults = explainer, explainer.observer, explainer.faults
+        self.space, self.settings, self.detector, self.writer = (
+            self.observer.space,
+            explainer.settings,
+            detector,
+            writer,
+        )
+        self.reach = max(round(self.settings.lookback / detector.design.interval), 1)
 
     # Schedule
 
@@ -63,15 +57,18 @@ class AlarmHandler:
             raised = state.alarm(state.pending.number).last
             return raised + self.settings.confirm * self.settings.revise**state.pending.attempts
         changes = [] if state.change is None else [state.change.next_fit]
-        return min([*changes, *map(self._next_look, state.hidden)], default=float("inf"))
+        return min([*changes, *(self._next_look(h) for h in state.hidden)], default=float("inf"))
 
     def earliest_start(self, state: MonitorState) -> float:
         """The earliest time at which a later window may begin, s."""
         raised = state.now if state.pending is None else state.alarm(state.pending.number).last
         usual, change = raised - self.settings.longest - self.settings.lookback, state.change
-        if change is None or not change.best.hypothesis.incipient or not self._within_window(state, change):
+        if change is None or not change.best.hypothesis.incipient or not self.explainer.is_current(state, change):
             return usual
         return min(usual, change.best.onset - self.settings.lookback)
+
+    def _next_look(self, fault: HiddenFault) -> float:
+        return fault.seen + self.settings.confirm
 
     # Entry points
 
@@ -81,12 +78,12 @@ class AlarmHandler:
         It is a new alarm unless the latest change still explains the residual, or a known fault only changed its size.
         """
         change = state.change
-        if change is not None and self._within_window(state, change):
-            fits = self._explanations(state, self._window_start(state, change), change.before, change.explanations)
+        if change is not None and self.explainer.is_current(state, change):
+            fits = self.explainer.of_change(state, change)
             if fits[0].fits and fits[0].hypothesis.columns:
                 state = state.with_alarm(state.alarm(change.number).raised_again(state.now))
                 return self._revise(state, change, "revised", fits, announce=False)
-        resized = size_change(self.observer, state, self._search_start(state, state.now), self.faults)
+        resized = size_change(self.observer, state, self.explainer.search_start(state, state.now), self.faults)
         if resized is not None:
             moved = adopt_sizes(self.observer, state, resized)
             moved, announced = with_new_sizes(moved, resized, self.settings.revise)
@@ -102,14 +99,12 @@ class AlarmHandler:
         if state.pending is None:
             if change is not None and state.now >= change.next_fit:
                 return self._reconsider(state, change)
-            return self._examine_hidden(state)
-        if change is not None and self._within_window(state, change):
+            due = [h for h in state.hidden if self._next_look(h) <= state.now]
+            return examine_hidden(self.observer, self.writer, state, due)
+        if change is not None and self.explainer.is_current(state, change):
             # The previous change may have been explained wrongly: one change that explains both alarms is preferred.
-            start, earlier = self._window_start(state, change), change.explanations
-            fits = self._explanations(state, start, change.before, earlier)
-            if fits[0].fits and fits[0].hypothesis.columns:
-                return self._same_change(state, change, fits)
-            if change.best.at_bound:
+            fits = self.explainer.of_change(state, change)
+            if (fits[0].fits and fits[0].hypothesis.columns) or change.best.at_bound:
                 return self._same_change(state, change, fits)
         return self._isolate(state)
 
@@ -121,18 +116,19 @@ class AlarmHandler:
         state = replace(state, pending=None, detector_memory=None).with_alarm(retired)
         return state, self.writer.retired(state, retired, reason, announced)
 
-    def fault_free(self, believed: Tensor) -> Tensor:
-        """Parameter values (P,) with every fault at nominal and the calibrated constants as they are."""
-        healthy = believed.clone()
-        healthy[: self.watched] = self.space.nominal()[: self.watched]
-        return healthy
+    def _sensor_shares(self, state: MonitorState) -> tuple[tuple[str, float], ...]:
+        """The share of each sensor in the detector's statistic."""
+        since = self.explainer.search_start(state, state.now)
+        white = normalized_residuals(state, max(int((state.samples.time > since).sum()), 1), self.reach)
+        names = [sensor.name for sensor in self.observer.network.description.sensors]
+        return tuple(zip(names, self.detector.shares(white).tolist(), strict=True))
 
     # Isolation
 
     def _isolate(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
         assert state.pending is not None
         number = state.pending.number
-        fits = self._explanations_from_onset(state, self._search_start(state, state.alarm(number).last))
+        fits = self.explainer.of_alarm(state, state.alarm(number).last)
         if not fits[0].hypothesis.columns:
             return self._unexplained(state, fits)
         alarm = state.alarm(number)
@@ -142,9 +138,8 @@ class AlarmHandler:
             state, event = self.retire(state, number, f"it counts with alarm {earlier_alarm}", announced=False)
             events, number = [event], earlier_alarm
             state = state.with_alarm(state.alarm(earlier_alarm).raised_again(alarm.last))
-        since = self._parameters_valid_since(state)
-        next_fit = self._next_revision(fits[0], state.now)
-        change = DetectedChange(number, state.believed, since, tuple(fits), alarm.last, next_fit)
+        next_fit = self.explainer.next_fit(fits[0], state.now)
+        change = DetectedChange(number, state.believed, state.valid_since, tuple(fits), alarm.last, next_fit)
         state, answer = self._adopt(state, change, "isolated")
         return state, [*events, *answer]
 
@@ -166,9 +161,9 @@ class AlarmHandler:
 
         If none of them fits the noise level, the change is replaced only by a clearly likelier one.
         """
-        if not self._within_window(state, change):
+        if not self.explainer.is_current(state, change):
             return replace(state, change=replace(change, next_fit=float("inf"))), []
-        fits = self._explanations(state, self._window_start(state, change), change.before, change.explanations)
+        fits = self.explainer.of_change(state, change)
         best = fits[0]
         present = [f for f in fits if f.hypothesis.columns == change.best.hypothesis.columns]
         resized = state.adjusted > change.best.onset  # sizes changed since, so no single change explains the window
@@ -178,7 +173,7 @@ class AlarmHandler:
             or (present and best.evidence - present[0].evidence < STRONG_EVIDENCE)
         )
         if not best.fits and not_better:
-            later = self._next_revision(change.best, state.now)
+            later = self.explainer.next_fit(change.best, state.now)
             return replace(state, change=replace(change, next_fit=later)), []
         return self._revise(state, change, "revised", fits)
 
@@ -189,7 +184,7 @@ class AlarmHandler:
         waiting, events = replace(state, pending=PendingAlarm(number, attempts)), []
         if attempts == 1:
             waiting = waiting.with_alarm(waiting.alarm(number).with_state(State.CANNOT_TELL))
-            events = [self.writer.unexplained(waiting, number, self._reported(fits))]
+            events = [self.writer.unexplained(waiting, number, self.explainer.reported(fits))]
         if self.next_fit(waiting) - state.alarm(number).last <= self.settings.longest:
             return waiting, events
         waiting, event = self.retire(waiting, number, "no fault of the list explains it better than chance does")
@@ -215,7 +210,7 @@ class AlarmHandler:
     ) -> tuple[MonitorState, list[Event]]:
         """Adopt the latest change with new explanations."""
         alarm_time = change.alarm_time if change.alarm_time > fits[0].onset else state.alarm(change.number).last
-        next_fit = self._next_revision(fits[0], state.now)
+        next_fit = self.explainer.next_fit(fits[0], state.now)
         revised = replace(change, explanations=tuple(fits), alarm_time=alarm_time, next_fit=next_fit)
         return self._adopt(state, revised, kind, announce)
 
@@ -226,7 +221,7 @@ class AlarmHandler:
 
         announce: whether the event is announced even if only the sizes changed.
         """
-        reported = self._reported(change.explanations)
+        reported = self.explainer.reported(change.explanations)
         best = reported[0]
         kept = tuple(
             f
@@ -247,8 +242,8 @@ class AlarmHandler:
             [fault.size for fault in self.faults],
             lambda c: effect_of_value(self.observer, window, change.before, change.hypothesis, c, healthy[c])[0],
         )
-        state = self._with_hidden(state, change)
-        state, events = self._end_recovered(state, change, reported)
+        state = with_hidden(self.observer, state, change)
+        state, events = end_recovered(self.writer, state, change, reported)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:
             numbers = [t.number for t in ended]
@@ -263,105 +258,9 @@ class AlarmHandler:
         kind = kind if kind == "revised" and alarm.state is answer else str(answer)  # type: ignore[assignment]
         return state, [*events, self.writer.answered(state, change, reported, kind, announce or kind != "revised")]
 
-    def _with_hidden(self, state: MonitorState, change: DetectedChange) -> MonitorState:
-        """The state with the faults that recovered at a change but that the readings since would not show."""
-        onset, now = change.best.onset, state.now
-        hidden = [t for t in change.ended if not recovery_is_observable(self.observer, state, change, t)]
-        new = [HiddenFault(t, float(change.before[t.column]), onset, now) for t in hidden]
-        judged = {*change.best.hypothesis.columns, *state.off_nominal.nonzero().flatten().tolist()}
-        return replace(state, hidden=(*(h for h in state.hidden if h.track.column not in judged), *new))
-
-    def _examine_hidden(self, state: MonitorState) -> tuple[MonitorState, list[Event]]:
-        """Report the hidden faults of which the readings since the last look show that they have ended."""
-        valid, due = self._parameters_valid_since(state), [h for h in state.hidden if self._next_look(h) <= state.now]
-        gone = [h for h in due if end_is_shown(self.observer, state, h, max(h.seen, valid))]
-        hidden = (replace(h, seen=state.now) if h in due else h for h in state.hidden if h not in gone)
-        state, events = replace(state, hidden=tuple(hidden)), []
-        if state.change is not None:
-            ended = tuple(t for t in state.change.ended if t not in [h.track for h in gone])
-            state = replace(state, change=replace(state.change, ended=ended))
-        standing = {t.number for t in (*state.tracks, *(h.track for h in state.hidden))}
-        for number in sorted({h.track.number for h in gone}):
-            if number not in standing and state.alarm(number).state is State.CANNOT_TELL:
-                state = state.with_alarm(state.alarm(number).with_state(State.RECOVERED))
-            events.append(self.writer.end_shown(state, number, [h for h in gone if h.track.number == number]))
-        return state, events
-
-    def _end_recovered(
-        self, state: MonitorState, change: DetectedChange, reported: Sequence[HypothesisFit]
-    ) -> tuple[MonitorState, list[Event]]:
-        """End the alarms of recovered faults; "cannot tell" if the readings would not show one of them any more."""
-        events, unseen = [], [h.track.column for h in state.hidden]
-        for number in sorted({t.number for t in change.ended}):
-            columns, alarm = [t.column for t in change.ended if t.number == number], state.alarm(number)
-            hidden = [c for c in columns if c in unseen]
-            answer = State.CANNOT_TELL if hidden else State.RECOVERED
-            if alarm.state is not answer:
-                state = state.with_alarm(alarm.with_state(answer))
-                names = [self.space.names[c] for c in hidden or columns]
-                events.append(self.writer.ended(state, change, reported, number, names, not hidden))
-        return state, events
-
     @staticmethod
     def _answer_of(reported: Sequence[HypothesisFit]) -> State:
         best = reported[0]
         if best.at_bound:
             return State.CANNOT_TELL
         return State.ISOLATED if len(reported) == 1 and best.fits else State.EXPLAINED
-
-    def _reported(self, fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
-        return credible_set(merged(fits), self.settings.level)
-
-    # Windows and fits
-
-    def _explanations(
-        self, state: MonitorState, start: float, believed: Tensor, earlier: Sequence[HypothesisFit] = ()
-    ) -> list[HypothesisFit]:
-        """Explanations of the readings since `start` s, likeliest first. earlier: fits that serve
-        as initial guesses.
-        """
-        s, healthy, window = self.settings, self.fault_free(believed), state.window(start)
-        return isolate(self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier)
-
-    def _explanations_from_onset(self, state: MonitorState, start: float) -> list[HypothesisFit]:
-        """Explanations of the readings since `start` s.
-
-        The window is doubled while the onset lies at its beginning, because the change may have occurred before it.
-        """
-        earliest = max(self._parameters_valid_since(state), state.earliest_start)
-        while True:
-            fits = self._explanations(state, start, state.believed)
-            at_start = fits[0].onset - start <= 2.0 * fits[0].onset_std and bool(fits[0].hypothesis.columns)
-            if not at_start or start <= earliest:
-                return fits
-            start = max(start - (state.now - start), earliest)
-
-    def _sensor_shares(self, state: MonitorState) -> tuple[tuple[str, float], ...]:
-        """The share of each sensor in the detector's statistic."""
-        since = max(self._search_start(state, state.now), state.now - self.settings.lookback)
-        white = normalized_residuals(state, max(int((state.samples.time > since).sum()), 1))
-        names = [sensor.name for sensor in self.observer.network.description.sensors]
-        return tuple(zip(names, self.detector.shares(white).tolist(), strict=True))
-
-    def _search_start(self, state: MonitorState, alarm_time: float) -> float:
-        """The earliest onset of a change that raised an alarm, s: not before the previous change."""
-        return max(alarm_time - self.settings.lookback, self._parameters_valid_since(state))
-
-    def _parameters_valid_since(self, state: MonitorState) -> float:
-        """Since when the observer's present parameters have applied, s."""
-        last = state.change.best.onset if state.change is not None else state.reachable
-        return max(state.reachable, last, state.adjusted)
-
-    def _window_start(self, state: MonitorState, change: DetectedChange) -> float:
-        """Start of the window in which the latest change is fitted again, s."""
-        return max(change.best.onset - self.settings.lookback, change.since, state.reachable)
-
-    def _within_window(self, state: MonitorState, change: DetectedChange) -> bool:
-        longest = self.settings.longest * (GROWING_WINDOWS if change.best.hypothesis.incipient else 1.0)
-        return state.now - change.best.onset <= longest and change.best.onset >= state.reachable
-
-    def _next_revision(self, fit: HypothesisFit, now: float) -> float:
-        return fit.onset + self.settings.revise * max(now - fit.onset, self.settings.confirm)
-
-    def _next_look(self, fault: HiddenFault) -> float:
-        return fault.seen + self.settings.confirm

@@ -17,6 +17,7 @@ from fdi_torch.monitor.alarm_handling import AlarmHandler
 from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event
+from fdi_torch.monitor.explanations import Explainer
 from fdi_torch.monitor.hypothesis import faults_of
 from fdi_torch.monitor.monitor_settings import MonitorSettings, usual_settings
 from fdi_torch.monitor.monitor_state import MonitorState
@@ -68,7 +69,8 @@ class Monitor:
         self.faults = faults_of(space.names[: self.watched])
         self.observer = ObserverBank(network, space, noise.gain, noise.whitening, longest_step)
         self.writer = EventWriter(self.observer, self.settings, self.watched)
-        self.alarms = AlarmHandler(self.observer, detector, self.faults, self.watched, self.settings, self.writer)
+        explainer = Explainer(self.observer, self.faults, self.watched, self.settings)
+        self.alarms = AlarmHandler(explainer, detector, self.writer)
 
     def start(
         self,
@@ -84,7 +86,7 @@ class Monitor:
         no alarm, because it would use noise estimates from readings that are still to come.
         """
         theta = self.space.nominal() if believed is None else believed
-        state = initial_state(self.observer, samples, theta, self.alarms.fault_free(theta), levels)
+        state = initial_state(self.observer, samples, theta, self.alarms.explainer.fault_free(theta), levels)
         return replace(state, learning_until=learning_until)
 
     def advance(
@@ -119,7 +121,6 @@ class Monitor:
             alarms=state.alarms,
             tracks=state.tracks,
             hidden=state.hidden,
-            unexplained_rms=state.unexplained_rms,
             pending=state.pending,
             learning_until=state.learning_until,
         )
@@ -160,6 +161,6 @@ class Monitor:
     def _observed(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, Tensor]:
         """The state after the samples, and the detector's statistic (S,) at each of them."""
         moved = advance_observer(self.observer, state, samples)
-        residuals = normalized_residuals(moved, len(samples))
+        residuals = normalized_residuals(moved, len(samples), self.alarms.reach)
         statistic, memory = self.detector.update(residuals, state.detector_memory)
         return replace(moved, detector_memory=memory), statistic

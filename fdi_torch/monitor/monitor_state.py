@@ -104,7 +104,6 @@ class MonitorState:
       earliest_start: no later window begins before it, s.
     Parameters:
       believed (P,): values that the observer uses; healthy (P,): the same with every fault at nominal.
-      unexplained_rms (sensors,): root mean square of the white residuals that the known faults leave unexplained.
     Bookkeeping:
       clock: time of the last sample. detector_memory: None after a restart of the detector. alarms: all so far.
       pending: the alarm that is not isolated yet. change: the latest. tracks: the known faults. hidden: faults whose
@@ -121,7 +120,6 @@ class MonitorState:
     believed: Tensor
     healthy: Tensor
     reachable: float
-    unexplained_rms: Tensor
     clock: ClockState
     earliest_start: float = LONG_AGO
     detector_memory: Tensor | None = None
@@ -147,6 +145,12 @@ class MonitorState:
     def now(self) -> float:
         """Time of the last sample, s."""
         return float(self.samples.time[-1])
+
+    @property
+    def valid_since(self) -> float:
+        """Since when the observer's present parameters have applied, s."""
+        last = self.change.best.onset if self.change is not None else self.reachable
+        return max(self.reachable, last, self.adjusted)
 
     @property
     def off_nominal(self) -> Tensor:

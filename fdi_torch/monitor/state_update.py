@@ -32,7 +32,6 @@ def initial_state(
         believed=believed,
         healthy=healthy,
         reachable=now,
-        unexplained_rms=torch.zeros_like(residual),
         clock=ClockState(now),
     )
 
@@ -50,15 +49,8 @@ def adopt_change(observer: ObserverBank, state: MonitorState, change: DetectedCh
     """Run the observer again from the change's onset with new parameters (P,), and restart the detector."""
     fit = change.best
     window = state.window(fit.onset)
-    off_before, off = state.off_nominal, believed != state.healthy
     state = replace(state, believed=believed, change=change, pending=None, detector_memory=None)
-    moved = _run(observer, state, window, change.before, fit.onset, fit.hypothesis.incipient)
-    rms = moved.white[-len(window) :].square().nanmean(dim=0).nan_to_num().sqrt()
-    if fit.fits or not bool(off.any()):
-        rms = torch.zeros_like(rms)
-    elif bool(off[off_before].all()):
-        rms = torch.maximum(rms, state.unexplained_rms)  # no fault recovered: the earlier misfit may come back
-    return replace(moved, unexplained_rms=rms)
+    return _run(observer, state, window, change.before, fit.onset, fit.hypothesis.incipient)
 
 
 def adopt_sizes(observer: ObserverBank, state: MonitorState, fit: HypothesisFit) -> MonitorState:
@@ -84,11 +76,21 @@ def drop_old_samples(state: MonitorState) -> MonitorState:
     )
 
 
-def normalized_residuals(state: MonitorState, count: int) -> Tensor:
-    """The last white residuals (count, sensors) for the detector, over the root mean square that the known faults left
-    unexplained when they were fitted, where that is above 1.
+def normalized_residuals(state: MonitorState, count: int, reach: int) -> Tensor:
+    """The last white residuals (count, sensors) for the detector.
+
+    While a fault is known, each is divided by the root mean square of the `reach` residuals before it, where that is
+    above 1: the law of a real fault is inexact, and its error comes and goes with the levels.
     """
-    return state.white[-count:] / state.unexplained_rms.clamp(min=1.0)
+    white = state.white[-count:]
+    if not bool(state.off_nominal.any()):
+        return white
+    before = state.white[:-1][-(count + reach - 1) :]
+    missing = white.new_full((count + reach - 1 - len(before), white.shape[-1]), torch.nan)
+    windows = torch.cat([missing, before]).unfold(0, reach, 1)
+    # A cumulative sum adds in the same order however many samples are processed at once.
+    total = windows.square().nan_to_num().cumsum(-1)[..., -1]
+    return white / (total / torch.isfinite(windows).sum(-1).clamp(min=1)).sqrt().clamp(min=1.0)
 
 
 def _run(

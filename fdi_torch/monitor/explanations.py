@@ -1,0 +1,73 @@
+"""Explanations of the readings in the windows of a monitor's state, and how long a change is fitted again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
+from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
+from fdi_torch.monitor.observer_bank import ObserverBank
+
+GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes a fault that grows
+
+
+@dataclass(frozen=True)
+class Explainer:
+    """Fits the faults that may occur: the first `watched` parameters of the observer's space."""
+
+    observer: ObserverBank
+    faults: Sequence[Fault]
+    watched: int
+    settings: MonitorSettings
+
+    def fault_free(self, believed: Tensor) -> Tensor:
+        """Parameter values (P,) with every fault at nominal and the calibrated constants as they are."""
+        healthy = believed.clone()
+        healthy[: self.watched] = self.observer.space.nominal()[: self.watched]
+        return healthy
+
+    def search_start(self, state: MonitorState, alarm_time: float) -> float:
+        """The earliest onset of a change that raised an alarm, s: not before the previous change."""
+        return max(alarm_time - self.settings.lookback, state.valid_since)
+
+    def of_alarm(self, state: MonitorState, alarm_time: float) -> list[HypothesisFit]:
+        """Explanations of an alarm, likeliest first.
+
+        The window is doubled while the onset lies at its beginning, because the change may have occurred before it.
+        """
+        start, earliest = self.search_start(state, alarm_time), max(state.valid_since, state.earliest_start)
+        while True:
+            fits = self._fits(state, start, state.believed)
+            at_start = fits[0].onset - start <= 2.0 * fits[0].onset_std and bool(fits[0].hypothesis.columns)
+            if not at_start or start <= earliest:
+                return fits
+            start = max(start - (state.now - start), earliest)
+
+    def of_change(self, state: MonitorState, change: DetectedChange) -> list[HypothesisFit]:
+        """Explanations of the latest change, likeliest first; those it had are further initial guesses."""
+        start = max(change.best.onset - self.settings.lookback, change.since, state.reachable)
+        return self._fits(state, start, change.before, change.explanations)
+
+    def _fits(
+        self, state: MonitorState, start: float, believed: Tensor, earlier: Sequence[HypothesisFit] = ()
+    ) -> list[HypothesisFit]:
+        s, healthy, window = self.settings, self.fault_free(believed), state.window(start)
+        return isolate(self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier)
+
+    def is_current(self, state: MonitorState, change: DetectedChange) -> bool:
+        """Whether a change is recent enough to be fitted again."""
+        longest = self.settings.longest * (GROWING_WINDOWS if change.best.hypothesis.incipient else 1.0)
+        return state.now - change.best.onset <= longest and change.best.onset >= state.reachable
+
+    def next_fit(self, fit: HypothesisFit, now: float) -> float:
+        """When an explanation is fitted again, s."""
+        return fit.onset + self.settings.revise * max(now - fit.onset, self.settings.confirm)
+
+    def reported(self, fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
+        """The fewest explanations that together have the reported probability."""
+        return credible_set(merged(fits), self.settings.level)
