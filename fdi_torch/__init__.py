@@ -32,8 +32,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "fdi_torch.estimate.levenberg_marquardt": ("levenberg_marquardt",),
     "fdi_torch.jobs.fmu_export": ("export_fmu",),
     "fdi_torch.jobs.python_functions": (
-        *("FreeRun", "GapResult", "MonitorResult"),
-        *("gap", "monitor", "predict", "simulate", "study", "train"),
+        *("FreeRun", "GapResult", "MonitorResult", "RefitResult"),
+        *("gap", "monitor", "predict", "refit", "simulate", "study", "train"),
     ),
     "fdi_torch.jobs.report": ("Report", "report"),
     "fdi_torch.jobs.run_setup": ("simulate_recording",),

@@ -142,6 +142,12 @@ class ParameterSpace:
             doubled = [p.name for i, p in enumerate(self.parameters) if self._index[p.name] != i]
             raise ValueError(f"expected each parameter once, got {doubled[0]} twice; remove one")
 
+    def __repr__(self) -> str:
+        units = ["" if p.unit == "1" else f" {p.unit}" for p in self]
+        return "\n".join(
+            f"{p.name} = {p.nominal:g}, {p.low:g} to {p.high:g}{u}" for p, u in zip(self, units, strict=True)
+        )
+
     def __len__(self) -> int:
         return len(self.parameters)
 

@@ -127,6 +127,13 @@ def test_what_is_wrong_with_a_file_is_said_with_row_and_column(tmp_path: Path, t
         read(tmp_path, text)
 
 
+def test_a_mapped_unit_that_contradicts_the_header_is_used_and_reported(tmp_path: Path) -> None:
+    recording = read(tmp_path, GOOD, h1=ChannelSource("h1_cm", "mm"))
+    assert recording.notes == ("run.csv: h1_cm: read in mm as mapped, although its header says cm",)
+    assert recording.outputs[0, 0] == pytest.approx(0.1 * float(read(tmp_path, GOOD).outputs[0, 0]))
+    assert read(tmp_path, GOOD, h1=ChannelSource("h1_cm", "cm")).notes == ()
+
+
 def test_a_unit_of_the_wrong_kind_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"run.csv: column h1_cm: expected a unit of level.*got 'kg'"):
         read(tmp_path, GOOD, h1=ChannelSource("h1_cm", "kg"))

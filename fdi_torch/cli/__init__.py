@@ -130,8 +130,8 @@ def _carried_out(name: str, words: list[str]) -> int:
     except (ValueError, OSError) as error:
         if arguments.traceback:
             raise
-        for line in str(error).splitlines():
-            screen.complain(f"fdi {name}: {line}")
+        for problem in getattr(error, "problems", [str(error)]):
+            screen.complain(f"fdi {name}: {problem}")
         return MISUSE
     except (MemoryError, RuntimeError) as error:
         sentence = _resource_problem(error)

@@ -43,6 +43,11 @@ def show(done: TrainResult, screen: Screen) -> None:
     if diagnosis.warning:
         screen.say(f"{diagnosis.warning}.")
         screen.say("- next: fdi gap finds where and by which effect the plant file deviates from the recording")
+        network, space = done.fitting.networks[0], done.fitting.space
+        onsets = [f"{place.prefix}.onset" for place in network.placements]
+        onsets = [name for name in onsets if name in network.constants and name not in space]
+        if onsets:
+            screen.say(f"- a fault that begins within the recording: also estimate its onset, such as {onsets[0]}")
         screen.say()
     rows = []
     for i, p in enumerate(done.fitting.space):

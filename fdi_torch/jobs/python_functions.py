@@ -20,6 +20,8 @@ from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.free_runs.prediction import START_SAMPLES, Prediction
 from fdi_torch.gap.free_runs.prediction import predict as run_freely
+from fdi_torch.gap.free_runs.refit import Refit
+from fdi_torch.gap.free_runs.refit import refit as refitted
 from fdi_torch.gap.verdict_words import cause_words, explanation_words, verdict_sentence
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs import train as train_job
@@ -30,7 +32,7 @@ from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
-from fdi_torch.parameters import display_in
+from fdi_torch.parameters import display_in, quantity_text
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure
@@ -39,8 +41,7 @@ from fdi_torch.tables import Shown, Table
 
 Tell = Callable[[float, str], None]
 AnyPlant = PlantDescription | str | Path
-AnyRecording = Recording | str | Path
-HERE = "session"
+AnyRecording = Recording | Mapping[str, Any] | str | Path
 
 
 def silent(share: float, text: str) -> None:
@@ -76,8 +77,8 @@ def simulate(
     bit for a given seed. Raises ConfigError, which names the wrong key and the expected value.
     """
     keys = {"inputs": inputs, "duration": duration, "sample_time": sample_time, "hold": hold}
-    keys |= {"start_levels": start_levels, "faults": dict(faults or {}), "noise": dict(noise or {})}
-    return simulate_recording(build_run({"plant": plant, "simulate": keys, "seed": seed}, Path.cwd(), HERE))
+    keys |= {"start_levels": start_levels, "faults": dict(faults or {}), "noise": noise or {}}
+    return simulate_recording(build_run({"plant": plant, "simulate": keys, "seed": seed}, Path.cwd(), "arguments"))
 
 
 def train(
@@ -95,7 +96,7 @@ def train(
     if run is None or isinstance(run, str | Path):
         run = load_run(run)
     elif not isinstance(run, Run):
-        run = build_run(_keys(run), Path.cwd(), HERE)
+        run = build_run(_keys(run), Path.cwd(), "train")
     return train_job.train(run, tell, resume, listener)
 
 
@@ -189,7 +190,7 @@ def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = si
     if isinstance(run, str | Path):
         run = load_monitor(run)
     elif not isinstance(run, MonitorRun):
-        run = build_monitor(_keys(run), Path.cwd(), HERE)
+        run = build_monitor(_keys(run), Path.cwd(), "monitor")
     events: list[Event] = []
     summary = run_monitor(run, MonitorCallbacks(tell, events.append, lambda prepared: None))
     return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
@@ -251,6 +252,42 @@ def predict(
     return FreeRun(plant, parts[0], prediction)
 
 
+@dataclass(frozen=True, repr=False)
+class RefitResult(Shown):
+    """plant: the plant with fitted constants and effects. fit: errors, values and standard errors, SI."""
+
+    fit: Refit
+
+    @property
+    def plant(self) -> PlantDescription:
+        return self.fit.plant
+
+    @property
+    def headline(self) -> str:
+        errors = ", ".join(f"{s.name} {quantity_text(self.fit.rmse[s.name], s.unit)}" for s in self.plant.sensors)
+        return f"refit of {self.plant.name}: root mean square error {errors}"
+
+    def table(self) -> Table:
+        """One row per value that all recordings share, SI."""
+        return Table.of_rows(("parameter", "value", "std error"), [(n, *pair) for n, pair in self.fit.fitted.items()])
+
+    def narrowed(self) -> PlantDescription:
+        """The plant with the standard errors of the fit as tolerances where these are smaller."""
+        return self.fit.narrowed()
+
+
+def refit(
+    plant: AnyPlant, recordings: AnyRecording | Sequence[AnyRecording], *, step: float | None = None, **choices: Any
+) -> RefitResult:
+    """Fit all constants with a tolerance and all effects of a plant to recordings, as `fdi refit` does: calibrate it.
+
+    step: of the simulation, s. choices: leave_out, hold, vary (names or patterns), as the options of `fdi refit`.
+    """
+    plant = plant_of(plant)
+    with one_thread():
+        return RefitResult(refitted(plant, recordings_of(recordings, plant), step=step, **choices))
+
+
 def study(
     study: Study | Mapping[str, Any] | str | Path,
     *,
@@ -266,7 +303,7 @@ def study(
     if isinstance(study, str | Path):
         study = load_study(study)
     elif not isinstance(study, Study):
-        study = build_study(_keys(study), Path.cwd(), HERE)
+        study = build_study(_keys(study), Path.cwd(), "study")
     return study_job.run_study(study, resume, cluster, tell)
 
 
@@ -281,12 +318,17 @@ def plant_of(plant: AnyPlant) -> PlantDescription:
 
 
 def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDescription) -> list[Recording]:
-    """Recordings with the plant's channels, split into segments with known inputs; names are read as files."""
+    """Recordings with the plant's channels, split into segments with known inputs.
+
+    Names are read as files, and mappings as entries of a run file.
+    """
     segments: list[Recording] = []
-    for each in [wanted] if isinstance(wanted, Recording | str | Path) else wanted:
-        if isinstance(each, Recording):
-            whole = read_recording(each.source, plant, given={each.source: each})
-            segments += [part for part in whole.known_segments() if len(part) > 1]
-        else:
+    listed: Sequence[Any] = wanted if isinstance(wanted, list | tuple) else [wanted]
+    for each in listed:
+        if isinstance(each, str | Path):
             segments += named_recordings(str(each), plant, Path.cwd())
+            continue
+        given = {each.source: each} if isinstance(each, Recording) else None
+        whole = read_recording(each.source if isinstance(each, Recording) else each, plant, given=given)
+        segments += [part for part in whole.known_segments() if len(part) > 1]
     return segments
