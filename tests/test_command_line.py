@@ -132,6 +132,12 @@ def test_a_file_with_other_names_is_refused_with_the_lines_that_map_it(
     assert "50 samples, 49 s" in capsys.readouterr().out
 
 
+def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["train", "leak.yaml"])
+    assert "unrecognized argument: leak.yaml; name a file by its option: --config leak.yaml" in capsys.readouterr().err
+
+
 def test_check_states_the_volume_and_the_emptying_time_of_each_tank(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", "--plant", "three_tank"]) == cli.DONE
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
