@@ -57,7 +57,12 @@ __all__ = sorted(_HOME_OF)
 
 
 class _CallableModule(ModuleType):
-    """A subpackage that can be called like the public function of the same name."""
+    # A subpackage that can be called like the public function of the same name.
+
+    @property
+    def __doc__(self) -> str | None:  # type: ignore[override]
+        """The function's documentation, for `help` in a notebook."""
+        return self.__wrapped__.__doc__
 
     @property
     def __wrapped__(self) -> Callable[..., Any]:

@@ -158,6 +158,7 @@ def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path) -> None:
     for html in (found._repr_html_(), RIG._repr_html_(), fdi_torch.predict(RIG, recording)._repr_html_()):
         assert "<svg" in html and "var(--" not in html  # a notebook does not define the variables of our pages
         assert "max-width" in html
+    assert re.search(r"mcap: train, started 20.*, completed$", repr(fdi_torch.read_run(found.log)))
     page = fdi_torch.report(found.log)
     assert page.page.read_text().count("one tank") and "leak at A" in page.table().columns["says"][0]
 
@@ -186,6 +187,7 @@ def test_a_monitor_runs_along_a_recording_in_memory(tmp_path: Path) -> None:
     table = found.table().columns
     kinds = [kind for kind in table["kind"] if kind not in ("notice", "watching")]
     assert kinds[:2] == ["alarm", "isolated"]
+    assert "isolated" in repr(found) and "stds" not in repr(found)
     isolated = table["kind"].index("isolated")
     assert table["onset"][isolated] == pytest.approx(400.0, abs=3.0) and table["units"][isolated] == ("1",)
 

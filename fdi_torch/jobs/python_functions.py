@@ -181,6 +181,9 @@ class MonitorResult(Shown):
         names = ("time", "kind", "alarm", "text", "headline", "faults", "sizes", "stds", "units", "onset", "onset_std")
         return Table({name: [getattr(event, name) for event in self.events] for name in names})
 
+    def brief(self) -> Table:
+        return Table.of_rows(("time, s", "event", "text"), [(e.time, e.kind, e.text) for e in self.events])
+
 
 def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = silent) -> MonitorResult:
     """Run a monitor along a recording, as `fdi monitor` does.
