@@ -163,7 +163,7 @@ class _ProjectedRegression:
         )
 
     def screened(self, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Score and strength of options, (M,) each; columns (S, C, M): their changes of the readings."""
+        """Score and strength of M options, (M,) each; columns (S, C, M): change of the readings by each option."""
         columns = self.fitter.whiten(columns)
         score, strength = columns.new_zeros(2, columns.shape[-1]).unbind()
         shared = columns.new_zeros(columns.shape[-1], self.basis.shape[-1])
@@ -251,7 +251,7 @@ def _named(network: TankNetwork, values: Mapping[str, float]) -> tuple[Parameter
 
 
 def _starts(options: Sequence[Option]) -> dict[str, Tensor]:
-    """Parameters of options with the same fitted names, by short name, (M, 1) each."""
+    """Start values (M, 1) of each parameter, by short name, of M options that fit the same parameters."""
     return {
         ParameterName.parse(name).field: torch.tensor([[o.start[name]] for o in options], dtype=torch.float64)
         for name in options[0].start

@@ -130,7 +130,7 @@ def localize(
         return changed(known, finer, finer.sinusoids) if finer else known
 
     def refitted(known: _EvaluatedDiscrepancy) -> _EvaluatedDiscrepancy:
-        """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
+        """The discrepancy after a refit of all parameters to the readings less its contribution."""
         fit, corrected = known.regression.fit, replace(data, readings=data.readings - known.explained)
         refitter = Fitter(corrected, fitter.noise, known.under.whitening)
         new = refitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
