@@ -31,10 +31,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "fdi_torch.estimate.profile": ("Profile", "profile_likelihood"),
     "fdi_torch.estimate.levenberg_marquardt": ("levenberg_marquardt",),
     "fdi_torch.jobs.fmu_export": ("export_fmu",),
-    "fdi_torch.jobs.python_functions": (
-        *("FreeRun", "GapResult", "MonitorResult", "RefitResult"),
-        *("gap", "monitor", "predict", "refit", "simulate", "study", "train"),
-    ),
+    "fdi_torch.jobs.python_functions": (*("gap", "monitor", "predict", "refit", "simulate", "study", "train"),),
+    "fdi_torch.jobs.python_results": ("FreeRun", "GapResult", "MonitorResult", "RefitResult"),
     "fdi_torch.jobs.report": ("Report", "report"),
     "fdi_torch.jobs.run_setup": ("simulate_recording",),
     "fdi_torch.jobs.study": ("StudyResult",),

@@ -1,4 +1,4 @@
-"""The commands as Python functions, for scripts and notebooks, with results that display themselves.
+"""The commands as Python functions, for scripts and notebooks.
 
 A function accepts a file (run, monitor or study file) or the same content as a mapping, in which a `Plant` may replace
 the plant's name and a `Recording` the recording's file name.
@@ -7,7 +7,7 @@ the plant's name and a `Recording` the recording's file name.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +16,23 @@ from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monito
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
-from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.diagnose import Settings
-from fdi_torch.gap.free_runs.prediction import START_SAMPLES, Prediction
+from fdi_torch.gap.free_runs.prediction import START_SAMPLES
 from fdi_torch.gap.free_runs.prediction import predict as run_freely
-from fdi_torch.gap.free_runs.refit import Refit
 from fdi_torch.gap.free_runs.refit import refit as refitted
-from fdi_torch.gap.verdict_words import cause_words, explanation_words, verdict_sentence
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs import train as train_job
 from fdi_torch.jobs.gap import one_thread, run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
+from fdi_torch.jobs.python_results import FreeRun, GapResult, MonitorResult, RefitResult
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
-from fdi_torch.parameters import display_in, quantity_text
+from fdi_torch.parameters import display_in
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.report.fit_figure import fit_figure
-from fdi_torch.report.style import notebook_svg
-from fdi_torch.tables import Shown, Table
 
 Tell = Callable[[float, str], None]
 AnyPlant = PlantDescription | str | Path
@@ -100,40 +95,6 @@ def train(
     return train_job.train(run, tell, resume, listener)
 
 
-@dataclass(frozen=True, repr=False)
-class GapResult(Shown):
-    """answer: verdict, causes, explanations and closure. log: the MCAP log, for `report` and `fdi replay`."""
-
-    answer: Answer
-    plant: PlantDescription
-    log: Path
-
-    @property
-    def headline(self) -> str:
-        return verdict_sentence(self.answer.to_dict())
-
-    def table(self) -> Table:
-        """One row per parameter of each cause, SI; without a cause, the explanations and their probabilities."""
-        rows = [
-            (cause_words({"effect": c.effect, "location": c.location}), name, a.value, a.std, a.unit)
-            for c in self.answer.causes
-            for name, a in c.parameters.items()
-        ]
-        return (
-            Table.of_rows(("cause", "parameter", "value", "std error", "unit"), rows) if rows else self.explanations()
-        )
-
-    def explanations(self) -> Table:
-        """All explanations with their posterior probabilities, likeliest first."""
-        posterior = self.answer.to_dict()["posterior"]
-        rows = [(explanation_words(e["causes"]), e["probability"]) for e in posterior]
-        return Table.of_rows(("explanation", "probability"), rows)
-
-    def adopted(self, constants: bool = False) -> PlantDescription:
-        """The plant with the causes added as effects. constants: also use the constants fitted together with them."""
-        return adopted(self.plant, self.answer, constants)
-
-
 def gap(
     plant: AnyPlant,
     recordings: AnyRecording | Sequence[AnyRecording],
@@ -160,31 +121,6 @@ def gap(
     return GapResult(answer, plant, log)
 
 
-@dataclass(frozen=True, repr=False)
-class MonitorResult(Shown):
-    """events: in order of time. lasted: duration of the recording, s. spent: computing time, s."""
-
-    events: tuple[Event, ...]
-    lasted: float
-    spent: float
-    log: Path
-
-    @property
-    def headline(self) -> str:
-        alarms = sum(event.kind == "alarm" for event in self.events)
-        count = "no alarm" if not alarms else "1 alarm" if alarms == 1 else f"{alarms} alarms"
-        isolated = [event for event in self.events if event.kind in ("isolated", "revised")]
-        return f"{count} in {self.lasted:g} s" + (f"; {isolated[-1].headline}" if isolated else "")
-
-    def table(self) -> Table:
-        """One row per event; sizes in the units of the column `units`."""
-        names = ("time", "kind", "alarm", "text", "headline", "faults", "sizes", "stds", "units", "onset", "onset_std")
-        return Table({name: [getattr(event, name) for event in self.events] for name in names})
-
-    def brief(self) -> Table:
-        return Table.of_rows(("time, s", "event", "text"), [(e.time, e.kind, e.text) for e in self.events])
-
-
 def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = silent) -> MonitorResult:
     """Run a monitor along a recording, as `fdi monitor` does.
 
@@ -197,35 +133,6 @@ def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = si
     events: list[Event] = []
     summary = run_monitor(run, MonitorCallbacks(tell, events.append, lambda prepared: None))
     return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
-
-
-@dataclass(frozen=True, repr=False)
-class FreeRun(Shown):
-    """Free run of a plant along a recording, from initial levels estimated from the first samples."""
-
-    plant: PlantDescription
-    recording: Recording
-    prediction: Prediction
-
-    @property
-    def headline(self) -> str:
-        return f"free run of {self.plant.name} along {self.recording.source}"
-
-    def table(self) -> Table:
-        """One row per sensor: root mean square error, SI."""
-        rows = [(s.name, self.prediction.rmse[s.name], s.unit) for s in self.plant.sensors]
-        return Table.of_rows(("sensor", "RMSE", "unit"), rows)
-
-    def picture(self) -> str:
-        """Measured and predicted readings, as SVG."""
-        columns = [sensor.column for sensor in self.plant.sensors]
-        figure = fit_figure(self.recording, {self.plant.name: self.prediction.readings}, self.headline, columns)
-        return notebook_svg(figure, "free-run", self.headline)
-
-    def to_xarray(self) -> Any:
-        """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
-        columns = [sensor.column for sensor in self.plant.sensors]
-        return self.recording.selected((), columns).compared(self.prediction.readings)
 
 
 def predict(
@@ -253,30 +160,6 @@ def predict(
     with one_thread():
         prediction = run_freely(plant, parts[0], start_samples, step, settle, vary)
     return FreeRun(plant, parts[0], prediction)
-
-
-@dataclass(frozen=True, repr=False)
-class RefitResult(Shown):
-    """plant: the plant with fitted constants and effects. fit: errors, values and standard errors, SI."""
-
-    fit: Refit
-
-    @property
-    def plant(self) -> PlantDescription:
-        return self.fit.plant
-
-    @property
-    def headline(self) -> str:
-        errors = ", ".join(f"{s.name} {quantity_text(self.fit.rmse[s.name], s.unit)}" for s in self.plant.sensors)
-        return f"refit of {self.plant.name}: root mean square error {errors}"
-
-    def table(self) -> Table:
-        """One row per value that all recordings share, SI."""
-        return Table.of_rows(("parameter", "value", "std error"), [(n, *pair) for n, pair in self.fit.fitted.items()])
-
-    def narrowed(self) -> PlantDescription:
-        """The plant with the standard errors of the fit as tolerances where these are smaller."""
-        return self.fit.narrowed()
 
 
 def refit(

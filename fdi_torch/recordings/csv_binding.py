@@ -11,9 +11,10 @@ from math import isnan
 from pathlib import Path
 
 from fdi_torch.names import shortened
-from fdi_torch.parameters import header_unit, si_unit_of, unit_factor
+from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
 from fdi_torch.recordings.csv_text import Heading
+from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.source import ChannelSource, ClockSource
 from fdi_torch.recordings.time_stamps import stamp_reader
 from fdi_torch.units import spelled
