@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def show(done: TrainResult, screen: Screen) -> None:
     """Print the estimate as a table with units, the diagnosis, and the paths of log and pictures.
 
-    A model that does not explain the recording is said before anything else.
+    If the model does not explain the recording, that comes first.
     """
     final, diagnosis = done.result.estimate, done.result.diagnosis
     if diagnosis.warning:
