@@ -31,10 +31,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "fdi_torch.estimate.profile": ("Profile", "profile_likelihood"),
     "fdi_torch.estimate.levenberg_marquardt": ("levenberg_marquardt",),
     "fdi_torch.jobs.fmu_export": ("export_fmu",),
-    "fdi_torch.jobs.python_functions": (
-        *("FreeRun", "GapResult", "MonitorResult"),
-        *("gap", "monitor", "predict", "simulate", "study", "train"),
-    ),
+    "fdi_torch.jobs.python_functions": (*("gap", "monitor", "predict", "refit", "simulate", "study", "train"),),
+    "fdi_torch.jobs.python_results": ("FreeRun", "GapResult", "MonitorResult", "RefitResult"),
     "fdi_torch.jobs.report": ("Report", "report"),
     "fdi_torch.jobs.run_setup": ("simulate_recording",),
     "fdi_torch.jobs.study": ("StudyResult",),
@@ -57,7 +55,12 @@ __all__ = sorted(_HOME_OF)
 
 
 class _CallableModule(ModuleType):
-    """A subpackage that can be called like the public function of the same name."""
+    # A subpackage that can be called like the public function of the same name.
+
+    @property
+    def __doc__(self) -> str | None:  # type: ignore[override]
+        """The function's documentation, for `help` in a notebook."""
+        return self.__wrapped__.__doc__
 
     @property
     def __wrapped__(self) -> Callable[..., Any]:

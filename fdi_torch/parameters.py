@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.names import shortened, unknown
-from fdi_torch.units import MOST_CHARACTERS, UnitError, factor, in_unit, number_and_unit, same_kind
+from fdi_torch.units import UnitError, factor, in_unit, number_and_unit, same_kind
 
 SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
 
@@ -141,6 +141,12 @@ class ParameterSpace:
         if len(self._index) < len(self.parameters):
             doubled = [p.name for i, p in enumerate(self.parameters) if self._index[p.name] != i]
             raise ValueError(f"expected each parameter once, got {doubled[0]} twice; remove one")
+
+    def __repr__(self) -> str:
+        units = ["" if p.unit == "1" else f" {p.unit}" for p in self]
+        return "\n".join(
+            f"{p.name} = {p.nominal:g}, {p.low:g} to {p.high:g}{u}" for p, u in zip(self, units, strict=True)
+        )
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -282,31 +288,6 @@ def _in_chosen_unit(si_unit: str, chosen: Mapping[str, str]) -> str:
     if divided and (quantity in _DEFAULT_UNITS or by in _DEFAULT_UNITS):
         return f"{_in_chosen_unit(quantity, chosen)}/{_in_chosen_unit(by, chosen)}"
     return si_unit
-
-
-@lru_cache(maxsize=1024)
-def header_unit(header: str) -> tuple[str, str] | None:
-    """Split a CSV header of the form name_unit, name [unit] or name (unit): 'Q1_cm3_s' -> ('Q1', 'cm3_s'); None without
-    a unit.
-
-    The shortest name followed by a unit wins: `qL_cmd_lps` is (`qL_cmd`, `lps`), `Q1_cm3_s` is (`Q1`, `cm3_s`).
-    `tank_A` is a name without unit: write amperes as mA, or in brackets.
-    """
-    cuts = [i for i in range(max(0, len(header) - MOST_CHARACTERS - 1), len(header)) if header[i] == "_"]
-    splits = [(header[:i], header[i + 1 :]) for i in cuts if header[i + 1 :] != "A"]
-    for name, unit in [bracketed] if (bracketed := _bracketed(header)) else splits:
-        try:
-            si_unit_of(unit)
-        except ValueError:
-            continue
-        return name, unit
-    return None
-
-
-def _bracketed(header: str) -> tuple[str, str] | None:
-    opening = {"]": "[", ")": "("}.get(header[-1:])
-    place = header.rfind(opening) if opening else -1
-    return (header[:place].rstrip(" \t_"), header[place + 1 : -1].strip()) if place > 0 else None
 
 
 _DEFAULT_UNITS = {"m": "cm", "m^2": "cm^2", "m^3": "cm^3", "m^3/s": "cm^3/s", "Pa": "mbar", "A": "mA"}

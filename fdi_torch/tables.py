@@ -63,12 +63,16 @@ class Shown:
         """The numbers behind the headline, in SI unless a column names another unit."""
         raise NotImplementedError
 
+    def brief(self) -> Table:
+        """The part of the table that is printed."""
+        return self.table()
+
     def __repr__(self) -> str:
-        return f"{type(self).__name__}: {self.headline}\n{self.table().text()}".rstrip()
+        return f"{type(self).__name__}: {self.headline}\n{self.brief().text()}".rstrip()
 
     def _repr_html_(self) -> str:
         """Headline, table and picture for notebooks."""
-        return f"<div><p><b>{escape(self.headline)}</b></p>{self.table().html()}{self.picture()}</div>"
+        return f"<div><p><b>{escape(self.headline)}</b></p>{self.brief().html()}{self.picture()}</div>"
 
     def picture(self) -> str:
         """The picture below the table as HTML; empty if there is none."""

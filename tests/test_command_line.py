@@ -114,6 +114,37 @@ def test_check_shows_channels_and_findings(rig: str, capsys: pytest.CaptureFixtu
     assert "h1       output  cm          40" in shown
 
 
+def test_a_file_with_other_names_is_refused_with_the_lines_that_map_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rig.csv").write_text(CSV.replace("Q1_cm3_s", "FIC-1 (cm^3/s)").replace("h2_cm", "LT-2"))
+    assert cli.main(["check", "rig.csv", "--plant", "three_tank"]) == cli.MISUSE
+    refused = capsys.readouterr().err
+    assert "expected a column for Q1, h2, got t_s, FIC-1 (cm^3/s), " in refused
+    lines = refused[refused.index("recordings:") :]
+    Path("runs.yaml").write_text(
+        lines.replace("Q1: {column: ..., unit: ...}", "Q1: {column: FIC-1}").replace(
+            "h2: {column: ..., unit: ...}", "h2: {column: LT-2, unit: cm}"
+        )
+    )
+    assert cli.main(["check", "runs.yaml", "--plant", "three_tank"]) == cli.DONE
+    assert "50 samples, 49 s" in capsys.readouterr().out
+
+
+def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["train", "leak.yaml"])
+    assert "unrecognized argument: leak.yaml; name a file by its option: --config leak.yaml" in capsys.readouterr().err
+
+
+def test_check_states_the_volume_and_the_emptying_time_of_each_tank(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", "--plant", "three_tank"]) == cli.DONE
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    # Torricelli: 2 A sqrt(H) / (C_d a sqrt(2 g)) = 2 * 0.016 / (0.6 * 0.6e-4 * sqrt(2 * 9.81)) = 200.7 s
+    assert ["T1", "160", "100", "16", "201"] in rows
+
+
 def test_check_as_json_prints_nothing_else(rig: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", rig, "--plant", "three_tank", "--json"]) == cli.DONE
     answer = json.loads(capsys.readouterr().out)
@@ -134,7 +165,6 @@ def test_check_of_a_run_file_says_what_is_usable(tmp_path: Path, capsys: pytest.
         (["RIG"], "fdi check: expected --plant, a recording and --plant, or --config; see fdi check --help"),
         (["RIG", "--plant", "three_tonk"], "got 'three_tonk'; the nearest is 'three_tank'"),
         (["gone.csv", "--plant", "three_tank"], "fdi check: gone.csv: expected a file, got none there"),
-        (["RIG", "--plant", "dts200"], "expected a column for qL_cmd"),
         (["--config", "gone.yaml"], "fdi check: gone.yaml: expected a file, got none there"),
         (["--config", "CONFIG"], "fdi check: expected recordings in the run file, got a simulation"),
     ],

@@ -119,7 +119,9 @@ def test_a_file_without_a_header_is_told_how_to_be_read(tmp_path: Path, row: str
         read_csv(path, ("Q1",), ("h1",))
 
 
-@pytest.mark.parametrize("above", ["", "t [s] || flow [ml.s^-1] || level [cm]\r\n", "Zeit\tFluss\tStand\n"])
+@pytest.mark.parametrize(
+    "above", ["", "t [s] || flow [ml.s^-1] || level [cm]\r\n", "Zeit\tFluss\tStand\n", "Lab\t24.11.2026\n"]
+)
 def test_titles_above_a_file_without_a_header_are_skipped(tmp_path: Path, above: str) -> None:
     path = tmp_path / "lab.txt"
     path.write_text(above + "0,0E+0\t1,5\t294\n5,0E+0\t1,5\t295\n")

@@ -18,7 +18,7 @@ from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.jobs.gap import run_gap
-from fdi_torch.jobs.gap_replay import settings_of
+from fdi_torch.jobs.replay import settings_of
 from fdi_torch.logbook import own_signals, read_run, series
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.recordings.csv_writing import write_csv

@@ -45,6 +45,15 @@ def test_the_terminal_prints_the_unknown_and_the_named_causes(capsys: pytest.Cap
     assert ["Q1", "97.0", "%"] in rows and not any(row[:1] == ["P13"] for row in rows)
 
 
+def test_constants_that_stay_out_of_their_tolerances_are_to_be_calibrated_first() -> None:
+    beyond = {"nominal": 0.6, "tolerance": 0.02, "recalibrated": 0.66, "augmented": 0.66, "std": 0.001, "unit": "1"}
+    absorbed = {**beyond, "augmented": 0.61}  # back within its tolerance with the causes
+    answer = replace(BOTH, constants={"P13.discharge_coefficient": beyond, "OUT2.discharge_coefficient": absorbed})
+    first = next_steps(answer, False, None, None, None)[0]
+    assert "P13.discharge_coefficient is more than 2 tolerances off: calibrate" in first and "OUT2" not in first
+    assert "calibrate" not in " ".join(next_steps(BOTH, False, None, None, None))
+
+
 def test_an_ambiguous_verdict_states_which_causes_are_certain() -> None:
     sets = [(("leak", "T1"), ODD), (("leak", "T1"),)]
     posterior = [ProbableExplanation((("leak", "T1"),), 0.6, "Q1"), ProbableExplanation((("leak", "T1"),), 0.39)]

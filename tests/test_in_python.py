@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -154,9 +155,12 @@ def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path) -> None:
     assert abs(estimate_of - 0.3) < 4.0 * error_of < 0.2
     assert found.headline.startswith("single fault: A.leak.size = 0.") and "A.leak.size" in repr(found)
     assert "<table>" in found._repr_html_()
+    # 200 cm^2 x 60 cm are 12 l, which leave in 2 A sqrt(H) / (0.6 * 0.5e-4 * sqrt(2 g)) = 233.17 s
+    assert "<td>A</td><td>12</td><td>233.1" in RIG._repr_html_()
     for html in (found._repr_html_(), RIG._repr_html_(), fdi_torch.predict(RIG, recording)._repr_html_()):
         assert "<svg" in html and "var(--" not in html  # a notebook does not define the variables of our pages
         assert "max-width" in html
+    assert re.search(r"mcap: train, started 20.*, completed$", repr(fdi_torch.read_run(found.log)))
     page = fdi_torch.report(found.log)
     assert page.page.read_text().count("one tank") and "leak at A" in page.table().columns["says"][0]
 
@@ -185,6 +189,7 @@ def test_a_monitor_runs_along_a_recording_in_memory(tmp_path: Path) -> None:
     table = found.table().columns
     kinds = [kind for kind in table["kind"] if kind not in ("notice", "watching")]
     assert kinds[:2] == ["alarm", "isolated"]
+    assert "isolated" in repr(found) and "stds" not in repr(found)
     isolated = table["kind"].index("isolated")
     assert table["onset"][isolated] == pytest.approx(400.0, abs=3.0) and table["units"][isolated] == ("1",)
 
@@ -204,6 +209,37 @@ def test_arguments_of_another_kind_are_named() -> None:
         fdi_torch.ConfigError, match=r"inputs.Q: expected a value such as .* or \{steps: .*got \[3, 4\]"
     ):
         fdi_torch.simulate(RIG, inputs={"Q": [3, 4]})
+    with pytest.raises(fdi_torch.ConfigError, match=r"simulate.noise: expected \{std: .*, got 1 mm"):
+        fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, noise="1 mm")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"start level of A: expected equilibrium, free or a level in m, got 'eq'"):
+        fdi_torch.set_up(RIG, [simulated()], ["A.leak"], "eq")  # type: ignore[arg-type]
+    frame: Any = {1, 2}
+    for function in (fdi_torch.gap, fdi_torch.predict):
+        with pytest.raises(fdi_torch.ConfigError, match=r"expected a file name, .*fdi_torch.read_frame\), got a set"):
+            function(RIG, frame)  # type: ignore[operator]
+    with pytest.raises(fdi_torch.ConfigError, match=r"train: recordings.0: expected a file name, .* got a set"):
+        fdi_torch.train({"plant": RIG, "recordings": [frame], "estimate": {"parameters": ["A.leak"]}})
+
+
+def test_constant_inputs_of_the_differential_equation_are_a_tensor_or_numbers() -> None:
+    level = torch.tensor([0.2], dtype=torch.float64)
+    by_tensor, by_list = (RIG.ode(u)(level[0], level) for u in (torch.tensor([5e-5], dtype=torch.float64), [5e-5]))
+    outflow = 0.6 * 0.5e-4 * (2.0 * 9.81 * 0.2) ** 0.5
+    assert torch.equal(by_tensor, by_list) and float(by_list) == pytest.approx((5e-5 - outflow) / 0.02)
+    with pytest.raises(ValueError, match=r"expected inputs of Q, got a tensor of shape \(2,\)"):
+        RIG.ode([1.0, 2.0])
+
+
+def test_a_calibration_in_python_recovers_the_constant_and_narrows_its_tolerance() -> None:
+    true = replace(RIG, pipes=(Pipe("drain", "A", "outside", area="0.5 cm^2", discharge_coefficient=0.65),))
+    recording = fdi_torch.simulate(true, inputs=STEPS, duration="300 s", noise={"std": {"h": "1 mm"}}, seed=3)
+    wide = replace(RIG, tolerances={"drain.discharge_coefficient": 0.3})
+    found = fdi_torch.refit(wide, recording)
+    value, error = found.fit.fitted["drain.discharge_coefficient"]
+    assert abs(value - 0.65) < 4.0 * error < 0.01 and found.plant.pipes[0].discharge_coefficient == value
+    assert found.plant.tolerances == wide.tolerances
+    assert found.narrowed().tolerances["drain.discharge_coefficient"] == pytest.approx(error / value, rel=0.05)
+    assert "mean square error h 0.09" in found.headline and "discharge_coefficient" in repr(found)
 
 
 def test_an_effect_without_a_field_means_its_size() -> None:
@@ -255,6 +291,11 @@ def test_a_data_frame_follows_the_rules_of_files() -> None:
 def test_a_file_is_read_by_its_name(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("t_s,Q_cm3_s,h_cm\n0,50,10\n1,50,11\n")
     assert fdi_torch.read_recording(str(tmp_path / "run.csv"), RIG).outputs[:, 0].tolist() == [0.1, 0.11]
+    (tmp_path / "other.csv").write_text("t_s,Q_cm3_s,LT1\n0,50,10\n1,50,11\n")
+    entry = {"file": str(tmp_path / "other.csv"), "columns": {"h": {"column": "LT1", "unit": "cm"}}}
+    assert fdi_torch.read_recording(entry, RIG).outputs[:, 0].tolist() == [0.1, 0.11]
+    with pytest.raises(fdi_torch.ConfigError, match=r"recording: expected a known key .* the nearest is 'columns'"):
+        fdi_torch.read_recording({**entry, "colums": {}}, RIG)
 
 
 def test_trajectories_become_labelled_arrays() -> None:

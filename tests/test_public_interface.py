@@ -38,6 +38,7 @@ from fdi_torch import effects, gap, simulate
 import fdi_torch
 import fdi_torch.gap.answer as answer
 assert "recordings" in inspect.signature(gap).parameters and fdi_torch.gap is gap
+assert "holdouts" in gap.__doc__
 assert len(effects()) == len(effects.EFFECTS) and fdi_torch.gap.answer is answer
 assert fdi_torch.simulate.experiment.Experiment
 """

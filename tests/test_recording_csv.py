@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from fdi_torch.parameters import header_unit, si_unit_of, unit_factor
+from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv
+from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.source import ChannelSource
 
 GOOD = "t_s,Q1_cm3_s,h1_cm\n0,50,10\n1,50,11\n2,60,12\n"
@@ -125,6 +126,13 @@ def test_blank_lines_comments_and_quotes_are_passed_over(tmp_path: Path) -> None
 def test_what_is_wrong_with_a_file_is_said_with_row_and_column(tmp_path: Path, text: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         read(tmp_path, text)
+
+
+def test_a_mapped_unit_that_contradicts_the_header_is_used_and_reported(tmp_path: Path) -> None:
+    recording = read(tmp_path, GOOD, h1=ChannelSource("h1_cm", "mm"))
+    assert recording.notes == ("run.csv: h1_cm: read in mm as mapped, although its header says cm",)
+    assert recording.outputs[0, 0] == pytest.approx(0.1 * float(read(tmp_path, GOOD).outputs[0, 0]))
+    assert read(tmp_path, GOOD, h1=ChannelSource("h1_cm", "cm")).notes == ()
 
 
 def test_a_unit_of_the_wrong_kind_is_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,6 +44,31 @@ def test_a_refit_adopts_the_effect_and_predicts_each_file_by_the_other(
     assert [Path(trial["source"]).name for trial in shown["leave_one_file_out"]] == ["day3.csv", "day5.csv"]
     for trial in shown["leave_one_file_out"]:
         assert sum(trial["refitted"].values()) < sum(trial["as_is"].values())
+
+
+def test_a_calibration_reports_how_far_constants_moved_and_writes_what_was_learnt_as_tolerances(
+    tmp_path: Path, rig: PlantDescription, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    gain = replace(next(p for p in rig.pumps if p.name == "Q2"), gain=0.085)  # its range ends at 0.85, below 0.9
+    wrong = replace(rig, effects=(), pumps=(rig.pumps[0], gain), tolerances={"Q2.gain": 1.0, "T1.area": 1e-6})
+    (tmp_path / "wrong.yaml").write_text(dump_plant(wrong))
+    words = ["refit", "--plant", "wrong.yaml", "--recording", "runs.yaml", "--adopt", "out.yaml", "--quiet"]
+    assert cli.main(words) == cli.DONE
+    shown = capsys.readouterr().out
+    assert "Q2.gain lies at the high end of its range" in shown and "next: out.yaml keeps the tolerances" in shown
+    assert load_plant(tmp_path / "out.yaml").tolerances == wrong.tolerances
+
+    right = replace(wrong, pumps=rig.pumps, tolerances={"Q2.gain": 0.03, "T1.area": 1e-6})
+    (tmp_path / "wrong.yaml").write_text(dump_plant(right))
+    assert cli.main([*words, "--narrow"]) == cli.DONE
+    shown = capsys.readouterr().out
+    assert "constants fitted  unit" in shown and "effects" not in shown
+    assert re.search(r"- Q2\.gain lies 3\.\d tolerances from its value in the plant file", shown)
+    narrowed = load_plant(tmp_path / "out.yaml").tolerances
+    assert 0.0 < narrowed["Q2.gain"] < 0.01 and narrowed["T1.area"] <= 1e-6
+    gain_found = next(p.gain for p in load_plant(tmp_path / "out.yaml").pumps if p.name == "Q2")
+    assert abs(gain_found - 0.9) < 4.0 * 0.9 * narrowed["Q2.gain"]
 
 
 def test_held_values_stay(

@@ -66,7 +66,7 @@ EQUATIONS = (
 )  # fmt: skip
 
 STATEMENTS = (
-    ("Definitions 1–3", "which faults can be seen, told apart and sized; from computed signatures and from structure",
+    ("Definitions 1–3", "which faults can be detected, isolated and sized; from computed signatures and from structure",
      ("monitor.diagnosability:diagnosability", "monitor.structural_analysis:structure_of")),
     ("Theorem 1", "what must hold for that, and what correlation alone never sees",
      ("monitor.diagnosability:diagnosability", "monitor.diagnosability:without_gain_and_offset")),

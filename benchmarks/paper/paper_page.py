@@ -146,7 +146,7 @@ own; *bound* is the Cramér-Rao bound at the truth, the least that any unbiased 
 
 Largest error of the refined estimates: {worst}; of the search alone: {searched}. Without noise a standard error only
 reflects integration and rounding errors; the bound says what noise of 50 dB would cost. The search takes steps of 1 s;
-where the faults bring tanks 2 and 3 to nearly equal levels (3- to 5-dim), that step's error is what is left of its own.
+where the faults bring tanks 2 and 3 to nearly equal levels (3- to 5-dim), the remaining error is that of these steps.
 
 {table_2}
 
@@ -193,7 +193,7 @@ against the variance are undefined there, and the residual alone decides. {alarm
 ![residuals](figure_7.png)
 
 Dashed: a fault sets in. Grey: nominal parameters throughout. Blue: the newest parameters go back at the end of each
-window, so that the residual begins at zero again at 2000 s, where the next fault sets in. Green: what is left after the
+window, so that the residual begins at zero again at 2000 s, where the next fault sets in. Green: the residual after the
 fit of each window, known at its end.
 
 ## All 31 fault modes

@@ -25,7 +25,7 @@ LEAST, MOST = 0.3, 3.0
 @dataclass(frozen=True)
 class Disturbance:
     """time: s for which a value is held (white: 1, held), or the correlation time (slow). intensities (N,): of each
-    tank, relative to each other. ratio: the root mean square of what the levels move by, over the sensors' noise.
+    tank, relative to each other. ratio: root mean square change of the levels, over the sensors' noise.
     """
 
     kind: str

@@ -36,9 +36,9 @@ _DECIMALS_OF_LEVEL = 3
 
 
 def as_csv(rig: Rig, commands: Array, readings: Array, seal: str) -> str:
-    """The recording in the rig's own size and pace. seal: the key's.
+    """The recording, rescaled to the rig's own lengths and times. seal: hash of the case's sealed key.
 
-    commands (T, C) in the header's unit, readings (T, S) as levels in m: on the bench, and a second apart there.
+    commands (T, C) in the header's unit, readings (T, S) as levels in m, both of the simulated rig, one per second.
     """
     header, columns, places = ["t_s"], [np.arange(len(commands)) * rig.scales.time], [decimals(0, rig.scales.time)]
     for i, channel in enumerate(rig.plant.channels()):
@@ -133,7 +133,7 @@ def _expect_unchanged(line: Mapping[str, Any], part: str, actual: str) -> None:
     if actual != line[part]:
         raise ValueError(
             f"{line['case']}: expected a {part} of SHA-256 {line[part][:12]}..., got {actual[:12]}...; "
-            "it was changed after it was sealed: make the benchmark anew"
+            "it was changed after it was sealed: repeat `fdi challenge`"
         )
 
 
@@ -153,11 +153,11 @@ def open_key(out: Path) -> dict[str, dict[str, Any]]:
     keys = {line["case"]: line for line in lines_of(out / "key.jsonl")}
     for case, line in manifest(out).items():
         if case not in keys:
-            raise ValueError(f"{case}: expected a sealed key, got none; make the benchmark anew")
+            raise ValueError(f"{case}: expected a sealed key, got none; repeat `fdi challenge`")
         actual = digest(sealed_line(keys[case]))
         if actual != line["key"]:
             raise ValueError(
                 f"{case}: expected a key of SHA-256 {line['key'][:12]}..., got {actual[:12]}...; "
-                "it was changed after it was sealed: make the benchmark anew"
+                "it was changed after it was sealed: repeat `fdi challenge`"
             )
     return keys

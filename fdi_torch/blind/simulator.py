@@ -206,10 +206,10 @@ def _no_command(delay: Array) -> Array:
 
 @dataclass(frozen=True)
 class Drive:
-    """What one rig is driven with. asked (T, M): flow asked of each pump, m^3/s, held over the second that follows.
+    """The inputs of one simulated rig. asked (T, M): commanded flow of each pump, m^3/s, held for the next second.
 
-    start (N,) m. disturbance (T, N): random flow into each tank, m^3/s, held likewise. control: of one level, by one
-    pump; error (T,) m: what its reading is off.
+    start (N,): initial levels, m. disturbance (T, N): random flow into each tank, m^3/s, held likewise. control: a
+    controller of one level by one pump; error (T,): the error of its level measurement, m.
     """
 
     asked: Array

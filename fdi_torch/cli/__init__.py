@@ -16,6 +16,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from contextvars import copy_context
+from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
@@ -130,8 +131,8 @@ def _carried_out(name: str, words: list[str]) -> int:
     except (ValueError, OSError) as error:
         if arguments.traceback:
             raise
-        for line in str(error).splitlines():
-            screen.complain(f"fdi {name}: {line}")
+        for problem in getattr(error, "problems", [str(error)]):
+            screen.complain(f"fdi {name}: {problem}")
         return MISUSE
     except (MemoryError, RuntimeError) as error:
         sentence = _resource_problem(error)
@@ -161,8 +162,19 @@ def _say_that_it_began(name: str, quiet: bool) -> None:
             sys.stderr.flush()
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that names the option for a file without one."""
+
+    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
+        known, others = super().parse_known_args(args, namespace)
+        for option in ("--config", "--recording"):
+            if others and Path(others[0]).suffix and option in self._option_string_actions:
+                self.error(f"unrecognized argument: {others[0]}; name a file by its option: {option} {others[0]}")
+        return known, others
+
+
 def _parser(name: str, options: ModuleType) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=f"fdi {name}",
         description=options.__doc__,
         epilog=options.EXAMPLES,

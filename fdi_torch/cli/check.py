@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import replace
 from pathlib import Path
 
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
+from fdi_torch.config.loaded_recordings import known_segments_of, listed_recordings, read_recording
 from fdi_torch.config.plant_file import chosen_plant
-from fdi_torch.config.recording_config import RecordingConfig, config_of
+from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.preprocess.acquisition import examined
 from fdi_torch.parameters import display_unit
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
+from fdi_torch.plant.scales import emptying_time
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.check import ChannelSummary, RecordingCheck, check_recording
@@ -44,13 +46,17 @@ def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
     """The check of a recording, with refused or masked channels first."""
     check = check_recording(whole, plant)
     examinations = [examined(plant, part) for part in whole.known_segments()]
-    problems = [ChannelFinding("slip", ", ".join(e.fault.channels), e.fault.text) for e in examinations if e.fault]
+    problems = [_slip(", ".join(e.fault.channels), e.fault.text) for e in examinations if e.fault]
     problems += [
         ChannelFinding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})
         for e in examinations
         for s in e.stuck
     ]
     return replace(check, findings=(*problems, *check.findings))
+
+
+def _slip(channels: str, text: str) -> ChannelFinding:
+    return ChannelFinding("slip", channels, text.removeprefix(f"{channels}: "))
 
 
 def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[RecordingConfig], Path]:
@@ -61,8 +67,10 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
         return run_file.plant, run_file.config.recordings, run_file.base
     if arguments.plant is None:
         raise ValueError("expected --plant, a recording and --plant, or --config; see fdi check --help")
-    named = [] if arguments.recording is None else [config_of(arguments.recording)]
-    return chosen_plant(arguments.plant), named, Path.cwd()
+    plant, folder = chosen_plant(arguments.plant), Path.cwd()
+    return plant, *(
+        ([], folder) if arguments.recording is None else listed_recordings(arguments.recording, plant, folder)
+    )
 
 
 def _show_plant(plant: PlantDescription, screen: Screen) -> None:
@@ -71,6 +79,14 @@ def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     counts = [(plant.tanks, "tank"), *flows, (plant.sensors, "sensor")]
     parts = ", ".join(_count(len(c), what) for c, what in counts if c or any(c is a for a in always))
     screen.say(f"plant {plant.name}: {parts}, {_count(len(plant.tolerances), 'constant')} with a tolerance")
+    (area, per_area), (height, per_height) = display_unit("m^2"), display_unit("m")
+    rows = []
+    for tank in plant.tanks:
+        sizes = (per_area * tank.area, per_height * tank.height, 1e3 * tank.area * tank.height)
+        time = emptying_time(plant, tank)
+        rows.append([tank.name, *(f"{size:.4g}" for size in sizes), f"{time:.3g}" if math.isfinite(time) else "never"])
+    header = ("tank", f"area, {area}", f"height, {height}", "volume, l", "empties from full in, s")
+    screen.table("", header, rows)
 
 
 def _count(number: int, what: str) -> str:

@@ -14,7 +14,7 @@ from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.effects import full_name
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
 from fdi_torch.monitor.monitor_setup import usual_faults
-from fdi_torch.parameters import parse_quantity
+from fdi_torch.parameters import ParameterName, display_unit, parse_quantity
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
@@ -25,16 +25,17 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     named = [full_name(name.strip(), plant) for name in (arguments.faults or "").split(",") if name.strip()]
     faults = named or usual_faults(plant)
     recording, constant = _inputs(arguments, plant)
+    uncertain = [n for n in plant.tolerances if n not in faults and ParameterName.parse(n).field != "start_level"]
     report = diagnosability(
         plant,
         faults,
         recording,
         torch.tensor(reading_noise(arguments.noise, plant), dtype=torch.float64),
-        calibrate=[name for name in arguments.calibrate.split(",") if name],
+        calibrate=uncertain,
         start="equilibrium" if constant else "free",
-        false_alarm=arguments.false_alarm,
-        miss=arguments.miss,
     )
+    if uncertain:
+        screen.say(f"uncertain within their tolerances: {', '.join(uncertain)}")
     _show(report, screen)
     screen.result({"format": "fdi_torch.diagnosability/1", **report.to_dict()})
     return 0
@@ -64,14 +65,14 @@ def _show(report: Diagnosability, screen: Screen) -> None:
     screen.say(f"{report.rank} of {len(report.faults)} faults (or combinations) are determined together")
     header = ("fault", "unit", "std, all together", "by correlation", "smallest detectable", "smallest isolable")
     columns = (report.std, report.std_by_correlation, report.smallest_detectable, report.smallest_isolable)
-    rows = [
-        [name, unit or "1", *(f"{value:.3g}" for value in numbers)]
-        for name, unit, *numbers in zip(report.faults, report.units, *columns, strict=True)
-    ]
+    rows = []
+    for name, si_unit, *values in zip(report.faults, report.units, *columns, strict=True):
+        unit, scale = display_unit(si_unit)
+        rows.append([name, unit or "1", *(f"{scale * value:.3g}" for value in values)])
     screen.table("", header, rows, left=2)
     screen.say()
     shows = [[name, *(f"{v:.3g}" for v in row)] for name, row in zip(report.faults, report.shows, strict=True)]
-    screen.table("effect of a unit of each fault, in noise standard deviations", ("fault", *report.sensors), shows)
+    screen.table("effect of one SI unit of each fault, in noise standard deviations", ("fault", *report.sensors), shows)
     screen.say()
     apart = [[str(i + 1), name, *(f"{v:.2g}" for v in row)] for i, (name, row) in
              enumerate(zip(report.faults, report.apart, strict=True))]  # fmt: skip

@@ -47,6 +47,12 @@ def next_steps(
     not written.
     """
     steps = []
+    moved = [name for name, c in answer.constants.items() if _tolerances_off(c, "augmented") > MOVED]
+    if moved:
+        steps.append(
+            f"next: with the causes too, {', '.join(moved)} is more than {MOVED:g} tolerances off: calibrate the plant "
+            "file with a fault-free recording (fdi refit --adopt), then repeat the diagnosis with the calibrated file"
+        )
     if planned and answer.next_input:
         samples = answer.next_input.get("parted_after_samples")
         when = f"after some {samples} samples" if samples else "in a longer run"
@@ -147,13 +153,18 @@ def _constants(constants: Mapping[str, Any], screen: Screen) -> None:
     """Constants that moved far out of their tolerance."""
     rows = []
     for name, c in constants.items():
-        if max(abs(c[stage] - c["nominal"]) for stage in ("recalibrated", "augmented")) > MOVED * c["tolerance"]:
+        if max(_tolerances_off(c, stage) for stage in ("recalibrated", "augmented")) > MOVED:
             unit, scale = display_unit(c["unit"])
             numbers = [c["nominal"], c["tolerance"], c["recalibrated"], c["augmented"], c["std"]]
             rows.append([name, *(f"{scale * v:.4g}" for v in numbers[:4]), f"{scale * numbers[4]:.2g}", unit])
     if rows:
         header = ("constant", "nominal", "tolerance", "recalibrated", "with the causes", "std error", "unit")
         screen.table(f"constants more than {MOVED:g} tolerances off", header, rows)
+
+
+def _tolerances_off(constant: Mapping[str, Any], stage: str) -> float:
+    """Distance of a constant from its nominal value, in tolerances."""
+    return float(abs(constant[stage] - constant["nominal"]) / constant["tolerance"])
 
 
 def _confusability(impostors: Mapping[str, Any] | None) -> list[str]:

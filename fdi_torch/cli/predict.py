@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import torch
 from fdi_torch.cli import DONE
 from fdi_torch.cli.gap_text import MOVED
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.channels import missing_inputs
+from fdi_torch.config.channels import expect_columns
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
 from fdi_torch.config.plant_file import chosen_plant, load_plant
 from fdi_torch.config.recording_config import RecordingConfig
@@ -22,7 +21,6 @@ from fdi_torch.gap.free_runs.prediction import Prediction, predict
 from fdi_torch.parameters import display_unit, quantity_text
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.csv_files import read_header
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import save
 
@@ -78,7 +76,8 @@ def _recordings(name: str, plant: PlantDescription, arguments: argparse.Namespac
     if Path(name).suffix in (".yaml", ".yml"):
         return named_recordings(name, plant, Path.cwd())
     columns = _constants(arguments, plant)
-    _expect_inputs(name, plant, columns)
+    constants = "if it was constant, add --constant {inputs}=0 (--from and --to select a part); "
+    expect_columns(find_data(name, Path.cwd()), plant, columns, constants)
     config = RecordingConfig.model_validate(
         {
             "file": name,
@@ -114,20 +113,6 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _expect_inputs(name: str, plant: PlantDescription, columns: Collection[str]) -> None:
-    """Raises ValueError with all inputs that a CSV file lacks, and how to supply them."""
-    path = find_data(name, Path.cwd())
-    missing = [c for c in missing_inputs(path, plant) if c not in columns]
-    if missing:
-        constants = " ".join(f"--constant {channel}=0" for channel in missing)
-        mapping = f"recordings: [{{file: {name}, columns: {{{missing[0]}: {{column: ..., unit: ...}}}}}}]"
-        raise ValueError(
-            f"{path}: expected a column for {' and '.join(missing)}, got {', '.join(read_header(path))}; if they were "
-            f"constant, add {constants} (--from and --to select a part); if a column has another name, map it in a "
-            f"YAML file: {mapping}"
-        )
 
 
 def _own_constants(plant: PlantDescription, recording: Recording, prediction: Prediction, screen: Screen) -> None:

@@ -10,6 +10,7 @@ import torch
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.adoption import write_adopted
+from fdi_torch.cli.gap_text import MOVED
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import named_recordings
@@ -39,11 +40,17 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     trials: list[LeftOutRun] = []
     with one_thread():
         fitted = fitted_to(recordings)
-        _show(fitted, screen)
+        _show(fitted, plant, screen)
         _show_run_specific(fitted, screen)
         if arguments.adopt:
-            write_adopted(arguments.plant, plant, fitted.plant, Path(arguments.adopt), screen)
+            adopted = fitted.narrowed() if arguments.narrow else fitted.plant
+            write_adopted(arguments.plant, plant, adopted, Path(arguments.adopt), screen)
             screen.note(f"plant file with the fitted values: {arguments.adopt}")
+            if plant.tolerances and not arguments.narrow:
+                screen.say(
+                    f"- next: {arguments.adopt} keeps the tolerances of {arguments.plant}; --narrow replaces them by "
+                    "the standard errors of this fit, which suits constants that do not drift from day to day"
+                )
         if arguments.leave_one_file_out:
             with screen.progress("leave-one-file-out validation") as advance:
                 trials = leave_one_file_out(
@@ -70,22 +77,31 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     return DONE
 
 
-def _show(result: Refit, screen: Screen) -> None:
+def _show(result: Refit, before: PlantDescription, screen: Screen) -> None:
+    """Print the errors and the fitted values beside those of the plant file `before`."""
+    fits = {"constants fitted": result.before, "constants and effects fitted": result.rmse}
+    if not result.plant.effects:
+        fits = {"constants fitted": result.rmse}
     rows = []
     for sensor in result.plant.sensors:
         unit, scale = display_unit(sensor.unit, sensor.column)
-        rows.append([sensor.name, *(f"{scale * of[sensor.name]:.4g}" for of in (result.before, result.rmse)), unit])
-    screen.table("root mean square error", ("sensor", "constants fitted", "effects too", "unit"), rows)
-    constants = build_network(result.plant).constants
-    rows = []
+        rows.append([sensor.name, *(f"{scale * of[sensor.name]:.4g}" for of in fits.values()), unit])
+    screen.table("root mean square error", ("sensor", *fits, "unit"), rows)
+    constants = build_network(before).constants
+    rows, remarks = [], []
     for name, (value, error) in result.fitted.items():
         unit, scale = display_unit(constants[name].unit)
-        rows.append([name, f"{scale * value:.4g}", f"{scale * error:.2g}", "" if unit == "1" else unit])
-    screen.table("fitted to all recordings", ("parameter", "value", "std error", "unit"), rows)
+        numbers = [f"{scale * constants[name].nominal:.4g}", f"{scale * value:.4g}", f"{scale * error:.2g}"]
+        rows.append([name, *numbers, "" if unit == "1" else unit])
+        far = abs(value - constants[name].nominal) / constants[name].std
+        if far > MOVED:
+            remarks.append(f"{name} lies {far:.2g} tolerances from its value in the plant file")
+    screen.table("fitted to all recordings", ("parameter", "plant file", "fitted", "std error", "unit"), rows)
     screen.say(f"{result.parameters} values fitted, including initial levels")
     values = torch.tensor([value for value, _ in result.fitted.values()], dtype=torch.float64)
-    for name, end in parameters_at_bounds(ParameterSpace([constants[name] for name in result.fitted]), values).items():
-        screen.say(f"- {name} lies at the {end} end of its range")
+    ends = parameters_at_bounds(ParameterSpace([constants[name] for name in result.fitted]), values)
+    for remark in [*remarks, *(f"{name} lies at the {end} end of its range" for name, end in ends.items())]:
+        screen.say(f"- {remark}")
 
 
 def _show_run_specific(result: Refit, screen: Screen) -> None:

@@ -10,6 +10,7 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli import compare as comparing
 from fdi_torch.cli.screen import Screen
 from fdi_torch.logbook import Replay, compare, read_run, replay
+from fdi_torch.logbook.replay import RELATIVE
 
 DIFFERS = 3
 
@@ -27,11 +28,10 @@ def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
         done = replay(
             arguments.log,
             lambda log: repeat_run(log, target, (), arguments.trial, advance),
-            relative=arguments.relative,
             select=comparable(arguments.trial),
         )
         advance(1.0)
-    for line in in_words(done, arguments.relative):
+    for line in in_words(done):
         screen.say(line)
     screen.result({"format": "fdi_torch.replay/1", "replay": done})
     return DIFFERS if done.outcome == "differs" else DONE
@@ -53,11 +53,11 @@ def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
     return DONE
 
 
-def in_words(done: Replay, relative: float) -> list[str]:
+def in_words(done: Replay) -> list[str]:
     """Lines with the outcome and the first difference."""
     lines = [f"{done.outcome}: {done.events} events compared, largest relative difference {done.largest:.3g}"]
     if done.outcome == "within tolerance":
-        lines[0] += f" of {relative:g}"
+        lines[0] += f" of {RELATIVE:g}"
     for title, difference in (("beyond the tolerance", done.first), ("not bit-equal", done.first_inexact)):
         if difference is not None:
             where = f"event {difference.event}, {difference.topic} at {difference.place}, {difference.field}"

@@ -29,6 +29,8 @@ def show(result: StudyResult, screen: Screen) -> None:
         screen.table(heading(summary), HEADER, [_row(score) for score in summary.scores], left=2)
         screen.say(ending(summary))
         screen.say()
+    if single:
+        screen.say(LEGEND)
     if not single:
         header = ("setting", "trials", "failures", "worst error (share of range)")
         screen.table("", header, [_short_row(summary) for summary in result.summaries])
@@ -39,7 +41,14 @@ def show(result: StudyResult, screen: Screen) -> None:
     screen.say(f"log: {result.log} (fdi report {result.log} makes the page)")
 
 
-HEADER = ("estimator", "parameter", "bias", "RMSE", "/ bound", "95 %", "/ linearised", "95 %", "coverage", "95 %")
+HEADER = (
+    *("estimator", "parameter", "bias, SI", "RMSE, SI", "RMSE / bound", "95 %", "RMSE / linearised", "95 %"),
+    *("coverage", "95 %"),
+)
+LEGEND = (
+    "bound: Cramér-Rao bound; linearised: the efficient estimator, which knows the truth; coverage: share of trials "
+    "whose stated 95 % interval contains the truth; 95 %: confidence interval of the number before it"
+)
 
 
 def _row(score: Score) -> list[str]:
@@ -58,7 +67,10 @@ def heading(summary: Summary) -> str:
 
 def ending(summary: Summary) -> str:
     failed = ", ".join(f"{name} {count}" for name, count in summary.failures.items())
-    text = f"failures: {failed}; sum of correlations {summary.rho.value:.6f}"
+    text = (
+        f"trials that ended far from the truth: {failed}; correlation of readings and model, summed over the sensors: "
+    )
+    text += f"{summary.rho.value:.6f}"
     if summary.undetermined:
         text += f"; {summary.undetermined} trials whose readings cannot determine every parameter"
     return text

@@ -37,12 +37,17 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def show(done: TrainResult, screen: Screen) -> None:
     """Print the estimate as a table with units, the diagnosis, and the paths of log and pictures.
 
-    A model that does not explain the recording is said before anything else.
+    If the model does not explain the recording, that comes first.
     """
     final, diagnosis = done.result.estimate, done.result.diagnosis
     if diagnosis.warning:
         screen.say(f"{diagnosis.warning}.")
         screen.say("- next: fdi gap finds where and by which effect the plant file deviates from the recording")
+        network, space = done.fitting.networks[0], done.fitting.space
+        onsets = [f"{place.prefix}.onset" for place in network.placements]
+        onsets = [name for name in onsets if name in network.constants and name not in space]
+        if onsets:
+            screen.say(f"- a fault that begins within the recording: also estimate its onset, such as {onsets[0]}")
         screen.say()
     rows = []
     for i, p in enumerate(done.fitting.space):

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from fdi_torch.config.recording_config import ColumnConfig, FileConfig
 from fdi_torch.config.strict import Amount, quantity
-from fdi_torch.names import unknown
-from fdi_torch.parameters import header_unit
+from fdi_torch.names import shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recordings.csv_files import read_header
+from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.source import ChannelSource, ClockSource
 
 
@@ -108,10 +108,24 @@ def unrecorded_valves(
     return {name: ChannelSource(None, "1", openings[name]) for name in _without_column(path, openings, config)}
 
 
-def missing_inputs(path: Path, plant: PlantDescription) -> list[str]:
-    """The plant's inputs without a column in a CSV file, apart from valves whose opening the plant file states."""
-    with_opening = unrecorded_valves(path, plant)
-    return [name for name in _without_column(path, plant.channels()) if name not in with_opening]
+def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[str] = (), other_fix: str = "") -> None:
+    """Raises ValueError with all channels that have no column in a table, and the YAML file that maps them.
+
+    also_known: channels that need no column. other_fix: a further way to supply inputs, with {inputs}.
+    """
+    known = {*unrecorded_valves(path, plant), *also_known}
+    missing = [name for name in _without_column(path, _units(plant)) if name not in known]
+    if not missing:
+        return
+    inputs = [name for name in missing if name in plant.channels()]
+    found = ", ".join(map(shortened, read_header(path)))
+    columns = "".join(f"\n      {name}: {{column: ..., unit: ...}}" for name in missing)
+    raise ValueError(
+        f"{path}: expected a column for {', '.join(missing)}, got {found}; "
+        f"{other_fix.format(inputs=inputs[0]) if other_fix and inputs else ''}if columns have other names, save these "
+        "lines as runs.yaml with the names completed (units only where the header has none), and name runs.yaml "
+        f"instead:\nrecordings:\n  - file: {path.name}\n    columns:{columns}"
+    )
 
 
 def _without_column(path: Path, names: Collection[str], config: FileConfig | None = None) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from pydantic import ValidationError
 
-from fdi_torch.config.channels import channel_mapping, expect_units, is_log, unrecorded_valves
+from fdi_torch.config.channels import channel_mapping, expect_columns, expect_units, is_log, unrecorded_valves
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.recording_config import FileConfig, RecordingConfig, StartLevel, config_of, in_seconds
 from fdi_torch.config.yaml_files import find_data, find_file, read_extended
@@ -72,21 +72,29 @@ def _unknown(whole: Recording) -> str:
 
 
 def named_recordings(name: str, plant: PlantDescription, base: Path) -> list[Recording]:
-    """The recordings of a command line's argument, in segments with known inputs.
+    """The recordings of a command line's argument (see `listed_recordings`), in segments with known inputs."""
+    configs, folder = listed_recordings(name, plant, base)
+    return [part.recording for part in load_recordings(configs, plant, folder)]
+
+
+def listed_recordings(name: str, plant: PlantDescription, base: Path) -> tuple[list[RecordingConfig], Path]:
+    """The entries of a command line's argument, and the folder of their relative paths.
 
     name: a CSV or MCAP file, or a YAML file with a list under `recordings`, as in a run file.
     """
-    if is_query(name) or Path(name).suffix not in (".yaml", ".yml"):
-        return [part.recording for part in load_recordings([config_of(name)], plant, base)]
+    if is_query(name):
+        return [config_of(name)], base
+    if Path(name).suffix not in (".yaml", ".yml"):
+        expect_columns(find_data(name, base), plant)
+        return [config_of(name)], base
     path = find_file(name, base)
     listed = read_extended(path).get("recordings")
     if not listed:
         raise ConfigError([f"{path}: recordings: expected at least one, got none; list files under it"])
     try:
-        configs = [RecordingConfig.model_validate(entry) for entry in listed]
+        return [RecordingConfig.model_validate(entry) for entry in listed], path.parent
     except ValidationError as error:
         raise explain(error, f"{path}: recordings") from None
-    return [loaded.recording for loaded in load_recordings(configs, plant, path.parent)]
 
 
 def separate_recordings(recordings: Sequence[Any]) -> tuple[list[Any], dict[str, Recording]]:
@@ -103,7 +111,7 @@ def separate_recordings(recordings: Sequence[Any]) -> tuple[list[Any], dict[str,
 
 
 def read_recording(
-    config: RecordingConfig | str | Path,
+    config: RecordingConfig | Mapping[str, Any] | str | Path,
     plant: PlantDescription,
     base: Path | None = None,
     given: Mapping[str, Recording] | None = None,
@@ -111,11 +119,12 @@ def read_recording(
     """The plant's inputs and outputs in a recording, cropped, masked and decimated; unknown inputs are NaN.
 
     From now on its channels are displayed in the units that its file has for them.
-    config: the recording's entry in a run file, or the name of the file. base: folder of relative paths. given:
+    config: the name of the file, or the recording's entry in a run file: {"file": "run.xlsx", "columns": {"h1":
+    {"column": "LT-101", "unit": "mm"}}}. base: folder of relative paths. given:
     recordings in memory, by the name that `file` gives them. Raises ConfigError naming file, row and column.
     """
     if not isinstance(config, RecordingConfig):
-        config = config_of(str(config))
+        config = config_of(config)
     channels, columns = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
     in_memory = (given or {}).get(config.file)
     folder = base or Path.cwd()

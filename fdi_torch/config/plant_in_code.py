@@ -26,7 +26,9 @@ from fdi_torch.plant.description import (
     Tank,
 )
 from fdi_torch.plant.flow_component import FlowComponent
+from fdi_torch.plant.scales import emptying_time
 from fdi_torch.simulate.ode import Inputs, PlantOde
+from fdi_torch.tables import Table
 
 Read = Callable[[Any, str], float]
 """A function from a value as written and its SI unit to its SI value."""
@@ -127,11 +129,13 @@ class Plant(PlantDescription):
         return dump_plant(self)
 
     def _repr_html_(self) -> str:
-        """The drawing of the rig for notebooks."""
+        """The drawing of the rig for notebooks, and the volume and emptying time of each tank."""
         from fdi_torch.report.schematic import schematic
         from fdi_torch.report.style import notebook_svg
 
-        return notebook_svg(schematic(self), f"plant-{self.name}", f"plant {self.name}")
+        sizes = [(t.name, 1e3 * t.area * t.height, emptying_time(self, t)) for t in self.tanks]
+        table = Table.of_rows(("tank", "volume, l", "empties from full in, s"), sizes)
+        return notebook_svg(schematic(self), f"plant-{self.name}", f"plant {self.name}") + table.html()
 
 
 def _units_as_written(plant: PlantDescription) -> dict[str, str]:

@@ -52,7 +52,7 @@ def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
             data[kind.part()] = {c.name: _flow_mapping(c) for c in getattr(plant, kind.part())}
         data["sensors"] = {s.name: _sensor_mapping(s) for s in plant.sensors}
         units = absolute_units(plant)
-        data["tolerances"] = {name: _text(v, units.get(name, "1")) for name, v in plant.tolerances.items()}
+        data["tolerances"] = {n: _text(v, units[n]) if n in units else _share(v) for n, v in plant.tolerances.items()}
         data["varying"] = list(plant.varying)
         data["effects"] = [_effect_mapping(placed, plant) for placed in plant.effects]
         data["matters"] = {m.fault: _matter_mapping(m, plant) for m in plant.matters}
@@ -116,6 +116,12 @@ def _effect_mapping(placed: PlacedEffect, plant: PlantDescription) -> dict[str, 
 
 def _given(**fields: Any) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if value is not None}
+
+
+def _share(value: float) -> str | float:
+    """'3 %', or the bare number if that does not read back exactly."""
+    short = f"{100.0 * value:.9g} %"
+    return short if parse_quantity(short, "1") == value else value
 
 
 def _text(value: float, unit: str) -> str | float:

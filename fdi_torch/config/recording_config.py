@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
+from pathlib import PurePath
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo
 
-from pydantic import AfterValidator, AllowInfNan, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, AllowInfNan, BeforeValidator, Field, ValidationError, model_validator
 
+from fdi_torch.config.problems import explain
 from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.database import expect_no_password, is_query
@@ -122,7 +125,14 @@ class FileConfig(Strict):
     @model_validator(mode="before")
     @classmethod
     def _a_name_alone_is_the_file(cls, data: Any) -> Any:
-        return {"file": data} if isinstance(data, str) else data
+        if isinstance(data, str):
+            return {"file": data}
+        if not isinstance(data, Mapping | FileConfig):
+            raise ValueError(
+                "expected a file name, its keys such as {file: run.csv}, or in Python a Recording (of a data frame: "
+                f"fdi_torch.read_frame), got a {type(data).__name__}"
+            )
+        return data
 
 
 def _moment(value: Any) -> float | datetime:
@@ -163,6 +173,9 @@ class RecordingConfig(FileConfig):
     start_levels: StartLevels = Field("free", description="free, equilibrium, or a mapping such as {T1: 50 cm}")
 
 
-def config_of(name: str) -> RecordingConfig:
-    """The entry for a recording named alone. Raises ValueError for an address with a written password."""
-    return RecordingConfig(file=_name(name))
+def config_of(entry: Any) -> RecordingConfig:
+    """The entry of a recording from its file name alone, or from its keys. Raises ConfigError naming the key."""
+    try:
+        return RecordingConfig.model_validate(str(entry) if isinstance(entry, PurePath) else entry)
+    except ValidationError as error:
+        raise explain(error, "recording") from None

@@ -47,6 +47,12 @@ def flat_names(value: Any, prefix: str = "") -> Any:
     return flat
 
 
+def _noise(value: Any) -> Any:
+    if not isinstance(value, Mapping | NoiseConfig):
+        raise ValueError(f"expected {{std: {{h1: 1 mm}}}} or {{snr_db: 30}}, got {shortened(str(value))}")
+    return value
+
+
 class NoiseConfig(Strict):
     snr_db: Decibel | None = Field(None, description="signal-to-noise ratio of each output, dB")
     definition: Literal["variance", "power"] = Field(
@@ -68,7 +74,9 @@ class SimulationConfig(Strict):
     faults: Annotated[dict[str, Amount], BeforeValidator(lambda value: flat_names(value))] = Field(
         default_factory=dict, description="values of any parameters, such as T1.leak: 0.3"
     )
-    noise: NoiseConfig = Field(default_factory=NoiseConfig, description="added to every output")
+    noise: Annotated[NoiseConfig, BeforeValidator(_noise)] = Field(
+        default_factory=NoiseConfig, description="added to every output"
+    )
     seed: int | None = Field(None, description="seed of the noise; by default the run's seed")
 
 

@@ -47,6 +47,8 @@ def _values(text: bytes, source: str) -> Any:
         where = getattr(error, "problem_mark", None)
         line = f"line {where.line + 1}: " if where else ""
         problem = getattr(error, "problem", None) or str(error).partition("\n")[0]
+        if "'\\t'" in problem:
+            problem = "a line is indented by a tab; indent by spaces"
         sentence = problem if isinstance(error, _RejectedError) else f"not valid YAML: {problem}"
         raise ConfigError([f"{source}: {line}{sentence}"]) from error
 

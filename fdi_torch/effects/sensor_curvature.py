@@ -15,8 +15,8 @@ from fdi_torch.plant.signals import Clock
 class SensorCurvature(Effect):
     """The reading is y + c (y - y_m)^2: a sensor linearised at the middle y_m of its range.
 
-    Typical: c times the range of 0.01 to 0.1 for pressure cells, up to 0.5 for capacitive and float sensors. The same
-    as another gain over a narrow range of levels.
+    Typical: c times the sensor's range is 0.01 to 0.1 for pressure cells, up to 0.5 for capacitive and float sensors.
+    Over a narrow range of levels it acts like a wrong gain.
     """
 
     name = "sensor_curvature"

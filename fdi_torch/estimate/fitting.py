@@ -156,7 +156,7 @@ def set_up(
     start: initial levels, one choice for all tanks or a mapping by tank, for all recordings or a sequence with one
     entry per recording. A choice is 'equilibrium' (the level of the plant file, else the equilibrium under the first
     inputs), 'free' (estimated) or a level in m.
-    Raises ValueError for an unknown parameter and for a channel that is not recorded.
+    Raises ValueError for an unknown parameter or choice, and for a channel that is not recorded.
     """
     if not isinstance(plant, PlantDescription):
         raise TypeError(f"plant: expected a Plant, got {plant!r}; read a plant file by fdi_torch.load_plant")
@@ -193,6 +193,8 @@ def start_levels(
     levels, free = [], []
     for i, tank in enumerate(plant.tanks):
         choice = by_tank.get(tank.name, "free")
+        if isinstance(choice, str) and choice not in ("equilibrium", "free"):
+            raise ValueError(f"start level of {tank.name}: expected equilibrium, free or a level in m, got '{choice}'")
         if choice == "free":
             first_levels = first_levels or levels_shown_first(plant, network, recording)
             parameter = _free_start(tank, first_levels[i])

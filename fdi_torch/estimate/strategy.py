@@ -1,4 +1,4 @@
-"""What a search strategy is: three functions on a state, `init`, `ask` and `tell`, that know costs and boxes only.
+"""What a search strategy is: three functions on a state, `init`, `ask` and `tell`, that see only costs and bounds.
 
 A strategy is used by `evolve`, or alone:
 

@@ -219,7 +219,7 @@ def _levels(power: Tensor, layout: Layout, width: int) -> Tensor:
 def _likelihood(power: Tensor, layout: Layout, width: int, levels: Tensor) -> Tensor:
     """Twice the negative log-likelihood for each correlation and model error.
 
-    The taper leaves one of 1.94 frequencies independent.
+    The Hann window correlates neighbouring frequencies, so that N of them count as N / 1.94 independent ones.
     """
     level = torch.log(torch.clamp(levels, min=torch.finfo(power.dtype).tiny))
     return 2.0 * (level + _shapes(layout).mean_log) * len(power) * width / 1.94

@@ -55,7 +55,7 @@ def constants_of(fit: Fit) -> dict[str, float]:
 
 
 def ceiling_model(result: DiagnosisResult) -> Model:
-    """The best explanation with free functions added; if it has an unknown, its free form itself."""
+    """The best explanation with free functions added, or as it is if it already has the free form of an unknown."""
     best, plant = result.best, result.fitter.data.plant
     if result.free_form_fit:
         return model_of(best)

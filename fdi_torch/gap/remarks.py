@@ -43,7 +43,8 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
     if not data.plant.tolerances:
         remarks.append(
             "the plant file lists no tolerances, so that every constant counts as exact and a small error of one "
-            "looks like an effect; list them under tolerances, as in P13.discharge_coefficient: 3 %"
+            "looks like an effect; list them under tolerances, as in P13.discharge_coefficient: 3 %, and calibrate "
+            "them by fdi refit with a fault-free recording"
         )
     if not result.best.converged:
         remarks.append(

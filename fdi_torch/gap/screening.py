@@ -159,7 +159,7 @@ class _ProjectedRegression:
         return _ProjectedRegression(fitter, fit, remaining[..., 0], basis)
 
     def screened(self, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Score and strength of options, (M,) each; columns (S, C, M): their changes of the readings."""
+        """Score and strength of M options, (M,) each; columns (S, C, M): change of the readings by each option."""
         white = self.fitter.whiten(columns).permute(1, 2, 0)
         shared = (white @ self.basis.permute(1, 0, 2)).sum(dim=0)
         score = (white @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
@@ -242,7 +242,7 @@ def _named(network: TankNetwork, values: Mapping[str, float]) -> tuple[Parameter
 
 
 def _starts(options: Sequence[Option]) -> dict[str, Tensor]:
-    """Parameters of options with the same fitted names, by short name, (M, 1) each."""
+    """Start values (M, 1) of each parameter, by short name, of M options that fit the same parameters."""
     return {
         ParameterName.parse(name).field: torch.tensor([[o.start[name]] for o in options], dtype=torch.float64)
         for name in options[0].start

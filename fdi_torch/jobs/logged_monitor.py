@@ -162,7 +162,7 @@ class LoggedMonitor:
         try:
             report = diagnosability(self.plant, names, part, prepared.noise.reading_std, start="free")
         except ValueError as error:
-            return f"{text}; which of them can be told apart is unknown: {error}"
+            return f"{text}; which of them can be isolated is unknown: {error}"
         return "; ".join([text, *report.groups])
 
     def _start(self, samples: Samples) -> Any:

@@ -1,4 +1,4 @@
-"""The commands as Python functions, for scripts and notebooks, with results that display themselves.
+"""The commands as Python functions, for scripts and notebooks.
 
 A function accepts a file (run, monitor or study file) or the same content as a mapping, in which a `Plant` may replace
 the plant's name and a `Recording` the recording's file name.
@@ -7,7 +7,7 @@ the plant's name and a `Recording` the recording's file name.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,31 +16,27 @@ from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monito
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
-from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.diagnose import Settings
-from fdi_torch.gap.free_runs.prediction import START_SAMPLES, Prediction
+from fdi_torch.gap.free_runs.prediction import START_SAMPLES
 from fdi_torch.gap.free_runs.prediction import predict as run_freely
-from fdi_torch.gap.verdict_words import cause_words, explanation_words, verdict_sentence
+from fdi_torch.gap.free_runs.refit import refit as refitted
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs import train as train_job
 from fdi_torch.jobs.gap import one_thread, run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
+from fdi_torch.jobs.python_results import FreeRun, GapResult, MonitorResult, RefitResult
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
 from fdi_torch.parameters import display_in
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.report.fit_figure import fit_figure
-from fdi_torch.report.style import notebook_svg
-from fdi_torch.tables import Shown, Table
 
 Tell = Callable[[float, str], None]
 AnyPlant = PlantDescription | str | Path
-AnyRecording = Recording | str | Path
-HERE = "session"
+AnyRecording = Recording | Mapping[str, Any] | str | Path
 
 
 def silent(share: float, text: str) -> None:
@@ -76,8 +72,8 @@ def simulate(
     bit for a given seed. Raises ConfigError, which names the wrong key and the expected value.
     """
     keys = {"inputs": inputs, "duration": duration, "sample_time": sample_time, "hold": hold}
-    keys |= {"start_levels": start_levels, "faults": dict(faults or {}), "noise": dict(noise or {})}
-    return simulate_recording(build_run({"plant": plant, "simulate": keys, "seed": seed}, Path.cwd(), HERE))
+    keys |= {"start_levels": start_levels, "faults": dict(faults or {}), "noise": noise or {}}
+    return simulate_recording(build_run({"plant": plant, "simulate": keys, "seed": seed}, Path.cwd(), "arguments"))
 
 
 def train(
@@ -95,42 +91,8 @@ def train(
     if run is None or isinstance(run, str | Path):
         run = load_run(run)
     elif not isinstance(run, Run):
-        run = build_run(_keys(run), Path.cwd(), HERE)
+        run = build_run(_keys(run), Path.cwd(), "train")
     return train_job.train(run, tell, resume, listener)
-
-
-@dataclass(frozen=True, repr=False)
-class GapResult(Shown):
-    """answer: verdict, causes, explanations and closure. log: the MCAP log, for `report` and `fdi replay`."""
-
-    answer: Answer
-    plant: PlantDescription
-    log: Path
-
-    @property
-    def headline(self) -> str:
-        return verdict_sentence(self.answer.to_dict())
-
-    def table(self) -> Table:
-        """One row per parameter of each cause, SI; without a cause, the explanations and their probabilities."""
-        rows = [
-            (cause_words({"effect": c.effect, "location": c.location}), name, a.value, a.std, a.unit)
-            for c in self.answer.causes
-            for name, a in c.parameters.items()
-        ]
-        return (
-            Table.of_rows(("cause", "parameter", "value", "std error", "unit"), rows) if rows else self.explanations()
-        )
-
-    def explanations(self) -> Table:
-        """All explanations with their posterior probabilities, likeliest first."""
-        posterior = self.answer.to_dict()["posterior"]
-        rows = [(explanation_words(e["causes"]), e["probability"]) for e in posterior]
-        return Table.of_rows(("explanation", "probability"), rows)
-
-    def adopted(self, constants: bool = False) -> PlantDescription:
-        """The plant with the causes added as effects. constants: also use the constants fitted together with them."""
-        return adopted(self.plant, self.answer, constants)
 
 
 def gap(
@@ -159,28 +121,6 @@ def gap(
     return GapResult(answer, plant, log)
 
 
-@dataclass(frozen=True, repr=False)
-class MonitorResult(Shown):
-    """events: in order of time. lasted: duration of the recording, s. spent: computing time, s."""
-
-    events: tuple[Event, ...]
-    lasted: float
-    spent: float
-    log: Path
-
-    @property
-    def headline(self) -> str:
-        alarms = sum(event.kind == "alarm" for event in self.events)
-        count = "no alarm" if not alarms else "1 alarm" if alarms == 1 else f"{alarms} alarms"
-        isolated = [event for event in self.events if event.kind in ("isolated", "revised")]
-        return f"{count} in {self.lasted:g} s" + (f"; {isolated[-1].headline}" if isolated else "")
-
-    def table(self) -> Table:
-        """One row per event; sizes in the units of the column `units`."""
-        names = ("time", "kind", "alarm", "text", "headline", "faults", "sizes", "stds", "units", "onset", "onset_std")
-        return Table({name: [getattr(event, name) for event in self.events] for name in names})
-
-
 def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = silent) -> MonitorResult:
     """Run a monitor along a recording, as `fdi monitor` does.
 
@@ -189,39 +129,10 @@ def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = si
     if isinstance(run, str | Path):
         run = load_monitor(run)
     elif not isinstance(run, MonitorRun):
-        run = build_monitor(_keys(run), Path.cwd(), HERE)
+        run = build_monitor(_keys(run), Path.cwd(), "monitor")
     events: list[Event] = []
     summary = run_monitor(run, MonitorCallbacks(tell, events.append, lambda prepared: None))
     return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
-
-
-@dataclass(frozen=True, repr=False)
-class FreeRun(Shown):
-    """Free run of a plant along a recording, from initial levels estimated from the first samples."""
-
-    plant: PlantDescription
-    recording: Recording
-    prediction: Prediction
-
-    @property
-    def headline(self) -> str:
-        return f"free run of {self.plant.name} along {self.recording.source}"
-
-    def table(self) -> Table:
-        """One row per sensor: root mean square error, SI."""
-        rows = [(s.name, self.prediction.rmse[s.name], s.unit) for s in self.plant.sensors]
-        return Table.of_rows(("sensor", "RMSE", "unit"), rows)
-
-    def picture(self) -> str:
-        """Measured and predicted readings, as SVG."""
-        columns = [sensor.column for sensor in self.plant.sensors]
-        figure = fit_figure(self.recording, {self.plant.name: self.prediction.readings}, self.headline, columns)
-        return notebook_svg(figure, "free-run", self.headline)
-
-    def to_xarray(self) -> Any:
-        """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
-        columns = [sensor.column for sensor in self.plant.sensors]
-        return self.recording.selected((), columns).compared(self.prediction.readings)
 
 
 def predict(
@@ -251,6 +162,18 @@ def predict(
     return FreeRun(plant, parts[0], prediction)
 
 
+def refit(
+    plant: AnyPlant, recordings: AnyRecording | Sequence[AnyRecording], *, step: float | None = None, **choices: Any
+) -> RefitResult:
+    """Fit all constants with a tolerance and all effects of a plant to recordings, as `fdi refit` does: calibrate it.
+
+    step: of the simulation, s. choices: leave_out, hold, vary (names or patterns), as the options of `fdi refit`.
+    """
+    plant = plant_of(plant)
+    with one_thread():
+        return RefitResult(refitted(plant, recordings_of(recordings, plant), step=step, **choices))
+
+
 def study(
     study: Study | Mapping[str, Any] | str | Path,
     *,
@@ -266,7 +189,7 @@ def study(
     if isinstance(study, str | Path):
         study = load_study(study)
     elif not isinstance(study, Study):
-        study = build_study(_keys(study), Path.cwd(), HERE)
+        study = build_study(_keys(study), Path.cwd(), "study")
     return study_job.run_study(study, resume, cluster, tell)
 
 
@@ -281,12 +204,17 @@ def plant_of(plant: AnyPlant) -> PlantDescription:
 
 
 def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDescription) -> list[Recording]:
-    """Recordings with the plant's channels, split into segments with known inputs; names are read as files."""
+    """Recordings with the plant's channels, split into segments with known inputs.
+
+    Names are read as files, and mappings as entries of a run file.
+    """
     segments: list[Recording] = []
-    for each in [wanted] if isinstance(wanted, Recording | str | Path) else wanted:
-        if isinstance(each, Recording):
-            whole = read_recording(each.source, plant, given={each.source: each})
-            segments += [part for part in whole.known_segments() if len(part) > 1]
-        else:
+    listed: Sequence[Any] = wanted if isinstance(wanted, list | tuple) else [wanted]
+    for each in listed:
+        if isinstance(each, str | Path):
             segments += named_recordings(str(each), plant, Path.cwd())
+            continue
+        given = {each.source: each} if isinstance(each, Recording) else None
+        whole = read_recording(each.source if isinstance(each, Recording) else each, plant, given=given)
+        segments += [part for part in whole.known_segments() if len(part) > 1]
     return segments

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.config.loaded_recordings import LoadedRecording
-from fdi_torch.config.logged_config import logged_mapping
+from fdi_torch.config.logged_config import logged_gap_settings, logged_mapping, logged_plant
 from fdi_torch.config.monitor_file import build_monitor
 from fdi_torch.config.run_file import Run, build_run
 from fdi_torch.config.study_file import build_study
 from fdi_torch.config.yaml_files import with_overrides
+from fdi_torch.gap.diagnose import Settings
 from fdi_torch.jobs import monitor as monitor_job
 from fdi_torch.jobs import study as study_job
-from fdi_torch.jobs.gap_replay import replay_gap
+from fdi_torch.jobs.gap import groups, run_gap
 from fdi_torch.jobs.logged_monitor import ALARM, LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.logged_recordings import logged_recording
 from fdi_torch.jobs.row_buffer import logged_rows, recording_of_rows, rows_until, samples_of_rows
@@ -184,3 +185,22 @@ def logged_truth(log: LoggedRun) -> dict[str, float]:
     """Simulated fault values, SI by full name; empty for real data."""
     truth = series(log, "/plant/truth")
     return {name: float(values[0]) for name, values in truth.items() if name != "t" and len(values)}
+
+
+def replay_gap(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
+    """Repeat a diagnosis into the log `path`.
+
+    overrides: changed settings, such as library=pump_lag,leak@T1, leave_out=pump_lag, step=0.5, named_only=true.
+    """
+    settings = settings_of(log, overrides)
+    sources = [name for name in log.metadata.get("fdi_torch.data", {}) if name.endswith(".path")]
+    diagnosed = int(log.metadata.get("fdi_torch.config", {}).get("recordings", 1))
+    names = groups(max(len(sources) - diagnosed, 0), diagnosed)
+    recordings = [logged_recording(log, group, k) for k, group in enumerate(names)]
+    run_gap(path, logged_plant(log), recordings[:diagnosed], recordings[diagnosed:], settings, tell, parent)
+
+
+def settings_of(log: LoggedRun, overrides: Iterable[str] = ()) -> Settings:
+    """The logged settings with overrides. Raises ConfigError for an unknown key or a wrong value."""
+    given = logged_gap_settings(log, overrides)
+    return Settings(**given | {"library": given["library"] or None})

@@ -56,7 +56,7 @@ class ExclusiveFile:
 def being_written(path: Path) -> bool:
     """Whether a process holds the file open as an `ExclusiveFile`. Raises OSError if it cannot be opened.
 
-    Ask only about a file that is not empty: the shared lock may otherwise precede its writer's.
+    Ask only about a file that is not empty; otherwise this check may lock the file before its writer does.
     """
     with path.open("rb") as file:
         try:

@@ -91,6 +91,12 @@ class Run:
             raise LogError(f"{self.path}: expected an MCAP file, got something else; check the path")
         self._read_head()
 
+    def __repr__(self) -> str:
+        """What was run, when, and how it ended."""
+        run, status = (self.metadata.get(f"fdi_torch.{name}", {}) for name in ("run", "status"))
+        started, ended = run.get("started", "at an unknown time")[:19], status.get("status", "unfinished")
+        return f"{self.path}: {run.get('kind', 'a log of another program')}, started {started}, {ended}"
+
     @property
     def ours(self) -> bool:
         """Whether this program wrote the log."""

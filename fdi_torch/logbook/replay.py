@@ -21,8 +21,8 @@ from fdi_torch.logbook.reader import Message, Run, read_run
 Rerun = Callable[[Run], "str | Path | Iterable[Message]"]
 Select = Callable[[Iterable[Message]], Iterable[Message]]
 Outcome = Literal["bit-equal", "within tolerance", "differs"]
-ABSOLUTE = 1e-12
-"""Absolute part of the tolerance of a number."""
+ABSOLUTE, RELATIVE = 1e-12, 1e-9
+"""Absolute and relative part of the tolerance of a number."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def replay(
     path: str | Path,
     rerun: Rerun,
     *,
-    relative: float = 1e-9,
+    relative: float = RELATIVE,
     select: Select | None = None,
     env: Mapping[str, str] | None = None,
 ) -> Replay:

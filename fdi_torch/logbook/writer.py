@@ -19,12 +19,12 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+import orjson
 
 from fdi_torch.interruption import UNDISTURBED, Terminated
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError, log_error
-from fdi_torch.logbook.flat_metadata import flatten
-from fdi_torch.logbook.payload import as_array
+from fdi_torch.logbook.payload import as_array, plain
 from fdi_torch.logbook.provenance import environment, git_state, version_of
 from fdi_torch.logbook.reader import Message
 from fdi_torch.logbook.sink import Sink, Timed
@@ -259,3 +259,21 @@ def _sha256(text: str) -> str:
 def _wall_text(nanoseconds: int) -> str:
     moment = datetime.fromtimestamp(nanoseconds // 10**9, UTC)
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{nanoseconds % 10**9:09d}Z"
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Nested values as dotted names and texts: {"a": {"b": [1, 2]}} -> {"a.b": "[1,2]"}."""
+    flat: dict[str, str] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat.update(flatten(value, f"{prefix}{name}."))
+        else:
+            flat[f"{prefix}{name}"] = value if isinstance(value, str) else _text(value)
+    return flat
+
+
+def _text(value: Any) -> str:
+    try:
+        return orjson.dumps(value).decode()
+    except TypeError:
+        return orjson.dumps(plain({"value": value}).get("value", str(value))).decode()

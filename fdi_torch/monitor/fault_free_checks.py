@@ -94,14 +94,14 @@ def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -
     needed = seconds * design.learning_factor(RATE_FACTOR)
     shortest = float(f"{1.0 / design.quantile(0.95):.2g}")
     text = (
-        f"learnt from {seconds:g} s, {needed:.0f} s are needed: on average one false alarm in {every:g} s, "
-        f"with 95 % at most one in {shortest:g} s"
+        f"the noise is learnt from {seconds:.4g} s of {needed:.4g} s needed; expect one false alarm in {every:.5g} s "
+        f"on average, with 95 % confidence at most one in {shortest:g} s"
     )
     if noise.whitening.flows is None:
         text += ", if no random flow is slow: to model these, install a C++ compiler or the extra fdi_torch[compiler]"
     if needed <= seconds:
         return text
-    return f"{text}; too little was learnt, so the threshold is raised: lengthen fault_free"
+    return f"{text}; the fault-free part is short, so that the threshold is raised: lengthen fault_free"
 
 
 def noise_std_from_differences(readings: Tensor) -> Tensor:

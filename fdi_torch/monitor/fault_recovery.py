@@ -62,7 +62,7 @@ def reset_to_nominal(space: ParameterSpace, change: DetectedChange, recovered: S
 
 
 def _is_nominal(space: ParameterSpace, fit: HypothesisFit, column: int) -> bool:
-    """Whether an estimate agrees with nominal to three standard deviations."""
+    """Whether an estimate lies within three standard deviations of nominal."""
     return abs(float(fit.value[column]) - space.parameters[column].nominal) <= 3.0 * float(fit.std[column])
 
 

@@ -117,7 +117,7 @@ ESTIMATORS: dict[str, Estimator] = {
 
 
 def _searched(window: WindowData, before: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Distant members of the search (R, K, P), best first, and the best cost (R,)."""
+    """The best clearly different members of the search (R, K, P), best first, and the best cost (R,)."""
     low, high = window.box
     objective: Objective = "correlation" if window.moves() else "likelihood"
     span = float(window.fitting.recordings[0].time[-1] - window.fitting.recordings[0].time[0])

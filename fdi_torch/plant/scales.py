@@ -11,11 +11,20 @@ import math
 from statistics import geometric_mean
 
 from fdi_torch.plant.constants import flow_scale, nominal_capacity
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import PlantDescription, Tank
 
 # Height, m, and emptying time A H / (C_d a sqrt(2 g H)), s, of the tanks of three_tank.
 _HEIGHT = 1.0
 _EMPTYING_TIME = 0.016 * _HEIGHT / (0.6 * 0.6e-4 * math.sqrt(2.0 * 9.81))
+
+
+def emptying_time(plant: PlantDescription, tank: Tank) -> float:
+    """Time in which a full tank empties through all pipes that leave it, s: 2 A H / (C sqrt(H)) by Torricelli's law.
+
+    Infinite for a tank that no pipe leaves. Elevations of orifices and levels behind them are neglected.
+    """
+    capacity = sum(nominal_capacity(plant, pipe) for pipe in plant.pipes if pipe.source == tank.name)
+    return 2.0 * tank.area * math.sqrt(tank.height) / capacity if capacity else math.inf
 
 
 def time_scale(plant: PlantDescription) -> float:

@@ -11,11 +11,13 @@ from math import isnan
 from pathlib import Path
 
 from fdi_torch.names import shortened
-from fdi_torch.parameters import header_unit, si_unit_of, unit_factor
+from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
 from fdi_torch.recordings.csv_text import Heading
+from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.source import ChannelSource, ClockSource
 from fdi_torch.recordings.time_stamps import stamp_reader
+from fdi_torch.units import spelled
 
 TIME_NAMES = (
     *("t", "time", "timestamp", "datetime", "date time", "date_time", "date/time", "time stamp", "utc"),
@@ -79,6 +81,16 @@ def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | N
     rule = _rule(path, header, name, source)
     plus = tuple(bind(path, header, name, replace(source, column=each, plus=()), si_unit) for each in source.plus)
     return Bound(name, column, header.index(column), factor, si_unit, rule=rule, plus=plus, unit=unit)
+
+
+def unit_notes(bounds: Sequence[Bound]) -> list[str]:
+    """A note on each channel whose mapping states another unit of the same kind than its header."""
+    notes = []
+    for bound in bounds:
+        _, in_header = (bound.position is not None and header_unit(bound.header)) or ("", bound.unit)
+        if spelled(in_header) != spelled(bound.unit) and si_unit_of(in_header) == bound.si_unit:
+            notes.append(f"{bound.header}: read in {bound.unit} as mapped, although its header says {in_header}")
+    return notes
 
 
 def column_of(path: Path, header: Sequence[str], column: str) -> str:

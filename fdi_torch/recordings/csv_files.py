@@ -19,12 +19,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from fdi_torch.parameters import header_unit
 from fdi_torch.recording import Hold, Recording
-from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of
+from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of, unit_notes
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
 from fdi_torch.recordings.csv_tags import read_tags
 from fdi_torch.recordings.csv_text import heading_of, open_csv
+from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.sheets import Sheet, in_order, informative_rows, merge_sheets
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, file_sha256
 from fdi_torch.recordings.time_stamps import from_zone
@@ -141,9 +141,8 @@ def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
     values = channels_in_si(table, columns, in_file)
     order = in_order(seconds, values, _sorted(clock_source), place, first, _summer_time_hint(clock, clock_source))
     sheet = Sheet(str(path), order.seconds, tuple(b.name for b in in_file), order.values)
-    return Read(
-        [sheet], *_units_and_constants(bounds), clock.stamps, [f"{path.name}: {n}" for n in (*notes, *order.notes)]
-    )
+    notes = [f"{path.name}: {note}" for note in (*unit_notes(bounds), *notes, *order.notes)]
+    return Read([sheet], *_units_and_constants(bounds), clock.stamps, notes)
 
 
 def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:

@@ -14,7 +14,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
 
-from fdi_torch.parameters import header_unit, si_unit_of
+from fdi_torch.parameters import si_unit_of
+from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.table_files import TableText, format_of, table_text
 from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, expect_unpacked
 
@@ -127,11 +128,12 @@ def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[H
     Lines that start with #, Excel's `sep=;`, and titles may precede the header; a row of units may follow names
     without units. A title is a row with one cell.
     header: False if the file has none; columns are then named by their numbers 1, 2 ..., and the data begin in the
-    first row with a number.
+    first row with a number that has as many cells as the row below it.
     """
-    remaining, separator = _short_lines(path, lines), getattr(lines, "delimiter", "")
-    title = "an empty file"
-    for number, line in enumerate(remaining, start=1):
+    remaining: Iterator[str] = _short_lines(path, lines)
+    separator, number, title = getattr(lines, "delimiter", ""), 0, "an empty file"
+    while (line := next(remaining, None)) is not None:
+        number += 1
         if line.lower().startswith("sep=") and len(line.strip()) == 5:
             separator = line[4]
         elif line.strip() and not line.startswith("#"):
@@ -145,8 +147,11 @@ def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[H
             if header and sum(map(bool, names)) > 1:
                 return _with_units(path, names, delimiter, number, remaining)
             if not header and any(_BEGINS_AS_NUMBER.match(name) for name in names):
-                numbers = tuple(str(k + 1) for k in range(len(names)))
-                return Heading(numbers, delimiter, number - 1), chain([line], remaining)
+                below = next(remaining, None)
+                remaining = chain([] if below is None else [below], remaining)
+                if below is None or len(_cells(path, below, delimiter, number)) == len(names):
+                    numbers = tuple(str(k + 1) for k in range(len(names)))
+                    return Heading(numbers, delimiter, number - 1), chain([line], remaining)
             if title == "an empty file":
                 title = f"'{line.strip()[:60]}'"
     expected = "a header line such as t_s,Q1_cm3_s,h1_cm" if header else "a row of numbers"

@@ -134,7 +134,7 @@ class SectionWriter:
         return self.rows.setdefault(output.place, (len(self.rows), output.row))[0]
 
     def _prepare(self) -> str:
-        """The function of all constants, start levels and delays; written last, when the others' needs are known."""
+        """The function of all constants, start levels and delays; written last: the others determine its outputs."""
         section = self.program.prepare
         for output in section:
             if output.row.theta:

@@ -1,6 +1,6 @@
 """Expression graphs of pointwise programs, in which equal subexpressions share one node.
 
-Every node knows with what it varies: from lane to lane, from step to step, with both or neither. The generated program
+Every node states whether its value differs between lanes, between steps, both, or neither. The generated program
 computes what does not vary in time once per trajectory, and what does not vary between lanes once for all lanes.
 """
 

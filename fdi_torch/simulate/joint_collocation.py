@@ -56,7 +56,7 @@ class JointCollocation:
         return self._joined([part.converge(columns, piece, rounds) for part, columns, piece in pieces])
 
     def simulate_tank(self, theta: Tensor, levels: Tensor, tank: int) -> Tensor:
-        """Simulate one tank with the levels of all others given: levels (L, N, tanks) m, with that tank's replaced."""
+        """Levels (L, N, tanks), m, with those of one tank computed from the given levels of all others."""
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
         return torch.cat([part.simulate_tank(columns, piece, tank) for part, columns, piece in pieces], dim=1)
 

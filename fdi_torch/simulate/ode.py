@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +17,7 @@ from fdi_torch.recording import Recording
 RESOLUTION = 0.01  # smoothing of square roots and rims
 INSTANT = 1e-3  # time-dependent effects are averaged over this interval about t
 
-Inputs = Recording | Tensor | Callable[[Tensor], Tensor]
+Inputs = Recording | Tensor | Sequence[float] | Callable[[Tensor], Tensor]
 """A recording, whose inputs are used with its hold; constant inputs (channels,); or a function of time (s) to them."""
 
 
@@ -85,10 +85,10 @@ def _function_of_time(inputs: Inputs, network: TankNetwork, like: Tensor) -> Cal
     channels = network.description.channels()
     if isinstance(inputs, Recording):
         return _played(inputs.selected(channels, ()))
-    if isinstance(inputs, Tensor):
-        if inputs.shape[-1:] != (len(channels),):
-            raise ValueError(f"expected inputs of {', '.join(channels)}, got a tensor of shape {tuple(inputs.shape)}")
-        constant = inputs.to(like)
+    if not callable(inputs):
+        constant = torch.as_tensor(inputs, dtype=like.dtype, device=like.device)
+        if constant.shape[-1:] != (len(channels),):
+            raise ValueError(f"expected inputs of {', '.join(channels)}, got a tensor of shape {tuple(constant.shape)}")
         return lambda t: constant
     return inputs
 

@@ -1,8 +1,8 @@
 """Fit all effects and constants of a plant file to recordings together, without searching for causes.
 
-The plant file is one that `fdi gap --adopt` wrote, or one whose effects you chose. Every constant with a tolerance and
-every number of an effect is fitted; values under `varying` belong to each recording. The error of each sensor is
-reported before and after, with each value and its standard error.
+Use it to calibrate a plant file with a fault-free recording, and after `fdi gap --adopt`. Every constant with a
+tolerance and every number of an effect is fitted; values under `varying` belong to each recording. The error of each
+sensor is reported, with each value and its standard error.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from fdi_torch.cli.options import add_holdout, add_leave_out, add_plant_and_reco
 
 EXAMPLES = """
 examples:
+  fdi refit --plant rig.yaml --recording run.csv --adopt calibrated.yaml --narrow      calibrate the constants
   fdi refit --plant second.yaml --recording runs.yaml --adopt final.yaml
   fdi refit --plant rig.yaml --recording run.csv --hold 'h?.offset,*.sensor_lag.*'
   fdi refit --plant rig.yaml --recording runs.yaml --leave-one-file-out --settle 30   predict each file without it
@@ -41,3 +42,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_start_samples(parser)
     parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the fitted values")
+    parser.add_argument(
+        "--narrow", action="store_true", help="there, use the standard errors of the fit as tolerances where smaller"
+    )

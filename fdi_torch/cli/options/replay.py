@@ -18,9 +18,6 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", metavar="RUN.mcap", help="a log of fdi train, study, gap or monitor")
     parser.add_argument(
-        "--relative", metavar="R", type=float, default=1e-9, help="tolerance of numbers (default: 1e-9)"
-    )
-    parser.add_argument(
         "--set",
         metavar="KEY=VALUE",
         action="append",

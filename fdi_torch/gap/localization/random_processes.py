@@ -54,7 +54,7 @@ def random_flows(
 
 
 def _moved(fitter: Fitter, linearised: Linearised) -> float:
-    """Norm of what the disturbances move the readings by, in units of the sensor noise."""
+    """Norm of the change of the readings by the disturbances, in units of the sensor noise."""
     assert fitter.whitening is not None
     plant = fitter.data.plant
     moved = fitter.whitening.smoothed(fitter.data.readings - linearised.readings[0])

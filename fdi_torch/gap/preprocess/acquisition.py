@@ -115,7 +115,7 @@ def stuck_in(plant: PlantDescription, recording: Recording) -> tuple[StuckSegmen
 
 
 def without_sensors(plant: PlantDescription, names: Collection[str]) -> PlantDescription:
-    """The plant without these sensors and without all that its file states of them."""
+    """The plant without these sensors, their effects and their tolerances."""
     sensors = tuple(s for s in plant.sensors if s.name not in names)
     effects = tuple(e for e in plant.effects if e.location not in names)
     return with_tolerances(replace(plant, sensors=sensors, effects=effects), lambda name: name.place not in names)

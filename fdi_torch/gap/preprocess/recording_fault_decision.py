@@ -43,10 +43,10 @@ library lacks (`estimate.evidence.Odds`)."""
 SURE = 0.95
 """Posterior probability above which a fault is reported."""
 EVALUATIONS = 30
-"""Evaluations of the fit of a rival effect, a budget of computing: a fit that is cut short counts for less than it may,
-and a fault is reported more easily."""
+"""Most evaluations of the fit of a rival effect. It limits computing time: a fit that is stopped early understates the
+evidence for the rival, so that a fault of the recording is reported more easily."""
 RIVALS, MOST_EFFECTS = 6, 2
-"""Effects that are fitted about the likeliest combination, and effects in one combination; likewise a budget."""
+"""Most rival effects fitted, and most effects in one combination; they limit computing time as well."""
 
 
 def recording_fault(

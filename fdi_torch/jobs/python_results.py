@@ -1,0 +1,131 @@
+"""Results of the Python functions that display themselves: as text, as tables and pictures in notebooks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fdi_torch.gap.answer import Answer, adopted
+from fdi_torch.gap.free_runs.prediction import Prediction
+from fdi_torch.gap.free_runs.refit import Refit
+from fdi_torch.gap.verdict_words import cause_words, explanation_words, verdict_sentence
+from fdi_torch.monitor.events import Event
+from fdi_torch.parameters import quantity_text
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.report.fit_figure import fit_figure
+from fdi_torch.report.style import notebook_svg
+from fdi_torch.tables import Shown, Table
+
+
+@dataclass(frozen=True, repr=False)
+class GapResult(Shown):
+    """answer: verdict, causes, explanations and closure. log: the MCAP log, for `report` and `fdi replay`."""
+
+    answer: Answer
+    plant: PlantDescription
+    log: Path
+
+    @property
+    def headline(self) -> str:
+        return verdict_sentence(self.answer.to_dict())
+
+    def table(self) -> Table:
+        """One row per parameter of each cause, SI; without a cause, the explanations and their probabilities."""
+        rows = [
+            (cause_words({"effect": c.effect, "location": c.location}), name, a.value, a.std, a.unit)
+            for c in self.answer.causes
+            for name, a in c.parameters.items()
+        ]
+        return (
+            Table.of_rows(("cause", "parameter", "value", "std error", "unit"), rows) if rows else self.explanations()
+        )
+
+    def explanations(self) -> Table:
+        """All explanations with their posterior probabilities, likeliest first."""
+        posterior = self.answer.to_dict()["posterior"]
+        rows = [(explanation_words(e["causes"]), e["probability"]) for e in posterior]
+        return Table.of_rows(("explanation", "probability"), rows)
+
+    def adopted(self, constants: bool = False) -> PlantDescription:
+        """The plant with the causes added as effects. constants: also use the constants fitted together with them."""
+        return adopted(self.plant, self.answer, constants)
+
+
+@dataclass(frozen=True, repr=False)
+class MonitorResult(Shown):
+    """events: in order of time. lasted: duration of the recording, s. spent: computing time, s."""
+
+    events: tuple[Event, ...]
+    lasted: float
+    spent: float
+    log: Path
+
+    @property
+    def headline(self) -> str:
+        alarms = sum(event.kind == "alarm" for event in self.events)
+        count = "no alarm" if not alarms else "1 alarm" if alarms == 1 else f"{alarms} alarms"
+        isolated = [event for event in self.events if event.kind in ("isolated", "revised")]
+        return f"{count} in {self.lasted:g} s" + (f"; {isolated[-1].headline}" if isolated else "")
+
+    def table(self) -> Table:
+        """One row per event; sizes in the units of the column `units`."""
+        names = ("time", "kind", "alarm", "text", "headline", "faults", "sizes", "stds", "units", "onset", "onset_std")
+        return Table({name: [getattr(event, name) for event in self.events] for name in names})
+
+    def brief(self) -> Table:
+        return Table.of_rows(("time, s", "event", "text"), [(e.time, e.kind, e.text) for e in self.events])
+
+
+@dataclass(frozen=True, repr=False)
+class FreeRun(Shown):
+    """Free run of a plant along a recording, from initial levels estimated from the first samples."""
+
+    plant: PlantDescription
+    recording: Recording
+    prediction: Prediction
+
+    @property
+    def headline(self) -> str:
+        return f"free run of {self.plant.name} along {self.recording.source}"
+
+    def table(self) -> Table:
+        """One row per sensor: root mean square error, SI."""
+        rows = [(s.name, self.prediction.rmse[s.name], s.unit) for s in self.plant.sensors]
+        return Table.of_rows(("sensor", "RMSE", "unit"), rows)
+
+    def picture(self) -> str:
+        """Measured and predicted readings, as SVG."""
+        columns = [sensor.column for sensor in self.plant.sensors]
+        figure = fit_figure(self.recording, {self.plant.name: self.prediction.readings}, self.headline, columns)
+        return notebook_svg(figure, "free-run", self.headline)
+
+    def to_xarray(self) -> Any:
+        """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
+        columns = [sensor.column for sensor in self.plant.sensors]
+        return self.recording.selected((), columns).compared(self.prediction.readings)
+
+
+@dataclass(frozen=True, repr=False)
+class RefitResult(Shown):
+    """plant: the plant with fitted constants and effects. fit: errors, values and standard errors, SI."""
+
+    fit: Refit
+
+    @property
+    def plant(self) -> PlantDescription:
+        return self.fit.plant
+
+    @property
+    def headline(self) -> str:
+        errors = ", ".join(f"{s.name} {quantity_text(self.fit.rmse[s.name], s.unit)}" for s in self.plant.sensors)
+        return f"refit of {self.plant.name}: root mean square error {errors}"
+
+    def table(self) -> Table:
+        """One row per value that all recordings share, SI."""
+        return Table.of_rows(("parameter", "value", "std error"), [(n, *pair) for n, pair in self.fit.fitted.items()])
+
+    def narrowed(self) -> PlantDescription:
+        """The plant with the standard errors of the fit as tolerances where these are smaller."""
+        return self.fit.narrowed()
