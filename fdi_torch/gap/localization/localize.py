@@ -90,12 +90,15 @@ def localize(
         excess = max(excess, found.gain - expected)
         if not is_rounding_error(fitter, place, float(found.explained.square().mean(dim=0).max().sqrt())):
             needed, evaluated[place] = max(needed, found.gain + math.log(RARE)), found
-    likeliest = max(evaluated.values(), key=_gain, default=None)
-    for place, known in evaluated.items():
-        # A larger noise than that which the likeliest discrepancy left hides what another place explains as well.
-        if likeliest and known is not likeliest:
-            again = ascent.evaluate(known.regression, known.discrepancy, place, likeliest.noise)
-            evaluated[place] = max(known, ascent.climbed(ascent.with_finer_positions(again), needed), key=_gain)
+    likeliest: _EvaluatedDiscrepancy | None = None
+    while evaluated and (best := max(evaluated.values(), key=_gain)) is not likeliest:
+        likeliest = best
+        for place, known in evaluated.items():
+            # A larger noise than that which the likeliest discrepancy left hides what another place explains as well.
+            if known is not likeliest:
+                again = ascent.evaluate(known.regression, known.discrepancy, place, likeliest.noise)
+                again = ascent.climbed(ascent.with_finer_positions(again), needed)
+                evaluated[place] = max(known, again, key=_gain)
     localized = [e.localized(fitter) for e in evaluated.values()]
     random = [*drifting_sensors(regression, likely, places, base, needed)]
     random += random_flows(regression, likely, places, base)
