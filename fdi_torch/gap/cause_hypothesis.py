@@ -42,13 +42,13 @@ class CauseHypothesis:
     inexact: bool = False
 
     @property
-    def place(self) -> LocalizedDiscrepancy | None:
+    def unknown(self) -> LocalizedDiscrepancy | None:
         """The discrepancy, if it is an unknown."""
         return None if self.inexact else self.discrepancy
 
     @property
     def unknown_at(self) -> str | None:
-        return self.place.location if self.place else None
+        return self.unknown.location if self.unknown else None
 
     @property
     def noise(self) -> StateNoise:
@@ -56,7 +56,7 @@ class CauseHypothesis:
 
     @property
     def fit(self) -> Fit:
-        return self.place.fit if self.place else self.explanation.fit
+        return self.unknown.fit if self.unknown else self.explanation.fit
 
 
 def likeliest(hypotheses: Collection[CauseHypothesis]) -> CauseHypothesis:
@@ -84,8 +84,8 @@ def influence(fitter: Fitter, fit: Fit, effects: Collection[CauseName]) -> float
     others = [p for p in fit.candidate.placements if (p.effect.name, p.location) not in effects]
     engine = fitter.engine(Candidate(tuple(others)), list(fit.values_of(others)))
     theta = vector_of(engine.space, fit.values)
-    nominal = engine.converge(theta.unsqueeze(0), fit.linearised.levels[..., : len(fitter.data.plant.tanks)])
+    reduced = engine.converge(theta.unsqueeze(0), fit.linearised.levels[..., : len(fitter.data.plant.tanks)])
     scale, pull, _ = fitter.priors(engine.space, theta)
-    change = fitter.noise.whiten(fit.linearised.readings[0] - nominal.readings[0], fitter.data.mask).flatten()
-    jacobian = (fitter.noise.whiten(nominal.jacobian[0], fitter.data.mask) * scale).flatten(0, 1)
+    change = fitter.noise.whiten(fit.linearised.readings[0] - reduced.readings[0], fitter.data.mask).flatten()
+    jacobian = (fitter.noise.whiten(reduced.jacobian[0], fitter.data.mask) * scale).flatten(0, 1)
     return float(torch.linalg.vector_norm(without(decomposed(jacobian, pull)[0], change.unsqueeze(1))))

@@ -99,9 +99,9 @@ def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_reading
     sure: whether the likeliest alone has 95 %. from_readings: causes that the readings show without a model.
     """
     best = credible_set[0]
-    if not best.causes and not best.place and not from_readings:
+    if not best.causes and not best.unknown and not from_readings:
         return "no_gap" if sure else "ambiguous"
-    if all(h.place for h in credible_set) or any(effect == UNKNOWN for effect, _ in from_readings):
+    if all(h.unknown for h in credible_set) or any(effect == UNKNOWN for effect, _ in from_readings):
         return "unknown"
     return "named" if sure else "ambiguous"
 
@@ -109,12 +109,12 @@ def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_reading
 def _free_form(posterior: Posterior, reach: OperatingRange) -> Fit | None:
     """The free discrepancy of the likeliest hypothesis as a fit, if the hypothesis has an unknown."""
     best = posterior.best
-    if best.place is None:
+    if best.unknown is None:
         return None
     # The free functions shall explain what the drift of a sensor would absorb.
-    fitter = with_disturbances(best.explanation.fitter, best.fit, replace(best.place.noise, wander=None))
+    fitter = with_disturbances(best.explanation.fitter, best.fit, replace(best.unknown.noise, wander=None))
     placements = [p for p in best.fit.candidate.placements if (p.effect.name, p.location) in best.causes]
-    return fitted_free_form(fitter, best.fit, placements, best.place.location, best.place.periods, reach)
+    return fitted_free_form(fitter, best.fit, placements, best.unknown.location, best.unknown.periods, reach)
 
 
 def recalibrate(data: DataSet) -> tuple[Fitter, Fit, list[float]]:

@@ -147,22 +147,22 @@ class HypothesisSearch:
         added: list[CauseHypothesis] = []
         least = max([rival, *(h.weight for h in hypotheses)]) + math.log(RARE)
         for h in hypotheses:
-            if h.place and h.weight > least:
-                under = with_disturbances(h.explanation.fitter, h.fit, replace(h.place.noise, wander=None))
-                at_place = [o for o in self.options if o.placement.location == h.place.location]
+            if h.unknown and h.weight > least:
+                under = with_disturbances(h.explanation.fitter, h.fit, replace(h.unknown.noise, wander=None))
+                at_place = [o for o in self.options if o.placement.location == h.unknown.location]
                 others = tuple(p for p in h.fit.candidate.placements if (p.effect.name, p.location) in h.causes)
                 base = under.fit(Candidate(others, (h.fit.values_of(others),)), h.fit)
                 for fit in self.pool.fits_beside(under, base, at_place):
-                    self.pool.evaluate(fit, replace(h.place.noise, wander=None))
+                    self.pool.evaluate(fit, replace(h.unknown.noise, wander=None))
                 here = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
-                added += [law for e in here for law in self._with_discrepancies(e, [h.place.location], h)]
+                added += [law for e in here for law in self._with_discrepancies(e, [h.unknown.location], h)]
         return [*added, *map(self._as_known, hypotheses)]
 
     def _as_known(self, h: CauseHypothesis) -> CauseHypothesis:
         """The hypothesis, or that of an effect at the place of its unknown which predicts as well."""
-        if h.place is None:
+        if h.unknown is None:
             return h
-        needed = self._fitness(h.explanation) + h.place.fitness
+        needed = self._fitness(h.explanation) + h.unknown.fitness
         for known in self.pool.explanations.values():
             if _names_unknown(known, h) and self._fitness(known) >= needed:
                 return CauseHypothesis(known, causes_in_order(known.fit), h.weight)
