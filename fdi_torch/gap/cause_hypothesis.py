@@ -14,16 +14,13 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-import torch
-
 from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.estimate.kalman import StateNoise
-from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.explanation_pool import RankedExplanation
-from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy
+from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, unexplained_norm
 from fdi_torch.gap.start_choice import vector_of
 
 
@@ -85,7 +82,5 @@ def influence(fitter: Fitter, fit: Fit, effects: Collection[CauseName]) -> float
     engine = fitter.engine(Candidate(tuple(others)), list(fit.values_of(others)))
     theta = vector_of(engine.space, fit.values)
     reduced = engine.converge(theta.unsqueeze(0), fit.linearised.levels[..., : len(fitter.data.plant.tanks)])
-    scale, pull, _ = fitter.priors(engine.space, theta)
-    change = fitter.noise.whiten(fit.linearised.readings[0] - reduced.readings[0], fitter.data.mask).flatten()
-    jacobian = (fitter.noise.whiten(reduced.jacobian[0], fitter.data.mask) * scale).flatten(0, 1)
-    return float(torch.linalg.vector_norm(without(decomposed(jacobian, pull)[0], change.unsqueeze(1))))
+    change = fit.linearised.readings[0] - reduced.readings[0]
+    return unexplained_norm(fitter, engine.space, theta, reduced.jacobian[0], change)

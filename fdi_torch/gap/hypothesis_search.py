@@ -24,7 +24,11 @@ from fdi_torch.gap.cause_hypothesis import (
 from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
 from fdi_torch.gap.library import tanks_of
 from fdi_torch.gap.localization.localize import localize, localize_beside
-from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, log_likelihood
+from fdi_torch.gap.localization.localized_discrepancy import (
+    LocalizedDiscrepancy,
+    log_likelihood,
+    unexplained_norm,
+)
 from fdi_torch.gap.marginal_likelihood import log_prior, occam, with_disturbances
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import SearchResult
@@ -156,23 +160,39 @@ class HypothesisSearch:
                     self.pool.evaluate(fit, replace(h.unknown.noise, wander=None))
                 here = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
                 added += [law for e in here for law in self._with_discrepancies(e, [h.unknown.location], h)]
-        return [*added, *map(self._as_known, hypotheses)]
+        return [self._as_known(h) for h in [*hypotheses, *added]]
 
     def _as_known(self, h: CauseHypothesis) -> CauseHypothesis:
         """The hypothesis, or that of an effect at the place of its unknown which predicts as well."""
         if h.unknown is None:
             return h
-        needed = self._fitness(h.explanation) + h.unknown.fitness
         for known in self.pool.explanations.values():
-            if _names_unknown(known, h) and self._fitness(known) >= needed:
+            if _names_unknown(known, h) and self._predicts_as_well(known, h.explanation, h.unknown):
                 return CauseHypothesis(known, causes_in_order(known.fit), h.weight)
         return h
 
-    def _fitness(self, explanation: RankedExplanation) -> float:
-        """Log likelihood of an explanation less one nat for each parameter (Akaike, 1974)."""
+    def _predicts_as_well(
+        self, known: RankedExplanation, explanation: RankedExplanation, unknown: LocalizedDiscrepancy
+    ) -> bool:
+        """Whether an effect at the place of an unknown predicts as well by Akaike's criterion (1974), which costs one
+        nat for each parameter, after its law moved towards the unknown as far as its relative error allows.
+
+        The log likelihood is quadratic along this way, and has its maximum at the unknown.
+        """
+        fitter, fit, remaining = self.pool.fitter, known.fit, 1.0  # share of the way
+        if unknown.predicted is not None:
+            towards = unknown.predicted - fit.linearised.readings[0]
+            distance = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], towards)
+            here = [c for c in known.key if c[1] == unknown.location]
+            remaining -= min(ODDS.discrepancy * influence(fitter, fit, here) / distance, 1.0) if distance else 1.0
+        better = self._log_likelihood(explanation) + unknown.log_likelihood - self._log_likelihood(known)
+        saved = unknown.parameters + len(explanation.fit.space) - len(known.fit.space)
+        return better * remaining**2 <= max(saved, 0)
+
+    def _log_likelihood(self, explanation: RankedExplanation) -> float:
         fitter, fit = explanation.fitter, explanation.fit
         volume = occam(fitter, fit.space, fit.theta, fitter.whiten(fit.linearised.jacobian[0]))
-        return explanation.log_weight - log_prior(fit.key, self.pool.choices) - volume - len(fit.space)
+        return explanation.log_weight - log_prior(fit.key, self.pool.choices) - volume
 
     def _with_inexact_laws(self, h: CauseHypothesis) -> list[CauseHypothesis]:
         """Without effects that are small compared with others at their place.

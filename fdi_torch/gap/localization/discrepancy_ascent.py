@@ -12,7 +12,7 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import Positions, with_best_frequency
-from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, log_likelihood
+from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, log_likelihood, unexplained_norm
 from fdi_torch.gap.localization.single_regressor_gain import largest_influence
 from fdi_torch.gap.localization.sparse_regression import SparseFit, column_costs
 from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
@@ -45,8 +45,8 @@ class EvaluatedDiscrepancy:
         return self.without + self.regressed.evidence
 
     @property
-    def fitness(self) -> float:
-        return self.without + self.regressed.reduction - float(self.regressed.used.sum())
+    def log_likelihood(self) -> float:
+        return self.without + self.regressed.reduction
 
     @property
     def explained(self) -> Tensor:
@@ -54,11 +54,20 @@ class EvaluatedDiscrepancy:
         return self.discrepancy.columns @ self.regressed.mean
 
     def localized(self, fitter: Fitter) -> LocalizedDiscrepancy:
-        """The result. fitter: that of the explanation, under its sensor noise alone."""
-        explained, at = self.explained, self.discrepancy
-        size = float(torch.linalg.vector_norm(fitter.noise.whiten(explained, fitter.data.mask)))
+        """The result. fitter: that of the explanation, whose sensor noise is the unit of the size."""
+        explained, at, used, fit = self.explained, self.discrepancy, self.regressed.used, self.regression.fit
+        size = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], explained)
         return LocalizedDiscrepancy(
-            self.location, self.gain, self.fitness, explained, size, at.frequency, self.regression.fit, self.noise
+            self.location,
+            self.gain,
+            self.log_likelihood,
+            int(used.sum()),
+            explained,
+            at.linearised.readings[0] + explained,
+            size,
+            at.frequency,
+            fit,
+            self.noise,
         )
 
 

@@ -14,6 +14,7 @@ from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.regressors import HARMONICS
 from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
+from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Linearised
 
 
@@ -21,17 +22,19 @@ from fdi_torch.simulate.collocation import Linearised
 class LocalizedDiscrepancy:
     """A discrepancy at one component, in addition to a fit.
 
-    gain: in log evidence against the fit alone, without prior odds. fitness: log likelihood less one nat for each
-    parameter of the discrepancy (Akaike, 1974), over that of the fit alone. explained: its influence on the readings
-    (S, C); none of a random process. size: norm of its influence, in units of the sensor noise. frequency:
-    of its sinusoids, Hz, if any. fit, noise: the fit refitted, and the most likely disturbance noise, with the
-    discrepancy.
+    gain: in log evidence against the fit alone, without prior odds. log_likelihood: gain in it against the fit alone,
+    by this number of parameters. explained: its influence on the readings (S, C); none of a random process.
+    predicted (S, C): the readings with it; None of a random process. size: norm of the part of it that no parameter of
+    the fit explains, in units of the sensor noise. frequency: of its sinusoids, Hz, if any. fit, noise: the fit
+    refitted, and the most likely disturbance noise, with the discrepancy.
     """
 
     location: str
     gain: float
-    fitness: float
+    log_likelihood: float
+    parameters: int
     explained: Tensor
+    predicted: Tensor | None
     size: float
     frequency: float | None
     fit: Fit
@@ -70,6 +73,19 @@ def nearly_without_the_largest(noise: StateNoise) -> StateNoise:
     intensity = noise.intensity.clone()
     intensity[intensity.argmax()] = 0.1 * intensity.min()
     return replace(noise, intensity=intensity)
+
+
+def unexplained_norm(
+    fitter: Fitter, space: ParameterSpace, theta: Tensor, jacobian: Tensor, deviation: Tensor
+) -> float:
+    """Norm, in units of the sensor noise, of the part of a deviation that no parameter within its tolerance explains.
+
+    deviation (S, C): of the readings. jacobian (S, C, P): their derivatives by the parameters at theta.
+    """
+    scale, pull, _ = fitter.priors(space, theta)
+    basis, _ = decomposed(fitter.noise.whiten(jacobian, fitter.data.mask).flatten(0, 1) * scale, pull)
+    column = fitter.noise.whiten(deviation, fitter.data.mask).flatten().unsqueeze(1)
+    return float(torch.linalg.vector_norm(without(basis, column)))
 
 
 def is_rounding_error(fitter: Fitter, place: str, std: float) -> bool:

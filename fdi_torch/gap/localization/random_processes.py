@@ -50,7 +50,7 @@ def random_flows(
     gain = log_evidence(fitter, fit, apart, linearised) - base - cost
     size = _moved(with_disturbances(fitter, fit, apart, linearised), linearised)
     nothing = torch.zeros_like(fitter.data.readings)
-    return [LocalizedDiscrepancy(tank, gain, gain + cost - 1.0, nothing, size, None, fit, apart)]
+    return [LocalizedDiscrepancy(tank, gain, gain + cost, 1, nothing, None, size, None, fit, apart)]
 
 
 def _moved(fitter: Fitter, linearised: Linearised) -> float:
@@ -75,7 +75,7 @@ def drifting_sensors(
         gain = log_evidence(fitter, fit, noise, regression.at(sensor)[1]) - base
         cost = _drift_cost(fitter, noise.wander)
         nothing, size = torch.zeros_like(fitter.data.readings), _drift_size(fitter, noise.wander)
-        return LocalizedDiscrepancy(sensor, gain - cost, gain - 2.0, nothing, size, None, fit, noise)
+        return LocalizedDiscrepancy(sensor, gain - cost, gain, 2, nothing, None, size, None, fit, noise)
 
     def most_likely(start: LocalizedDiscrepancy) -> LocalizedDiscrepancy:
         linearised = regression.at(start.location)[1]
