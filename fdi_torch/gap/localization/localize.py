@@ -18,7 +18,7 @@ from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_ascent import STEPS, Ascent, EvaluatedDiscrepancy, gain_of
+from fdi_torch.gap.localization.discrepancy_ascent import CONVERGED, STEPS, Ascent, EvaluatedDiscrepancy, gain_of
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
@@ -83,9 +83,9 @@ def localize(
         excess = max(excess, found.gain - expected)
         if not is_rounding_error(fitter, place, float(found.explained.square().mean(dim=0).max().sqrt())):
             needed, evaluated[place] = max(needed, found.gain + math.log(RARE)), found
-    likeliest: EvaluatedDiscrepancy | None = None
-    while evaluated and (best := max(evaluated.values(), key=gain_of)) is not likeliest:
-        likeliest = best
+    before = -math.inf
+    while evaluated and (likeliest := max(evaluated.values(), key=gain_of)).gain - before > CONVERGED:
+        before = likeliest.gain
         for place, known in evaluated.items():
             # A larger noise than that which the likeliest discrepancy left hides what another place explains as well.
             if known is not likeliest:
