@@ -94,6 +94,16 @@ def test_a_second_effect_that_only_corrects_the_law_of_the_first_is_not_a_cause(
     assert [(c.effect, c.location) for c in answer.causes] == [("pump_lag", "Q1")]
 
 
+def test_an_effect_whose_law_is_slightly_wrong_is_no_unknown() -> None:
+    """A draw that opens and closes in 20 s; the library's begins and ends at once."""
+    commanded = recorded({}, 8).inputs
+    time, net = torch.arange(len(commanded), dtype=torch.float64), commanded.clone()
+    net[:, 0] -= 1.5e-5 * (((time - 250.0) / 20.0).clamp(0.0, 1.0) - ((time - 520.0) / 20.0).clamp(0.0, 1.0))
+    answer = diagnose(nominal_plant(), replace(recorded({}, 8, inputs=net, std=2e-4), inputs=commanded))
+    assert [(c.effect, c.location) for c in answer.causes] == [("unmetered_flow", "T1")]
+    assert answer.verdict == "named"
+
+
 def test_the_influence_of_an_effect_is_the_chi_square_that_a_fit_without_it_adds() -> None:
     """For an effect in which the readings are linear; with exact constants, only the initial levels can replace it."""
     recording = recorded({"h3.sensor_drift.rate": 2e-6}, 3, samples=600)
