@@ -113,7 +113,7 @@ class Strategy(Protocol):
 
 def strategy_named(name: str) -> Strategy:
     """The strategy of this name in `STRATEGIES`."""
-    found: Strategy = import_module(f"fdi_torch.estimate.{STRATEGIES[name]}").STRATEGY
+    found: Strategy = import_module(f"fdi_torch.estimate.{STRATEGIES[name][0]}").STRATEGY
     return found
 
 
