@@ -269,7 +269,7 @@ class Collocation:
         inputs = [*middle.unbind(1), *(commands[i] for i in driven), *moving]
         moved = tuple(self._names) if moving else ()
         plant, placements = network.description, tuple(p.prefix for p in network.placements)
-        components = plant.tanks, plant.pipes, plant.pumps, plant.weirs, plant.transfers
+        components = plant.tanks, *plant.flow_components()
         known = partials_of(components, placements, moved, tuple(driven), reaches_rim)
         values_at, rows = known(rates, inputs, shape)
         by_level, by_theta = (middle.new_zeros(lanes, n, m, steps) for m in (n, width))
