@@ -35,6 +35,7 @@ from fdi_torch.simulate.scan import scan_in_time
 # Newton's method has converged at corrections below these, in units of the plant's length scale: of the whole plant,
 # of one tank.
 CONVERGED, ONE_CONVERGED = 1e-7, 1e-5
+ONE_ROUNDS = 8  # most corrections of one tank
 
 
 @dataclass(frozen=True)
@@ -140,13 +141,11 @@ class Collocation:
         return self.linearise(theta, levels)
 
     def simulate_tank(
-        self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes tanks"], tank: int, rounds: int = 8
-    ) -> Float[Tensor, "L nodes tanks"]:
-        """Simulate one tank with the levels of all others given: levels (L, K+1, tanks) m, with that tank's
-        replaced.
-        """
+        self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes tanks"], tank: int
+    ) -> Float[Tensor, "L nodes n"]:
+        """Simulate one tank with the levels of all others given, m: the trajectory with that tank's level replaced."""
         levels = self._path(theta, levels).movedim(1, 2).clone()
-        for _ in range(rounds):
+        for _ in range(ONE_ROUNDS):
             path = levels.movedim(1, 2)
             values = self.network.bind(self.space, theta.unsqueeze(-2))
             rates, by_level, _ = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), values, [], 0)
@@ -162,7 +161,7 @@ class Collocation:
                 break
         return levels
 
-    def rates(self, middle: Float[Tensor, "#L K tanks"], theta: Float[Tensor, "L P"]) -> Float[Tensor, "L K tanks"]:
+    def rates(self, middle: Float[Tensor, "#L K m"], theta: Float[Tensor, "L P"]) -> Float[Tensor, "L K n"]:
         """dh/dt (L, K, tanks), m/s, at given mid-step levels (L or 1, K, tanks)."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
         shape = (len(theta), middle.shape[1])

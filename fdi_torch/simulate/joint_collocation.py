@@ -58,12 +58,12 @@ class JointCollocation:
 
     def simulate_tank(
         self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N tanks"], tank: int
-    ) -> Float[Tensor, "L N tanks"]:
+    ) -> Float[Tensor, "L N n"]:
         """Levels (L, N, tanks), m, with those of one tank computed from the given levels of all others."""
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
         return torch.cat([part.simulate_tank(columns, piece, tank) for part, columns, piece in pieces], dim=1)
 
-    def rates(self, middle: Float[Tensor, "#L K tanks"], theta: Float[Tensor, "L P"]) -> Float[Tensor, "L K tanks"]:
+    def rates(self, middle: Float[Tensor, "#L K m"], theta: Float[Tensor, "L P"]) -> Float[Tensor, "L K n"]:
         """dh/dt (L, N-1, tanks), m/s, at given mid-step levels; 0 between recordings."""
         pieces = torch.split(_with_last(middle), self._nodes, dim=1)
         rates = [
