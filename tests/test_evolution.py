@@ -11,6 +11,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution import REASONS, EvolutionSettings, Search, evolve, snapshot, stop_reason
+from fdi_torch.estimate.evolution_settings import STRATEGIES
 from fdi_torch.estimate.generation import ask, draw_other, init, tell
 from fdi_torch.estimate.strategy import state_from_dict, strategy_named
 
@@ -19,7 +20,9 @@ RAND_1 = EvolutionSettings("rand/1/bin", population=50, evaluations=60_000, fact
 L_SHADE = EvolutionSettings("l-shade", population=80, evaluations=30_000)
 # Several minima need large populations (Hansen and Kern 2004, figure 2).
 CMA_ES = EvolutionSettings("cma_es", population=200, evaluations=60_000)
-ALL = pytest.mark.parametrize("settings", [RAND_1, L_SHADE, CMA_ES], ids=["rand/1/bin", "l-shade", "cma_es"])
+OWN = {s.strategy: s for s in (RAND_1, L_SHADE)}
+OF_EACH = {name: OWN.get(name, replace(CMA_ES, strategy=name)) for name in STRATEGIES}
+ALL = pytest.mark.parametrize("settings", OF_EACH.values(), ids=OF_EACH)
 SHIFT = torch.tensor([0.7, -1.3, 1.9, -0.4], dtype=DOUBLE)
 # An orthogonal matrix without zeros.
 ROTATION = torch.eye(4, dtype=DOUBLE) - 0.5 * torch.ones(4, 4, dtype=DOUBLE)

@@ -55,8 +55,8 @@ class Rig:
             raise ValueError(f"rig {self.plant.name}: expected pumps and sensors, got none; add at least one of each")
 
 
-def _coefficient_tolerances(pipes: tuple[Pipe, ...], share: float = 0.03) -> dict[str, float]:
-    return {f"{pipe.name}.discharge_coefficient": share for pipe in pipes}
+def _coefficient_tolerances(pipes: tuple[Pipe, ...]) -> dict[str, float]:
+    return {f"{pipe.name}.discharge_coefficient": 0.03 for pipe in pipes}
 
 
 def three_tank() -> Rig:

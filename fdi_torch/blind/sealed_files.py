@@ -27,7 +27,7 @@ from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import DECIMALS, command_unit
 from fdi_torch.blind.plants import Rig
 from fdi_torch.blind.scaling import decimals
-from fdi_torch.plant.description import FaultPriority, Pipe, PlantDescription, Pump, Sensor, Tank, Transfer, Weir
+from fdi_torch.plant.description import FLOW_KINDS, FaultPriority, PlantDescription, Sensor, Tank
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.recordings.source import file_sha256
@@ -114,7 +114,7 @@ def read_plant(out: Path, line: Mapping[str, Any]) -> PlantDescription:
     path = _plant_file(out, line["case"])
     _expect_unchanged(line, "plant", file_sha256(path))
     data = json.loads(path.read_text())
-    kinds = {"tanks": Tank, "pipes": Pipe, "pumps": Pump, "weirs": Weir, "transfers": Transfer, "sensors": Sensor}
+    kinds = {"tanks": Tank, "sensors": Sensor} | {kind.part(): kind for kind in FLOW_KINDS}
     parts = {name: tuple(kind(**fields) for fields in data.get(name, ())) for name, kind in kinds.items()}
     matters = tuple(FaultPriority(**matter) for matter in data.get("matters", ()))
     lists = {"effects": (), "varying": tuple(data["varying"]), "matters": matters}

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from scipy import stats
 
 
-def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Exact interval for a share of k in n (Clopper and Pearson, 1934); (0, 1) for n = 0."""
+def clopper_pearson(k: int, n: int) -> tuple[float, float]:
+    """Exact 95 % interval for a share of k in n (Clopper and Pearson, 1934); (0, 1) for n = 0."""
     if n == 0:
         return 0.0, 1.0
-    low, high = stats.binomtest(k, n).proportion_ci(confidence, "exact")
+    low, high = stats.binomtest(k, n).proportion_ci(0.95, "exact")
     return float(low), float(high)
 
 
@@ -28,7 +28,7 @@ def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
     return median, ranked[outside[-1] - 1], ranked[n - outside[-1]]
 
 
-def mean_interval(values: Sequence[float], z: float = 1.96) -> tuple[float, float, float]:
+def mean_interval(values: Sequence[float]) -> tuple[float, float, float]:
     """Mean and its normal 95 % interval; NaN without values, zero width for one value."""
     if not values:
         return math.nan, math.nan, math.nan
@@ -36,7 +36,7 @@ def mean_interval(values: Sequence[float], z: float = 1.96) -> tuple[float, floa
     if len(values) == 1:
         return mean, math.nan, math.nan
     std = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
-    half = z * std / math.sqrt(len(values))
+    half = 1.96 * std / math.sqrt(len(values))
     return mean, mean - half, mean + half
 
 

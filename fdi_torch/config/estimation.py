@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
 from fdi_torch.effects import all_placements, build_network, full_name, placements_for
-from fdi_torch.estimate.evolution_settings import EvolutionSettings
+from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
 from fdi_torch.names import shortened, unknown
 from fdi_torch.parameters import Parameter, ParameterSpace, display_unit
 from fdi_torch.plant.description import PlantDescription
@@ -83,7 +83,7 @@ class EstimationConfig(Strict):
     )
     objective: ObjectiveConfig = Field(default_factory=ObjectiveConfig)
     search: Annotated[EvolutionSettings, BeforeValidator(_known_settings)] = Field(
-        default_factory=EvolutionSettings, description="search of the basin; strategy: l-shade, rand/1/bin or cma_es"
+        default_factory=EvolutionSettings, description=f"search of the basin; strategy: {', '.join(STRATEGIES)}"
     )
     refine: RefineConfig = Field(default_factory=RefineConfig)
     step: StepConfig = Field(default_factory=StepConfig)

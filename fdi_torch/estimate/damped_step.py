@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import apply, dot, solve_positive
@@ -61,7 +62,7 @@ class Step:
         return Step(self.trial[keep], self.predicted[keep], self.solvable[keep])
 
 
-def newton_decrement(model: Quadratic) -> tuple[Tensor, Tensor]:
+def newton_decrement(model: Quadratic) -> tuple[Float[Tensor, " L"], Bool[Tensor, " L"]]:
     """g'H^-1 g / 2 over the free parameters, (L,), and whether H is positive definite there, (L,) bool."""
     free = ~model.held()
     scaled_gradient = torch.where(free, model.gradient * model.unit, 0.0)
@@ -70,7 +71,7 @@ def newton_decrement(model: Quadratic) -> tuple[Tensor, Tensor]:
     return 0.5 * dot(scaled_gradient, newton), positive
 
 
-def damped_step(model: Quadratic, damping: Tensor) -> Step:
+def damped_step(model: Quadratic, damping: Float[Tensor, " L"]) -> Step:
     """The damped Newton step within the bounds, damping (L,).
 
     A parameter that would leave its range is fixed at the bound, and the step of the others is solved again until all
@@ -96,7 +97,9 @@ def damped_step(model: Quadratic, damping: Tensor) -> Step:
     return Step(trial, predicted, solvable)
 
 
-def bent_step(model: Quadratic, damping: Tensor, trial: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
+def bent_step(
+    model: Quadratic, damping: Float[Tensor, " L"], trial: Float[Tensor, "L P"], bend: Float[Tensor, "L P"]
+) -> tuple[Float[Tensor, "L P"], Bool[Tensor, " L"]]:
     """The step to `trial` (L, P) with its second-order correction, (L, P), and whether it is valid, (L,) bool.
 
     bend (L, P): J'c, with c = r(theta + step) - r(theta) - J step the nonlinearity of the residuals along the step. The

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.estimate.combinations import Combination, listed, value_text
@@ -206,7 +207,7 @@ def _inflows(
     return network.less_overflow(point, network.net_inflows(point, network.flows(point)))
 
 
-def sample_noise(values: Tensor, weight: Tensor) -> Tensor:
+def sample_noise(values: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
     """Model-free estimate of the readings' noise (C,) from second differences of neighbouring samples (S, C).
 
     sigma = median |y_{s+1} - 2 y_s + y_{s-1}| / (0.6745 sqrt 6). Second differences remove a smooth signal, and the
@@ -221,7 +222,7 @@ def sample_noise(values: Tensor, weight: Tensor) -> Tensor:
     return torch.stack(levels)
 
 
-def lasting(residual: Tensor, weight: Tensor) -> Tensor:
+def lasting(residual: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
     """Variance inflation of each channel due to correlated residuals, (C,): (1 + a) / (1 - a), a: lag-1 correlation.
 
     This is the ratio of an AR(1) spectrum at frequency zero to white noise of the same variance (Box & Jenkins 1970). A

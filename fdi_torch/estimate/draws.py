@@ -8,6 +8,7 @@ int64 arithmetic modulo 2^64.
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -34,7 +35,7 @@ def mix(words: Tensor) -> Tensor:
     return words
 
 
-def stream(seed: Tensor, *counters: int) -> Tensor:
+def stream(seed: Int[Tensor, "*problems"], *counters: int) -> Int[Tensor, "*problems"]:
     """Keys (*problems) int64 of independent random streams, one for each seed (*problems) and tuple of counters."""
     key = mix(seed)
     for counter in counters:
@@ -42,7 +43,7 @@ def stream(seed: Tensor, *counters: int) -> Tensor:
     return key
 
 
-def uniform(key: Tensor, count: int) -> Tensor:
+def uniform(key: Int[Tensor, "*problems"], count: int) -> Float[Tensor, "*problems count"]:
     """The first `count` draws of each stream, uniform on the open interval (0, 1).
 
     key (*problems) int64 -> (*problems, count) float64. Each draw is the midpoint of one of 2^32 equal cells.

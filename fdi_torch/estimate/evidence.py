@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -46,7 +47,7 @@ def log_prior(count: int, places: int, choices: int) -> float:
     return each + math.lgamma(count + 1)
 
 
-def log_det(curvature: Tensor) -> float:
+def log_det(curvature: Float[Tensor, "P P"]) -> float:
     """Log determinant of a curvature (P, P) that is scaled by each parameter's prior width.
 
     Eigenvalues below one are set to one: a direction without information in the data keeps its prior.
@@ -54,7 +55,7 @@ def log_det(curvature: Tensor) -> float:
     return float(torch.log(torch.clamp(torch.linalg.eigvalsh(curvature), min=1.0)).sum())
 
 
-def log_volume(curvature: Tensor, width: Tensor) -> float:
+def log_volume(curvature: Float[Tensor, "P P"], width: Float[Tensor, " P"]) -> float:
     """Log of the Occam factor, the ratio of posterior volume to uniform prior volume: -log det(W H W / 2 pi) / 2 <= 0.
 
     curvature (P, P): Hessian H of the cost, half a chi-square. width (P,): widths of the prior, the diagonal of W. A

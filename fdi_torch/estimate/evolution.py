@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from fdi_torch.capacity import expect_room
@@ -119,7 +120,7 @@ def snapshot(search: Search) -> EvolutionResult:
     )
 
 
-def stop_reason(state: SearchState, settings: EvolutionSettings) -> Tensor:
+def stop_reason(state: SearchState, settings: EvolutionSettings) -> Int[Tensor, "*problems"]:
     """Stopping reason of each problem, (*problems) int64, an index into REASONS; 0 while it runs.
 
     converged: the range of the members is at most `parameter_tolerance` times the box's width in every parameter, and

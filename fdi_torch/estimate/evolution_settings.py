@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
-# Name of each strategy -> module in `estimate` whose `STRATEGY` it is.
-STRATEGIES = {"rand/1/bin": "generation", "l-shade": "generation", "cma_es": "cma_es"}
+# Name of each strategy -> module in `estimate` whose `STRATEGY` it is, and its default population for P parameters.
+STRATEGIES: dict[str, tuple[str, Callable[[int], int]]] = {
+    "rand/1/bin": ("generation", lambda parameters: 10 * parameters),
+    "l-shade": ("generation", lambda parameters: 18 * parameters),
+    "cma_es": ("cma_es", lambda parameters: 4 + int(3.0 * math.log(parameters))),
+}
 
 
 @dataclass(frozen=True)
 class EvolutionSettings:
     """Settings of the search: first those of all strategies, then those of each one.
 
-    population: number of members N; None: 10 P (rand/1/bin), 18 P (l-shade) or
-    4 + 3 ln P (cma_es; more is safer where the cost has several minima), with P parameters.
+    population: number of members N; None: that of `STRATEGIES`. More are safer where the cost has several minima.
     evaluations: budget of cost evaluations per problem.
     parameter_tolerance: relative to the box's width; cost_tolerance: relative to the scale of the costs, `State.scale`.
     patience: number of generations without improvement after which a problem has stalled.
@@ -54,10 +58,7 @@ class EvolutionSettings:
         _expect(self.cost_tolerance >= 0.0, "cost_tolerance of at least 0", self.cost_tolerance)
 
     def first_population(self, parameters: int) -> int:
-        several = max(parameters, 1)
-        if self.strategy == "cma_es":
-            return self.population or 4 + int(3.0 * math.log(several))
-        return self.population or (18 if self.strategy == "l-shade" else 10) * several
+        return self.population or STRATEGIES[self.strategy][1](max(parameters, 1))
 
     def population_after(self, first: int, evaluations: int) -> int:
         """Population size of the next generation: constant, or linear in the evaluations (L-SHADE, equation 10)."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from fdi_torch.estimate.bounds import halfway
@@ -47,7 +48,11 @@ class Trial(Proposal):
 
 
 def init(
-    low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor, first_guess: Tensor | None = None
+    low: Float[Tensor, "*problems P"],
+    high: Float[Tensor, "*problems P"],
+    settings: EvolutionSettings,
+    seed: Int[Tensor, "*problems"],
+    first_guess: Float[Tensor, "*problems G P"] | None = None,
 ) -> State:
     """Draw the first population uniformly in the box, low + rand(0, 1) (high - low), not yet evaluated. (20)
 
@@ -149,7 +154,7 @@ def _ascending(values: list[Tensor]) -> list[Tensor]:
     return values
 
 
-def tell(state: State, trial: Trial, cost: Tensor, settings: EvolutionSettings) -> State:
+def tell(state: State, trial: Trial, cost: Float[Tensor, "*problems N"], settings: EvolutionSettings) -> State:
     """Select between parents and candidates, update the memories and sort the population. (23)
 
     cost (*problems, N): costs of the candidates; one that is not finite never replaces its parent.

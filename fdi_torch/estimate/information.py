@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import row_sum
@@ -20,7 +21,11 @@ RELATIVE_EIGENVALUE = 1e-10
 _SHARE = 1e-6
 
 
-def fisher_information(jacobian: Tensor, noise_std: Tensor, weight: Tensor | None = None) -> Tensor:
+def fisher_information(
+    jacobian: Float[Tensor, "*batch S C P"],
+    noise_std: Float[Tensor, "*#batch C"],
+    weight: Float[Tensor, "*#batch S C"] | None = None,
+) -> Float[Tensor, "*batch P P"]:
     """Fisher information (*batch, P, P) for independent Gaussian noise: sum of J J' / sigma^2 over all readings.
 
     jacobian (*batch, S, C, P): derivatives of the readings. noise_std (*batch, C): in each reading's unit.
@@ -52,7 +57,11 @@ class Certainty:
     scale: Tensor
 
 
-def certainty(information: Tensor, held: Tensor | None = None, threshold: float = RELATIVE_EIGENVALUE) -> Certainty:
+def certainty(
+    information: Float[Tensor, "*batch P P"],
+    held: Bool[Tensor, "*batch P"] | None = None,
+    threshold: float = RELATIVE_EIGENVALUE,
+) -> Certainty:
     """Covariance from the Fisher information (*batch, P, P), priors included: the Cramer-Rao bound at the estimate.
 
     held (*batch, P) bool: parameters taken as exactly known, such as those at an active bound. Their standard error is
@@ -105,7 +114,7 @@ def _certainty_from(covariance: Tensor, null: Tensor, scale: Tensor, held: Tenso
     return Certainty(covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt(), covariance, determined, null, scale)
 
 
-def determined_combinations(null: Tensor, scale: Tensor) -> list[tuple[list[int], Tensor]]:
+def determined_combinations(null: Float[Tensor, "P P"], scale: Float[Tensor, " P"]) -> list[tuple[list[int], Tensor]]:
     """Groups of parameters that are jointly undetermined, with the linear combinations of them that are determined.
 
     null (P, P), scale (P,): from one `Certainty`. Returns for each group the indices of its m parameters and the

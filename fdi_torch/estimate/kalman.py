@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.simulate.build import load_library
@@ -176,15 +177,15 @@ class Filtered:
         self.white = variance.new_empty(kalman_filter.samples, kalman_filter.channels, kalman_filter.channels)
         self.log_det = float(self._run("kalman_gains", self.gain, self.white))
 
-    def innovations(self, y: Tensor) -> Tensor:
+    def innovations(self, y: Float[Tensor, "S C M"]) -> Float[Tensor, "S C M"]:
         """Innovations (S, C, M) of unit variance of residuals y (S, C, M); 0 where masked."""
         return self._run_on_columns("kalman_innovations", y)
 
-    def transposed(self, v: Tensor) -> Tensor:
+    def transposed(self, v: Float[Tensor, "S C M"]) -> Float[Tensor, "S C M"]:
         """Adjoint of `innovations`: u (S, C, M) such that sum(u y) = sum(v innovations(y)) for every y."""
         return self._run_on_columns("kalman_transposed", v)
 
-    def score(self, nu: Tensor) -> Score:
+    def score(self, nu: Float[Tensor, "S C"]) -> Score:
         """Score of the log-likelihood, given innovations nu (S, C) of unit variance."""
         slopes, information = ([torch.empty_like(x) for x in (self.q, self.r, self.p0)] for _ in range(2))
         shocks = nu.new_empty(self.gain.shape[:2])
@@ -199,14 +200,14 @@ class Filtered:
         wander = decaying[order - 1 : order] + at_start[order - 1 : order] if self.wanders else decaying[:0]
         return torch.cat([decaying[: self.flows], of_sensors, wander])
 
-    def smoothed(self, residual: Tensor) -> Tensor:
+    def smoothed(self, residual: Float[Tensor, "S C"]) -> Float[Tensor, "S n"]:
         """Smoothed deviation of the levels from the trajectory, (S, n) m, given all residuals (S, C)."""
         shocks = self.score(self.innovations(residual.unsqueeze(-1)).squeeze(-1)).shocks
         states = residual.new_empty(self.own.samples, self.order)
         self._run("kalman_levels", shocks, states)
         return states[:, : self.own.order]
 
-    def predicted(self, residual: Tensor) -> Tensor:
+    def predicted(self, residual: Float[Tensor, "S C"]) -> Float[Tensor, "S n"]:
         """Deviation of the levels from the trajectory, (S, n) m, predicted for each sample from the residuals (S, C) of
         all earlier ones."""
         states = residual.new_empty(self.own.samples, self.order)

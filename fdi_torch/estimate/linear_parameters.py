@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 RIDGE = 1e-6  # least root of a prior precision; keeps parameters without information in place
 
 
-def decomposed(jacobian: Tensor, pull: Tensor) -> tuple[Tensor, Tensor]:
+def decomposed(
+    jacobian: Float[Tensor, "N M"], pull: Float[Tensor, " P"]
+) -> tuple[Float[Tensor, "NP rank"], Float[Tensor, "rank M"]]:
     """Orthonormal basis Q (N + P, M) of the influence of the parameters on readings and priors, and factor R (M, M).
 
     jacobian (N, M): whitened derivatives of the readings by the P parameters and by M - P further ones without a prior.

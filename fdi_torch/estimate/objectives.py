@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from fdi_torch.estimate.linearisation import Linearisation
@@ -71,7 +72,7 @@ class Problem:
         terms = [replace(term, noise_std=level) for term, level in zip(self.terms, levels, strict=True)]
         return Problem(self.space, terms, "likelihood")
 
-    def cost(self, theta: Tensor, lanes: Tensor) -> Tensor:
+    def cost(self, theta: Float[Tensor, "L N P"], lanes: Int[Tensor, " L"]) -> Float[Tensor, "L N"]:
         """Cost (L, N) of the candidates theta (L, N, P) of the problems `lanes` (L,)."""
         total = self._prior(theta)
         for term in self.terms:
@@ -83,12 +84,12 @@ class Problem:
                 total = total + deviance(sums[..., 1], data, known_noise(term, lanes)).sum(-1)
         return total
 
-    def correlations(self, theta: Tensor, lanes: Tensor) -> Tensor:
+    def correlations(self, theta: Float[Tensor, "L N P"], lanes: Int[Tensor, " L"]) -> Float[Tensor, "L N C"]:
         """Correlation rho (18) of each channel of the first recording, (L, N, C)."""
         data = of_lanes(self.terms[0].data, lanes)
         return 1.0 - correlation_loss(self.terms[0].engine.moments(self.terms[0].theta(theta), data), data)
 
-    def linearise(self, theta: Tensor, lanes: Tensor) -> Linearisation:
+    def linearise(self, theta: Float[Tensor, "L P"], lanes: Int[Tensor, " L"]) -> Linearisation:
         """Cost (L,), gradient (L, P) and Gauss-Newton curvature (L, P, P) at theta (L, P), priors included."""
         precision = self._precision(theta)
         deviation = torch.where(precision > 0, theta - self.space.nominal(theta), torch.zeros_like(theta))
@@ -111,7 +112,7 @@ class Problem:
             curvature = curvature.index_add(2, columns, rows)
         return Linearisation(cost, gradient, curvature)
 
-    def noise(self, theta: Tensor, lanes: Tensor) -> list[Tensor]:
+    def noise(self, theta: Float[Tensor, "L P"], lanes: Int[Tensor, " L"]) -> list[Tensor]:
         """Standard deviation of one reading's residual, (L, C) for each recording.
 
         The P degrees of freedom that the parameters use are divided equally among all channels of all recordings.

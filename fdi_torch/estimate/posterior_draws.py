@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.estimate.bounds import reflected
@@ -216,7 +217,7 @@ def first_walkers(
     return reflected(theta, low, high).cpu().numpy()
 
 
-def convergence(chains: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def convergence(chains: Float[Tensor, "M D P"]) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, " P"]]:
     """R-hat and effective sample sizes, bulk and tail, (P,) each, of chains (M, D, P), by ArviZ."""
     statistics = needed("arviz_stats.base", "draws").array_stats
     columns = [chains[..., i].numpy() for i in range(chains.shape[-1])]

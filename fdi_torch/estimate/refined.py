@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 STATUSES = ("running", "converged", "stalled", "max_iterations", "failed", "abandoned")
@@ -98,7 +99,9 @@ def unfinished(start: Tensor, state: State | None) -> Refined:
     )
 
 
-def flat_box(start: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def flat_box(
+    start: Float[Tensor, "*batch P"], low: Tensor, high: Tensor
+) -> tuple[Float[Tensor, "B P"], Float[Tensor, "B P"], Float[Tensor, "B P"]]:
     """start (*batch, P) clamped to its box, with low and high, each (B, P). Raises ValueError for an empty box."""
     parameters = start.shape[-1]
     if not bool((low <= high).all()):

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.estimate.evolution import EvolutionResult
@@ -172,7 +173,7 @@ def status_of(refinement: Refined) -> str:
     return "not refined" if no_iterations else status
 
 
-def information_std(problem: Problem, theta: Tensor) -> Tensor:
+def information_std(problem: Problem, theta: Float[Tensor, "one P"]) -> Float[Tensor, " P"]:
     """Standard errors (P,) from the Gauss-Newton curvature at theta (1, P); infinite for undetermined parameters."""
     curvature = problem.linearise(theta, torch.zeros(1, dtype=torch.int64)).curvature[0]
     return make_estimate(problem.space, theta[0], curvature).std

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import row_sum
@@ -56,8 +57,14 @@ def success_weights(gain: Tensor, success: Tensor) -> Tensor:
 
 
 def update_memory(
-    memory_f: Tensor, memory_cr: Tensor, cell: Tensor, factor: Tensor, rate: Tensor, gain: Tensor, success: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+    memory_f: Float[Tensor, "*problems H"],
+    memory_cr: Float[Tensor, "*problems H"],
+    cell: Int[Tensor, "*problems"],
+    factor: Float[Tensor, "*problems N"],
+    rate: Float[Tensor, "*problems N"],
+    gain: Float[Tensor, "*problems N"],
+    success: Bool[Tensor, "*problems N"],
+) -> tuple[Float[Tensor, "*problems H"], Float[Tensor, "*problems H"], Int[Tensor, "*problems"]]:
     """Store the weighted mean of the successful F and CR in one cell of the memories (*problems, H). [Algorithm 1]
 
     cell (*problems): index of the cell, which advances cyclically. factor, rate, gain (parent's minus candidate's cost)
@@ -75,8 +82,12 @@ def update_memory(
 
 
 def update_archive(
-    archive: Tensor, filled: Tensor, parents: Tensor, success: Tensor, u: Tensor
-) -> tuple[Tensor, Tensor]:
+    archive: Float[Tensor, "*problems A P"],
+    filled: Int[Tensor, "*problems"],
+    parents: Float[Tensor, "*problems N P"],
+    success: Bool[Tensor, "*problems N"],
+    u: Float[Tensor, "*problems N"],
+) -> tuple[Float[Tensor, "*problems A P"], Int[Tensor, "*problems"]]:
     """Add replaced parents to the archive, each in the next free row, or in a random row once the archive is full.
 
     archive (*problems, A, P), of which the first `filled` (*problems) rows are in use; parents (*problems, N, P);

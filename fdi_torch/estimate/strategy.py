@@ -19,6 +19,7 @@ from importlib import import_module
 from typing import Any, Protocol, Self
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
@@ -113,7 +114,7 @@ class Strategy(Protocol):
 
 def strategy_named(name: str) -> Strategy:
     """The strategy of this name in `STRATEGIES`."""
-    found: Strategy = import_module(f"fdi_torch.estimate.{STRATEGIES[name]}").STRATEGY
+    found: Strategy = import_module(f"fdi_torch.estimate.{STRATEGIES[name][0]}").STRATEGY
     return found
 
 
@@ -163,7 +164,9 @@ def _check_box(low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Ten
         )
 
 
-def with_first_guess(population: Tensor, guess: Tensor) -> Tensor:
+def with_first_guess(
+    population: Float[Tensor, "*problems N P"], guess: Float[Tensor, "*problems G P"]
+) -> Float[Tensor, "*problems N P"]:
     """The population (*problems, N, P) whose first members are replaced by the guesses (*problems, K, P)."""
     if guess.shape[-2] > population.shape[-2]:
         raise ValueError(
@@ -172,7 +175,7 @@ def with_first_guess(population: Tensor, guess: Tensor) -> Tensor:
     return torch.cat((guess, population[..., guess.shape[-2] :, :]), -2)
 
 
-def pick(rows: Tensor, index: Tensor) -> Tensor:
+def pick(rows: Float[Tensor, "*problems M P"], index: Int[Tensor, "*problems K"]) -> Float[Tensor, "*problems K P"]:
     """Copy the rows `index` (*problems, K) of `rows` (*problems, M, P) into a new tensor (*problems, K, P)."""
     problem = torch.arange(index[..., 0].numel(), device=index.device).reshape(*index.shape[:-1], 1)
     flat = (index + problem * rows.shape[-2]).reshape(-1)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.estimate.combinations import Combination, undetermined_groups
@@ -83,8 +84,8 @@ class Estimate:
 
 def make_estimate(
     space: ParameterSpace,
-    theta: Tensor,
-    information: Tensor,
+    theta: Float[Tensor, " P"],
+    information: Float[Tensor, "P P"],
     *,
     status: str = "",
     noise_std: Tensor | None = None,
@@ -130,7 +131,7 @@ def parameters_at_bounds(space: ParameterSpace, theta: Tensor) -> dict[str, str]
     return at_bounds
 
 
-def wider_than_range(space: ParameterSpace, std: Tensor) -> tuple[str, ...]:
+def wider_than_range(space: ParameterSpace, std: Float[Tensor, " P"]) -> tuple[str, ...]:
     """One sentence for each parameter whose standard error (P,) is finite but larger than its range."""
     return tuple(
         f"{p.name} is hardly determined: standard error {quantity_text(error, p.unit, 3)}, more than its range from "

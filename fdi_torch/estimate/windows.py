@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.estimate.diagnosis import fault_flow, sample_noise
@@ -61,7 +62,7 @@ class Window:
     misfit: float
 
 
-def noise_of(recording: Recording, plant: PlantDescription) -> Tensor:
+def noise_of(recording: Recording, plant: PlantDescription) -> Float[Tensor, " C"]:
     """Sample-to-sample noise of each sensor, (C,), in its reading's unit, limited from below."""
     readings = readings_of(recording, plant)
     spans = readings.values.new_tensor([reading_span(plant, sensor) for sensor in plant.sensors])
@@ -81,7 +82,7 @@ def cut_up(recording: Recording, length: float) -> list[Recording]:
     return [recording.window(first + k * length, first + (k + 1) * length) for k in range(count)]
 
 
-def window_step(fittings: Sequence[Fitting], std: Tensor) -> float:
+def window_step(fittings: Sequence[Fitting], std: Float[Tensor, " C"]) -> float:
     """Longest integration step (s) whose error is within STEP_ERROR times the sensor noise `std` (C,).
 
     It is determined on the window with the largest total variation of the inputs.
@@ -98,7 +99,7 @@ def window_step(fittings: Sequence[Fitting], std: Tensor) -> float:
     return choose_step(engine_at, points, STEP_ERROR * std, ladder, quantile=0.9)
 
 
-def window_of(fitting: Fitting, std: Tensor, suspects: Collection[str], step: float) -> Window:
+def window_of(fitting: Fitting, std: Float[Tensor, " C"], suspects: Collection[str], step: float) -> Window:
     """Fit one window and decide which faults are present.
 
     The fit starts from no fault, from all faults together and from each fault alone, and the best optimum is taken.

@@ -11,6 +11,7 @@ from copy import copy
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from fdi_torch.parameters import ParameterSpace, by_prefix
@@ -78,7 +79,7 @@ class TankNetwork(nn.Module):
         other.may_overflow = False
         return other
 
-    def bind(self, space: ParameterSpace, theta: Tensor) -> PlaceValues:
+    def bind(self, space: ParameterSpace, theta: Float[Tensor, "*batch P"]) -> PlaceValues:
         """All constants by place and field: from theta (*batch, P) where `space` names them, else nominal."""
         named = self.constants.named(self.nominal)
         for name, value in space.named(theta).items():
@@ -86,7 +87,13 @@ class TankNetwork(nn.Module):
             named[name] = value
         return Constants(by_prefix(named))
 
-    def forward(self, state: Tensor, commands: Tensor, clock: Clock, values: PlaceValues) -> Tensor:
+    def forward(
+        self,
+        state: Float[Tensor, "*batch order"],
+        commands: Float[Tensor, "*#batch actuators"],
+        clock: Clock,
+        values: PlaceValues,
+    ) -> Float[Tensor, "*batch order"]:
         """Rate of change of the state (*batch, order), m/s; state: as in `rates`, last dimension; commands: outputs of
         the actuators (*batch, actuators).
         """

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
@@ -48,7 +49,9 @@ def operating_range_of(recording: Recording, plant: PlantDescription) -> Operati
     )
 
 
-def with_simulated_levels(operating_range: OperatingRange, plant: PlantDescription, levels: Tensor) -> OperatingRange:
+def with_simulated_levels(
+    operating_range: OperatingRange, plant: PlantDescription, levels: Float[Tensor, "K tanks"]
+) -> OperatingRange:
     """The same range, with the levels of tanks without a sensor taken from a simulation: levels (K, tanks), m."""
     unmeasured = {t.name: _range(levels[:, i]) for i, t in enumerate(plant.tanks)}
     for sensor in plant.sensors:

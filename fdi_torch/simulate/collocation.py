@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.capacity import expect_room
@@ -34,6 +35,7 @@ from fdi_torch.simulate.scan import scan_in_time
 # Newton's method has converged at corrections below these, in units of the plant's length scale: of the whole plant,
 # of one tank.
 CONVERGED, ONE_CONVERGED = 1e-7, 1e-5
+ONE_ROUNDS = 8  # most corrections of one tank
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class Collocation:
         self._output_map = OutputMap(network, experiment, self._names)
         self._fixed_commands: list[Tensor] | None = None
 
-    def linearise(self, theta: Tensor, levels: Tensor) -> Linearised:
+    def linearise(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes n"]) -> Linearised:
         """One Newton step from the trajectories levels (L, K+1, n), with derivatives; theta (L, P).
 
         A trajectory of the tanks' levels alone (n = tanks) is completed by the steady states of the effects.
@@ -130,7 +132,7 @@ class Collocation:
         corrected, defect = newton_correction(self.experiment.steps, path, rates, by_level, start)
         return corrected.movedim(2, 1), defect
 
-    def converge(self, theta: Tensor, levels: Tensor, rounds: int = 12) -> Linearised:
+    def converge(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes n"], rounds: int = 12) -> Linearised:
         """Newton steps at fixed theta from levels (L, K+1, tanks), m, until they converge or `rounds` are used up."""
         for _ in range(rounds - 1):
             levels, defect = self.corrected(theta, levels)
@@ -138,12 +140,12 @@ class Collocation:
                 break
         return self.linearise(theta, levels)
 
-    def simulate_tank(self, theta: Tensor, levels: Tensor, tank: int, rounds: int = 8) -> Tensor:
-        """Simulate one tank with the levels of all others given: levels (L, K+1, tanks) m, with that tank's
-        replaced.
-        """
+    def simulate_tank(
+        self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes tanks"], tank: int
+    ) -> Float[Tensor, "L nodes n"]:
+        """Simulate one tank with the levels of all others given, m: the trajectory with that tank's level replaced."""
         levels = self._path(theta, levels).movedim(1, 2).clone()
-        for _ in range(rounds):
+        for _ in range(ONE_ROUNDS):
             path = levels.movedim(1, 2)
             values = self.network.bind(self.space, theta.unsqueeze(-2))
             rates, by_level, _ = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), values, [], 0)
@@ -159,7 +161,7 @@ class Collocation:
                 break
         return levels
 
-    def rates(self, middle: Tensor, theta: Tensor) -> Tensor:
+    def rates(self, middle: Float[Tensor, "#L K m"], theta: Float[Tensor, "L P"]) -> Float[Tensor, "L K n"]:
         """dh/dt (L, K, tanks), m/s, at given mid-step levels (L or 1, K, tanks)."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
         shape = (len(theta), middle.shape[1])
@@ -167,17 +169,17 @@ class Collocation:
         rates = self.network.rates(levels.unbind(0), commands, self._actuation.clock, values)
         return torch.stack([r.expand(shape) for r in rates], dim=1).movedim(1, 2)
 
-    def read(self, levels: Tensor, theta: Tensor) -> Tensor:
+    def read(self, levels: Float[Tensor, "#L nodes n"], theta: Float[Tensor, "L P"]) -> Float[Tensor, "L S C"]:
         """Readings (L, S, C) of given levels (L or 1, K+1, tanks), m."""
         path = levels.expand(len(theta), *levels.shape[1:]).movedim(1, 2)
         return self._output_map.read(path, self.network.bind(self.space, theta.unsqueeze(-2))).movedim(1, 2)
 
-    def look(self, levels: Tensor, theta: Tensor) -> LinearisedOutputs:
+    def look(self, levels: Float[Tensor, "L nodes n"], theta: Float[Tensor, "L P"]) -> LinearisedOutputs:
         """The sensors linearised at given levels (L, K+1, tanks)."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
         return self._output_map.look(levels.movedim(1, 2), values, self._columns(theta))
 
-    def constant_guess(self, theta: Tensor) -> Tensor:
+    def constant_guess(self, theta: Float[Tensor, "L P"]) -> Float[Tensor, "L nodes n"]:
         """Trajectories that stay at their start, (L, K+1, n)."""
         start, _ = self._start(theta, self.network.bind(self.space, theta.unsqueeze(-2)), slopes=False)
         return start.unsqueeze(1).expand(-1, len(self.experiment.nodes), -1).clone()
@@ -269,7 +271,7 @@ class Collocation:
         inputs = [*middle.unbind(1), *(commands[i] for i in driven), *moving]
         moved = tuple(self._names) if moving else ()
         plant, placements = network.description, tuple(p.prefix for p in network.placements)
-        components = plant.tanks, plant.pipes, plant.pumps, plant.weirs, plant.transfers
+        components = plant.tanks, *plant.flow_components()
         known = partials_of(components, placements, moved, tuple(driven), reaches_rim)
         values_at, rows = known(rates, inputs, shape)
         by_level, by_theta = (middle.new_zeros(lanes, n, m, steps) for m in (n, width))

@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.capacity import expect_room
@@ -75,20 +76,22 @@ class CompiledEngine:
         self._form = experiment.step_control is not None, inner
         self._tables: dict[torch.dtype, dict[str, Tensor]] = {}
 
-    def levels(self, theta: Tensor) -> Tensor:
+    def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
         expect_no_gradient(self, theta, "levels")
         out = self._empty(theta, len(self.network.description.tanks))
         self._run("levels", theta, out)
         return out
 
-    def readings(self, theta: Tensor) -> Tensor:
+    def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
         if is_differentiated(theta):
             return readings_with_gradient(self, theta)
         out = self._empty(theta, self._sensors)
         self._run("readings", theta, out)
         return out
 
-    def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+    def linearise(
+        self, theta: Float[Tensor, "*batch P"]
+    ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
         expect_no_gradient(self, theta, "linearise")
         out = self._empty(theta, self._sensors)
         jacobian = self._empty(theta, self._sensors, len(self.space))

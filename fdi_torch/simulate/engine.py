@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Protocol
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -69,15 +70,17 @@ class Engine(Protocol):
     name: str
     why: str  # the reason for the choice of this engine, one sentence
 
-    def readings(self, theta: Tensor) -> Tensor:
+    def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
         """theta (*batch, P) -> readings (*batch, S, C) in SI; differentiable if theta requires a gradient."""
         ...
 
-    def levels(self, theta: Tensor) -> Tensor:
+    def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
         """theta (*batch, P) -> tank levels at the samples (*batch, S, tanks), m."""
         ...
 
-    def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+    def linearise(
+        self, theta: Float[Tensor, "*batch P"]
+    ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
         """theta (*batch, P) -> readings (*batch, S, C) and their Jacobian (*batch, S, C, P), forward mode."""
         ...
 
@@ -95,7 +98,7 @@ class Engine(Protocol):
         ...
 
 
-def expect_problems(theta: Tensor, data: Readings) -> None:
+def expect_problems(theta: Float[Tensor, "*problems N P"], data: Readings) -> None:
     """Raises ValueError if theta (*problems, N, P) and the data have different problem dimensions."""
     problems = data.values.shape[:-2]
     if problems and theta.shape[:-2] != problems:
@@ -105,7 +108,7 @@ def expect_problems(theta: Tensor, data: Readings) -> None:
         )
 
 
-def moments_of(readings: Tensor, data: Readings) -> Tensor:
+def moments_of(readings: Float[Tensor, "*problems N S C"], data: Readings) -> Tensor:
     """`Engine.moments` from readings (*problems, N, S, sensors)."""
     y, w = data.known.unsqueeze(-3), data.weight.unsqueeze(-3)
     residual = y - readings
@@ -113,7 +116,9 @@ def moments_of(readings: Tensor, data: Readings) -> Tensor:
     return torch.stack([(w * residual * c).sum(-2) for c in columns], dim=-1)
 
 
-def gram_of(readings: Tensor, jacobian: Tensor, data: Readings) -> Tensor:
+def gram_of(
+    readings: Float[Tensor, "*problems N S C"], jacobian: Float[Tensor, "*problems N S C P"], data: Readings
+) -> Tensor:
     """`Engine.gram` from readings (*problems, N, S, sensors) and their Jacobian (..., P)."""
     y, w = data.known.unsqueeze(-3), data.weight.unsqueeze(-3).expand(readings.shape)
     residual = y - readings

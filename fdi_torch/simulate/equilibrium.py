@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
@@ -16,7 +17,7 @@ AT_REST = 1e-12
 MOST_STEPS = 200
 
 
-def equilibrium(network: TankNetwork, inputs: Tensor) -> Tensor:
+def equilibrium(network: TankNetwork, inputs: Float[Tensor, " channels"]) -> Float[Tensor, " tanks"]:
     """Levels (tanks,), m, at which dh/dt = 0 for constant inputs (channels,) and nominal constants.
 
     Pseudo-transient continuation (Kelley and Keyes, 1998): implicit Euler steps that double until they equal Newton's.

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.capacity import expect_room
@@ -99,7 +100,9 @@ def lay_out(
     )
 
 
-def grid_nodes(time: Tensor, inputs: Tensor, hold: Hold, step: float, every: bool = False) -> Tensor:
+def grid_nodes(
+    time: Float[Tensor, " S"], inputs: Float[Tensor, "S M"], hold: Hold, step: float, every: bool = False
+) -> Float[Tensor, " nodes"]:
     """Step ends (K+1,) s from the first to the last sample.
 
     A step ends at every switch of the inputs (S, M), and at every sample of time (S,) unless samples are denser than

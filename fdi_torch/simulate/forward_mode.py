@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import forward_ad
 from torch.overrides import TorchFunctionMode
@@ -43,7 +44,7 @@ def stack_with_slope(value: Tensor) -> Tensor:
     return torch.stack([number, slope])
 
 
-def directions(lanes: Tensor) -> Tensor:
+def directions(lanes: Float[Tensor, "L P"]) -> Float[Tensor, "PL P"]:
     """lanes (L, P) -> (P L, P): one copy of the batch per parameter, with the unit slope by that parameter."""
     count, parameters = lanes.shape
     along = torch.eye(parameters, dtype=lanes.dtype, device=lanes.device).repeat_interleave(count, dim=0)

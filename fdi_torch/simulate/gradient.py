@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -19,7 +20,7 @@ def is_differentiated(theta: Tensor) -> bool:
     return theta.requires_grad and torch.is_grad_enabled()
 
 
-def readings_with_gradient(engine: _Linearising, theta: Tensor) -> Tensor:
+def readings_with_gradient(engine: _Linearising, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
     """theta (*batch, P) -> readings y (*batch, S, C), with dL/dtheta = sum over S and C of dL/dy dy/dtheta.
 
     The Jacobian dy/dtheta (*batch, S, C, P) is computed together with the readings and stored for the backward pass, 8

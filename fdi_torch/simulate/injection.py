@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.plant.signals import CumulativeSignal
@@ -40,7 +41,12 @@ class Injection:
 
 
 def lay_out_samples(
-    time: Tensor, inputs: Tensor, hold: Hold, step: float, from_first: bool = True, resolution: float | None = None
+    time: Float[Tensor, " S"],
+    inputs: Float[Tensor, "S channels"],
+    hold: Hold,
+    step: float,
+    from_first: bool = True,
+    resolution: float | None = None,
 ) -> Experiment:
     """An experiment with every sample at the end of a step of at most `step` s; time (S,) s, inputs (S, channels).
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace, name_in_recording
@@ -39,7 +40,7 @@ class JointCollocation:
         """The plant of the first recording; the others differ only in the constants of each recording."""
         return self.parts[0].network
 
-    def linearise(self, theta: Tensor, levels: Tensor) -> Linearised:
+    def linearise(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N n"]) -> Linearised:
         """theta (L, P) and an approximate trajectory levels (L, N, tanks) -> one Newton step, with derivatives."""
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
         return self._joined([part.linearise(columns, piece) for part, columns, piece in pieces])
@@ -50,17 +51,19 @@ class JointCollocation:
         corrected = [part.corrected(columns, piece) for part, columns, piece in pieces]
         return torch.cat([c[0] for c in corrected], dim=1), torch.stack([c[1] for c in corrected]).amax(dim=0)
 
-    def converge(self, theta: Tensor, levels: Tensor, rounds: int = 12) -> Linearised:
+    def converge(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N n"], rounds: int = 12) -> Linearised:
         """Newton steps at fixed theta from levels (L, N, tanks), m, until every recording has converged."""
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
         return self._joined([part.converge(columns, piece, rounds) for part, columns, piece in pieces])
 
-    def simulate_tank(self, theta: Tensor, levels: Tensor, tank: int) -> Tensor:
+    def simulate_tank(
+        self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N tanks"], tank: int
+    ) -> Float[Tensor, "L N n"]:
         """Levels (L, N, tanks), m, with those of one tank computed from the given levels of all others."""
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
         return torch.cat([part.simulate_tank(columns, piece, tank) for part, columns, piece in pieces], dim=1)
 
-    def rates(self, middle: Tensor, theta: Tensor) -> Tensor:
+    def rates(self, middle: Float[Tensor, "#L K m"], theta: Float[Tensor, "L P"]) -> Float[Tensor, "L K n"]:
         """dh/dt (L, N-1, tanks), m/s, at given mid-step levels; 0 between recordings."""
         pieces = torch.split(_with_last(middle), self._nodes, dim=1)
         rates = [
@@ -68,7 +71,7 @@ class JointCollocation:
         ]
         return with_blanks(rates)
 
-    def read(self, levels: Tensor, theta: Tensor) -> Tensor:
+    def read(self, levels: Float[Tensor, "#L N n"], theta: Float[Tensor, "L P"]) -> Float[Tensor, "L S C"]:
         """Readings (L, S, C) of given levels (L or 1, N, tanks)."""
         pieces = zip(self.parts, self._split(levels), self._own(theta), strict=True)
         return with_blanks([part.read(piece, columns) for part, piece, columns in pieces])
@@ -84,7 +87,7 @@ class JointCollocation:
             for part, columns, levels, t, g in pieces
         ]
 
-    def constant_guess(self, theta: Tensor) -> Tensor:
+    def constant_guess(self, theta: Float[Tensor, "L P"]) -> Float[Tensor, "L N n"]:
         """Trajectories that stay at their start levels, (L, N, tanks)."""
         pairs = zip(self.parts, self._own(theta), strict=True)
         return torch.cat([part.constant_guess(columns) for part, columns in pairs], dim=1)

@@ -8,6 +8,7 @@ With M = 1 - dt/2 df/dh at each step, the correction x of the levels and the sen
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.simulate.recurrence import midpoint_correction, midpoint_step
@@ -15,7 +16,13 @@ from fdi_torch.simulate.scan import product, scan_in_time
 
 
 def newton_step(
-    span: Tensor, path: Tensor, rates: Tensor, by_level: Tensor, by_theta: Tensor, start: Tensor, start_slopes: Tensor
+    span: Float[Tensor, " K"],
+    path: Float[Tensor, "L n K+1"],
+    rates: Float[Tensor, "L n K"],
+    by_level: Float[Tensor, "L n n K"],
+    by_theta: Float[Tensor, "L n P K"],
+    start: Float[Tensor, "L n"],
+    start_slopes: Float[Tensor, "L n P"],
 ) -> tuple[Tensor, ...]:
     """One Newton step of all lanes and steps at once.
 
@@ -36,8 +43,12 @@ def newton_step(
 
 
 def newton_correction(
-    span: Tensor, path: Tensor, rates: Tensor, by_level: Tensor, start: Tensor
-) -> tuple[Tensor, Tensor]:
+    span: Float[Tensor, " K"],
+    path: Float[Tensor, "L n K+1"],
+    rates: Float[Tensor, "L n K"],
+    by_level: Float[Tensor, "L n n K"],
+    start: Float[Tensor, "L n"],
+) -> tuple[Float[Tensor, "L n K+1"], Float[Tensor, " L"]]:
     """The corrected levels (L, n, K+1) and the largest correction (L,) of `newton_step`, without sensitivities."""
     compiled = midpoint_correction(span, path, rates, by_level, start)
     if compiled is not None:

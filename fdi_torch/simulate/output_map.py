@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.plant.network import PlaceValues, TankNetwork
@@ -53,7 +54,7 @@ class LinearisedOutputs:
     tanks: Sequence[int]
     samples: SampleGrid
 
-    def along(self, paths: Tensor, moves: Sequence[int]) -> Tensor:
+    def along(self, paths: Float[Tensor, "L tanks M nodes"], moves: Sequence[int]) -> Float[Tensor, "L C M S"]:
         """Change of the readings (L, C, M, S) along M directions.
 
         paths: change of the levels (L, tanks, M, K+1). moves: index of the parameter that changes by one along each
@@ -84,7 +85,7 @@ class OutputMap:
         intervals = torch.diff(self.times, prepend=2 * self.times[:1] - self.times[1:2])
         self.clock = Clock(self.times - intervals, intervals, experiment.resolution)
 
-    def read(self, path: Tensor, values: PlaceValues) -> Tensor:
+    def read(self, path: Float[Tensor, "L tanks nodes"], values: PlaceValues) -> Float[Tensor, "L C S"]:
         """Readings (L, C, S) of levels path (L, tanks, K+1)."""
         measured = [self.samples.of(path[:, tank]) for tank in self.network.sensor_tanks()]
         for i, delay in self.network.reading_delays(values).items():
@@ -94,7 +95,7 @@ class OutputMap:
         readings = stage.step(measured, tuple(memory), [])[0]
         return torch.stack([r.expand(shape) for r in readings], dim=1)
 
-    def look(self, path: Tensor, values: PlaceValues, theta: Signals) -> LinearisedOutputs:
+    def look(self, path: Float[Tensor, "L tanks nodes"], values: PlaceValues, theta: Signals) -> LinearisedOutputs:
         """The readings and their linearisation; theta: each named parameter (L, 1)."""
         shape, tanks = (len(path), len(self.times)), self.network.sensor_tanks()
         measured = [self.samples.of(path[:, tank]) for tank in tanks]

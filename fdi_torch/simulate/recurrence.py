@@ -13,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.simulate.build import BuildError, load_library
@@ -21,7 +22,12 @@ MOST = 32
 _SOURCE = Path(__file__).with_name("recurrence.hpp")
 
 
-def compiled_scan(a: Tensor, b: Tensor, first: Tensor, gain: Tensor | None = None) -> Tensor | None:
+def compiled_scan(
+    a: Float[Tensor, "L n n K"],
+    b: Float[Tensor, "L n m K"],
+    first: Float[Tensor, "L n m"],
+    gain: Float[Tensor, "L n n K"] | None = None,
+) -> Float[Tensor, "L n m K+1"] | None:
     """x_{k+1} = A_k x_k + G_k b_k: a and gain (L, n, n, K), b (L, n, m, K), first (L, n, m) -> x (L, n, m, K+1)."""
     if not _plain(a, b, first, *(() if gain is None else (gain,))):
         return None

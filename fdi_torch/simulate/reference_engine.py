@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from copy import copy
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -49,7 +50,7 @@ class ReferenceEngine:
         self.network, self.space, self.experiment, self.why = network, space, experiment, why
         self.method, self.rtol, self.atol, self.every_node = method, rtol, atol, every_node
 
-    def readings(self, theta: Tensor) -> Tensor:
+    def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
         """theta (*batch, P) -> readings (*batch, S, sensors) in SI."""
         batch = theta.shape[:-1]
         lanes = theta.reshape(theta.shape[:-1].numel(), theta.shape[-1])
@@ -59,14 +60,16 @@ class ReferenceEngine:
             result = torch.cat([self._run(lane) for lane in lanes.split(1)], dim=1)
         return result.movedim(1, 0).reshape(*batch, *result.shape[::2])
 
-    def levels(self, theta: Tensor) -> Tensor:
+    def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
         """theta (*batch, P) -> tank levels at the samples (*batch, S, tanks), m."""
         lanes = theta.reshape(theta.shape[:-1].numel(), theta.shape[-1])
         states = self._sample(*self._integrate(self.network.bind(self.space, lanes), len(lanes)))
         levels = states[..., : len(self.network.description.tanks)]
         return levels.movedim(1, 0).reshape(*theta.shape[:-1], *levels.shape[::2])
 
-    def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+    def linearise(
+        self, theta: Float[Tensor, "*batch P"]
+    ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
         """theta (*batch, P) -> readings (*batch, S, sensors), their Jacobian (*batch, S, sensors, P), forward mode.
 
         Levels and their slopes are integrated together; torch differentiates each operation of the right-hand side.
@@ -229,7 +232,7 @@ def hermite(
     return left + blend * (right - left) + step * (bend_left * slope_left - bend_right * slope_right)
 
 
-def late(series: Tensor, times: Tensor, delay: Tensor) -> Tensor:
+def late(series: Float[Tensor, "S L"], times: Float[Tensor, " S"], delay: Float[Tensor, "#L"]) -> Float[Tensor, "S L"]:
     """series (S, L) at times (S,), delayed by `delay` (L,) s with linear interpolation; constant before the first
     sample.
     """

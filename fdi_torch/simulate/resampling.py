@@ -10,12 +10,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fdi_torch.simulate.experiment import Experiment
 
 
-def interpolate(at: Tensor, times: Tensor, values: Tensor) -> Tensor:
+def interpolate(
+    at: Float[Tensor, " K"], times: Float[Tensor, " S"], values: Float[Tensor, " S"]
+) -> Float[Tensor, " K"]:
     """Linear interpolation of values (S,) at increasing times (S,) to times `at` (K,); constant beyond the ends."""
     after = torch.searchsorted(times, at).clamp(max=len(times) - 1)
     before = (after - 1).clamp(min=0)
@@ -24,7 +27,9 @@ def interpolate(at: Tensor, times: Tensor, values: Tensor) -> Tensor:
     return torch.lerp(values[before], values[after], share)
 
 
-def step_means(experiment: Experiment, readings: Tensor, mask: Tensor) -> tuple[Experiment, Tensor, Tensor]:
+def step_means(
+    experiment: Experiment, readings: Float[Tensor, "S C"], mask: Bool[Tensor, "S C"]
+) -> tuple[Experiment, Tensor, Tensor]:
     """The experiment with one sample per step, the mean readings, and the number of readings of each, (S', C) both.
 
     readings, mask (S, C): at the samples of the experiment, which are unchanged if no step has more than one.

@@ -5,6 +5,7 @@ steps.
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.simulate.recurrence import compiled_scan
@@ -12,7 +13,9 @@ from fdi_torch.simulate.recurrence import compiled_scan
 LENGTH = 8  # sequential steps in each block, and in blocks of blocks
 
 
-def linear_scan(transition: Tensor, forcing: Tensor, first: Tensor) -> Tensor:
+def linear_scan(
+    transition: Float[Tensor, "L K n n"], forcing: Float[Tensor, "L K n m"], first: Float[Tensor, "L n m"]
+) -> Float[Tensor, "L K+1 n m"]:
     """x_{k+1} = A_k x_k + b_k for k = 0..K-1.
 
     transition (L, K, n, n), forcing (L, K, n, m), first (L, n, m) -> x (L, K+1, n, m), with time last in memory.
@@ -21,7 +24,12 @@ def linear_scan(transition: Tensor, forcing: Tensor, first: Tensor) -> Tensor:
     return scan_in_time(a, b, first).permute(0, 3, 1, 2)
 
 
-def scan_in_time(a: Tensor, b: Tensor, first: Tensor, gain: Tensor | None = None) -> Tensor:
+def scan_in_time(
+    a: Float[Tensor, "L n n K"],
+    b: Float[Tensor, "L n m K"],
+    first: Float[Tensor, "L n m"],
+    gain: Float[Tensor, "L n n K"] | None = None,
+) -> Float[Tensor, "L n m K+1"]:
     """`linear_scan` with time last: a (L, n, n, K), b (L, n, m, K), first (L, n, m) -> (L, n, m, K+1).
 
     gain: G (L, n, n, K), if the forcing is G_k b_k. Without a compiled loop, all blocks run in parallel from zero
@@ -79,7 +87,7 @@ def _one_by_one(a: Tensor, b: Tensor, first: Tensor) -> list[Tensor]:
     return states
 
 
-def product(a: Tensor, x: Tensor) -> Tensor:
+def product(a: Float[Tensor, "L n n K"], x: Float[Tensor, "L n m K"]) -> Float[Tensor, "L n m K"]:
     """a (L, n, n, K) times x (L, n, m, K) at every step, as an explicit sum: bitwise equal alone and in a batch."""
     total = a[:, :, 0, None] * x[:, None, 0]
     for j in range(1, a.shape[2]):

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
@@ -25,7 +26,7 @@ LONGEST_STEP = 1.0
 TOLERANCE = 1e-10  # of levels, in units of the plant's length scale
 
 
-def clean_readings(network: TankNetwork, planned: Recording, values: Mapping[str, float]) -> Tensor:
+def clean_readings(network: TankNetwork, planned: Recording, values: Mapping[str, float]) -> Float[Tensor, "T N"]:
     """Noise-free readings (T, N) with some constants changed by name, by L-stable steps with a tolerance of 1e-10.
 
     Without a compiler, an adaptive solver does the same a thousand times slower.
@@ -45,7 +46,9 @@ def clean_readings(network: TankNetwork, planned: Recording, values: Mapping[str
         return reference.readings(theta)[0]
 
 
-def noise_level(clean: Tensor, snr_db: float, definition: str = "variance") -> Tensor:
+def noise_level(
+    clean: Float[Tensor, "*batch T N"], snr_db: float, definition: str = "variance"
+) -> Float[Tensor, "*batch N"]:
     """Standard deviation (*batch, N) of the noise that gives clean readings (*batch, T, N) this signal-to-noise ratio
     in dB.
 
@@ -56,7 +59,11 @@ def noise_level(clean: Tensor, snr_db: float, definition: str = "variance") -> T
 
 
 def with_noise(
-    planned: Recording, clean: Tensor, std: Tensor, generator: torch.Generator, network: TankNetwork
+    planned: Recording,
+    clean: Float[Tensor, "T N"],
+    std: Float[Tensor, " N"],
+    generator: torch.Generator,
+    network: TankNetwork,
 ) -> Recording:
     """The recording of clean readings (T, N) by sensors with white noise of standard deviation std (N,).
 
@@ -66,7 +73,7 @@ def with_noise(
     return replace(planned, outputs=quantized(clean + noise, network), mask=torch.isfinite(clean), source="simulated")
 
 
-def quantized(readings: Tensor, network: TankNetwork) -> Tensor:
+def quantized(readings: Float[Tensor, "T N"], network: TankNetwork) -> Float[Tensor, "T N"]:
     """Readings (T, N) rounded by the plant's quantizing sensors."""
     values = network.bind(ParameterSpace(), readings.new_zeros(0))
     columns = list(readings.unbind(-1))

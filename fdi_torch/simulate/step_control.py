@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.plant.description import PlantDescription
@@ -69,7 +70,7 @@ def _step_of_unit_error(plant: PlantDescription) -> float:
     return STEP_FOR_ONE_METRE * fastest_exchange(plant)
 
 
-def next_step(elapsed: Tensor, length: Tensor, span: Tensor) -> Tensor:
+def next_step(elapsed: Float[Tensor, " L"], length: Float[Tensor, " L"], span: Tensor) -> Float[Tensor, " L"]:
     """Length of each lane's next step (L,), s, after `elapsed` s of `span`.
 
     The step is the lane's `length`, shortened so that no short step remains before the end; `span` for a finished lane.
@@ -80,7 +81,12 @@ def next_step(elapsed: Tensor, length: Tensor, span: Tensor) -> Tensor:
 
 
 def accept_steps(
-    step: Tensor, error: Tensor, elapsed: Tensor, length: Tensor, span: Tensor, shortest: float
+    step: Float[Tensor, " L"],
+    error: Float[Tensor, " L"],
+    elapsed: Float[Tensor, " L"],
+    length: Float[Tensor, " L"],
+    span: Tensor,
+    shortest: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Accept or reject a step of each lane (L,): the accepted lanes, the times they have reached, and their next
     lengths, s.

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.simulate.engine import Engine
@@ -38,7 +39,7 @@ def step_ladder(interval: float, scale: float, longest: float) -> list[float]:
     return [step for step in reversed(steps) if lowest <= step <= highest * (1.0 + ROUNDING)] or [longest]
 
 
-def probe_points(low: Tensor, high: Tensor, count: int = PROBES) -> Tensor:
+def probe_points(low: Float[Tensor, " P"], high: Float[Tensor, " P"], count: int = PROBES) -> Float[Tensor, "N P"]:
     """Points (count, P) spread evenly over a box (P,) by a scrambled Sobol sequence with a fixed seed."""
     if low.numel() == 0:
         return low.new_zeros(1, 0)
@@ -48,8 +49,8 @@ def probe_points(low: Tensor, high: Tensor, count: int = PROBES) -> Tensor:
 
 def choose_step(
     engine_at: Callable[[float], Engine],
-    points: Tensor,
-    tolerance: Tensor,
+    points: Float[Tensor, "N P"],
+    tolerance: Float[Tensor, " C"],
     ladder: list[float],
     quantile: float = 1.0,
 ) -> float:

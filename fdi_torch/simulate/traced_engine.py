@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
@@ -33,16 +34,18 @@ class TracedEngine:
     def __init__(self, network: TankNetwork, space: ParameterSpace, experiment: Experiment, why: str = "") -> None:
         self.network, self.space, self.experiment, self.why = network, space, experiment, why
 
-    def levels(self, theta: Tensor) -> Tensor:
+    def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
         expect_no_gradient(self, theta, "levels")
         return self._simulate(theta, tangent=False, levels=True)[0]
 
-    def readings(self, theta: Tensor) -> Tensor:
+    def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
         if is_differentiated(theta):
             return readings_with_gradient(self, theta)
         return self._simulate(theta, tangent=False)[0]
 
-    def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+    def linearise(
+        self, theta: Float[Tensor, "*batch P"]
+    ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
         expect_no_gradient(self, theta, "linearise")
         readings, jacobian = self._simulate(theta, tangent=True)
         assert jacobian is not None

@@ -26,15 +26,12 @@ LOOPBACK = "127.0.0.1"  # address of a local cluster, not reachable from other m
 LOST_WORKERS = 20
 
 
-def run_on_cluster(
-    plan: Plan, blocks: Iterable[Block], address: str, workers: int | None = None
-) -> Iterator[list[Trial]]:
+def run_on_cluster(plan: Plan, blocks: Iterable[Block], address: str) -> Iterator[list[Trial]]:
     """Yield the blocks as they are completed, in any order. address: of a Dask scheduler (tcp://...), or 'local'.
 
-    workers: of a local cluster, by default one per core. Raises ValueError if Dask is not installed or no scheduler
-    answers.
+    Raises ValueError if Dask is not installed or no scheduler answers.
     """
-    with connected(address, workers) as client:
+    with connected(address) as client:
         yield from run_with(client, plan, blocks)
 
 

@@ -121,7 +121,7 @@ def test_npz_holds_numbers_and_texts(finished: Path) -> None:
 def test_a_topic_that_is_not_there(finished: Path, form: str) -> None:
     with pytest.raises(LogError, match=r"expected one of the topics /diagnosis/fault, .*, got /no"):
         export(read_run(finished), "/no", form, io.BytesIO())
-    with pytest.raises(ValueError, match="expected one of the formats csv, ndjson, npz, got xls"):
+    with pytest.raises(ValueError, match=r"expected one of the formats .*, got xls"):
         export(read_run(finished), "/log", "xls", io.BytesIO())
 
 
