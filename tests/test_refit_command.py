@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,3 +84,17 @@ def test_held_values_stay(
     assert "Q2.pump_gain.factor" not in shown["fitted"] and not shown["explained"] and shown["unexplained_ratio"] > 1.2
     assert cli.main([*words[:5], "--hold", "Q9.gain", "--quiet"]) == cli.MISUSE
     assert "Q9.gain" in capsys.readouterr().err
+
+
+def test_who_stops_reading_loses_neither_the_adopted_plant_nor_the_exit_code(
+    tmp_path: Path, rig: PlantDescription
+) -> None:
+    for reader, hold in (("true", ""), ("head -1", ""), ("true", "--hold '*.pump_gain.*'")):
+        words = (
+            f"{sys.executable} -m fdi_torch refit --plant rig.yaml --recording day3.csv --adopt out.yaml --quiet {hold}"
+        )
+        piped = f"{words} | {reader}; exit ${{PIPESTATUS[0]}}"
+        done = subprocess.run(["bash", "-c", piped], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (cli.NOT_EXPLAINED if hold else cli.DONE, "")
+        assert load_plant(tmp_path / "out.yaml").effects
+        (tmp_path / "out.yaml").unlink()
