@@ -41,6 +41,7 @@ DOORS = {
     "xarray": (),
     "scipy": (
         "recordings/matlab.py",
+        "recordings/volume_balance.py",
         "blind/statistics.py",
         "estimate/state_noise.py",
         "logbook/compare.py",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from fdi_torch.cli import main
+import fdi_torch
+from fdi_torch.cli import DONE, NOT_EXPLAINED, main
 
 PLANT = """
 tanks: {T: {area: 100 cm^2, height: 50 cm}}
@@ -32,9 +34,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def said(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, object]:
-    assert main(["predict", "--plant", "rig.yaml", "--start-samples", "3", "--json", *words]) == 0
-    out: dict[str, object] = json.loads(capsys.readouterr().out)
+def said(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    """The JSON of a free run, whose exit code says whether the plant explains every recording."""
+    code = main(["predict", "--plant", "rig.yaml", "--start-samples", "3", "--json", *words])
+    out: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert code == (DONE if all(run["explained"] for run in out.get("runs", [out])) else NOT_EXPLAINED)
     return out
 
 
@@ -54,9 +58,11 @@ def test_a_pump_that_was_not_recorded_has_to_be_told(folder: Path, capsys: pytes
     assert main(["predict", "--plant", "rig.yaml", "nopump.csv"]) == 2
     said_so = capsys.readouterr().err
     assert "expected a column for Q, got t_s, h_mm, v_pct" in said_so and "--constant Q=0" in said_so
-    assert said(capsys, "nopump.csv", "--constant", "Q=0")["rmse"] == {"h": pytest.approx(0.0, abs=1e-6)}
-    with_unit, bare = (said(capsys, "nopump.csv", "--constant", f"Q={q}")["rmse"] for q in ("50 cm^3/s", "5e-5"))
-    assert with_unit == bare and bare["h"] > 0.05  # 10 cm stood there, and 50 cm^3/s for 39 s are 19.5 cm
+    at_rest = said(capsys, "nopump.csv", "--constant", "Q=0")
+    assert at_rest["rmse"] == {"h": pytest.approx(0.0, abs=1e-6)} and at_rest["explained"]
+    with_unit, bare = (said(capsys, "nopump.csv", "--constant", f"Q={q}") for q in ("50 cm^3/s", "5e-5"))
+    assert with_unit["rmse"] == bare["rmse"] and not bare["explained"]
+    assert bare["rmse"]["h"] > 0.05  # 10 cm stood there, and 50 cm^3/s for 39 s are 19.5 cm
     assert main(["predict", "--plant", "rig.yaml", "nopump.csv", "--constant", "Q"]) == 2
     assert "INPUT=VALUE" in capsys.readouterr().err
 
@@ -74,6 +80,22 @@ def test_the_picture_has_both_plants(folder: Path, capsys: pytest.CaptureFixture
     (folder / "before.yaml").write_text(PLANT.replace("100 cm^2", "80 cm^2"))
     said(capsys, "novalve.csv", "--picture", "run.svg", "--beside", "before.yaml")
     assert (folder / "run.svg").stat().st_size > 5000
+
+
+def test_a_plant_that_does_not_explain_the_recording_is_said_first(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Readings in steps of 5 mm count as noise of 5 mm / sqrt(12); a tank of 80 cm^2 fills 1.25 mm/s faster."""
+    words = ["predict", "--plant", "rig.yaml", "--start-samples", "3", "novalve.csv"]
+    assert main(words) == DONE
+    assert "Unreliable" not in capsys.readouterr().out
+    (folder / "rig.yaml").write_text(PLANT.replace("100 cm^2", "80 cm^2"))
+    assert main([*words, "--picture", "run.svg"]) == NOT_EXPLAINED
+    shown = capsys.readouterr().out
+    warning = "Unreliable: the model does not explain the recording (residuals 19 times the sensors' noise)"
+    assert shown.startswith(f"{warning}.\n- next: fdi gap finds") and warning[:40] in (folder / "run.svg").read_text()
+    run = fdi_torch.predict("rig.yaml", "novalve.csv", start_samples=3)
+    assert run.headline == f"{warning}; free run of rig along {folder / 'novalve.csv'}"
 
 
 def test_no_recording_is_misuse(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

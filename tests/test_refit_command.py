@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,8 +56,9 @@ def test_a_calibration_reports_how_far_constants_moved_and_writes_what_was_learn
     wrong = replace(rig, effects=(), pumps=(rig.pumps[0], gain), tolerances={"Q2.gain": 1.0, "T1.area": 1e-6})
     (tmp_path / "wrong.yaml").write_text(dump_plant(wrong))
     words = ["refit", "--plant", "wrong.yaml", "--recording", "runs.yaml", "--adopt", "out.yaml", "--quiet"]
-    assert cli.main(words) == cli.DONE
+    assert cli.main(words) == cli.NOT_EXPLAINED
     shown = capsys.readouterr().out
+    assert re.match(r"Unreliable: the model does not explain the recording \(residuals \d\.\d times", shown)
     assert "Q2.gain lies at the high end of its range" in shown and "next: out.yaml keeps the tolerances" in shown
     assert load_plant(tmp_path / "out.yaml").tolerances == wrong.tolerances
 
@@ -76,7 +79,22 @@ def test_held_values_stay(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     words = ["refit", "--plant", "rig.yaml", "--recording", "day3.csv", "--hold", "*.pump_gain.*", "--json", "--quiet"]
-    assert cli.main(words) == cli.DONE
-    assert "Q2.pump_gain.factor" not in json.loads(capsys.readouterr().out)["fitted"]
+    assert cli.main(words) == cli.NOT_EXPLAINED
+    shown = json.loads(capsys.readouterr().out)
+    assert "Q2.pump_gain.factor" not in shown["fitted"] and not shown["explained"] and shown["unexplained_ratio"] > 1.2
     assert cli.main([*words[:5], "--hold", "Q9.gain", "--quiet"]) == cli.MISUSE
     assert "Q9.gain" in capsys.readouterr().err
+
+
+def test_who_stops_reading_loses_neither_the_adopted_plant_nor_the_exit_code(
+    tmp_path: Path, rig: PlantDescription
+) -> None:
+    for reader, hold in (("true", ""), ("head -1", ""), ("true", "--hold '*.pump_gain.*'")):
+        words = (
+            f"{sys.executable} -m fdi_torch refit --plant rig.yaml --recording day3.csv --adopt out.yaml --quiet {hold}"
+        )
+        piped = f"{words} | {reader}; exit ${{PIPESTATUS[0]}}"
+        done = subprocess.run(["bash", "-c", piped], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (cli.NOT_EXPLAINED if hold else cli.DONE, "")
+        assert load_plant(tmp_path / "out.yaml").effects
+        (tmp_path / "out.yaml").unlink()

@@ -15,9 +15,9 @@ from fdi_torch.config.estimation import parameter_values, placements_of
 from fdi_torch.config.run_file import Run
 from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.effects import build_network
-from fdi_torch.estimate.diagnosis import sample_noise
 from fdi_torch.estimate.fitting import set_up, start_levels
 from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
+from fdi_torch.estimate.misfit import sample_noise
 from fdi_torch.jobs.run_setup import hybrid_settings, requested_space
 from fdi_torch.monitor.detection import NO_ALARM, Detector, make_detector
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise

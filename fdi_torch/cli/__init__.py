@@ -73,12 +73,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def command_line() -> NoReturn:
     """The entry point `fdi`. Standard output may be closed early, as by `| head`, or from the start."""
     _open_standard_streams()
+    code = DONE
     try:
         code = main()
         sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = DONE
     except OSError as error:
         sys.stderr.write(f"fdi: {sentence('standard output', error)}\n")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

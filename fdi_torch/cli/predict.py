@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from fdi_torch.cli import DONE
+from fdi_torch.cli.explained import exit_code, say_first
 from fdi_torch.cli.gap_text import MOVED
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.channels import expect_columns
@@ -17,6 +17,7 @@ from fdi_torch.config.plant_file import chosen_plant, load_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.yaml_files import find_data
 from fdi_torch.effects import build_network
+from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
 from fdi_torch.parameters import display_unit, quantity_text
 from fdi_torch.plant.description import PlantDescription
@@ -35,6 +36,9 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     for note in dict.fromkeys(note for r in recordings for note in r.notes):
         screen.note(note)
     predictions = [(recording, _predict(plant, recording, arguments)) for recording in recordings]
+    misfits = [misfit_of(prediction.rmse, [recording], plant) for recording, prediction in predictions]
+    worst = max(misfits, key=lambda misfit: misfit.ratio)
+    say_first(worst, screen)
     first = f"{arguments.start_samples} samples" if arguments.settle is None else f"{arguments.settle:g} s"
     screen.say(f"free run of {plant.name}, initial levels from the first {first}")
     screen.table(
@@ -58,11 +62,11 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             before = _predict(other, recording, arguments, vary="")
             runs = {_other_name(other, plant, arguments): before.readings} | runs
         columns = [sensor.column for sensor in plant.sensors]
-        title = f"free run along {Path(recording.source).name}"
+        title = misfits[-1].headline(f"free run along {Path(recording.source).name}")
         screen.note(f"picture: {save(fit_figure(recording, runs, title, columns), Path(arguments.picture))}")
-    results = [_result(plant, recording, prediction, arguments) for recording, prediction in predictions]
+    results = [_result(plant, *run, misfit, arguments) for run, misfit in zip(predictions, misfits, strict=True)]
     screen.result(results[0] if len(results) == 1 else {"format": "fdi_torch.predictions/1", "runs": results})
-    return DONE
+    return exit_code(worst)
 
 
 def _predict(
@@ -136,12 +140,17 @@ def _row(plant: PlantDescription, recording: Recording, prediction: Prediction) 
 
 
 def _result(
-    plant: PlantDescription, recording: Recording, prediction: Prediction, arguments: argparse.Namespace
+    plant: PlantDescription,
+    recording: Recording,
+    prediction: Prediction,
+    misfit: Misfit,
+    arguments: argparse.Namespace,
 ) -> dict[str, Any]:
     return {
         "format": "fdi_torch.prediction/1",
         "plant": plant.name,
         "recording": recording.source,
+        **misfit.to_dict(),
         "rmse": dict(prediction.rmse),
         "start_levels": dict(prediction.start_levels),
         "own": dict(prediction.own),

@@ -8,14 +8,15 @@ from pathlib import Path
 
 import torch
 
-from fdi_torch.cli import DONE
 from fdi_torch.cli.adoption import write_adopted
+from fdi_torch.cli.explained import exit_code, say_first
 from fdi_torch.cli.gap_text import MOVED
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.effects import build_network
+from fdi_torch.estimate.misfit import misfit_of
 from fdi_torch.estimate.uncertainty import parameters_at_bounds
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import LeftOutRun, leave_one_file_out
@@ -40,6 +41,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     trials: list[LeftOutRun] = []
     with one_thread():
         fitted = fitted_to(recordings)
+        misfit = misfit_of(fitted.rmse, recordings, plant)
+        say_first(misfit, screen)
         _show(fitted, plant, screen)
         _show_run_specific(fitted, screen)
         if arguments.adopt:
@@ -66,6 +69,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     screen.result(
         {
             "format": "fdi_torch.refit/1",
+            **misfit.to_dict(),
             "before": dict(fitted.before),
             "rmse": dict(fitted.rmse),
             "parameters": fitted.parameters,
@@ -74,7 +78,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             "leave_one_file_out": trials,
         }
     )
-    return DONE
+    return exit_code(misfit)
 
 
 def _show(result: Refit, before: PlantDescription, screen: Screen) -> None:

@@ -39,23 +39,20 @@ def _shown(text: str) -> Text:
     return Text(printable(text))
 
 
-class _Results(Console):
-    """Standard output. A reader that stops reading ends the command without an error."""
+class _Output(Console):
+    """A standard stream. The work continues even if nobody reads on, so that the files it writes are complete."""
 
     def on_broken_pipe(self) -> None:
-        raise
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+
+
+class _Results(_Output):
+    """Standard output."""
 
     def print(self, *what: Any, **how: Any) -> None:
         with named_errors("standard output"):
             super().print(*what, **how)
-
-
-class _Progress(Console):
-    """Standard error. The work continues even if nobody reads the progress."""
-
-    def on_broken_pipe(self) -> None:
-        self.quiet = True
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 class Screen:
@@ -65,7 +62,12 @@ class Screen:
         self.json = json
         self.quiet = quiet
         self._out = _Results(width=None if sys.stdout.isatty() else ENDLESS, highlight=False, soft_wrap=True)
-        self._err = _Progress(stderr=True, highlight=False, soft_wrap=True)
+        self._err = _Output(stderr=True, highlight=False, soft_wrap=True)
+
+    @property
+    def unread(self) -> bool:
+        """Whether the reader of standard output, such as `head`, has stopped reading."""
+        return self._out.quiet
 
     def say(self, text: str = "") -> None:
         """Print a line of the result; not with JSON."""
@@ -103,10 +105,13 @@ class Screen:
 
     def line(self, text: str) -> None:
         """Print a line of JSON immediately, for results that come one by one; only with JSON."""
-        if self.json:
-            with named_errors("standard output"):
-                sys.stdout.write(printable_json(text) + "\n")
-                sys.stdout.flush()
+        if self.json and not self.unread:
+            try:
+                with named_errors("standard output"):
+                    sys.stdout.write(printable_json(text) + "\n")
+                    sys.stdout.flush()
+            except BrokenPipeError:
+                self._out.on_broken_pipe()
 
     @contextmanager
     def stream(self) -> Iterator[BinaryIO]:

@@ -6,7 +6,8 @@ import argparse
 import math
 from collections.abc import Sequence
 
-from fdi_torch.cli import DONE, NOT_CONVERGED, NOT_EXPLAINED
+from fdi_torch.cli import DONE, NOT_CONVERGED
+from fdi_torch.cli.explained import exit_code, say_first
 from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.windows import show_windows
@@ -31,7 +32,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     screen.result(as_json(done))
     if done.result.estimate.status != "converged":
         return NOT_CONVERGED
-    return DONE if done.result.diagnosis.explained else NOT_EXPLAINED
+    return exit_code(done.result.diagnosis.misfit)
 
 
 def show(done: TrainResult, screen: Screen) -> None:
@@ -40,15 +41,11 @@ def show(done: TrainResult, screen: Screen) -> None:
     If the model does not explain the recording, that comes first.
     """
     final, diagnosis = done.result.estimate, done.result.diagnosis
-    if diagnosis.warning:
-        screen.say(f"{diagnosis.warning}.")
-        screen.say("- next: fdi gap finds where and by which effect the plant file deviates from the recording")
-        network, space = done.fitting.networks[0], done.fitting.space
-        onsets = [f"{place.prefix}.onset" for place in network.placements]
-        onsets = [name for name in onsets if name in network.constants and name not in space]
-        if onsets:
-            screen.say(f"- a fault that begins within the recording: also estimate its onset, such as {onsets[0]}")
-        screen.say()
+    network, space = done.fitting.networks[0], done.fitting.space
+    onsets = [f"{place.prefix}.onset" for place in network.placements]
+    onsets = [name for name in onsets if name in network.constants and name not in space][:1]
+    hints = [f"a fault that begins within the recording: also estimate its onset, such as {name}" for name in onsets]
+    say_first(diagnosis.misfit, screen, *hints)
     rows = []
     for i, p in enumerate(done.fitting.space):
         unit, scale = display_unit(p.unit)
@@ -159,8 +156,7 @@ def as_json(done: TrainResult) -> dict[str, object]:
         "diagnosis": {
             "kind": result.diagnosis.kind,
             "confidence": result.diagnosis.confidence,
-            "explained": result.diagnosis.explained,
-            "unexplained_ratio": finite(result.diagnosis.unexplained_ratio),
+            **result.diagnosis.misfit.to_dict(),
             "faults": result.diagnosis.faults,
             "not_isolated": result.diagnosis.not_isolated,
         },
@@ -173,7 +169,3 @@ def as_json(done: TrainResult) -> dict[str, object]:
         **({"profiles": [profile.to_dict() for profile in done.profiles]} if done.profiles else {}),
         **({"draws": result.estimate.draws.to_dict()} if result.estimate.draws else {}),
     }
-
-
-def finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

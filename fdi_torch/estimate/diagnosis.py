@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.estimate.combinations import Combination, listed, value_text
+from fdi_torch.estimate.misfit import Misfit
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, common_name
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
@@ -21,8 +22,6 @@ from fdi_torch.simulate.equilibrium import RESOLUTION
 
 # Discharge coefficient of a sharp-edged round hole (Idelchik 1986), for converting a flow into an equivalent hole.
 HOLE_COEFFICIENT = 0.6
-# The model is rejected if the standard deviation of the residuals exceeds the sensor noise by more than this factor.
-UNEXPLAINED_RATIO = 1.2
 
 
 @dataclass(frozen=True)
@@ -45,9 +44,6 @@ class Fault:
     hole: float | None
 
 
-UNRELIABLE = "Unreliable: the model does not explain the recording"
-
-
 @dataclass(frozen=True)
 class Diagnosis:
     """Test results for all suspected faults, and whether the model explains the recording.
@@ -55,14 +51,11 @@ class Diagnosis:
     faults: all suspected faults, present or not. not_isolated: combinations of fault sizes, none of them determined
     alone, that deviate significantly from nominal, so that at least one of their faults is present.
     confidence: joint confidence of all statements (Bonferroni correction).
-    unexplained_ratio: standard deviation of the residuals over the sample-to-sample noise of the readings, largest of
-    all channels. explained: whether this ratio is at most UNEXPLAINED_RATIO.
     """
 
     faults: tuple[Fault, ...]
     confidence: float
-    explained: bool
-    unexplained_ratio: float
+    misfit: Misfit
     not_isolated: tuple[Combination, ...] = ()
 
     @property
@@ -89,15 +82,7 @@ class Diagnosis:
         """
         sizes = [value_text(f.name, f.value, f.std, f.unit) for f in self.present]
         sizes += [f"{listed(c.parameters, 'or')} ({c.words})" for c in self.not_isolated]
-        summary = f"{self.kind}: {'; '.join(sizes)}" if sizes else self.kind
-        return f"{self.warning}; {summary}" if self.warning else summary
-
-    @property
-    def warning(self) -> str:
-        """A warning if the model does not explain the recording, so that no estimate can be trusted; else empty."""
-        if self.explained:
-            return ""
-        return f"{UNRELIABLE} (residuals {self.unexplained_ratio:.2g} times the sensors' noise)"
+        return self.misfit.headline(f"{self.kind}: {'; '.join(sizes)}" if sizes else self.kind)
 
 
 def diagnose(
@@ -136,8 +121,7 @@ def diagnose(
         for c in combinations
         if sizes.issuperset(c.parameters) and probability_of_deviation(c.value, c.std, c.nominal) > level
     )
-    explained = unexplained_ratio <= UNEXPLAINED_RATIO
-    return Diagnosis(tuple(faults), confidence, explained, unexplained_ratio, not_isolated)
+    return Diagnosis(tuple(faults), confidence, Misfit(unexplained_ratio), not_isolated)
 
 
 def probability_of_deviation(value: float, std: float, nominal: float) -> float:
@@ -205,21 +189,6 @@ def _inflows(
     commands, _ = network.commands(inputs, network.steady_command_memory(inputs, clock, values), clock, values)
     point = network.operating_point(levels.unbind(), commands, clock, values)
     return network.less_overflow(point, network.net_inflows(point, network.flows(point)))
-
-
-def sample_noise(values: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
-    """Model-free estimate of the readings' noise (C,) from second differences of neighbouring samples (S, C).
-
-    sigma = median |y_{s+1} - 2 y_s + y_{s-1}| / (0.6745 sqrt 6). Second differences remove a smooth signal, and the
-    median is robust against a few switching events (Hall, Kay & Titterington 1990). weight (S, C): 0 masks a reading.
-    """
-    valid = (weight[2:] > 0) & (weight[1:-1] > 0) & (weight[:-2] > 0)
-    second = (values[2:] - 2.0 * values[1:-1] + values[:-2]).abs() / math.sqrt(6.0)
-    levels = [
-        second[:, c][valid[:, c]].median() / 0.6745 if bool(valid[:, c].any()) else second.new_zeros(())
-        for c in range(values.shape[1])
-    ]
-    return torch.stack(levels)
 
 
 def lasting(residual: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:

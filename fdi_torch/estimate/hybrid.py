@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.diagnosis import Diagnosis, diagnose, lasting, sample_noise
+from fdi_torch.estimate.diagnosis import Diagnosis, diagnose, lasting
 from fdi_torch.estimate.evolution import EvolutionResult, Search, evolve
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid_settings import HybridSettings, sparing
 from fdi_torch.estimate.levenberg_marquardt import Progress
+from fdi_torch.estimate.misfit import unexplained_ratio
 from fdi_torch.estimate.objectives import Problem
 from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.refinement import (
@@ -173,8 +174,7 @@ def conclude(
     noise = raw.noise(theta, lanes)
     for term, noise_level in zip(raw.terms, noise, strict=True):
         predicted.append(term.engine.readings(term.theta(theta))[0])
-        sensor_noise = sample_noise(term.data.known, term.data.weight)
-        noise_ratios.append(float((noise_level[0] / sensor_noise.clamp(min=1e-12)).max()))
+        noise_ratios.append(unexplained_ratio(noise_level[0], term.data.known, term.data.weight))
     for term, noise_level in zip(problem.terms, problem.noise(theta, lanes), strict=True):
         residuals = term.data.known - term.engine.readings(term.theta(theta))[0]
         inflated_noise.append(noise_level[0] * torch.sqrt(lasting(residuals, (term.data.weight > 0).to(residuals))))

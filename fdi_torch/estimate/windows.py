@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.estimate.diagnosis import fault_flow, sample_noise
+from fdi_torch.estimate.diagnosis import fault_flow
 from fdi_torch.estimate.fitting import Fitting, readings_of
 from fdi_torch.estimate.hybrid import search_box
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.misfit import sample_noise
 from fdi_torch.estimate.objectives import Problem, Term
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.constants import reading_span

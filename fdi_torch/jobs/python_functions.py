@@ -16,6 +16,7 @@ from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monito
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
+from fdi_torch.estimate.misfit import misfit_of
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.free_runs.prediction import START_SAMPLES
 from fdi_torch.gap.free_runs.prediction import predict as run_freely
@@ -170,8 +171,10 @@ def refit(
     step: of the simulation, s. choices: leave_out, hold, vary (names or patterns), as the options of `fdi refit`.
     """
     plant = plant_of(plant)
+    segments = recordings_of(recordings, plant)
     with one_thread():
-        return RefitResult(refitted(plant, recordings_of(recordings, plant), step=step, **choices))
+        fit = refitted(plant, segments, step=step, **choices)
+    return RefitResult(fit, misfit_of(fit.rmse, segments, plant))
 
 
 def study(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.free_runs.prediction import Prediction
 from fdi_torch.gap.free_runs.refit import Refit
@@ -88,7 +89,11 @@ class FreeRun(Shown):
 
     @property
     def headline(self) -> str:
-        return f"free run of {self.plant.name} along {self.recording.source}"
+        return self.misfit.headline(f"free run of {self.plant.name} along {self.recording.source}")
+
+    @property
+    def misfit(self) -> Misfit:
+        return misfit_of(self.prediction.rmse, [self.recording], self.plant)
 
     def table(self) -> Table:
         """One row per sensor: root mean square error, SI."""
@@ -109,9 +114,11 @@ class FreeRun(Shown):
 
 @dataclass(frozen=True, repr=False)
 class RefitResult(Shown):
-    """plant: the plant with fitted constants and effects. fit: errors, values and standard errors, SI."""
+    """plant: the plant with fitted constants and effects. fit: errors, values and standard errors, SI.
+    misfit: of all recordings."""
 
     fit: Refit
+    misfit: Misfit
 
     @property
     def plant(self) -> PlantDescription:
@@ -120,7 +127,7 @@ class RefitResult(Shown):
     @property
     def headline(self) -> str:
         errors = ", ".join(f"{s.name} {quantity_text(self.fit.rmse[s.name], s.unit)}" for s in self.plant.sensors)
-        return f"refit of {self.plant.name}: root mean square error {errors}"
+        return self.misfit.headline(f"refit of {self.plant.name}: root mean square error {errors}")
 
     def table(self) -> Table:
         """One row per value that all recordings share, SI."""

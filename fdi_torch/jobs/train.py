@@ -230,7 +230,7 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profile
         more["draws"] = final.draws.to_dict()
     diagnosis = result.diagnosis
     more["not_isolated"] = [combination.to_dict() for combination in diagnosis.not_isolated]
-    log.result(final.to_dict() | {"kind": diagnosis.kind, "explained": diagnosis.explained} | more)
+    log.result(final.to_dict() | {"kind": diagnosis.kind} | diagnosis.misfit.to_dict() | more)
     if final.status != "converged":
         log.set_status("not_converged", final.status)
 

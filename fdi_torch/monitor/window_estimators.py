@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.diagnosis import sample_noise
 from fdi_torch.estimate.draws import problem_seeds
 from fdi_torch.estimate.evolution import evolve
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.misfit import sample_noise
 from fdi_torch.estimate.objectives import Objective, Problem, Term, spread_of
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.engine import Readings

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fdi_torch.estimate.combinations import Combination
-from fdi_torch.estimate.diagnosis import UNRELIABLE
+from fdi_torch.estimate.misfit import UNRELIABLE, Misfit
 from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, fault_at
 from fdi_torch.report.material import Material
@@ -42,7 +42,7 @@ def headline(material: Material) -> str:
         rehearsal_words,
         study_words,
     )
-    warning = f"{UNRELIABLE}. " if material.about("result").get("explained") == "false" else ""
+    warning = unreliable_words(material)
     with material.in_its_units():
         for words in (of(material) for of in (*sentences, windows_words)):
             if words:
@@ -50,6 +50,15 @@ def headline(material: Material) -> str:
     status = material.about("status")
     words = status.get("status", "did not end").replace("_", " ").capitalize()
     return f"{words}: {status['reason']}" if status.get("reason") else words
+
+
+def unreliable_words(material: Material) -> str:
+    """The warning of an estimate whose model does not explain its recording; logs before 2026-11 lack its ratio."""
+    result = material.about("result")
+    if result.get("explained") != "false":
+        return ""
+    ratio = result.get("unexplained_ratio", "null")
+    return f"{UNRELIABLE if ratio == 'null' else Misfit(float(ratio)).warning}. "
 
 
 def fault_words(material: Material) -> str:

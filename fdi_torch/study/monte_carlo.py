@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.diagnosis import UNEXPLAINED_RATIO, sample_noise
 from fdi_torch.estimate.evolution import evolve
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.misfit import UNEXPLAINED_RATIO, sample_noise
 from fdi_torch.estimate.objectives import OBJECTIVES, Objective, Problem, Term, spread_of
 from fdi_torch.estimate.refined import CONVERGED, STATUSES, Refined
 from fdi_torch.simulate.engine import Engine, Readings

@@ -27,6 +27,7 @@ from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault
 from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerances
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.plant_units import refusal, wrong_units
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 
 FEWEST = 20
@@ -72,6 +73,8 @@ def examined(plant: PlantDescription, recording: Recording) -> CheckedRecording:
     plant = _with_recorded_sensors(plant, recording)
     if len(recording) < FEWEST or not plant.sensors:
         return CheckedRecording(recording, (), None)
+    if not recording.trusted and (wrong := wrong_units(plant, recording)):
+        return CheckedRecording(recording, (), RecordingFault(("units",), wrong))
     stuck = list(stuck_in(plant, recording))
     remaining, fault = without(recording, stuck), None
     constant = _constant_sensors(plant, remaining)
@@ -91,9 +94,7 @@ def usable(plant: PlantDescription, recording: Recording, effects: bool = False)
     """
     checked = examined(plant, recording)
     if checked.fault and not (effects and checked.fault.physical):
-        raise ValueError(
-            f"{recording.source}: {checked.fault.text}; if the recording is right, state trusted: true beside the file"
-        )
+        raise ValueError(refusal(recording, checked.fault.text))
     return checked
 
 

@@ -1,0 +1,21 @@
+"""Whether the model explains the recording: said first, and the exit code of train, refit and predict."""
+
+from __future__ import annotations
+
+from fdi_torch.cli import DONE, NOT_EXPLAINED
+from fdi_torch.cli.screen import Screen
+from fdi_torch.estimate.misfit import Misfit
+
+
+def say_first(misfit: Misfit, screen: Screen, *hints: str) -> None:
+    """Print the warning and what to do next if the model does not explain the recording."""
+    if misfit.warning:
+        screen.say(f"{misfit.warning}.")
+        gap = "next: fdi gap finds where and by which effect the plant file deviates from the recording"
+        for hint in (gap, *hints):
+            screen.say(f"- {hint}")
+        screen.say()
+
+
+def exit_code(misfit: Misfit) -> int:
+    return DONE if misfit.explained else NOT_EXPLAINED

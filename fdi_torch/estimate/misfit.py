@@ -1,0 +1,91 @@
+"""Whether a model explains a recording: its residuals beside the sample-to-sample noise of the readings.
+
+    ratio = max_c rms(y_c - model_c) / sigma_c
+
+The model is rejected above UNEXPLAINED_RATIO. train, refit and predict all judge and word it here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.repeated_readings import resolution
+
+UNEXPLAINED_RATIO = 1.2
+"""The model is rejected if the standard deviation of its residuals exceeds this multiple of the noise of a sensor."""
+EXACT = 1e-5
+"""Relative error of a simulated reading: a trajectory counts as converged at this defect."""
+UNRELIABLE = "Unreliable: the model does not explain the recording"
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """ratio: standard deviation of the residuals over the noise of the readings, largest of all channels."""
+
+    ratio: float
+
+    @property
+    def explained(self) -> bool:
+        return self.ratio <= UNEXPLAINED_RATIO
+
+    @property
+    def warning(self) -> str:
+        """A warning if the model does not explain the recording, so that no estimate can be trusted; else empty."""
+        size = (
+            f" (residuals {float(f'{self.ratio:.2g}'):g} times the sensors' noise)" if math.isfinite(self.ratio) else ""
+        )
+        return "" if self.explained else f"{UNRELIABLE}{size}"
+
+    def headline(self, text: str) -> str:
+        """The text, after the warning if there is one."""
+        return f"{self.warning}; {text}" if self.warning else text
+
+    def to_dict(self) -> dict[str, bool | float | None]:
+        ratio = self.ratio if math.isfinite(self.ratio) else None
+        return {"explained": self.explained, "unexplained_ratio": ratio}
+
+
+def misfit_of(rms: Mapping[str, float], recordings: Sequence[Recording], plant: PlantDescription) -> Misfit:
+    """The misfit of a model whose residuals along these recordings have the root mean square rms, SI by sensor."""
+    columns = [recordings[0].output_names.index(sensor.column) for sensor in plant.sensors]
+    values = torch.cat([r.outputs[:, columns] for r in recordings]).nan_to_num()
+    weight = torch.cat([r.mask[:, columns] for r in recordings])
+    return Misfit(unexplained_ratio(values.new_tensor([rms[sensor.name] for sensor in plant.sensors]), values, weight))
+
+
+def unexplained_ratio(rms: Tensor, values: Tensor, weight: Tensor) -> float:
+    """The ratio for residuals of root mean square rms (C,) of readings (S, C) of this weight; 0 masks a reading.
+
+    Rounding in steps of q adds q^2 / 12 to the variance of the readings, which second differences of a slow level do
+    not show.
+    """
+    ratios = [0.0]
+    for c, noise in enumerate(sample_noise(values, weight).tolist()):
+        valid, rms_of_channel = values[weight[:, c] > 0, c], float(rms[c])
+        if len(valid):
+            least = max(resolution(valid) / math.sqrt(12.0), EXACT * float(valid.abs().max()), 1e-12)
+            ratios.append(rms_of_channel / max(noise, least) if math.isfinite(rms_of_channel) else math.inf)
+    return max(ratios)
+
+
+def sample_noise(values: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
+    """Model-free estimate of the readings' noise (C,) from second differences of neighbouring samples (S, C).
+
+    sigma = median |y_{s+1} - 2 y_s + y_{s-1}| / (0.6745 sqrt 6). Second differences remove a smooth signal, and the
+    median is robust against a few switching events (Hall, Kay & Titterington 1990). weight (S, C): 0 masks a reading.
+    """
+    valid = (weight[2:] > 0) & (weight[1:-1] > 0) & (weight[:-2] > 0)
+    second = (values[2:] - 2.0 * values[1:-1] + values[:-2]).abs() / math.sqrt(6.0)
+    levels = [
+        second[:, c][valid[:, c]].median() / 0.6745 if bool(valid[:, c].any()) else second.new_zeros(())
+        for c in range(values.shape[1])
+    ]
+    return torch.stack(levels)

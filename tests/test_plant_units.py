@@ -1,0 +1,138 @@
+"""Units that are wrong for all areas, flows or levels: every command names them before it computes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import fdi_torch
+from fdi_torch.cli import DONE, MISUSE, main
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.parameters import display_in
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recordings.plant_units import wrong_units
+
+PLANT = """
+tanks:
+  A: {area: 200 cm^2, height: 60 cm}
+  B: {area: 150 cm^2, height: 60 cm}
+pipes:
+  AB: {source: A, target: B, area: 0.8 cm^2, discharge_coefficient: 0.6}
+  OUT: {source: B, area: 0.8 cm^2, discharge_coefficient: 0.6}
+pumps: {Q: {target: A, max_flow: 6 l/min}}
+sensors: {hA: {tank: A}, hB: {tank: B}}
+tolerances: {"*.discharge_coefficient": 5 %, Q.gain: 3 %}
+"""
+STEPS = [["0 s", "3 l/min"], ["100 s", "4.5 l/min"], ["250 s", "2 l/min"], ["400 s", "3.5 l/min"]]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The plant, and ten minutes of it with another gain of the pump than the file has, in run.csv."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.yaml").write_text(PLANT)
+    run = recorded(load_plant(tmp_path / "rig.yaml"), {"Q.pump_gain": 0.97})
+    (tmp_path / "run.csv").write_text("t_s,Q_l/min,hA_mm,hB_mm\n" + rows(run))
+    (tmp_path / "train.yaml").write_text(
+        "plant: rig.yaml\nrecordings: [{file: run.csv}]\nestimate: {parameters: [B.leak]}\n"
+    )
+    (tmp_path / "watch.yaml").write_text("plant: rig.yaml\nrecording: {file: run.csv}\nfault_free: [0 s, 600 s]\n")
+    return tmp_path
+
+
+def recorded(plant: PlantDescription, faults: dict[str, float | str]) -> fdi_torch.Recording:
+    noise = {"std": {"hA": "1 mm", "hB": "1 mm"}}
+    return fdi_torch.simulate(plant, inputs={"Q": {"steps": STEPS}}, duration="600 s", faults=faults, noise=noise)
+
+
+def rows(run: fdi_torch.Recording) -> str:
+    each = zip(run.time.tolist(), run.inputs[:, 0].tolist(), *run.outputs.T.tolist(), strict=True)
+    return "".join(f"{t},{6e4 * q},{1e3 * a},{1e3 * b}\n" for t, q, a, b in each)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["gap", "--plant", "rig.yaml", "--recording", "run.csv"],
+        ["refit", "--plant", "rig.yaml", "--recording", "run.csv"],
+        ["train", "--config", "train.yaml"],
+        ["monitor", "--config", "watch.yaml"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_every_command_refuses_areas_in_the_wrong_unit_with_one_sentence(
+    folder: Path, command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "rig.yaml").write_text(PLANT.replace("200 cm^2", "200 m^2").replace("150 cm^2", "150 m^2"))
+    assert main([*command, "--quiet"]) == MISUSE
+    sentence = "the areas of all tanks are 10000 times too large (write cm^2 in place of m^2)"
+    assert f"by the volume balance of the tanks, {sentence}; if the recording is right" in capsys.readouterr().err
+
+
+def in_file(old: str, new: str) -> Callable[[str], str]:
+    return lambda text: text.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "sentence"),
+    [
+        ("rig.yaml", in_file("200 cm^2", "200 m^2"), "tanks.A.area is 10000 times too large"),
+        ("rig.yaml", in_file("0.8 cm^2", "0.8 mm^2"), "the areas of all pipes are 100 times too small"),
+        (
+            "rig.yaml",
+            in_file("cm^2", "m^2"),
+            "the areas of all tanks and pipes are 10000 times too large (write cm^2 in place of m^2)",
+        ),
+        (
+            "run.csv",
+            in_file("l/min", "cm^3/s"),
+            "the flows of Q are 16.7 times too small (write l/min in place of cm^3/s)",
+        ),
+        ("run.csv", in_file("mm", "cm"), "the levels hA, hB are 10 times too large (write mm in place of cm)"),
+    ],
+)
+def test_check_names_what_is_wrong_and_what_to_write(
+    folder: Path, name: str, change: Callable[[str], str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / name).write_text(change((folder / name).read_text()))
+    assert main(["check", "run.csv", "--plant", "rig.yaml"]) == DONE
+    shown = capsys.readouterr().out
+    assert f"- units: by the volume balance of the tanks, {sentence}" in shown
+    assert " or " not in shown.split(sentence)[1].splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        {},
+        {"Q.pump_gain": 0.6},
+        {"B.leak": 0.5},
+        {"AB.plugging": 0.9},
+        {"Q.pump_lag": "20 s"},
+        {"hA.sensor_gain": 0.8},
+        {"B.leak": 0.3, "AB.plugging": 0.4},
+    ],
+    ids=str,
+)
+def test_a_faulty_plant_is_no_wrong_unit(folder: Path, faults: dict[str, float | str]) -> None:
+    plant = load_plant(folder / "rig.yaml")
+    assert wrong_units(plant, recorded(plant, faults)) == ""
+
+
+def test_a_plant_without_pumps_at_rest_or_too_short_says_nothing(folder: Path) -> None:
+    run = recorded(load_plant(folder / "rig.yaml"), {})
+    (folder / "large.yaml").write_text(PLANT.replace("200 cm^2", "200 m^2").replace("150 cm^2", "150 m^2"))
+    large = load_plant(folder / "large.yaml")
+    display_in(large.units)
+    assert wrong_units(large, run.stretch(0, 32)) == "" != wrong_units(large, run)
+    at_rest = replace(run, inputs=0.0 * run.inputs)
+    assert wrong_units(large, at_rest) == ""
+
+
+def test_swapped_sensors_are_no_wrong_unit(folder: Path) -> None:
+    plant = load_plant(folder / "rig.yaml")
+    run = recorded(plant, {})
+    assert wrong_units(plant, replace(run, outputs=run.outputs.flip(-1))) == ""
