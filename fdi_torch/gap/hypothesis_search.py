@@ -174,20 +174,17 @@ class HypothesisSearch:
     def _predicts_as_well(
         self, known: RankedExplanation, explanation: RankedExplanation, unknown: LocalizedDiscrepancy
     ) -> bool:
-        """Whether an effect at the place of an unknown predicts as well by Akaike's criterion (1974), which costs one
-        nat for each parameter, after its law moved towards the unknown as far as its relative error allows.
-
-        The log likelihood is quadratic along this way, and has its maximum at the unknown.
+        """Whether an effect at the place of an unknown differs from it by no more than its law may be wrong, or predicts as
+        well by Akaike's criterion (1974), which costs one nat for each parameter.
         """
-        fitter, fit, remaining = self.pool.fitter, known.fit, 1.0  # share of the way
+        fitter, fit = self.pool.fitter, known.fit
         if unknown.predicted is not None:
-            towards = unknown.predicted - fit.linearised.readings[0]
-            distance = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], towards)
-            here = [c for c in known.key if c[1] == unknown.location]
-            remaining -= min(ODDS.discrepancy * influence(fitter, fit, here) / distance, 1.0) if distance else 1.0
+            difference = unknown.predicted - fit.linearised.readings[0]
+            size = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], difference)
+            if is_inexact_law(fitter, fit, size, [c for c in known.key if c[1] == unknown.location]):
+                return True
         better = self._log_likelihood(explanation) + unknown.log_likelihood - self._log_likelihood(known)
-        saved = unknown.parameters + len(explanation.fit.space) - len(known.fit.space)
-        return better * remaining**2 <= max(saved, 0)
+        return better <= unknown.parameters + len(explanation.fit.space) - len(fit.space)
 
     def _log_likelihood(self, explanation: RankedExplanation) -> float:
         fitter, fit = explanation.fitter, explanation.fit
