@@ -174,8 +174,8 @@ class HypothesisSearch:
     def _predicts_as_well(
         self, known: RankedExplanation, explanation: RankedExplanation, unknown: LocalizedDiscrepancy
     ) -> bool:
-        """Whether an effect at the place of an unknown differs from it by no more than its law may be wrong, or predicts as
-        well by Akaike's criterion (1974), which costs one nat for each parameter.
+        """Whether an effect at the place of an unknown differs from it by no more than its law may be wrong, or
+        predicts as well by Akaike's criterion (1974), which costs one nat for each parameter.
         """
         fitter, fit = self.pool.fitter, known.fit
         if unknown.predicted is not None:
