@@ -14,6 +14,7 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, recalibrate
 from fdi_torch.gap.localization import single_regressor_gain as promise
+from fdi_torch.gap.localization.breakpoints import Breakpoints
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.marginal_likelihood import with_estimated_noise
 from fdi_torch.gap.problem import problem_of
@@ -34,6 +35,10 @@ def surveyed(request: pytest.FixtureRequest) -> tuple[DiscrepancyRegression, Fit
     return DiscrepancyRegression(under, null, 1.0 / 60.0, 40), under, null
 
 
+def gain_at(survey: DiscrepancyRegression, under: Fitter, null: Fit, place: str) -> float:
+    return promise.SingleRegressorGains(survey, under, null, torch.Generator().manual_seed(5)).at(place)
+
+
 def products(
     surveyed: tuple[DiscrepancyRegression, Fitter, Fit], place: str, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Tensor, Tensor]:
@@ -41,7 +46,7 @@ def products(
     survey, under, null = surveyed
     found: list[tuple[Tensor, Tensor]] = []
     monkeypatch.setattr(promise, "gains_of", lambda *p: found.append(p) or p[0])
-    promise.single_regressor_gains(survey, under, null, [place], torch.Generator().manual_seed(5))
+    gain_at(survey, under, null, place)
     return found[0]
 
 
@@ -73,8 +78,7 @@ def test_the_place_of_the_cause_has_the_largest_first_order_gain(
     surveyed: tuple[DiscrepancyRegression, Fitter, Fit],
 ) -> None:
     survey, under, null = surveyed
-    found = promise.single_regressor_gains(survey, under, null, PLACES, torch.Generator().manual_seed(5))
-    assert max(found, key=lambda place: found[place]) == "Q1"
+    assert max(PLACES, key=lambda place: gain_at(survey, under, null, place)) == "Q1"
 
 
 def test_a_step_between_two_nodes_is_expected_to_gain_what_it_does() -> None:
@@ -92,5 +96,17 @@ def test_a_step_between_two_nodes_is_expected_to_gain_what_it_does() -> None:
     white = without(basis, under.whiten(step.unsqueeze(-1)).flatten(0, 1))
     score = white.T @ without(basis, promise.whitened_residual(under, null, survey.at("h3")[1]))
     gain = 0.5 * float(score.square() / white.square().sum())
-    expected = promise.single_regressor_gains(survey, under, null, ["h3"], torch.Generator().manual_seed(5))["h3"]
-    assert expected == pytest.approx(gain, rel=0.3)
+    assert gain_at(survey, under, null, "h3") == pytest.approx(gain, rel=0.3)
+
+
+@pytest.mark.parametrize("jump", [False, True])
+def test_products_of_all_breakpoints_are_those_of_each_function(jump: bool) -> None:
+    generator = torch.Generator().manual_seed(1)
+    x = torch.randn(50, generator=generator, dtype=torch.float64)
+    x[10:20] = x[3]  # a signal that stands still at a breakpoint
+    factor, weights = (torch.randn(n, 50, generator=generator, dtype=torch.float64) for n in (1, 3))
+    at = torch.cat([x[:5], torch.linspace(-3.0, 3.0, 20, dtype=torch.float64)])
+    family = Breakpoints(x, factor[0], at, jump)
+    functions = torch.stack([(x >= c) * factor[0] if jump else (x - c).clamp(min=0.0) * factor[0] for c in at])
+    torch.testing.assert_close(family.products(weights), functions @ weights.T)
+    torch.testing.assert_close(torch.stack([family.function(i) for i in range(len(at))]), functions)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.forcing import Forcing
+from fdi_torch.gap.localization.breakpoints import Breakpoints
 from fdi_torch.gap.localization.regressors import (
     LAGS,
     RAMPS,
@@ -54,14 +55,19 @@ class SignalRanges:
     def hinges(self, s: Signals, name: str, count: int) -> list[Tensor]:
         return hinges(s[name], self(name), 2 * count)
 
-    def fine_hinges(self, s: Signals, name: str, count: int) -> list[Tensor]:
-        return self.hinges(s, name, FINER * count)
-
     def steps_in_value(self, s: Signals, name: str, count: int) -> list[Tensor]:
         return steps_in_value(s[name], self(name), 3 * count)
 
-    def fine_steps_in_value(self, s: Signals, name: str, count: int) -> list[Tensor]:
-        return self.steps_in_value(s, name, FINER * count)
+    def kinks(self, s: Signals, name: str, count: int, factor: Tensor | None = None) -> Breakpoints:
+        """Kinks as closely spaced as `count` of the hinges times FINER."""
+        return self._breakpoints(s, name, 2 * FINER * count, factor, jump=False)
+
+    def jumps(self, s: Signals, name: str, count: int, factor: Tensor | None = None) -> Breakpoints:
+        return self._breakpoints(s, name, 3 * FINER * count + 2, factor, jump=True)
+
+    def _breakpoints(self, s: Signals, name: str, count: int, factor: Tensor | None, jump: bool) -> Breakpoints:
+        at = torch.linspace(*self(name), count, dtype=s[name].dtype)[1:-1]
+        return Breakpoints(s[name], torch.ones_like(s[name]) if factor is None else factor, at, jump)
 
     def relays(self, s: Signals, name: str) -> list[tuple[float, Tensor]]:
         return relays(s[name], self(name), RELAYS)
@@ -69,6 +75,7 @@ class SignalRanges:
 
 # Local signals (K,), step lengths (K,) s -> regressors (K,) each
 RegressorFunction = Callable[[Signals, Tensor, SignalRanges], list[Tensor]]
+BreakpointFunction = Callable[[Signals, SignalRanges], list[Breakpoints]]
 
 
 @dataclass(frozen=True)
@@ -76,13 +83,13 @@ class DiscrepancyModel:
     """Regressors of one component's discrepancy.
 
     signals: the local signals along a recording. flows: regressors in m^3/s, or to be scaled to it, of a flow from
-    `source` to `target`. fine: the kinks and jumps among them on a finer grid. in_time: name of the signal that
+    `source` to `target`. fine: kinks and jumps as among them on a finer grid. in_time: name of the signal that
     functions of time multiply. areas: regressors of a relative change of the target's area, as level rates in m/s.
     """
 
     signals: Callable[[Forcing], Signals]
     flows: RegressorFunction
-    fine: RegressorFunction
+    fine: BreakpointFunction
     in_time: str
     source: str
     target: str
@@ -109,9 +116,9 @@ def reading_regressors(s: Signals, step: Tensor, ends: SignalRanges, scale: floa
     return [*regressors, *lags_and_decays(s["reading"], step, scale), *backlashes(s["reading"], ends("reading"))]
 
 
-def fine_reading_regressors(s: Signals, ends: SignalRanges) -> list[Tensor]:
+def fine_reading_regressors(s: Signals, ends: SignalRanges) -> list[Breakpoints]:
     """The kinks among `reading_regressors` on a finer grid."""
-    return ends.fine_hinges(s, "reading", 12)
+    return [ends.kinks(s, "reading", 12)]
 
 
 def _commanded(component: FlowComponent, plant: PlantDescription) -> DiscrepancyModel:
@@ -132,8 +139,8 @@ def _commanded(component: FlowComponent, plant: PlantDescription) -> Discrepancy
         regressors += stictions(s["flow"], ends("flow"))
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
-    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        return [*ends.fine_hinges(s, "command", 9), *(s["flow"] * b for b in ends.fine_hinges(s, "level", 6))]
+    def fine(s: Signals, ends: SignalRanges) -> list[Breakpoints]:
+        return [ends.kinks(s, "command", 9), ends.kinks(s, "level", 6, s["flow"])]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 
@@ -155,10 +162,9 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
             regressors += lags_and_decays(s["root"] * s["opening"], step, scale)
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
-    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        of_opening = [s["root"] * b for b in ends.fine_hinges(s, "opening", 9)] if has_valve else []
-        jumps = [s["flow"] * j for j in ends.fine_steps_in_value(s, "root", 24)]
-        return [*ends.fine_hinges(s, "root", 16), *jumps, *of_opening]
+    def fine(s: Signals, ends: SignalRanges) -> list[Breakpoints]:
+        of_opening = [ends.kinks(s, "opening", 9, s["root"])] if has_valve else []
+        return [ends.kinks(s, "root", 16), ends.jumps(s, "root", 24, s["flow"]), *of_opening]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 
@@ -178,8 +184,8 @@ def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         return [*ends.hinges(s, "head", 10), *ends.hinges(s, "root", 10)]
 
-    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        return [*ends.fine_hinges(s, "head", 10), *ends.fine_hinges(s, "root", 10)]
+    def fine(s: Signals, ends: SignalRanges) -> list[Breakpoints]:
+        return [ends.kinks(s, "head", 10), ends.kinks(s, "root", 10)]
 
     return DiscrepancyModel(signals, flows, fine, "root", first, second)
 
@@ -202,8 +208,8 @@ def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
     def areas(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         return [s["rate"] * b for b in ends.hinges(s, "level", 12)]
 
-    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        return [*ends.fine_hinges(s, "level", 12), *ends.fine_steps_in_value(s, "level", 24)]
+    def fine(s: Signals, ends: SignalRanges) -> list[Breakpoints]:
+        return [ends.kinks(s, "level", 12), ends.jumps(s, "level", 24)]
 
     return DiscrepancyModel(signals, flows, fine, "one", OUTSIDE, place, areas)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.forcing import Forcing
+from fdi_torch.gap.localization.breakpoints import Breakpoints
 from fdi_torch.gap.localization.component_regressors import (
     DiscrepancyModel,
     SignalRanges,
@@ -69,17 +70,22 @@ class Discrepancy:
 class Regressors:
     """Regressors of one component along one recording of K steps; of a sensor, along its K samples.
 
-    functions (M, K): of local variables, in m^3/s, or in the sensor's unit. fine (F, K): those with kinks, on a finer
-    grid. in_time (T, K): functions of the time (K,) times `factor` (K,). areas (A, K): of a tank, changes of its level
+    functions (M, K): of local variables, in m^3/s, or in the sensor's unit. fine: kinks and jumps on a finer grid.
+    in_time (T, K): functions of the time (K,) times `factor` (K,). areas (A, K): of a tank, changes of its level
     rate, m/s; otherwise None.
     """
 
     functions: Tensor
-    fine: Tensor
+    fine: list[Breakpoints]
     in_time: Tensor
     time: Tensor
     factor: Tensor
     areas: Tensor | None = None
+
+    @property
+    def steps_in_time(self) -> Breakpoints:
+        """Steps at all times."""
+        return Breakpoints(self.time, self.factor, self.time, jump=True)
 
     def sinusoids(self, frequency: Tensor) -> Tensor:
         """Harmonics of each frequency (F,), Hz, times the factor: (F, W, K)."""
@@ -135,7 +141,7 @@ class DiscrepancyRegression:
         self.theta, self.levels = fit.theta.unsqueeze(0), predicted_levels(fitter, fit)
         self.linearised = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.linearised, levels=self.levels))
-        self._at: dict[str, tuple[list[Regressors], Linearised]] = {}
+        self._last: tuple[str, list[Regressors], Linearised] | None = None
         parts, samples = len(self.pieces), len(fitter.data.readings)
         self.steps = max(min(steps, samples // SAMPLES_A_STEP) // parts, 2)
 
@@ -167,13 +173,13 @@ class DiscrepancyRegression:
 
     def at(self, place: str) -> tuple[list[Regressors], Linearised]:
         """Regressors of the component at a place along each recording, and the trajectory about which they act."""
-        if place not in self._at:
+        if self._last is None or self._last[0] != place:  # those of all places would fill the memory
             plant, channel = self.fitter.data.plant, self.sensor(place)
             if channel is None:
-                self._at[place] = self._of_component(discrepancy_model_at(place, plant)), self.linearised
+                self._last = place, self._of_component(discrepancy_model_at(place, plant)), self.linearised
             else:
-                self._at[place] = self._of_sensor(plant.sensors[channel])
-        return self._at[place]
+                self._last = place, *self._of_sensor(plant.sensors[channel])
+        return self._last[1:]
 
     def sensor(self, place: str) -> int | None:
         """The channel of a sensor; None if the place is no sensor."""
@@ -219,7 +225,7 @@ class DiscrepancyRegression:
         ends, regressors = SignalRanges(signals), []
         for piece, s in zip(self.pieces, signals, strict=True):
             step, factor = piece.engine.experiment.steps, s[component.in_time]
-            functions, fine = (torch.stack(each(s, step, ends)) for each in (component.flows, component.fine))
+            functions, fine = torch.stack(component.flows(s, step, ends)), component.fine(s, ends)
             areas = torch.stack(component.areas(s, step, ends)) if component.areas else None
             in_time = factor * self._functions_of_time(piece, piece.middle)
             regressors.append(Regressors(functions, fine, in_time, piece.middle, factor, areas))
@@ -242,7 +248,7 @@ class DiscrepancyRegression:
             functions = reading_regressors(s, piece.engine.experiment.sample_intervals, ends, scale)
             fine, in_time = fine_reading_regressors(s, ends), self._functions_of_time(piece, s["time"])
             one = torch.ones_like(s["time"])
-            regressors.append(Regressors(torch.stack(functions), torch.stack(fine), in_time, s["time"], one))
+            regressors.append(Regressors(torch.stack(functions), fine, in_time, s["time"], one))
         return regressors, self.engine.linearise(self.theta, levels)
 
     def _rate_changes(self, piece: RecordingLinearisation, component: DiscrepancyModel, flows: Tensor) -> Tensor:

@@ -82,16 +82,18 @@ class Positions:
         """Influence (S, C) of one regressor."""
         columns = []
         for k, r in enumerate(self.regression.at(self.place)[0]):
-            step = torch.zeros_like(r.factor)
-            if family == k + 1:
-                step[position:] = r.factor[position:]
-            function = step if family else r.fine[position]
+            if family < len(r.fine):
+                function = r.fine[family].function(position)
+            elif family == len(r.fine) + k:
+                function = r.steps_in_time.function(position)
+            else:
+                function = torch.zeros_like(r.factor)  # a step in time of another recording
             columns.append(self.regression.influence(self.place, k, function.unsqueeze(0))[..., 0])
         return with_blanks(columns, dim=0)
 
     def _products(self, white: Tensor, basis: Tensor) -> list[Tensor]:
-        """Products of all regressors with whitened columns (S C + P, W), what the basis explains projected out: kinks
-        and jumps (F, W), and the steps in time of each recording (K, W)."""
+        """Products of all regressors with whitened columns (S C + P, W), what the basis explains projected out, by the
+        families of `position_products`."""
         adjoints = adjoints_of(self.regression, self.under, white, basis)
         if (channel := self.regression.sensor(self.place)) is None:
             weights = inflow_weights(self.regression, self.place, adjoints)

@@ -18,7 +18,7 @@ from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_ascent import CONVERGED, STEPS, Ascent, EvaluatedDiscrepancy, gain_of
+from fdi_torch.gap.localization.discrepancy_ascent import CONVERGED, STEPS, Ascent, gain_of
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
@@ -26,11 +26,10 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     log_evidence,
     log_likelihood,
     nearly_without_disturbances,
-    nearly_without_the_largest,
 )
 from fdi_torch.gap.localization.random_processes import drifting_sensors, random_flows
 from fdi_torch.gap.localization.regressors import dominant_frequency
-from fdi_torch.gap.localization.single_regressor_gain import single_regressor_gains
+from fdi_torch.gap.localization.single_regressor_gain import SingleRegressorGains
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, occam, with_disturbances
 
 CALIBRATION_PLACES = 3  # places always evaluated; they show by how much first-order gains are too low
@@ -69,10 +68,10 @@ def localize(
     if _evidence_bound(fitter, fit, replace(noise, scale=scale), regression.steps) - base < needed:
         return Localization((), itself)
     ascent = Ascent(fitter, fit, noise, base)
-    starts = [likely, nearly_without_disturbances(likely), nearly_without_the_largest(likely)]
+    starts = [likely, nearly_without_disturbances(likely)]
     starts += [replace(rival, wander=None, apart=None)] if rival else []
     first_order = _first_order_gains(regression, starts, fit, places, base)
-    evaluated: dict[str, EvaluatedDiscrepancy] = {}
+    evaluated: dict[str, LocalizedDiscrepancy] = {}
     excess = -math.inf  # largest difference seen so far between a gain and its first-order estimate
     for place, (expected, start) in sorted(first_order.items(), key=lambda item: -item[1][0]):
         if len(evaluated) >= CALIBRATION_PLACES and expected + excess < needed:
@@ -82,17 +81,17 @@ def localize(
         itself = max(itself, *(e.without for e in (first, found) if e.regression is regression))
         excess = max(excess, found.gain - expected)
         if not is_rounding_error(fitter, place, float(found.explained.square().mean(dim=0).max().sqrt())):
-            needed, evaluated[place] = max(needed, found.gain + math.log(RARE)), found
+            needed, evaluated[place] = max(needed, found.gain + math.log(RARE)), found.localized(fitter)
     before = -math.inf
     while evaluated and (likeliest := max(evaluated.values(), key=gain_of)).gain - before > CONVERGED:
         before = likeliest.gain
         for place, known in evaluated.items():
             # A larger noise than that which the likeliest discrepancy left hides what another place explains as well.
             if known is not likeliest:
-                again = ascent.evaluate(known.regression, known.discrepancy, place, likeliest.noise)
+                again = ascent.about(known.fit, known.explained, likeliest.noise, place, known.frequency)
                 again = ascent.climbed(ascent.with_finer_positions(again), needed)
-                evaluated[place] = max(known, again, key=gain_of)
-    localized = [e.localized(fitter) for e in evaluated.values()]
+                evaluated[place] = max(known, again.localized(fitter), key=gain_of)
+    localized = list(evaluated.values())
     random = [*drifting_sensors(regression, likely, places, base, needed)]
     random += random_flows(regression, likely, places, base)
     for process in random:
@@ -130,15 +129,16 @@ def _first_order_gains(
     base: float,
 ) -> dict[str, tuple[float, StateNoise]]:
     """Gain in log evidence of the best single regressor of each place, under the best of the noises, and that noise."""
-    best: dict[str, tuple[float, StateNoise]] = {}
+    under_each = []
     for noise in starts:
         under = with_disturbances(regression.fitter, fit, noise, regression.linearised)
-        offset = log_likelihood(under, fit, regression.linearised) + noise.log_prior() - base
-        generator = torch.Generator().manual_seed(0)
-        for place, gain in single_regressor_gains(regression, under, fit, places, generator).items():
-            if place not in best or offset + gain > best[place][0]:
-                best[place] = offset + gain, noise
-    return best
+        without = log_likelihood(under, fit, regression.linearised) + noise.log_prior() - base
+        gains = SingleRegressorGains(regression, under, fit, torch.Generator().manual_seed(0))
+        under_each.append((without, gains, noise))
+    return {
+        place: max(((without + gains.at(place), noise) for without, gains, noise in under_each), key=lambda e: e[0])
+        for place in places
+    }
 
 
 def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise, choices: int) -> float:

@@ -68,13 +68,6 @@ def nearly_without_disturbances(noise: StateNoise) -> StateNoise:
     return replace(noise, intensity=(0.1 * noise.intensity.min()).expand_as(noise.intensity).clone())
 
 
-def nearly_without_the_largest(noise: StateNoise) -> StateNoise:
-    """The noise with nearly no random flow into the tank where it is largest: there it may stand for a discrepancy."""
-    intensity = noise.intensity.clone()
-    intensity[intensity.argmax()] = 0.1 * intensity.min()
-    return replace(noise, intensity=intensity)
-
-
 def unexplained_norm(
     fitter: Fitter, space: ParameterSpace, theta: Tensor, jacobian: Tensor, deviation: Tensor
 ) -> float:

@@ -22,7 +22,7 @@ from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.component_regressors import discrepancy_model_at
-from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
+from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.sparse_regression import column_costs
 from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.simulate.collocation import Linearised
@@ -40,26 +40,47 @@ class Adjoints:
     rates: list[Tensor]
 
 
-def single_regressor_gains(
-    regression: DiscrepancyRegression, under: Fitter, fit: Fit, places: Sequence[str], generator: torch.Generator
-) -> dict[str, float]:
-    """Gain in log evidence of the best single regressor of each place. under: fitter with the disturbance noise."""
-    basis = parameter_basis(under, fit)
-    residual = whitened_residual(under, fit, regression.linearised)
-    adjoints = adjoints_of(regression, under, torch.cat([residual, random_signs(residual, generator)], dim=1), basis)
-    gains, largest = {}, largest_influence(under)
-    for place in places:
-        if (channel := regression.sensor(place)) is None:
-            weights = inflow_weights(regression, place, adjoints)
-            products = _flow_products(regression, place, adjoints, weights)
-        else:
-            discrepancy = regression.of(place)
-            by_reading = _sensor_weights(discrepancy, under, fit, basis, adjoints, channel)
-            weights = [by_reading[piece.rows].T for piece in regression.pieces]
-            products = discrepancy.columns[:, channel].T @ by_reading
-        groups = products, torch.cat(position_products(regression, place, weights))
-        gains[place] = max(_largest_gain(group, largest) for group in groups)
-    return gains
+class SingleRegressorGains:
+    """Gain in log evidence of the best single regressor of a place, under one noise.
+
+    under: fitter with the disturbance noise.
+    """
+
+    def __init__(self, regression: DiscrepancyRegression, under: Fitter, fit: Fit, generator: torch.Generator) -> None:
+        self.regression, self.under, self.fit = regression, under, fit
+        self._basis, self._largest = parameter_basis(under, fit), largest_influence(under)
+        residual = whitened_residual(under, fit, regression.linearised)
+        columns = torch.cat([residual, random_signs(residual, generator)], dim=1)
+        self._adjoints = adjoints_of(regression, under, columns, self._basis)
+
+    def at(self, place: str) -> float:
+        channel = self.regression.sensor(place)
+        weights = self._inflow_weights(place) if channel is None else self._reading_weights(place, channel)
+        groups = self._products(place, weights), torch.cat(position_products(self.regression, place, weights))
+        return max(_largest_gain(group, self._largest) for group in groups)
+
+    def _inflow_weights(self, place: str) -> list[Tensor]:
+        return inflow_weights(self.regression, place, self._adjoints)
+
+    def _reading_weights(self, place: str, channel: int) -> list[Tensor]:
+        """Per recording, the weights (1 + SIGNS, K) of a sensor's readings, about the model's level of its tank."""
+        linearised = self.regression.at(place)[1]
+        residual = _whitened_adjoint(self.under, whitened_residual(self.under, self.fit, linearised), self._basis)
+        weights = torch.cat([residual[:, channel], self._adjoints.readings[:, channel, 1:]], dim=1)
+        return [weights[piece.rows].T for piece in self.regression.pieces]
+
+    def _products(self, place: str, weights: Sequence[Tensor]) -> Tensor:
+        """Products (M, 1 + SIGNS) of the regressors of the grids with weights."""
+        shared, per_recording = list[Tensor](), list[Tensor]()
+        for k, (regressors, net) in enumerate(zip(self.regression.at(place)[0], weights, strict=True)):
+            products = regressors.functions @ net.T
+            if regressors.areas is not None:
+                rates = self._adjoints.rates[k][self.regression.tank(place)]
+                products = torch.cat([regressors.areas @ rates.T, products])
+            shared.append(products)
+            sinusoids = regressors.sinusoids(self.regression.frequencies).flatten(0, 1)
+            per_recording.append(torch.cat([regressors.in_time, sinusoids]) @ net.T)
+        return torch.cat([torch.stack(shared).sum(dim=0), *per_recording])
 
 
 def _largest_gain(products: Tensor, largest: float) -> float:
@@ -69,11 +90,12 @@ def _largest_gain(products: Tensor, largest: float) -> float:
 
 
 def position_products(regression: DiscrepancyRegression, place: str, weights: Sequence[Tensor]) -> list[Tensor]:
-    """Products of the regressors at all positions with weights (., K) per recording: kinks and jumps (F, .), and the
-    steps in time of each recording (K, .)."""
+    """Products of the regressors at all positions with weights (W, K) per recording: kinks and jumps by their families,
+    (N, W) each, and the steps in time of each recording, (K, W)."""
     pairs = list(zip(regression.at(place)[0], weights, strict=True))
-    steps = [(r.factor * w).flip(-1).cumsum(dim=-1).flip(-1).T for r, w in pairs]
-    return [torch.stack([r.fine @ w.T for r, w in pairs]).sum(dim=0), *steps]
+    fine = [[b.products(w) for b in r.fine] for r, w in pairs]
+    families = [torch.stack(of_family).sum(dim=0) for of_family in zip(*fine, strict=True)]
+    return [*families, *(r.steps_in_time.products(w) for r, w in pairs)]
 
 
 def largest_influence(fitter: Fitter) -> float:
@@ -148,25 +170,3 @@ def inflow_weights(regression: DiscrepancyRegression, place: str, adjoints: Adjo
                 net += sign * inflows[regression.tank(end)]
         weights.append(net)
     return weights
-
-
-def _flow_products(
-    regression: DiscrepancyRegression, place: str, adjoints: Adjoints, weights: Sequence[Tensor]
-) -> Tensor:
-    shared, per_recording = list[Tensor](), list[Tensor]()
-    for regressors, net, rates in zip(regression.at(place)[0], weights, adjoints.rates, strict=True):
-        products = regressors.functions @ net.T
-        if regressors.areas is not None:
-            products = torch.cat([regressors.areas @ rates[regression.tank(place)].T, products])
-        shared.append(products)
-        sinusoids = regressors.sinusoids(regression.frequencies).flatten(0, 1)
-        per_recording.append(torch.cat([regressors.in_time, sinusoids]) @ net.T)
-    return torch.cat([torch.stack(shared).sum(dim=0), *per_recording])
-
-
-def _sensor_weights(
-    discrepancy: Discrepancy, under: Fitter, fit: Fit, basis: Tensor, adjoints: Adjoints, channel: int
-) -> Tensor:
-    """Weights (S, 1 + SIGNS) of a sensor's readings, about the model's level of its tank."""
-    residual = _whitened_adjoint(under, whitened_residual(under, fit, discrepancy.linearised), basis)
-    return torch.cat([residual[:, channel], adjoints.readings[:, channel, 1:]], dim=1)
