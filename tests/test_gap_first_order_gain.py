@@ -60,7 +60,7 @@ def test_products_are_those_of_the_columns(
     rows = torch.cat([(under.white(null.linearised)[1][0] * scale).flatten(0, 1), torch.diag(pull + 1e-9)])
     basis = torch.linalg.qr(rows)[0]
     residual = torch.cat([under.white(own.linearised)[0][0].flatten(), -off])
-    columns = under.whiten(own.columns).flatten(0, 1)
+    columns = under.whiten(own.columns[torch.ones(len(own.columns), dtype=torch.bool)]).flatten(0, 1)
     columns = torch.cat([columns, columns.new_zeros(len(pull), columns.shape[1])])
     columns -= basis @ (basis.T @ columns)
     scores, strengths = products(surveyed, place, monkeypatch)

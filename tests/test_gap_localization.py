@@ -141,7 +141,7 @@ def test_every_sample_counts_in_the_weight_of_a_discrepancy(far_from_the_plant: 
     under, discrepancy = with_disturbances(fitter, fit, quiet, regression.linearised), regression.of("Q2")
     found = WhitenedDiscrepancy(under, fit, discrepancy).sparse_fit(column_costs(discrepancy.choices, 1e6))
     used = found.used
-    rows = discrepancy.columns[..., used], torch.sqrt(found.precision[used])
+    rows = discrepancy.columns[used], torch.sqrt(found.precision[used])
     gained = least_chi_square(under, fit, regression.linearised)
     gained -= least_chi_square(under, fit, regression.linearised, *rows)
     assert gained > 1e4

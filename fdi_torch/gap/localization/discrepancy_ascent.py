@@ -51,7 +51,8 @@ class EvaluatedDiscrepancy:
     @property
     def explained(self) -> Tensor:
         """The part of the readings (S, C) that the discrepancy explains."""
-        return self.discrepancy.columns @ self.regressed.mean
+        used = self.regressed.used
+        return self.discrepancy.columns[used] @ self.regressed.mean[used]
 
     def localized(self, fitter: Fitter) -> LocalizedDiscrepancy:
         """The result. fitter: that of the explanation, whose sensor noise is the unit of the size."""
@@ -132,8 +133,7 @@ class Ascent:
         at, used = known.discrepancy, known.regressed.used
         positions = Positions(known.regression, known.location, known.under, at, used, self.generator)
         while finer := positions.best(known.discrepancy, known.regressed.used):
-            last = torch.arange(len(finer.choices)) == len(finer.choices) - 1
-            further = self._changed(known, finer, last)
+            further = self._changed(known, finer)
             if further.gain - known.gain < CONVERGED:
                 break
             known = further
@@ -142,17 +142,17 @@ class Ascent:
     def _with_finer_frequency(self, known: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
         used, regression, at = known.regressed.used, known.regression, known.discrepancy
         finer = with_best_frequency(regression, known.location, known.under, regression.fit, at, used)
-        return self._changed(known, finer, finer.sinusoids) if finer else known
+        return self._changed(known, finer) if finer else known
 
-    def _changed(self, known: EvaluatedDiscrepancy, discrepancy: Discrepancy, columns: Tensor) -> EvaluatedDiscrepancy:
-        """The same with a discrepancy that differs in some columns, (M,) bool."""
-        whitened = known.whitened.with_columns(discrepancy.columns, columns)
+    def _changed(self, known: EvaluatedDiscrepancy, discrepancy: Discrepancy) -> EvaluatedDiscrepancy:
+        """The same with a discrepancy that differs in some columns."""
+        whitened = known.whitened.with_columns(discrepancy.columns)
         regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest))
         return replace(known, discrepancy=discrepancy, whitened=whitened, regressed=regressed)
 
     def _with_likely_noise(self, known: EvaluatedDiscrepancy, climb: bool) -> EvaluatedDiscrepancy:
         at, used = known.discrepancy, known.regressed.used
-        further = LinearParameters(at.columns[..., used], torch.sqrt(known.regressed.precision[used]))
+        further = LinearParameters(at.columns[used], torch.sqrt(known.regressed.precision[used]))
         fit = known.regression.fit
         likely = estimate_disturbances(self.fitter, fit, at.linearised, further, known.noise, climb).noise
         return self.evaluate(known.regression, at, known.location, likely)

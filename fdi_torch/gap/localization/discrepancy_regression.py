@@ -37,6 +37,21 @@ SAMPLES_A_STEP = 9  # fewest samples per step function of time
 
 
 @dataclass(frozen=True)
+class Columns:
+    """Columns (S, C, M) in blocks (S, C, .), so that a change of one block copies no other."""
+
+    blocks: tuple[Tensor, ...]
+
+    def __len__(self) -> int:
+        return sum(b.shape[-1] for b in self.blocks)
+
+    def __getitem__(self, used: Tensor) -> Tensor:
+        """Some columns (S, C, .). used (M,) bool."""
+        parts = used.split([b.shape[-1] for b in self.blocks])
+        return torch.cat([b[..., part] for b, part in zip(self.blocks, parts, strict=True)], dim=-1)
+
+
+@dataclass(frozen=True)
 class Discrepancy:
     """Influence of a component's regressors on the readings, columns (S, C, M), about a linearised trajectory.
 
@@ -44,7 +59,7 @@ class Discrepancy:
     are none. sinusoids (M,) bool: which columns they are.
     """
 
-    columns: Tensor
+    columns: Columns
     linearised: Linearised
     choices: Tensor
     frequency: float | None
@@ -54,16 +69,15 @@ class Discrepancy:
         """The same with one more column (S, C)."""
         return replace(
             self,
-            columns=torch.cat([self.columns, column.unsqueeze(-1)], dim=-1),
+            columns=Columns((*self.columns.blocks, column.unsqueeze(-1))),
             choices=torch.cat([self.choices, self.choices.new_tensor([choices])]),
             sinusoids=torch.cat([self.sinusoids, self.sinusoids.new_zeros(1)]),
         )
 
     def with_sinusoids(self, frequency: float, columns: Tensor) -> Discrepancy:
         """The same with sinusoids of another frequency; columns (S, C, W): their influence."""
-        replaced = self.columns.clone()
-        replaced[..., self.sinusoids] = columns
-        return replace(self, columns=replaced, frequency=frequency)
+        grid, _, *added = self.columns.blocks
+        return replace(self, columns=Columns((grid, columns, *added)), frequency=frequency)
 
 
 @dataclass(frozen=True)
@@ -151,16 +165,16 @@ class DiscrepancyRegression:
         for k, r in enumerate(regressors):
             if r.areas is not None:
                 shared[k] = torch.cat([self._influence_of_areas(place, k, r.areas), shared[k]], dim=-1)
-        columns = _concatenated(shared, [self.influence(place, k, r.in_time) for k, r in enumerate(regressors)])
-        frequency, first = None, columns.shape[-1]
+        grid = _concatenated(shared, [self.influence(place, k, r.in_time) for k, r in enumerate(regressors)])
+        frequency, columns = None, Columns((grid,))
         if len(self.frequencies):
             frequency = float(self.frequencies[0])
-            columns = torch.cat([columns, self.sinusoids(place, self.frequencies)[..., 0, :]], dim=-1)
-        count = columns.shape[-1]
-        choices, sinusoids = columns.new_full((count,), count), torch.arange(count) >= first
+            columns = Columns((grid, self.sinusoids(place, self.frequencies)[..., 0, :]))
+        count = len(columns)
+        choices, sinusoids = grid.new_full((count,), count), torch.arange(count) >= grid.shape[-1]
         # A sinusoid is one of those of all frequencies: 1 / (2 dt) over the width sqrt(2 pi) s of the posterior,
         # s = sqrt(6 / G) / (2 pi T) with a gain of G nats (Rife and Boorstyn, 1974), is 2 S if it is just worth it.
-        choices[sinusoids] *= 2 * len(columns)
+        choices[sinusoids] *= 2 * len(grid)
         return Discrepancy(columns, linearised, choices, frequency, sinusoids)
 
     def sinusoids(self, place: str, frequency: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_regression import Discrepancy
+from fdi_torch.gap.localization.discrepancy_regression import Columns, Discrepancy
 from fdi_torch.gap.localization.sparse_regression import SparseFit, sparse_fit
 
 MOST_ROWS = 1000  # rows per channel from which columns are selected; more samples are summed in groups
@@ -34,16 +34,18 @@ class WhitenedDiscrepancy:
     def __init__(self, under: Fitter, fit: Fit, discrepancy: Discrepancy) -> None:
         residual, jacobian = under.white(discrepancy.linearised)
         scale, self._pull, self._off = under.priors(fit.space, fit.theta)
-        self._under, self._columns, self._residual = under, under.whiten(discrepancy.columns), residual[0]
-        self._jacobian = jacobian[0] * scale
+        self._under, self._residual, self._jacobian = under, residual[0], jacobian[0] * scale
+        self._white = {id(block): (block, under.whiten(block)) for block in discrepancy.columns.blocks}
 
-    def with_columns(self, columns: Tensor, changed: Tensor) -> WhitenedDiscrepancy:
-        """The same with other columns (S, C, M), of which only the `changed` ones, (M,) bool, are whitened."""
+    def with_columns(self, columns: Columns) -> WhitenedDiscrepancy:
+        """The same with other columns (S, C, M), of which only new blocks are whitened."""
         other = copy(self)
-        other._columns = columns.new_empty(columns.shape)
-        other._columns[..., ~changed] = self._columns[..., ~changed[: self._columns.shape[-1]]]
-        other._columns[..., changed] = self._under.whiten(columns[..., changed])
+        other._white = {id(b): self._white.get(id(b)) or (b, self._under.whiten(b)) for b in columns.blocks}
         return other
+
+    @property
+    def _columns(self) -> Columns:
+        return Columns(tuple(white for _, white in self._white.values()))
 
     def normal_equations(self, used: Tensor | None = None) -> NormalEquations:
         """Of some columns, used (M,) bool, with all samples; or of all, with samples summed in groups.
@@ -51,9 +53,12 @@ class WhitenedDiscrepancy:
         A group is shorter than any regressor's changes. What a sum of its samples leaves out is little of the residual,
         but may be many nats if the residual is large: it serves to select columns, not to weigh them.
         """
-        columns = self._columns if used is None else self._columns[..., used]
-        group = max(len(columns) // MOST_ROWS, 1) if used is None else 1
-        c, r, j = (_grouped(x, group).flatten(0, 1) for x in (columns, self._residual.unsqueeze(-1), self._jacobian))
+        blocks = self._columns.blocks if used is None else [self._columns[used]]
+        group = max(len(self._residual) // MOST_ROWS, 1) if used is None else 1
+        r, j, *grouped = (
+            _grouped(x, group).flatten(0, 1) for x in (self._residual[..., None], self._jacobian, *blocks)
+        )
+        c = torch.cat(grouped, dim=-1)
         basis, _ = decomposed(j, self._pull)
         of_priors = torch.nn.functional.pad(-self._off.unsqueeze(1), (c.shape[1], 0))
         remaining = without(basis, torch.cat([torch.cat([c, r], dim=1), of_priors]))
