@@ -73,10 +73,13 @@ def unexplained_norm(
 ) -> float:
     """Norm, in units of the sensor noise, of the part of a deviation that no parameter within its tolerance explains.
 
-    deviation (S, C): of the readings. jacobian (S, C, P): their derivatives by the parameters at theta.
+    deviation (S, C): of the readings. jacobian (S, C, P): their derivatives by the parameters at theta. A parameter at
+    a bound explains nothing.
     """
     scale, pull, _ = fitter.priors(space, theta)
-    basis, _ = decomposed(fitter.noise.whiten(jacobian, fitter.data.mask).flatten(0, 1) * scale, pull)
+    low, high, _ = fitter.box(space)
+    free = scale * ((theta > low) & (theta < high))
+    basis, _ = decomposed(fitter.noise.whiten(jacobian, fitter.data.mask).flatten(0, 1) * free, pull)
     column = fitter.noise.whiten(deviation, fitter.data.mask).flatten().unsqueeze(1)
     return float(torch.linalg.vector_norm(without(basis, column)))
 
