@@ -24,13 +24,14 @@ class Odds:
     effect: odds of one more effect of the library, divided equally among all effects at all places.
     same_place: factor for a second effect at the same place, as opposed to one effect with a different law.
     unknown: odds that some place follows a law that is not in the library, divided equally among all places.
-    discrepancy: relative error of an effect's law in the library, as a fraction of the effect on the readings.
+    law_error: standard deviation of the relative error of an effect's law in the library, as a fraction of the effect
+    on the readings.
     """
 
     effect: float = 0.1
     same_place: float = 1e-4
     unknown: float = 0.02
-    discrepancy: float = 0.15
+    law_error: float = 0.06
 
 
 ODDS = Odds()
@@ -45,6 +46,21 @@ def log_prior(count: int, places: int, choices: int) -> float:
     """
     each = count * (math.log(ODDS.effect) - math.log(choices)) + (count - places) * math.log(ODDS.same_place)
     return each + math.lgamma(count + 1)
+
+
+def log_law_error(error: float) -> float:
+    """Log density of the relative error of a law, over that of no error."""
+    return -0.5 * (error / ODDS.law_error) ** 2
+
+
+def log_odds_of_law(error: float, choices: int, places: int) -> float:
+    """Log odds that a deviation is an effect whose law has this relative error, against a law that no library has.
+
+    choices: number of possible pairs of effect and place. places: number of places. The error of the law is normal; the
+    difference of another law from the effect is uniform up to the effect's own size.
+    """
+    law = math.log(2.0 / (ODDS.law_error * math.sqrt(2.0 * math.pi))) + log_law_error(error)
+    return math.log(ODDS.effect / choices) - math.log(ODDS.unknown / places) + law
 
 
 def log_det(curvature: Float[Tensor, "P P"]) -> float:

@@ -4,9 +4,9 @@
     log weight(S, p) = log weight(S) + gain of a free discrepancy at p + log odds of an unknown there
 
 each under its most likely disturbance noise (`marginal_likelihood.py`, `localization/localize.py`). No library
-has the exact law of a rig (Brynjarsdottir and O'Hagan, 2014). A discrepancy at a place where S has an effect,
-and small compared with its influence, is therefore attributed to the effect, and its weight goes to S. A large one
-means that the law there is a different one: then the effects at that place are part of the unknown.
+has the exact law of a rig (Brynjarsdottir and O'Hagan, 2014). The weight of a discrepancy at a place where S has an
+effect is therefore divided: it is the error of the effect's law, or the law there is a different one, and the effects
+at that place are part of the unknown. The odds depend on its size, relative to the influence of the effect.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
@@ -65,12 +64,9 @@ def causes_in_order(fit: Fit) -> tuple[CauseName, ...]:
     return tuple((p.effect.name, p.location) for p in fit.candidate.placements)
 
 
-def is_inexact_law(fitter: Fitter, fit: Fit, size: float, effects: Collection[CauseName]) -> bool:
-    """Whether a deviation of the readings is small compared with the influence of some of a fit's effects.
-
-    size: its norm, in units of the sensor noise.
-    """
-    return size < ODDS.discrepancy * influence(fitter, fit, effects)
+def relative_size(fitter: Fitter, fit: Fit, size: float, effects: Collection[CauseName]) -> float:
+    """Size of a deviation of the readings over the influence of some of a fit's effects, both in units of the noise."""
+    return size / max(influence(fitter, fit, effects), 1e-12)
 
 
 def influence(fitter: Fitter, fit: Fit, effects: Collection[CauseName]) -> float:

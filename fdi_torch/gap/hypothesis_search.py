@@ -11,15 +11,17 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from fdi_torch.estimate.evidence import ODDS, RARE
+import torch
+
+from fdi_torch.estimate.evidence import ODDS, RARE, log_law_error, log_odds_of_law
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.cause_hypothesis import (
     CauseHypothesis,
     causes_in_order,
     influence,
-    is_inexact_law,
     likeliest,
+    relative_size,
 )
 from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
 from fdi_torch.gap.library import tanks_of
@@ -43,7 +45,8 @@ class HypothesisSearch:
     def __init__(self, pool: ExplanationPool, options: Sequence[Option], places: Sequence[str]) -> None:
         self.pool, self.options, self.places = pool, options, places
         self._log_odds = math.log(ODDS.unknown / len(places))
-        self._evaluated: dict[tuple[int, str], CauseHypothesis] = {}  # by the explanation's id, and the place
+        # By the explanation's id, and the place.
+        self._evaluated: dict[tuple[int, str], list[CauseHypothesis]] = {}
 
     def search(self, result: SearchResult, named: Sequence[CauseHypothesis]) -> list[CauseHypothesis]:
         """All hypotheses that were examined. named: those without a discrepancy."""
@@ -71,24 +74,35 @@ class HypothesisSearch:
     ) -> list[CauseHypothesis]:
         """An explanation alone, and with a discrepancy at each of some places, as far as relevant against the best."""
         if all((id(explanation), place) in self._evaluated for place in at):
-            return [self._evaluated[id(explanation), place] for place in at]
+            return [h for place in at for h in self._evaluated[id(explanation), place]]
         needed, rival = (self._needed(explanation, best), best.noise) if best else (-math.inf, None)
         found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed, rival)
-        hypotheses = [self._with_discrepancy(explanation, d) for d in found.discrepancies]
-        self._evaluated |= {(id(explanation), h.discrepancy.location): h for h in hypotheses if h.discrepancy}
+        hypotheses = {
+            (id(explanation), d.location): self._with_discrepancy(explanation, d) for d in found.discrepancies
+        }
+        self._evaluated |= hypotheses
         causes = causes_in_order(explanation.fit)
-        return [CauseHypothesis(explanation, causes, explanation.log_weight + found.itself), *hypotheses]
+        alone = CauseHypothesis(explanation, causes, explanation.log_weight + found.itself)
+        return [alone, *(h for each in hypotheses.values() for h in each)]
 
-    def _with_discrepancy(self, explanation: RankedExplanation, at: LocalizedDiscrepancy) -> CauseHypothesis:
-        """An explanation with a discrepancy at one place, which is attributed to an effect there if it is small."""
+    def _with_discrepancy(self, explanation: RankedExplanation, at: LocalizedDiscrepancy) -> list[CauseHypothesis]:
+        """An explanation with a discrepancy at one place, which may be the error of the law of an effect there."""
         causes = causes_in_order(explanation.fit)
         # A random flow into a tank may stand for the error of any flow there.
         plant, flow = self.pool.fitter.data.plant, at.noise.apart is not None
         here = [c for c in causes if c[1] == at.location or (flow and at.location in tanks_of(c[1], plant))]
         weight = explanation.log_weight + at.gain
-        if here and is_inexact_law(self.pool.fitter, explanation.fit, at.size, here):
-            return CauseHypothesis(explanation, causes, weight, at, inexact=True)
-        return CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight + self._log_odds, at)
+        if not here:
+            return [CauseHypothesis(explanation, causes, weight + self._log_odds, at)]
+        error = relative_size(self.pool.fitter, explanation.fit, at.size, here)
+        law, other = _shares([self._log_odds_of_law(error)])
+        return [
+            CauseHypothesis(explanation, causes, weight + law, at, inexact=True),
+            CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight + other, at),
+        ]
+
+    def _log_odds_of_law(self, error: float) -> float:
+        return log_odds_of_law(error, self.pool.choices, len(self.places))
 
     def _climbed(self, best: CauseHypothesis) -> list[CauseHypothesis]:
         """Hypotheses with an effect fewer or more than the best, while that improves it."""
@@ -133,7 +147,7 @@ class HypothesisSearch:
             evidence = log_likelihood(fitter, fit, fit.linearised) + log_prior(fit.key, self.pool.choices)
             explanation = RankedExplanation(replace(fit, cost=fitter.cost(fit)), fitter, noise, evidence)
             if found := localize_beside(fitter, fit, noise, at, self._needed(explanation, best)):
-                hypotheses.append(self._with_discrepancy(explanation, found))
+                hypotheses += self._with_discrepancy(explanation, found)
         return hypotheses
 
     def _needed(self, explanation: RankedExplanation, best: CauseHypothesis) -> float:
@@ -145,8 +159,8 @@ class HypothesisSearch:
     ) -> list[CauseHypothesis]:
         """The hypotheses after the effects of the library were fitted at the place of each unknown that is relevant.
 
-        An unknown is a law that no library has: its weight goes to an effect at the same place that predicts as well by
-        Akaike's criterion. The law of such an effect may also be inexact. rival: weight of the likeliest of all others.
+        An unknown is a law that no library has. Its weight is divided among it and the effects at the same place, whose
+        laws may be inexact. rival: weight of the likeliest of all others.
         """
         added: list[CauseHypothesis] = []
         least = max([rival, *(h.weight for h in hypotheses)]) + math.log(RARE)
@@ -160,31 +174,34 @@ class HypothesisSearch:
                     self.pool.evaluate(fit, replace(h.unknown.noise, wander=None))
                 here = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
                 added += [law for e in here for law in self._with_discrepancies(e, [h.unknown.location], h)]
-        return [self._as_known(h) for h in [*hypotheses, *added]]
+        return [divided for h in [*hypotheses, *added] for divided in self._among_known(h, h.weight > least)]
 
-    def _as_known(self, h: CauseHypothesis) -> CauseHypothesis:
-        """The hypothesis, or that of an effect at the place of its unknown which predicts as well."""
-        if h.unknown is None:
-            return h
-        for known in self.pool.explanations.values():
-            if _names_unknown(known, h) and self._predicts_as_well(known, h.explanation, h.unknown):
-                return CauseHypothesis(known, causes_in_order(known.fit), h.weight)
-        return h
+    def _among_known(self, h: CauseHypothesis, relevant: bool) -> list[CauseHypothesis]:
+        """The hypothesis, and those of single effects in place of its unknown, with its weight divided among them."""
+        if h.unknown is None or not relevant:
+            return [h]
+        known = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
+        errors = [self._law_error(e, h.explanation, h.unknown) for e in known]
+        *shares, other = _shares([self._log_odds_of_law(error) for error in errors])
+        named = [CauseHypothesis(e, causes_in_order(e.fit), h.weight + s) for e, s in zip(known, shares, strict=True)]
+        return [*named, replace(h, weight=h.weight + other)]
 
-    def _predicts_as_well(
+    def _law_error(
         self, known: RankedExplanation, explanation: RankedExplanation, unknown: LocalizedDiscrepancy
-    ) -> bool:
-        """Whether an effect at the place of an unknown differs from it by no more than its law may be wrong, or
-        predicts as well by Akaike's criterion (1974), which costs one nat for each parameter.
+    ) -> float:
+        """Relative error of the law of an effect if the unknown at its place is true.
+
+        It is 0 if the effect predicts as well by Akaike's criterion (1974), which costs one nat for each parameter.
         """
         fitter, fit = self.pool.fitter, known.fit
-        if unknown.predicted is not None:
-            difference = unknown.predicted - fit.linearised.readings[0]
-            size = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], difference)
-            if is_inexact_law(fitter, fit, size, [c for c in known.key if c[1] == unknown.location]):
-                return True
         better = self._log_likelihood(explanation) + unknown.log_likelihood - self._log_likelihood(known)
-        return better <= unknown.parameters + len(explanation.fit.space) - len(fit.space)
+        if better <= unknown.parameters + len(explanation.fit.space) - len(fit.space):
+            return 0.0
+        if unknown.predicted is None:
+            return math.inf
+        difference = unknown.predicted - fit.linearised.readings[0]
+        size = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], difference)
+        return relative_size(fitter, fit, size, [c for c in known.key if c[1] == unknown.location])
 
     def _log_likelihood(self, explanation: RankedExplanation) -> float:
         fitter, fit = explanation.fitter, explanation.fit
@@ -192,23 +209,29 @@ class HypothesisSearch:
         return explanation.log_weight - log_prior(fit.key, self.pool.choices) - volume
 
     def _with_inexact_laws(self, h: CauseHypothesis) -> list[CauseHypothesis]:
-        """Without effects that are small compared with others at their place.
+        """Without effects that may describe the error of the law of another effect at their place.
 
-        Such an effect describes the error of the other's law. It costs its selection among all effects there instead of
-        the prior odds of one more cause.
+        Such an effect costs its selection among all effects there instead of the prior odds of one more cause.
         """
         explained: list[CauseHypothesis] = []
         fitter, fit = self.pool.fitter, h.explanation.fit
         for cause in h.causes:
             here = [c for c in h.causes if c[1] == cause[1]]
-            if len(here) > 1 and is_inexact_law(fitter, fit, influence(fitter, fit, [cause]), here):
+            if len(here) > 1:
+                error = relative_size(fitter, fit, influence(fitter, fit, [cause]), here)
                 reduced = self.pool.without(h.explanation, cause)
                 odds = log_prior(reduced.key, self.pool.choices) - log_prior(h.explanation.key, self.pool.choices)
                 selected = len({o.cause for o in self.options if o.cause[1] == cause[1]})
-                others, weight = tuple(c for c in h.causes if c != cause), h.weight + odds - math.log(selected)
+                weight = h.weight + odds - math.log(selected) + log_law_error(error)
+                others = tuple(c for c in h.causes if c != cause)
                 law = CauseHypothesis(reduced, others, weight, h.discrepancy, h.inexact)
                 explained += [law, *self._with_inexact_laws(law)]
         return explained
+
+
+def _shares(log_odds: Sequence[float]) -> list[float]:
+    """Log probabilities of alternatives from their log odds against one more, which is the last."""
+    return torch.log_softmax(torch.tensor([*log_odds, 0.0], dtype=torch.float64), dim=0).tolist()
 
 
 def _without_discrepancy(h: CauseHypothesis, at: LocalizedDiscrepancy) -> Fitter:
