@@ -56,10 +56,10 @@ def log_law_error(error: float) -> float:
 def log_odds_of_law(error: float, choices: int, places: int) -> float:
     """Log odds that a deviation is an effect whose law has this relative error, against a law that no library has.
 
-    choices: number of possible pairs of effect and place. places: number of places. The error of the law is normal; the
-    difference of another law from the effect is uniform up to the effect's own size.
+    choices: number of possible pairs of effect and place. places: number of places. The error of the law is normal. The
+    difference of another law of the same size is at most twice that size, and uniform up to it.
     """
-    law = math.log(2.0 / (ODDS.law_error * math.sqrt(2.0 * math.pi))) + log_law_error(error)
+    law = math.log(2.0 * 2.0 / (ODDS.law_error * math.sqrt(2.0 * math.pi))) + log_law_error(error)
     return math.log(ODDS.effect / choices) - math.log(ODDS.unknown / places) + law
 
 
